@@ -19,25 +19,24 @@ from afspm import wire
 from afspm.microscopes.asylum import Asylum
 from afspm.microscopes.asylum.link import Link as AsylumLink
 from afspm.microscopes.gxsm import Gxsm
-from afspm.microscopes.gxsm.bridge_client import BridgeLink
 from afspm.microscopes.nanonis import Nanonis
-from afspm.microscopes.nanonis.link import Link as NanonisLink
 from afspm.model import ControlRequest, Parameter, Region, Request, ScanParameters, ScopeState, names
 from afspm.process.memory import Memory
 from afspm.translator.driver import Driver
 from afspm.translator.process import Translator
+from afspm.translator.tcp import Receiver
 from afspm.transport.port import RequestReceived, Served
 from benchmarks.processes import CLOCK, Roles, roles
 from benchmarks.rows import Row, measurement
 
 REQUESTS = 200
 AT_MOST_MS = 1.0
-VENDORS: dict[str, tuple[type[Driver], type]] = {
-    "asylum": (Asylum, AsylumLink),
-    "nanonis": (Nanonis, NanonisLink),
-    "gxsm": (Gxsm, BridgeLink),
+VENDORS: dict[str, tuple[type[Driver], tuple[type, str]]] = {
+    "asylum": (Asylum, (AsylumLink, "_exchange")),
+    "nanonis": (Nanonis, (Receiver, "some")),
+    "gxsm": (Gxsm, (Receiver, "some")),
 }
-"""The microscope, and its link to the controller, of which `_exchange` waits for the answer."""
+"""The driver, and the class and its method that waits for the answer of the controller."""
 FRAME = ScanParameters(Region((1e-7, -5e-8), (4e-7, 3e-7), 0.1), (48, 64), "m")
 
 
@@ -48,8 +47,8 @@ class Waiting:
         self.s = 0.0
 
     @contextmanager
-    def counted(self, link: Any) -> Iterator[None]:
-        plainly = link._exchange
+    def counted(self, link: Any, method: str) -> Iterator[None]:
+        plainly = getattr(link, method)
 
         @wraps(plainly)
         def timed(*arguments: Any) -> Any:
@@ -59,11 +58,11 @@ class Waiting:
             finally:
                 self.s += perf_counter() - began
 
-        link._exchange = timed
+        setattr(link, method, timed)
         try:
             yield
         finally:
-            link._exchange = plainly
+            setattr(link, method, plainly)
 
 
 class Answers:
@@ -122,10 +121,10 @@ def controllers() -> Iterator[Row]:
         with ExitStack() as stack:
             folder = Path(stack.enter_context(TemporaryDirectory()))
             made = translator(vendor, stack.enter_context(roles()), folder, port)
-            stack.callback(made.microscope.close)
-            stack.enter_context(waiting.counted(link))
+            stack.callback(made.driver.close)
+            stack.enter_context(waiting.counted(*link))
             asked = [Parameter(names.SCAN_SPEED, None, None)]
-            set_ = bias if names.TIP_BIAS_VOLTAGE in made.microscope.table else speed
+            set_ = bias if names.TIP_BIAS_VOLTAGE in made.driver.table else speed
             for what, kind, subjects in (
                 ("a value asked for", ControlRequest.PARAM, asked),
                 ("a value set", ControlRequest.PARAM, set_),
@@ -135,7 +134,7 @@ def controllers() -> Iterator[Row]:
                 for number in range(REQUESTS):
                     request = Request(kind, subjects[number % len(subjects)], id=f"{what}/{number}")
                     times.append(own_s(made, port, waiting, request))
-                    while made.microscope.status().state is not ScopeState.FREE:
+                    while made.driver.status().state is not ScopeState.FREE:
                         pass
                     made.look()
                 yield Row(f"{vendor}'s translator, {what}", "ms", median(times) * 1e3, None, AT_MOST_MS)

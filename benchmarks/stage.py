@@ -18,7 +18,7 @@ from afspm import wire
 from afspm.clock import ExperimentClock
 from afspm.launch import Launch, Sockets
 from afspm.model import ControlMode, ControlState, Region, Scan, ScopeState, ScopeStatus
-from afspm.transport.launching import open_port
+from afspm.transport.zmq_port import open_port
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))
 

@@ -10,7 +10,7 @@ import inspect
 import re
 import sys
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -97,23 +97,36 @@ def _plain(value: Any) -> str:
 
 
 def _class_page(name: str, cls: type) -> str:
-    text, meanings = _docstring(cls)
+    text, _ = _docstring(cls)
     lines = [f"## {name}", "", text, ""]
     for attribute, says in (("solves", "Solves"), ("flags", "Flags"), ("publishes", "Publishes")):
         if told := getattr(cls, attribute, ()):
             lines += [f"{says}: {', '.join(f'`{one}`' for one in told)}.", ""]
-    hints = typing.get_type_hints(cls.__init__, include_extras=True)  # type: ignore[misc]
-    parameters = [p for p in inspect.signature(cls).parameters.values() if p.kind is not p.VAR_KEYWORD]
-    if parameters:
+    settings = list(_settings(cls))
+    if settings:
         lines += ["| setting | value | default | meaning |", "| --- | --- | --- | --- |"]
-        for parameter in parameters:
-            hint = hints.get(parameter.name, Any)
+        for parameter, hint, meanings in settings:
             needed = parameter.default is parameter.empty
             default = "(needed)" if needed else _value(parameter.default, hint, ())
             meaning = meanings.get(parameter.name, "")
             lines.append(f"| `{parameter.name}` | {_kind(hint, ())} | {default} | {meaning} |")
         lines.append("")
     return "\n".join(lines)
+
+
+def _settings(cls: type) -> Iterator[tuple[inspect.Parameter, Any, dict[str, str]]]:
+    """Parameters of the constructor, with their types and meanings; where it hands **keywords on, those of its base."""
+    for base in cls.__mro__:
+        if "__init__" not in vars(base):
+            continue
+        init, (_, meanings) = vars(base)["__init__"], _docstring(base)
+        hints = typing.get_type_hints(init, include_extras=True)
+        parameters = list(inspect.signature(init).parameters.values())[1:]
+        for parameter in parameters:
+            if parameter.kind is not parameter.VAR_KEYWORD:
+                yield parameter, hints.get(parameter.name, Any), meanings
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+            return
 
 
 def _docstring(cls: type, list_of: str = "Args") -> tuple[str, dict[str, str]]:

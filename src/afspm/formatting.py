@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from datetime import UTC, datetime, tzinfo
 
 from afspm.clock import NS_PER_S
 
+_PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"),
+             (1e-12, "p"), (1e-15, "f"))  # fmt: skip
+PREFIXABLE = frozenset({"m", "V", "A", "s", "N", "Hz", "W", "F", "m/s", "m/V", "V/m", "C", "Pa", "Ohm", "Ω", "T", "g"})
 _LENGTHS = ((1e-3, "mm"), (1e-6, "um"), (1e-9, "nm"), (1e-12, "pm"))
 
 
@@ -99,3 +103,21 @@ def _zone(zone: tzinfo | None) -> str:
 
 def _moment(time_ns: int, zone: tzinfo | None) -> datetime:
     return datetime.fromtimestamp(time_ns / NS_PER_S, UTC).astimezone(zone)
+
+
+def scale(largest: float, unit: str) -> tuple[float, str]:
+    """Return (factor, unit with prefix) in which numbers up to `largest` read well: shown = value * factor."""
+    if unit not in PREFIXABLE or not math.isfinite(largest) or largest == 0.0:
+        return 1.0, unit
+    # what rounds up to a thousand belongs to the next prefix
+    size = abs(largest) * 1.0005
+    power, prefix = next(((p, name) for p, name in _PREFIXES if size >= p), _PREFIXES[-1])
+    return 1.0 / power, prefix + unit
+
+
+def quantity(value: float | None, unit: str, digits: int = 4) -> str:
+    """Return a number with its unit, "12.34 nm"; "–" if there is no number."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    factor, shown = scale(value, unit)
+    return f"{value * factor:.{digits}g} {shown}".strip()

@@ -35,8 +35,6 @@ class Sockets:
     """Connected: whom we send requests to."""
     heartbeat: str | None = None
     """Connected: where the supervisor listens for our beats."""
-    log: str | None = None
-    """Connected: where the log collector listens."""
 
 
 @dataclass(frozen=True)

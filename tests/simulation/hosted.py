@@ -19,7 +19,6 @@ from afspm.process.context import MEASURED_MESSAGES, STATE_MESSAGES, ProcessActi
 from afspm.process.memory import Memory
 from afspm.translator.driver import Driver
 from afspm.translator.process import Translator
-from afspm.transport.history import Published
 from afspm.transport.port import (
     CaughtUp,
     ControlConnected,
@@ -32,6 +31,7 @@ from afspm.transport.port import (
     SubscriberJoined,
 )
 from afspm.transport.port import Killed as KillReceived
+from afspm.transport.replay import Published
 from tests.simulation.baton import Baton
 from tests.simulation.network import ControlLine, Feed, Weather
 from tests.simulation.process import Process

@@ -10,9 +10,9 @@ import pytest
 from ui_lab import Night, Opened
 
 import afspm
-from afspm.dashboard.levelling import Levelling, levelled
-from afspm.dashboard.palettes import colours
-from afspm.dashboard.pictures import Contrast, indices, span_of
+from afspm.drawing.levelling import Levelling, levelled
+from afspm.drawing.palette import colour_map
+from afspm.drawing.raster import Contrast, indices, value_range
 from afspm.model import Region, Scan
 
 TURNED = Region((0.4e-6, -0.3e-6), (0.8e-6, 0.5e-6), 0.4)
@@ -68,7 +68,7 @@ def test_each_pixel_has_the_colour_of_its_value(night: Night, opened: Opened, sc
     page.wait_for_function("n => afspm.image.head.levelling === n", arg=levelling.value)
     assert page.get_attribute(".picture", "data-number") == number
     values = levelled(scan.values, levelling)
-    wanted = colours("gold")[indices(values, span_of(values, Contrast.ROBUST))]
+    wanted = colour_map("gold")[indices(values, value_range(values, Contrast.ROBUST))]
     for column, row in ((3, 20), (68, 4), (5, 44), (40, 20), (66, 42)):  # none under the scale bar
         found = page.evaluate(
             """([column, row]) => {

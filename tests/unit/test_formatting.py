@@ -70,3 +70,17 @@ def test_times_are_those_of_the_zone_that_is_given_and_utc_is_named() -> None:
 def test_the_day_of_an_end_is_told_where_it_is_another() -> None:
     assert formatting.period_text(EVENING, EVENING + HOUR_NS, UTC) == "2026-11-20 22:04 to 23:04 UTC"
     assert formatting.period_text(EVENING, EVENING + 3 * HOUR_NS, UTC) == "2026-11-20 22:04 to 2026-11-21 01:04 UTC"
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [(1.234e-8, "m", "12.34 nm"), (0.0, "m", "0 m"), (9.9999e-7, "m", "1 µm"), (-3.0, "V", "-3 V"), (5.0, "", "5"),
+     (0.001, "counts", "0.001 counts"), (float("nan"), "m", "–"), (None, "m", "–"), (2e-6, "m/s", "2 µm/s")],
+)  # fmt: skip
+def test_quantities_read_well(value: float | None, unit: str, text: str) -> None:
+    assert formatting.quantity(value, unit) == text
+
+
+def test_the_prefix_and_the_factor_belong_together() -> None:
+    factor, unit = formatting.scale(3e-7, "m")
+    assert (3e-7 * factor, unit) == (pytest.approx(300.0), "nm")

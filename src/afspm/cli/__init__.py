@@ -5,12 +5,9 @@ from __future__ import annotations
 import io
 import sys
 
-from afspm import garbage
-
 
 def main() -> None:
     """Entry point. An error of ours is told in its own words; a traceback is kept for what nobody foresaw."""
-    garbage.seldom()
     from afspm.cli.app import app
     from afspm.errors import AfspmError
 

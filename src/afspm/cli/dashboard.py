@@ -70,7 +70,9 @@ def resumed_with_dashboard(found: ResumableRun) -> ResumableRun:
 
 
 def _has_dashboard(experiment: Experiment) -> bool:
-    return NAME_OF_CLASS in {path.rpartition(".")[2] for path in experiment.resolved.class_paths.values()}
+    return NAME_OF_CLASS in {
+        process.class_path.rpartition(".")[2] for process in experiment.resolved.processes.values()
+    }
 
 
 def _overlay() -> Path:
@@ -153,7 +155,7 @@ def _start_part(file: Path) -> int:
     from afspm.supervisor import run as running
 
     experiment = with_dashboard([file])
-    names = [name for name, path in experiment.resolved.class_paths.items() if path.endswith(f".{NAME_OF_CLASS}")]
+    names = [one.name for one in experiment.resolved.processes.values() if one.class_path.endswith(f".{NAME_OF_CLASS}")]
     try:
         running.dry_run(experiment, running.RunOptions(only=tuple(names)))
     except ConfigError as error:

@@ -1,8 +1,8 @@
-"""Packets that wait to be handled: in order, none lost, in bounded memory however long one is busy."""
+"""Packets that wait to be handled: in order, none lost, in bounded memory however long a handler takes."""
 
 from __future__ import annotations
 
-import struct
+import pickle
 import tempfile
 from collections import deque
 from typing import IO
@@ -10,7 +10,6 @@ from typing import IO
 from afspm.model import Packet
 
 MEMORY_LIMIT_BYTES = 256 << 20
-_LENGTHS = struct.Struct("<IQq?")  # envelope, payload, time, whether there is one
 
 
 class Backlog:
@@ -33,15 +32,27 @@ class Backlog:
         if self._file is None and (not self._memory or self._memory_bytes + size <= self._limit_bytes):
             self._memory.append(packet)
             self._memory_bytes += size
-        else:
-            self._put_on_disk(packet)
+            return
+        if self._file is None:
+            self._file = tempfile.TemporaryFile(prefix="afspm-")  # noqa: SIM115 - open for as long as it is needed
+        self._file.seek(0, 2)
+        pickle.dump((packet.envelope, bytes(packet.payload), packet.time_ns), self._file)
+        self._on_disk += 1
 
     def take(self) -> Packet | None:
-        """The oldest packet; None if there is none."""
-        if not self._memory:
-            return self._take_from_disk()
-        packet = self._memory.popleft()
-        self._memory_bytes -= len(packet.payload)
+        """Return the oldest packet; None if there is none."""
+        if self._memory:
+            packet = self._memory.popleft()
+            self._memory_bytes -= len(packet.payload)
+            return packet
+        if self._file is None:
+            return None
+        self._file.seek(self._read_at)
+        packet = Packet(*pickle.load(self._file))
+        self._read_at = self._file.tell()
+        self._on_disk -= 1
+        if self._on_disk == 0:
+            self.close()
         return packet
 
     def close(self) -> None:
@@ -51,27 +62,3 @@ class Backlog:
         if self._file is not None:
             self._file.close()
             self._file = None
-
-    def _put_on_disk(self, packet: Packet) -> None:
-        if self._file is None:
-            self._file = tempfile.TemporaryFile(prefix="afspm-")  # noqa: SIM115 - open for as long as it is needed
-        envelope = packet.envelope.encode()
-        time_ns = packet.time_ns
-        self._file.seek(0, 2)
-        self._file.write(_LENGTHS.pack(len(envelope), len(packet.payload), time_ns or 0, time_ns is not None))
-        self._file.write(envelope)
-        self._file.write(packet.payload)
-        self._on_disk += 1
-
-    def _take_from_disk(self) -> Packet | None:
-        if self._file is None:
-            return None
-        self._file.seek(self._read_at)
-        envelope_len, payload_len, time_ns, has_time = _LENGTHS.unpack(self._file.read(_LENGTHS.size))
-        envelope = self._file.read(envelope_len).decode()
-        packet = Packet(envelope, self._file.read(payload_len), time_ns if has_time else None)
-        self._read_at = self._file.tell()
-        self._on_disk -= 1
-        if self._on_disk == 0:
-            self.close()
-        return packet

@@ -1,4 +1,4 @@
-"""Commands to the microscope that are seen through: asked for again where that helps, refused loudly where not."""
+"""Commands to the microscope, repeated with the same id until they are answered, and refused loudly."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from afspm.errors import NoResponse, Refused
 from afspm.model import ControlRequest, ControlResponse, Response, ScopeState
 
 PATIENCE_S = 60.0  # real time that a translator may take to be there again
-NOT_THERE_S = 1.0  # before one that can't be reached is asked again, when nothing is published in between
-STATE_WITHIN_S = 5.0  # before it is said that the microscope has told no state
+RETRY_S = 1.0  # before an unreachable one is asked again, when nothing is published in between
+STATE_WITHIN_S = 5.0  # before a warning that the microscope has published no state
 SETTLED_WITHIN_S = 2.0  # what was set is published, if it changed anything
 ASK_FREE_AGAIN_S = 5.0  # should the state FREE never reach us
 
@@ -30,8 +30,8 @@ _ASKED_FOR = {
     ControlRequest.END_EXPERIMENT: "ending the experiment",
 }
 _NO_STATE = (
-    "waiting for the microscope, which has told no state yet: is its translator running? One of version 1 that was "
-    "there before the scheduler tells its state at the next change: start it anew, or scan once by hand"
+    "waiting for the microscope, which has published no state yet: is its translator running? One of version 1 that "
+    "was there before the scheduler publishes its state at the next change: start it anew, or scan once by hand"
 )
 NOT_IN_CONTROL = {ControlResponse.NOT_IN_CONTROL, ControlResponse.WRONG_CONTROL_MODE}
 
@@ -39,17 +39,11 @@ NOT_IN_CONTROL = {ControlResponse.NOT_IN_CONTROL, ControlResponse.WRONG_CONTROL_
 class CommandRetry:
     """Asks the microscope for something, through the scheduler, in control."""
 
-    def __init__(self, link: ExperimentLink, holding: ControlHold) -> None:
+    def __init__(self, link: ExperimentLink, control: ControlHold) -> None:
         self._link = link
-        self._holding = holding
+        self._control = control
 
-    def ask(
-        self,
-        kind: ControlRequest,
-        subject: Any = None,
-        *,
-        until_s: float | None = None,
-    ) -> Response:
+    def ask(self, kind: ControlRequest, subject: Any = None, *, until_s: float | None = None) -> Response:
         """Ask for a command until it succeeds. Control must be held around it; where it is lost it is waited for.
 
         Not so in an unbroken block: what comes in the tenure after may find the microscope otherwise.
@@ -62,7 +56,7 @@ class CommandRetry:
         """
         request_id = self._link.next_id()
         while True:
-            self._holding.regain(until_s)
+            self._control.regain(until_s)
             states = self._link.view.count("ScopeStateMsg")
             response = self.send(kind, subject, request_id=request_id, until_s=until_s)
             if response.ok:
@@ -70,12 +64,36 @@ class CommandRetry:
             if response.code != ControlResponse.NO_RESPONSE:  # else it may have been carried out: the same id again
                 self.get_over(kind, response, states, until_s)
                 request_id = self._link.next_id()
-            elif kind == ControlRequest.ACTION and self._holding.is_unbroken:  # what is set is set anew
+            elif kind == ControlRequest.ACTION and self._control.is_unbroken:  # what is set is set anew
                 raise NoResponse(
-                    f"control was lost before the action was answered: {self._holding.why_lost}",
+                    f"control was lost before the action was answered: {self._control.why_lost}",
                     where=self._link.name,
                     hint="whether it was carried out is not known",
                 )
+
+    def in_control(self, kind: ControlRequest, subject: Any, until_s: float | None) -> Response:
+        """`ask`, with control held around it."""
+        with self._control.hold(until_s=until_s):
+            return self.ask(kind, subject, until_s=until_s)
+
+    def read(self, kind: ControlRequest, subject: Any, until_s: float | None) -> Response:
+        """Ask for what anybody may know; schedulers of version 1 tell only the holder of control."""
+        response = self.send(kind, subject, until_s=until_s)
+        if response.code != ControlResponse.NOT_IN_CONTROL:
+            return response
+        with self._control.hold(until_s=until_s):
+            return self.send(kind, subject, until_s=until_s)
+
+    def set(self, kind: ControlRequest, wanted: Any, message: str, until_s: float | None) -> None:
+        """Ask for a setting, and wait until its `message` is published and the tip has stopped moving.
+
+        A microscope that publishes nothing, since nothing changed, is not waited for long.
+        """
+        link, view = self._link, self._link.view
+        count = view.count(message)
+        self.ask(kind, wanted, until_s=until_s)
+        if link.wait(lambda: view.count(message) != count, link.earlier(SETTLED_WITHIN_S, until_s)):
+            link.wait(lambda: view.state is not ScopeState.MOVING, until_s)
 
     def send(
         self,
@@ -86,10 +104,10 @@ class CommandRetry:
         until_s: float | None = None,
         is_seen: Callable[[], bool] = lambda: False,
     ) -> Response:
-        """Ask once, but have patience with a microscope that is silent: same id, so it is executed once.
+        """Ask once, with patience for a microscope that is silent: the same id has it executed once.
 
         Args:
-            is_seen: whether what was asked for is seen to happen, which is as good as an answer.
+            is_seen: returns whether what was asked for is seen to happen, which is as good as an answer.
 
         Returns:
             The answer; NO_RESPONSE only if control was lost before there was any.
@@ -97,40 +115,30 @@ class CommandRetry:
         Raises:
             NoResponse: it stays silent.
         """
-        clock = self._link.clock
-        request_id = request_id or self._link.next_id()
-        give_up_s = clock.monotonic_s() + PATIENCE_S
-        if until_s is not None:
-            give_up_s = min(give_up_s, until_s)
-        told = False
+        link = self._link
+        request_id = request_id or link.next_id()
+        give_up_s = link.earlier(PATIENCE_S, until_s)
+        is_repeated = False
         self._wait_for_state(give_up_s)
         while True:
-            response = self._link.request(kind, subject, request_id=request_id, until_s=until_s)
-            if told and response.code in NOT_IN_CONTROL:  # now; whether it was done before is as unknown as it was
-                self._holding.lost(response.reason)
+            response = link.request(kind, subject, request_id=request_id, until_s=until_s)
+            if is_repeated and response.code in NOT_IN_CONTROL:  # now; whether it was done before is still unknown
+                self._control.lost(response.reason)
                 return Response(ControlResponse.NO_RESPONSE, reason=response.reason, id=request_id)
-            if response.code != ControlResponse.NO_RESPONSE or self._holding.was_lost:
+            if response.code != ControlResponse.NO_RESPONSE or self._control.was_lost:
                 return response
             if is_seen():
                 return Response(ControlResponse.SUCCESS, id=request_id)
-            if clock.monotonic_s() >= give_up_s:
+            if link.clock.monotonic_s() >= give_up_s:
                 raise NoResponse(
                     f"the microscope does not answer {kind.name}: {response.reason or 'no reason given'}",
-                    where=self._link.name,
+                    where=link.name,
                     hint="is its translator running? whether it was carried out is not known",
                 )
-            if not told:
-                self._link.log.warning("the microscope does not answer %s; asking again", kind.name)
-                told = True
-            self._wait_for_something(min(give_up_s, clock.monotonic_s() + NOT_THERE_S))
-
-    def _wait_for_state(self, give_up_s: float) -> None:
-        """Wait for the first state: a microscope that has not said a word yet is still starting, and would refuse."""
-        link = self._link
-        link.wait(lambda: link.view.status is not None, min(give_up_s, link.clock.monotonic_s() + STATE_WITHIN_S))
-        if link.view.status is None:
-            link.log.warning("%s", _NO_STATE)
-            link.wait(lambda: link.view.status is not None, give_up_s)
+            if not is_repeated:
+                link.log.warning("the microscope does not answer %s; asking again", kind.name)
+            is_repeated = True
+            self._wait_for_news(link.earlier(RETRY_S, give_up_s))
 
     def get_over(self, kind: ControlRequest, response: Response, states: int, until_s: float | None) -> None:
         """After a response that is no success: wait for what stands in the way, or raise Refused.
@@ -141,39 +149,32 @@ class CommandRetry:
         if response.code == ControlResponse.NO_RESPONSE:
             return  # control is lost, and waited for when it is asked again
         if response.code in NOT_IN_CONTROL:
-            self._holding.lost(response.reason)
+            self._control.lost(response.reason)
         elif response.code == ControlResponse.NOT_FREE:
-            self.wait_free(states, until_s)
+            self._wait_free(states, until_s)
         else:
             raise refused(kind, response, self._link.name)
 
-    def wait_free(self, states: int, until_s: float | None = None) -> None:
-        """Wait until the microscope says that it is free, later than `states`; not for ever, should that get lost.
+    def _wait_for_state(self, give_up_s: float) -> None:
+        """Wait for the first state: a microscope that has not said a word yet is still starting, and would refuse."""
+        link = self._link
+        link.wait(lambda: link.view.status is not None, link.earlier(STATE_WITHIN_S, give_up_s))
+        if link.view.status is None:
+            link.log.warning("%s", _NO_STATE)
+            link.wait(lambda: link.view.status is not None, give_up_s)
 
-        Raises:
-            NoResponse: it is not free until `until_s`.
-        """
+    def _wait_free(self, states: int, until_s: float | None) -> None:
+        """Wait until the microscope says that it is free, later than `states`; not for ever, should that get lost."""
         link, view = self._link, self._link.view
-        again_s = link.clock.monotonic_s() + ASK_FREE_AGAIN_S
         link.wait(
             lambda: view.state is ScopeState.FREE and view.count("ScopeStateMsg") != states,
-            again_s if until_s is None else min(again_s, until_s),
+            link.earlier(ASK_FREE_AGAIN_S, until_s),
         )
         if until_s is not None and link.clock.monotonic_s() >= until_s:
             raise NoResponse(f"the microscope was not free in time: it is {view.state.name}", where=link.name)
 
-    def settle(self, message: str, count: int, until_s: float | None = None) -> None:
-        """After a success: wait until `message` was published more than `count` times, and moving has ended.
-
-        A microscope that publishes nothing, since nothing changed, is not waited for long.
-        """
-        link, view = self._link, self._link.view
-        soon_s = link.clock.monotonic_s() + SETTLED_WITHIN_S
-        if link.wait(lambda: view.count(message) != count, soon_s if until_s is None else min(soon_s, until_s)):
-            link.wait(lambda: view.state is not ScopeState.MOVING, until_s)
-
-    def _wait_for_something(self, until_s: float) -> None:
-        """Until the microscope says anything, control changes, or `until_s`."""
+    def _wait_for_news(self, until_s: float) -> None:
+        """Wait until the microscope says anything or control changes."""
         view = self._link.view
 
         def counts() -> tuple[int, int]:
@@ -184,7 +185,7 @@ class CommandRetry:
 
 
 def refused(kind: ControlRequest, response: Response, where: str) -> Refused:
-    """A response as the error that it is."""
+    """Return a response as the error that it is."""
     known = response.code in ControlResponse._value2member_map_
     code = ControlResponse(response.code).name if known else str(response.code)
     what = _ASKED_FOR.get(kind, kind.name)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import logging
 import weakref
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from afspm.process.context import new_session
 from afspm.process.message_types import register_all
 from afspm.record.run_json import LATEST_FILE, RUN_FILE, STATE_DIR, read_run_json, run_json_or_empty
 from afspm.record.run_lock import cut_off_message
-from afspm.transport.launching import open_port
+from afspm.transport.zmq_port import open_port
 
 GUEST = "guest"
 GUEST_KEYS = "guest.keys"
@@ -49,15 +48,7 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
     register_all(launch.messages)
     clock = ExperimentClock.from_dict(launch.clock)
     port = open_port(launch, clock)
-    link = ExperimentLink(
-        port,
-        name,
-        source=launch.sockets.subscribe[0],
-        session=new_session(launch.run),
-        request_timeout_s=launch.request_timeout_s,
-        request_retries=launch.request_retries,
-        log=logging.getLogger(f"afspm.{name}"),
-    )
+    link = ExperimentLink.of_launch(launch, port, new_session(launch.run))
     try:
         if not link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S)):
             hint = cut_off_message(folder) or "is the experiment still running?"

@@ -1,4 +1,4 @@
-"""Which handler of a component a packet is for."""
+"""Brings packets to the handlers of a component."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Dispatcher:
         self._wanted: dict[str, bool] = {}
 
     def wants(self, packet: Packet) -> bool:
-        """Whether there is a handler for a packet; only those need to be kept."""
+        """Return whether there is a handler for a packet; only those need to be kept."""
         try:
             message = wire.message_of(packet.envelope)
         except WireError:
@@ -56,16 +56,15 @@ class Dispatcher:
 
     @property
     def wants_anything(self) -> bool:
-        """Whether there is any handler at all."""
-        return any(self._wants_message(message) for message in wire.known_messages())
+        return any(map(self._wants_message, wire.known_messages()))
 
     def give(self, packet: Packet) -> None:
-        """Call the handlers of a packet. What can't be read is told and dropped."""
+        """Call the handlers of a packet. One that can't be read is logged and dropped."""
         try:
             message = wire.message_of(packet.envelope)
             thing = wire.decode(message, packet.payload)
         except WireError as error:
-            self._log.warning("a packet that can't be read: %s", error)
+            self._log.warning("a packet can't be read: %s", error)
             return
         self._component.packet = packet
         try:
@@ -78,11 +77,10 @@ class Dispatcher:
 
     def _give_problems(self, state: ControlState) -> None:
         before, self._problems = self._problems, frozenset(state.problems)
-        if not self._has("on_problem"):
-            return
-        for number in sorted(before ^ self._problems):
-            flagged = number in self._problems
-            self._component.on_problem(_problem(number), flagged)
+        if self._has("on_problem"):
+            for number in sorted(before ^ self._problems):
+                problem = Problem(number) if number in Problem._value2member_map_ else number
+                self._component.on_problem(problem, number in self._problems)
 
     def _wants_message(self, message: str) -> bool:
         return self._handler(message) is not None or (message == "ControlState" and self._has("on_problem"))
@@ -95,19 +93,15 @@ class Dispatcher:
         return self._component.on_message if self._has("on_message") else None
 
     def _has(self, name: str) -> bool:
-        """Whether the component's class has a handler of its own."""
+        """Return whether the component's class has a handler of its own."""
         return hasattr(type(self._component), name) and overrides(self._component, self._base, name)
 
 
 def overrides(thing: object, base: type, name: str) -> bool:
-    """Whether the class of `thing` has another `name` than `base`."""
+    """Return whether the class of `thing` has another `name` than `base`."""
     return getattr(type(thing), name, None) is not getattr(base, name, None)
 
 
 def snake_case(name: str) -> str:
-    """ "SpatialROIWithScoreList" as "spatial_roi_with_score_list"."""
+    """Return "SpatialROIWithScoreList" as "spatial_roi_with_score_list"."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower()
-
-
-def _problem(number: int) -> int:
-    return Problem(number) if number in Problem._value2member_map_ else number

@@ -15,7 +15,7 @@ from afspm.model import Packet
 
 @dataclass(frozen=True, slots=True)
 class PublishedEvent:
-    """Something that was published.
+    """A message that was published.
 
     Attributes:
         envelope: by which it was subscribed to.
@@ -65,8 +65,14 @@ class Events(Iterator[PublishedEvent]):
                 self.close()
                 raise StopIteration from None
             packet = self._backlog.take()
-            if packet is not None and (event := self._read(packet)) is not None:
-                return event
+            if packet is None:
+                continue
+            try:
+                message = wire.decode(wire.message_of(packet.envelope), packet.payload)
+            except WireError as error:
+                self._link.log.warning("a packet can't be read: %s", error)
+                continue
+            return PublishedEvent(packet.envelope, message, packet.time_ns)
 
     def close(self) -> None:
         """Keep nothing more."""
@@ -79,13 +85,4 @@ class Events(Iterator[PublishedEvent]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def __del__(self) -> None:
-        self.close()
-
-    def _read(self, packet: Packet) -> PublishedEvent | None:
-        try:
-            message = wire.decode(wire.message_of(packet.envelope), packet.payload)
-        except WireError as error:
-            self._link.log.warning("a packet that can't be read: %s", error)
-            return None
-        return PublishedEvent(packet.envelope, message, packet.time_ns)
+    __del__ = close

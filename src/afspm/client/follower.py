@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
-import os
 from pathlib import Path
 
 from afspm import wire
@@ -14,10 +12,11 @@ from afspm.clock import Clock, ExperimentClock
 from afspm.errors import ExperimentEnded, NoResponse, WireError
 from afspm.launch import Launch
 from afspm.model import Packet, ProblemNames
+from afspm.process.context import new_session
 from afspm.process.message_types import register_all
 from afspm.record.overview import Overview
 from afspm.record.run_lock import cut_off_message
-from afspm.transport.launching import open_port
+from afspm.transport.zmq_port import open_port
 
 SMALL = (
     "ScopeStateMsg", "ControlState", "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "DriftMapping",
@@ -57,13 +56,7 @@ class Follower:
         self.ended = False
         self.heard_s: float | None = None
         self._port = open_port(self.launch, self.clock)
-        self._link = ExperimentLink(
-            self._port,
-            name,
-            source=guest.sockets.subscribe[0],
-            session=os.urandom(4).hex(),
-            log=logging.getLogger(f"afspm.{name}"),
-        )
+        self._link = ExperimentLink.of_launch(guest, self._port, new_session(""))
         self._link.listen(self._take)
 
     def pump(self, timeout_s: float | None) -> None:

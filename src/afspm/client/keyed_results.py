@@ -1,4 +1,4 @@
-"""What a keyed scan or spectrum needs to be there exactly once: the intent before, the result after, both on disk."""
+"""Keyed measurements happen exactly once: the intent is on disk before the request, the result after it."""
 
 from __future__ import annotations
 
@@ -25,12 +25,7 @@ LONGEST_KEY = 100
 
 @dataclass(frozen=True)
 class MeasurementResult:
-    """What came of a measurement.
-
-    Attributes:
-        things: the scans or spectra.
-        interruptions: what got in between, for a person.
-    """
+    """The scans or spectra of a measurement, and what interrupted it, for a person."""
 
     things: list[Any]
     interruptions: list[str]
@@ -46,7 +41,7 @@ class KeyedResults:
 
     def __init__(self, folder: Path | None, name: str) -> None:
         self._folder = folder / f"{name}.results" if folder else None
-        self._told = OutageLog("what is measured can't be kept", _log)
+        self._outage = OutageLog("what is measured can't be kept", _log)
         self._memory = Memory(folder / f"{name}.scope.json" if folder else None)
 
     @property
@@ -60,7 +55,7 @@ class KeyedResults:
         self._memory.save()
 
     def find(self, key: str, plan: dict[str, Any]) -> MeasurementResult | None:
-        """The result of an earlier life, or of an earlier call, with the same key.
+        """Return the result of an earlier life, or of an earlier call, with the same key.
 
         Raises:
             InvalidValue: the key was used for something else.
@@ -82,17 +77,17 @@ class KeyedResults:
         path = self._path(key)
         if path is not None:
             head = {"key": key, "plan": plan, "interruptions": result.interruptions}
-            parts = [_MAGIC, *_framed(json.dumps(head).encode())]
+            parts: list[bytes] = [json.dumps(head).encode()]
             for thing in result.things:
                 message, payload = wire.encode(thing)
-                parts += [*_framed(message.encode()), *_framed(payload)]
-            with self._told.trying():
-                write_atomic(path, parts)
+                parts += [message.encode(), payload]
+            with self._outage.trying():
+                write_atomic(path, [_MAGIC, *(piece for part in parts for piece in (_LENGTH.pack(len(part)), part))])
         self._memory.pop("pending", None)
         self._memory.save()
 
     def forget(self, key: str) -> None:
-        """Remove what is kept of a key that nobody will ask for again; whoever does, measures again."""
+        """Remove what is kept of a key; a component that asks for it again measures again."""
         path = self._path(key)
         if path is not None:
             with suppress(OSError):  # what stays is only space
@@ -107,18 +102,10 @@ class KeyedResults:
 
 
 def check_key(key: str) -> str:
-    """A key as it may be used in request ids.
-
-    Raises:
-        InvalidValue: it may not.
-    """
+    """Return a key as it may be used in request ids. Raises InvalidValue: it may not."""
     if not key or len(key.encode()) > LONGEST_KEY or "/" in key or not key.isprintable():
         raise InvalidValue(f"{key!r} can't be a key", hint=f"1 to {LONGEST_KEY} printable characters without '/'")
     return key
-
-
-def _framed(part: bytes) -> tuple[bytes, bytes]:
-    return _LENGTH.pack(len(part)), part
 
 
 def _read(path: Path) -> tuple[dict[str, Any], list[Any]]:
@@ -126,14 +113,13 @@ def _read(path: Path) -> tuple[dict[str, Any], list[Any]]:
         data = memoryview(path.read_bytes())
         if bytes(data[: len(_MAGIC)]) != _MAGIC:
             raise ValueError("not a result")
-        parts = []
-        at = len(_MAGIC)
+        parts, at = [], len(_MAGIC)
         while at < len(data):
-            (length,) = _LENGTH.unpack_from(data, at)
-            at += _LENGTH.size
-            parts.append(data[at : at + length])
-            at += length
-        head = json.loads(bytes(parts[0]))
-        return head, [wire.decode(str(n, "utf-8"), p) for n, p in zip(parts[1::2], parts[2::2], strict=True)]
+            begin = at + _LENGTH.size
+            at = begin + _LENGTH.unpack_from(data, at)[0]
+            parts.append(data[begin:at])
+        names, payloads = parts[1::2], parts[2::2]
+        things = [wire.decode(str(name, "utf-8"), part) for name, part in zip(names, payloads, strict=True)]
+        return json.loads(bytes(parts[0])), things
     except (OSError, ValueError, struct.error, WireError, IndexError) as error:
         raise FileError(f"can't be read: {error}", where=str(path), hint="remove it to measure anew") from error

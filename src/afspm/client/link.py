@@ -1,4 +1,4 @@
-"""The one place that waits: takes what the port brings to whom it is for, and asks the scheduler."""
+"""The one place that waits: takes what the port brings to its handlers, and asks the scheduler."""
 
 from __future__ import annotations
 
@@ -9,24 +9,22 @@ from typing import Any
 
 from afspm import wire
 from afspm.client.published_state import PublishedState
+from afspm.client.request_tracker import RequestTracker
 from afspm.clock import Clock
 from afspm.errors import ConfigError, ExperimentEnded, NoResponse, WireError
-from afspm.logic.sessions import run_of
+from afspm.launch import Launch
 from afspm.model import (
-    CLOCK_REQUEST,
     HAS_ENDED,
     OTHER_RUN_RESPONSE,
-    RELAY_REQUEST,
     ControlRequest,
     Packet,
-    RelayedMessage,
     Request,
     Response,
     ResponseDetail,
     request_name,
 )
 from afspm.process.context import STATE_MESSAGES, ProcessActivity
-from afspm.process.stopping import StopRequested
+from afspm.process.parent import StopRequested
 from afspm.transport.port import (
     CaughtUp,
     ControlConnected,
@@ -40,11 +38,9 @@ from afspm.transport.port import (
 )
 
 LONGER_THAN_THE_SCHEDULER = 1.2
-"""By so much we wait longer than the scheduler does for the microscope: what it says then is an answer, and who asks
-again instead makes the connection anew, as if the scheduler were gone."""
+"""Factor on the time that the scheduler waits for the microscope: what it says then is an answer, and a component that
+asks again instead makes the connection anew, as if the scheduler were gone."""
 CAUGHT_UP_WITHIN_S = 2.0  # a scheduler of version 1 replays without saying when it is done
-MOST_UNANSWERED = 4
-"""Of what is told without waiting for the answer."""
 Listener = Callable[[Packet, bool], None]
 
 
@@ -75,24 +71,31 @@ class ExperimentLink:
         self.activity = activity or ProcessActivity(self.clock)
         self.log = log or logging.getLogger(f"afspm.{name}")
         self.ended = False
-        self.stopping = False
-        self._left = False
-        self._refused = ""
-        self.connections = 0
-        self.connected = False
         self.request_timeout_s = request_timeout_s
+        self.requests = RequestTracker(port.send, name, session)
+        self.next_id = self.requests.next_id
         self._retries = request_retries
         self._source = source
-        self._session = session
-        self._requests = 0
-        self._asked = ""
-        self._answer: Response | None = None
-        self.version = wire.Version.UNKNOWN
-        self._told: dict[str, float] = {}  # ids of what was told and not answered yet, with the monotonic time
-        self._untold: dict[str, RelayedMessage] = {}
+        self._over: BaseException | None = None
         self._caught_up: set[str] = set()
-        self._listeners: dict[int, Listener] = {}
-        self._listened = 0
+        self._listeners: dict[object, Listener] = {}
+
+    @classmethod
+    def of_launch(cls, launch: Launch, port: Port, session: str, **given: Any) -> ExperimentLink:
+        """Return the link of a process that was launched with a line.
+
+        Args:
+            given: name, activity or log, as to the constructor.
+        """
+        return cls(
+            port,
+            given.pop("name", launch.name),
+            source=launch.sockets.subscribe[0] if launch.sockets.subscribe else None,
+            session=session,
+            request_timeout_s=launch.request_timeout_s,
+            request_retries=launch.request_retries,
+            **given,
+        )
 
     # --- waiting ---
 
@@ -111,77 +114,76 @@ class ExperimentLink:
         return True
 
     def wait_connected(self, done: Callable[[], bool], within_s: float, until_s: float | None = None) -> bool:
-        """Wait until `done()`, as long as the scheduler is not there and then for `within_s` at most.
-
-        What it has to say can't come while it is being restarted.
-        """
+        """Wait until `done()`: while the scheduler is away for as long as that lasts, else for `within_s` at most."""
         while not done():
             if not self.wait(lambda: self.connected or done(), until_s):
                 return False
-            connections = self.connections
-            if not self.wait(
-                lambda n=connections: done() or not self.connected or self.connections != n,  # type: ignore[misc]
-                self._earlier(within_s, until_s),
-            ):
+            is_settled = self.or_reconnected(lambda: done() or not self.connected)
+            if not self.wait(is_settled, self.earlier(within_s, until_s)):
                 return False
         return True
 
     def pump(self, timeout_s: float | None) -> None:
-        """Wait for what arrives, once, and bring it to whom it is for."""
+        """Wait for what arrives, once, and bring it to its handlers."""
         self.check()
         for incoming in self.port.poll(timeout_s):
             self._take(incoming)
         self.check()
 
     def check(self) -> None:
-        """Raises ExperimentEnded or StopRequested if it is so; NoResponse if we have left.
+        """Raise the reason why there is nothing more to wait for, if there is one.
 
         Raises:
+            ExperimentEnded, StopRequested: it is over, or we are to stop.
+            NoResponse: we have left.
             ConfigError: the scheduler is that of another run.
         """
-        if self._left:
-            raise NoResponse(
-                "the experiment was left, by close()", where=self.name, hint="afspm.connect() joins it again"
-            )
-        if self.stopping:
-            raise StopRequested
-        if self._refused:
-            hint = "end the other experiment, or give this one other addresses"
-            raise ConfigError(self._refused, where=self.name, hint=hint)
+        if self._over is not None:
+            raise self._over
         if self.ended:
             raise ExperimentEnded(HAS_ENDED, where=self.name)
 
     def leave(self) -> None:
         """Close the port: nothing is heard any more, and nobody can be asked."""
-        self._left = True
+        hint = "afspm.connect() joins it again"
+        self._over = NoResponse("the experiment was left, by close()", where=self.name, hint=hint)
         self.port.close()
 
     def wait_caught_up(self, until_s: float | None = None) -> None:
         """Wait until everything the scheduler has cached is here; once that is so, returns at once.
 
-        A scheduler that is not there is waited for: what it has to say may be that we have been measured already.
+        A scheduler that is away is waited for: its cache may show that we have been measured already.
         """
         if not self.wait_connected(self.is_caught_up, CAUGHT_UP_WITHIN_S, until_s) and self.connected:
-            self._caught_up.add(self._source or "")  # it does not say, it is of version 1
+            self._caught_up.add(self._source or "")  # it is of version 1, and does not say
 
     def is_caught_up(self) -> bool:
         return self._source in self._caught_up if self._source else bool(self._caught_up)
 
+    def until(self, timeout_s: float | None) -> float | None:
+        """Return the moment, in monotonic time, when a timeout is over."""
+        return None if timeout_s is None else self.clock.monotonic_s() + timeout_s
+
+    def earlier(self, timeout_s: float, until_s: float | None) -> float:
+        """Return the moment when a timeout is over, or `until_s` if that comes first."""
+        soon_s = self.clock.monotonic_s() + timeout_s
+        return soon_s if until_s is None else min(soon_s, until_s)
+
+    def or_reconnected(self, done: Callable[[], bool]) -> Callable[[], bool]:
+        """Return a condition that holds when `done()` does, or the scheduler was connected anew."""
+        connections = self.connections
+        return lambda: done() or self.connections != connections
+
     # --- listening ---
 
     def listen(self, listener: Listener) -> Callable[[], None]:
-        """`listener(packet, ours)` is called with every packet from now on; `ours`: it is the scheduler's.
+        """Call `listener(packet, ours)` with every packet from now on; `ours`: it is the scheduler's.
 
         Returns what ends that.
         """
-        self._listened += 1
-        number = self._listened
-        self._listeners[number] = listener
-
-        def forget() -> None:
-            self._listeners.pop(number, None)
-
-        return forget
+        key = object()
+        self._listeners[key] = listener
+        return lambda: self._listeners.pop(key, None) and None
 
     @contextmanager
     def listening(self, listener: Listener) -> Iterator[None]:
@@ -194,10 +196,17 @@ class ExperimentLink:
 
     # --- asking ---
 
-    def next_id(self) -> str:
-        """An id for a request, not used before in any life of this component."""
-        self._requests += 1
-        return f"{self.name}/{self._session}/{self._requests}"
+    @property
+    def connected(self) -> bool:
+        return self.requests.connected
+
+    @property
+    def connections(self) -> int:
+        return self.requests.connections
+
+    @property
+    def version(self) -> wire.Version:
+        return self.requests.version
 
     def request(
         self, kind: int, subject: Any = None, *, request_id: str = "", until_s: float | None = None
@@ -212,29 +221,27 @@ class ExperimentLink:
             NoResponse: no answer to any repetition, or none until `until_s` (monotonic).
         """
         request = Request(kind, subject, id=request_id or self.next_id())
-        frames = wire.encode_request(request)
-        self._asked, self._answer = request.id, None
-        answered_within_s = self.request_timeout_s * LONGER_THAN_THE_SCHEDULER
-        sent = 0
+        frames, requests, sent = wire.encode_request(request), self.requests, 0
+        requests.expect(request.id)
         try:
             while sent < self._tries(kind):
-                self._wait_connected(until_s)
-                connection = self.connections
+                self._wait_for_scheduler(until_s)
+                connections = self.connections
                 self.port.send(frames)
-                answer = self._await_answer(connection, self._earlier(answered_within_s, until_s))
-                if answer is not None:
-                    if answer.detail is ResponseDetail.EXPERIMENT_ENDED:
-                        self.ended = True  # this may come before the signal itself
-                    self.check()
-                    return answer
+                self.wait(
+                    self.or_reconnected(lambda: requests.answer is not None),
+                    self.earlier(self.request_timeout_s * LONGER_THAN_THE_SCHEDULER, until_s),
+                )
+                if requests.answer is not None:
+                    return self._checked(requests.answer)
                 if until_s is not None and self.clock.monotonic_s() >= until_s:
                     break
                 # a connection that was lost is the scheduler's restart, not its silence; one of version 1 may have
                 # ended over just this request
-                sent += connection == self.connections or self.version is wire.Version.ONE
+                sent += connections == self.connections or self.version is wire.Version.ONE
                 self.log.debug("%s (%s) is asked again", request_name(kind), request.id)
         finally:
-            self._asked = ""
+            requests.expect("")
         raise NoResponse(
             f"{request_name(kind)} was not answered, asked {max(sent, 1)} times",
             where=self.name,
@@ -243,41 +250,24 @@ class ExperimentLink:
 
     def send_only(self, kind: ControlRequest, subject: Any = None) -> None:
         """Ask without waiting for the answer, for what is done on the way out."""
-        self.port.send(wire.encode_request(Request(kind, subject, id=self.next_id())))
+        self.requests.send_only(kind, subject)
 
     def tell(self, thing: Any) -> None:
-        """Have the scheduler publish something of ours, and don't wait for it.
+        """Have the scheduler publish something of ours, and don't wait for it."""
+        self.requests.tell(thing, self.clock.monotonic_s(), self.request_timeout_s)
 
-        While some of it is not answered, only the newest of each kind is kept to be sent later.
-        """
-        if self.version is not wire.Version.OURS:
-            return  # its answer could be taken for that to the next request
-        told, since_s = RelayedMessage(*wire.encode(thing)), self.clock.monotonic_s() - self.request_timeout_s
-        self._told = {told_id: at_s for told_id, at_s in self._told.items() if at_s > since_s}
-        if len(self._told) < MOST_UNANSWERED:
-            self._send_told(told)
-        else:
-            self._untold[told.message] = told
+    def _checked(self, answer: Response) -> Response:
+        if answer.detail is ResponseDetail.EXPERIMENT_ENDED:
+            self.ended = True  # this may come before the signal itself
+        self.check()
+        return answer
 
-    def _send_told(self, told: RelayedMessage) -> None:
-        request = Request(RELAY_REQUEST, told, id=self.next_id())
-        self._told[request.id] = self.clock.monotonic_s()
-        self.port.send(wire.encode_request(request))
-
-    def until(self, timeout_s: float | None) -> float | None:
-        """A timeout as the moment, in monotonic time, when it is over."""
-        return None if timeout_s is None else self.clock.monotonic_s() + timeout_s
-
-    def _wait_connected(self, until_s: float | None) -> None:
-        if self.wait(lambda: self.connected, self._earlier(self.request_timeout_s, until_s)):
+    def _wait_for_scheduler(self, until_s: float | None) -> None:
+        if self.wait(lambda: self.connected, self.earlier(self.request_timeout_s, until_s)):
             return
         self.log.warning("the scheduler is not there; waiting for it")
         if not self.wait(lambda: self.connected, until_s):
             raise NoResponse("the scheduler is not there", where=self.name, hint="is the experiment running?")
-
-    def _earlier(self, timeout_s: float, until_s: float | None) -> float:
-        soon_s = self.clock.monotonic_s() + timeout_s
-        return soon_s if until_s is None else min(soon_s, until_s)
 
     def _tries(self, kind: int) -> int:
         # a scheduler of version 1 does not know ids: what it may have done must not be asked for twice
@@ -285,48 +275,27 @@ class ExperimentLink:
             return 1
         return 1 + self._retries
 
-    def _await_answer(self, connection: int, until_s: float) -> Response | None:
-        self.wait(lambda: self._answer is not None or self.connections != connection, until_s)
-        return self._answer
+    # --- what arrives ---
 
     def _take(self, incoming: Incoming) -> None:
         match incoming:
             case PacketReceived(packet, source):
                 self._take_packet(packet, source)
             case ReplyReceived(response):
-                self._take_reply(response)
+                if response.code == OTHER_RUN_RESPONSE and self._over is None:
+                    hint = "end the other experiment, or give this one other addresses"
+                    self._over = ConfigError(response.reason, where=self.name, hint=hint)
+                self.requests.on_reply(response, self.clock.monotonic_s())
             case CaughtUp(source):
                 self._caught_up.add(source)
             case ControlConnected():
-                self.connections += 1
-                self.connected = True
-                self._told.clear()  # what was on its way then may be lost, and its answer with it
-                self._show_run()
+                self.requests.on_connected()
             case ControlDisconnected():
-                self.connected = False
+                self.requests.connected = False
             case Killed():
                 self.ended = True
             case ParentGone():
-                self.stopping = True
-
-    def _show_run(self) -> None:
-        """Have the scheduler see by the id of a request whether it is of our run. Only one of ours has such runs."""
-        if run_of(self.name, f"{self.name}/{self._session}/0"):
-            self.port.send(wire.encode_request(Request(CLOCK_REQUEST, id=self.next_id())))
-
-    def _take_reply(self, response: Response) -> None:
-        if response.code == OTHER_RUN_RESPONSE:
-            self._refused = response.reason
-        if response.id in self._told:
-            del self._told[response.id]
-            if self._untold:
-                self._send_told(self._untold.pop(next(iter(self._untold))))
-            return
-        if not self._asked:
-            return  # late: it was given up on
-        if response.id in ("", self._asked):
-            self.version = wire.version_of(self._asked, response)
-            self._answer = response
+                self._over = StopRequested()
 
     def _take_packet(self, packet: Packet, source: str) -> None:
         ours = self._source is None or source == self._source
@@ -342,4 +311,4 @@ class ExperimentLink:
             if message in STATE_MESSAGES:
                 self.view.take(message, wire.decode(message, packet.payload))
         except WireError as error:
-            self.log.debug("a packet that can't be read: %s", error)
+            self.log.debug("a packet can't be read: %s", error)

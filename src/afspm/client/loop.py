@@ -1,4 +1,4 @@
-"""What runs a component: one thread that waits in one place, and calls one handler at a time."""
+"""Runs a component: one thread that waits in one place, and calls one handler at a time."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from afspm.model import Frame, Packet, Problem
 from afspm.process import failure
 from afspm.process.context import ProcessContext
 from afspm.process.memory import Memory
-from afspm.process.stopping import StopRequested
+from afspm.process.parent import StopRequested
 
 AFTER_THE_END_S = 30.0  # to handle what came before it
-AFTER_A_STOP_S = 0.5  # whoever stops us kills us soon
+AFTER_A_STOP_S = 0.5  # the parent that stops us kills us soon
 AT_ONCE = 16  # packets handled before the port is looked at again: a KILL must not wait for a long backlog
 
 
@@ -38,69 +38,55 @@ class ComponentLoop:
         self._backlog = Backlog()
         self._has_begun = False
         launch = context.launch
-        state_dir = Path(launch.state_dir) if launch.state_dir else None
         self._dispatcher = Dispatcher(component, Component, launch.envelopes, context.log)
         self._ticker = None if self._is_script else _ticker(component, context.clock)
-        port = context.open_port()
-        self._link = ExperimentLink(
-            port,
-            launch.name,
-            source=launch.sockets.subscribe[0] if launch.sockets.subscribe else None,
-            session=context.session,
-            request_timeout_s=launch.request_timeout_s,
-            request_retries=launch.request_retries,
-            activity=self._activity,
-            log=context.log,
+        self._link = ExperimentLink.of_launch(
+            launch, context.open_port(), context.session, activity=self._activity, log=context.log
         )
-        between = self._handle_what_came if self._is_script and self._dispatcher.wants_anything else _nothing
-        frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
-        self._scope = Scope(self._link, context.problems, state_dir, between, frame)
         self._link.listen(self._keep)
-        self._give_attributes(state_dir)
+        self._give_attributes(Path(launch.state_dir) if launch.state_dir else None)
 
     def run(self) -> int:
-        """Returns the exit code."""
-        code = ExitCode.CRASHED
+        """Return the exit code."""
         try:
-            code = self._run()
+            code = self._run_to_the_end()
+            self._end()
+        except MeasurementFailed as failed:
+            self._call_a_person(failed)
+            raise
         finally:
             self._backlog.close()
             self._link.port.close()
         return code
 
-    def _run(self) -> ExitCode:
+    def _run_to_the_end(self) -> ExitCode:
         try:
-            self._begin()
-            if self._is_script:
-                with self._activity.step():
-                    self._component.run()
-            else:
-                self._serve()
-            code = ExitCode.ENDED if self._link.ended else ExitCode.DONE
+            self._run()
         except ExperimentEnded:
-            code = ExitCode.ENDED
-            self._handle_the_rest(AFTER_THE_END_S)
+            self._handle_rest(AFTER_THE_END_S)
+            return ExitCode.ENDED
         except StopRequested:
-            code = ExitCode.ORPHAN
-            self._handle_the_rest(AFTER_A_STOP_S)
-        except MeasurementFailed as failed:
-            self._call_a_person(failed)
-            raise
-        self._end()
-        return code
+            self._handle_rest(AFTER_A_STOP_S)
+            return ExitCode.ORPHAN
+        return ExitCode.ENDED if self._link.ended else ExitCode.DONE
+
+    def _run(self) -> None:
+        with self._handler():
+            self._component.on_start()
+        if not self._is_script:  # a script may go on with what it held control for
+            self._component.scope.give_back_inherited()
+        self._has_begun = True
+        if self._is_script:
+            with self._activity.step():
+                self._component.run()
+        else:
+            self._serve()
 
     def _call_a_person(self, failed: MeasurementFailed) -> None:
         """Flag what keeps everybody from measuring on: started again, the component would scan without end."""
         self._context.log.critical("%s. Nothing is measured until a person clears device-malfunction", failed.what)
         with contextlib.suppress(RequestError, ExperimentEnded, StopRequested):
-            self._scope.flag(Problem.DEVICE_MALFUNCTION)
-
-    def _begin(self) -> None:
-        with self._handler():
-            self._component.on_start()
-        if not self._is_script:  # a script may go on with what it held control for
-            self._scope.give_back_inherited()
-        self._has_begun = True
+            self._component.scope.flag(Problem.DEVICE_MALFUNCTION)
 
     def _serve(self) -> None:
         """Handle what comes, and tick, until something ends it."""
@@ -112,25 +98,23 @@ class ComponentLoop:
                 self._ticker.done()
                 due_s = 0.0
             self._link.pump(0.0 if len(self._backlog) else due_s)
-            self._handle_what_came(AT_ONCE)
+            self._handle_backlog(AT_ONCE)
 
-    def _handle_what_came(self, at_most: int | None = None) -> None:
-        while (at_most is None or at_most > 0) and (packet := self._backlog.take()) is not None:
+    def _handle_backlog(self, at_most: float = float("inf")) -> None:
+        while at_most > 0 and (packet := self._backlog.take()) is not None:
             with self._handler():
                 self._dispatcher.give(packet)
-            at_most = None if at_most is None else at_most - 1
+            at_most -= 1
 
-    def _handle_the_rest(self, within_s: float) -> None:
+    def _handle_rest(self, within_s: float) -> None:
         """What was measured before the end is not to be lost: a table must not lack the last scan."""
-        if not self._has_begun:
-            return
         until_s = self._context.clock.monotonic_s() + within_s
-        while len(self._backlog) and self._context.clock.monotonic_s() < until_s:
+        while self._has_begun and len(self._backlog) and self._context.clock.monotonic_s() < until_s:
             with contextlib.suppress(ExperimentEnded, StopRequested):  # nothing can be asked for any more
-                self._handle_what_came(1)
+                self._handle_backlog(1)
 
     def _end(self) -> None:
-        """Say good-bye to the component. What it can't do any more must not hide why we ended."""
+        """Call `on_end`. What it can't do any more must not hide why we ended."""
         try:
             with self._handler():
                 self._component.on_end()
@@ -141,7 +125,7 @@ class ComponentLoop:
 
     @contextlib.contextmanager
     def _handler(self) -> Iterator[None]:
-        """One of the component's handlers: what it has put into memory is kept, unless it fails."""
+        """Around a handler of the component: what it has put into memory is kept, unless it fails."""
         with self._activity.step():
             yield
             if not self._is_script:  # a script says itself when what it remembers belongs together
@@ -152,14 +136,17 @@ class ComponentLoop:
             self._backlog.put(packet)
 
     def _give_attributes(self, state_dir: Path | None) -> None:
-        component, context = self._component, self._context
-        component.scope = self._scope
+        component, context, launch = self._component, self._context, self._context.launch
+        has_handlers = self._is_script and self._dispatcher.wants_anything
+        between = self._handle_backlog if has_handlers else lambda: None
+        frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
+        component.scope = Scope(self._link, context.problems, state_dir, between, frame)
         component.clock = context.clock
         component.log = context.log
         component.name = context.name
         component.memory = Memory(state_dir / f"{context.name}.json" if state_dir else None)
-        component.run_dir = Path(context.launch.run_dir or ".")
-        component.simulated = context.launch.simulated
+        component.run_dir = Path(launch.run_dir or ".")
+        component.simulated = launch.simulated
         component.packet = None
         component._publish = self._publish
 
@@ -175,7 +162,7 @@ class ComponentLoop:
 
 
 class _Ticker:
-    """When the next tick is due: by the beat of the first, not of the end of the last."""
+    """Counts the ticks, by the beat of the first."""
 
     def __init__(self, period: int, now: Callable[[], int], real_s: Callable[[int], float]) -> None:
         self._period = period
@@ -184,12 +171,12 @@ class _Ticker:
         self._next = now()
 
     def due_in_s(self) -> float:
-        """Real seconds until the next tick; at most 0 if it is due."""
+        """Return the real seconds until the next tick; at most 0 if it is due."""
         left = self._next - self._now()
         return self._real_s(left) if left > 0 else 0.0
 
     def done(self) -> None:
-        """It was made; those missed meanwhile are not made up for."""
+        """Count a tick; those missed meanwhile are not made up for."""
         missed = max(0, self._now() - self._next) // self._period
         self._next += (missed + 1) * self._period
 
@@ -203,7 +190,3 @@ def _ticker(component: Component, clock: Clock) -> _Ticker | None:
     if component.period_time == "real":
         return _Ticker(period, lambda: round(clock.monotonic_s() * NS_PER_S), lambda ns: ns / NS_PER_S)
     return _Ticker(period, clock.now_ns, lambda ns: clock.real_s(ns / NS_PER_S))
-
-
-def _nothing() -> None:
-    """Between the calls of a script without handlers."""

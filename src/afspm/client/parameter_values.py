@@ -1,11 +1,12 @@
-"""Values of parameters as the text that travels, and back."""
+"""Values of parameters, to and from the text on the wire."""
 
 from __future__ import annotations
 
 import math
 
+from afspm import wire
 from afspm.errors import InvalidValue, UnitError
-from afspm.model import Parameter
+from afspm.model import Parameter, Response
 from afspm.model.names import BASE_PARAMETERS
 from afspm.units import convert, parse_quantity
 
@@ -13,7 +14,7 @@ Value = float | str | bool
 
 
 def to_parameter(name: str, value: Value, unit: str | None) -> Parameter:
-    """A value to set: a number with or without `unit` (SI without), a quantity as text ("2 um/s"), True, "tapping" …
+    """Return a value to set: a number with or without `unit` (SI without), a quantity as text ("2 um/s"), True, "on" …
 
     Raises:
         InvalidValue: a number that is none.
@@ -33,9 +34,9 @@ def to_parameter(name: str, value: Value, unit: str | None) -> Parameter:
 
 
 def from_parameter(parameter: Parameter, unit: str | None) -> Value:
-    """The value in force, in `unit`; without one in SI for the base parameters, else as it came.
+    """Return the value in force, in `unit`; without one in SI for the base parameters, else as it came.
 
-    What is no number is True, False or text.
+    Text that is no number comes as True, False or text.
 
     Raises:
         UnitError: the microscope's unit can't be converted to `unit`.
@@ -51,6 +52,11 @@ def from_parameter(parameter: Parameter, unit: str | None) -> Value:
     if not parameter.unit or not wanted:
         return number
     return convert(number, parameter.unit, wanted)
+
+
+def value_in(response: Response, asked: Parameter, unit: str | None) -> Value:
+    """Return the value that a response reports; where a peer only says that it did it, the one that was asked for."""
+    return from_parameter(wire.decode_parameter(response.payload) if response.payload else asked, unit)
 
 
 def _quantity(text: str) -> tuple[float, str] | None:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from numbers import Real
 from pathlib import Path
-from typing import Any
 
 from afspm import wire
 from afspm.client.command_retry import SETTLED_WITHIN_S, CommandRetry, refused
@@ -15,8 +14,9 @@ from afspm.client.events import Events, PublishedEvent
 from afspm.client.keyed_results import KeyedResults, check_key
 from afspm.client.link import ExperimentLink
 from afspm.client.measurement import MeasurementRunner
-from afspm.client.parameter_values import Value, from_parameter, to_parameter
-from afspm.client.plans import MEASURED, MeasurementPlans, fits
+from afspm.client.parameter_values import Value, to_parameter, value_in
+from afspm.client.setup import MeasurementSetup
+from afspm.client.targets import ScanTarget, SpectrumTarget
 from afspm.errors import ExperimentEnded, InvalidValue
 from afspm.model import (
     ControlMode,
@@ -31,7 +31,6 @@ from afspm.model import (
     ProblemNames,
     Progress,
     Region,
-    Response,
     ScanParameters,
     ScanSet,
     ScopeState,
@@ -72,19 +71,18 @@ class Scope:
     ) -> None:
         self._link = link
         self._between = between
+        self._frame = frame
         self._depth = 0
         self._begun: tuple[int, int] | None = None  # what was done when progress was first told, and when
         self._flagged: dict[int, int] = {}  # by us, and how many control states had been published before
         self.problems = problems or ProblemNames()
-        self._holding = ControlHold(link, self.problems)
-        self._asker = CommandRetry(link, self._holding)
-        self._plans = MeasurementPlans(link.view, self._asker, frame)
+        self._control = ControlHold(link, self.problems)
+        self._commands = CommandRetry(link, self._control)
+        self._setup = MeasurementSetup(link.view, self._commands)
         self._results = KeyedResults(state_dir, link.name)
-        self._measuring = MeasurementRunner(link, self._holding, self._asker, self._results)
-        self._measuring.resume(MEASURED, fits)
+        self._runner = MeasurementRunner(link, self._control, self._commands, self._setup, self._results)
 
     def __repr__(self) -> str:
-        """How it is, as far as it was heard of: asks nobody, as a notebook may want it at any time."""
         view = self._link.view
         control = view.control or ControlState(ControlMode.UNDEFINED)
         flagged = "".join(f", {self.problems.name(number)} is flagged" for number in control.problems)
@@ -114,8 +112,8 @@ class Scope:
                 of the scan, until `forget`.
         """
         with self._call():
-            plan = self._plans.scan(region, shape)
-            result = self._measuring.take(plan, key, self._link.until(timeout_s))
+            target = ScanTarget.of(region, shape, self._frame)
+            result = self._runner.take(target, key, self._link.until(timeout_s))
             return ScanSet(result.things, result.interruptions)
 
     def spectrum(
@@ -133,9 +131,8 @@ class Scope:
             kind: e.g. "IV" (the parameter `x-spec-kind`); None: what is set.
         """
         with self._call():
-            plan = self._plans.spectrum(at, kind)
-            result = self._measuring.take(plan, key, self._link.until(timeout_s))
-            spectrum: Spectrum = result.things[0]
+            target = SpectrumTarget.of(at, kind, self._frame)
+            spectrum: Spectrum = self._runner.take(target, key, self._link.until(timeout_s)).things[0]
             return spectrum
 
     def forget(self, key: str) -> None:
@@ -152,17 +149,17 @@ class Scope:
         """
         with self._call():
             asked = to_parameter(parameter, value, unit)
-            response = self._command(ControlRequest.PARAM, asked, timeout_s)
-            return self._value_in(response, asked, asked.unit)
+            response = self._commands.in_control(ControlRequest.PARAM, asked, self._link.until(timeout_s))
+            return value_in(response, asked, asked.unit)
 
     def get(self, parameter: str, unit: str | None = None, *, timeout_s: float | None = ANSWER_S) -> Value:
-        """The value of a parameter in `unit`; without one in SI, or as it came if it is not a base one."""
+        """Return a parameter's value in `unit`; without one in SI, or as it came if it is not a base parameter."""
         with self._call():
             asked = Parameter(parameter)
-            response = self._read(ControlRequest.PARAM, asked, timeout_s)
+            response = self._commands.read(ControlRequest.PARAM, asked, self._link.until(timeout_s))
             if not response.ok:
                 raise refused(ControlRequest.PARAM, response, parameter)
-            return self._value_in(response, asked, unit)
+            return value_in(response, asked, unit)
 
     def set_feedback(
         self,
@@ -178,7 +175,7 @@ class Scope:
             feedback = Feedback(on, proportional_gain, integral_gain, setpoint)
             view, count = self._link.view, self._link.view.count("ZCtrlParameters")
             changes = _changes(view.feedback, feedback)
-            self._command(ControlRequest.SET_ZCTRL_PARAMS, feedback, timeout_s)
+            self._commands.in_control(ControlRequest.SET_ZCTRL_PARAMS, feedback, self._link.until(timeout_s))
             if changes:  # so that `feedback` then tells it
                 self._link.wait(lambda: view.count("ZCtrlParameters") != count, self._link.until(SETTLED_WITHIN_S))
 
@@ -186,28 +183,30 @@ class Scope:
         """Move the probe to (x, y) in m; returns when it stands there."""
         with self._call():
             until_s = self._link.until(timeout_s)
-            with self._holding.hold(until_s=until_s):
-                self._plans.move_probe(xy_m, until_s)
+            with self._control.hold(until_s=until_s):
+                self._setup.move_probe(xy_m, until_s)
 
     def set_scan_region(
         self, region: Region, *, shape: tuple[int, int] | None = None, timeout_s: float | None = None
     ) -> None:
-        """Set where the next scan is taken, and with `shape` (rows, columns) its pixels, all at once: one after the
-        other, they would be frames of their own, that may be refused. Returns when it is in force."""
+        """Set where the next scan is taken, and with `shape` (rows, columns) its pixels; returns when it is in force.
+
+        Both are set at once: one after the other, they would be frames of their own, that may be refused.
+        """
         with self._call():
             until_s = self._link.until(timeout_s)
-            with self._holding.hold(until_s=until_s):
-                self._plans.set_scan(region, shape, until_s)
+            with self._control.hold(until_s=until_s):
+                self._setup.set_scan(ScanTarget.of(region, shape, self._frame).parameters, until_s)
 
     def action(self, name: str, *, timeout_s: float | None = None) -> None:
         """Have the microscope do something by its name; returns when it has accepted it."""
         with self._call():
-            self._command(ControlRequest.ACTION, name, timeout_s)
+            self._commands.in_control(ControlRequest.ACTION, name, self._link.until(timeout_s))
 
     def supports(self, action: str, *, timeout_s: float | None = ANSWER_S) -> bool:
-        """Whether the microscope has an action of this name."""
+        """Return whether the microscope has an action of this name."""
         with self._call():
-            response = self._read(ControlRequest.ACTION_SUPPORT, action, timeout_s)
+            response = self._commands.read(ControlRequest.ACTION_SUPPORT, action, self._link.until(timeout_s))
             if response.code in (ControlResponse.ACTION_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED):
                 return False
             if not response.ok:
@@ -234,14 +233,14 @@ class Scope:
                 control is waited for when this one begins.
         """
         number = Problem.NONE if solving is None else self.problems.number(solving)
-        with self._holding.hold(solving=number, until_s=self._link.until(timeout_s), unbroken=unbroken):
+        with self._control.hold(solving=number, until_s=self._link.until(timeout_s), unbroken=unbroken):
             yield
 
     @property
     def in_control(self) -> bool:
-        """Whether control is ours now."""
+        """True if control is ours now."""
         self._catch_up()
-        return self._holding.held
+        return self._control.held
 
     def flag(self, problem: int | str) -> None:
         """Flag a problem, by name or number: control is taken from whoever has it, until the problem is cleared."""
@@ -256,7 +255,7 @@ class Scope:
             self._tell(ControlRequest.RMV_EXP_PRBLM, number)
 
     def _is_seen_flagged(self, problem: int) -> bool:
-        """Whether a problem is known to be flagged: a scheduler of version 1 ends over clearing one that is not."""
+        """A scheduler of version 1 ends over clearing a problem that is not flagged."""
         link, states = self._link, self._flagged.get(problem)
         if states == link.view.count("ControlState"):  # that we have flagged it ourselves is to be published yet
             link.wait(lambda: link.view.count("ControlState") != states, link.until(SETTLED_WITHIN_S))
@@ -270,7 +269,7 @@ class Scope:
         return tuple(map(self.problems.name, flagged))
 
     def is_flagged(self, problem: int | str) -> bool:
-        """Whether a problem is, by name or number, as far as it was heard."""
+        """Return whether a problem, by name or number, is flagged."""
         return self.problems.number(problem) in self.control_state.problems
 
     def set_mode(self, mode: ControlMode) -> None:
@@ -284,7 +283,7 @@ class Scope:
             self._tell(ControlRequest.END_EXPERIMENT, None)
 
     def progress(self, done: int, of: int, *, left_s: float | None = None) -> None:
-        """Say how far one is with what one set out to do, for those who look on. Costs nothing, and waits for nobody.
+        """Publish how far the component is, for those who look on. It waits for nobody.
 
         Args:
             done, of: how many of how many, of whatever is counted.
@@ -300,7 +299,7 @@ class Scope:
 
     @property
     def state(self) -> ScopeState:
-        """What the microscope is doing."""
+        """The state of the microscope."""
         self._catch_up()
         return self._link.view.state
 
@@ -317,7 +316,7 @@ class Scope:
 
     @property
     def scan_parameters(self) -> ScanParameters | None:
-        """Where and how the next scan will be taken; None if the microscope has not said."""
+        """Region and shape of the next scan; None if the microscope has not said."""
         self._catch_up()
         return self._link.view.scan_parameters
 
@@ -329,7 +328,7 @@ class Scope:
 
     @property
     def probe_position(self) -> ProbePosition | None:
-        """Where the probe stands; None if the microscope has not said."""
+        """The position of the probe; None if the microscope has not said."""
         self._catch_up()
         return self._link.view.probe_position
 
@@ -348,7 +347,7 @@ class Scope:
             return self._link.wait(condition, self._link.until(timeout_s))
 
     def sleep(self, experiment_s: float) -> None:
-        """Let time pass in the experiment. Unlike `time.sleep` it ends with the experiment, and keeps its clock."""
+        """Let experiment time pass. Unlike `time.sleep` it follows the experiment's clock, and ends with it."""
         if not (isinstance(experiment_s, Real) and experiment_s >= 0.0):
             raise InvalidValue(f"can't wait for {experiment_s!r}", hint="a number of seconds, zero or more")
         clock = self._link.clock
@@ -364,7 +363,7 @@ class Scope:
 
         In a component this is done for you.
         """
-        self._holding.leave()
+        self._control.leave()
         self._link.leave()
 
     def __enter__(self) -> Scope:
@@ -377,12 +376,12 @@ class Scope:
 
     def give_back_inherited(self) -> None:
         """Never keep control that an earlier life of this component died with. Called by the component's loop."""
-        self._holding.gives_back_inherited = True
-        self._holding.release_inherited()
+        self._control.gives_back_inherited = True
+        self._control.release_inherited()
 
     @contextmanager
     def _call(self) -> Iterator[None]:
-        """A call of the user; when the outermost is done, what arrived meanwhile is handled."""
+        """Around each call of the user; when the outermost is done, what arrived meanwhile is handled."""
         self._link.check()
         self._depth += 1
         try:
@@ -397,20 +396,6 @@ class Scope:
         self._link.wait_caught_up()
         self._link.pump(0.0)
 
-    def _command(self, kind: ControlRequest, subject: Any, timeout_s: float | None) -> Response:
-        until_s = self._link.until(timeout_s)
-        with self._holding.hold(until_s=until_s):
-            return self._asker.ask(kind, subject, until_s=until_s)
-
-    def _read(self, kind: ControlRequest, subject: Any, timeout_s: float | None) -> Response:
-        """Ask for what anybody may know; schedulers of version 1 tell only who is in control."""
-        until_s = self._link.until(timeout_s)
-        response = self._asker.send(kind, subject, until_s=until_s)
-        if response.code != ControlResponse.NOT_IN_CONTROL:
-            return response
-        with self._holding.hold(until_s=until_s):
-            return self._asker.send(kind, subject, until_s=until_s)
-
     def _tell(self, kind: ControlRequest, subject: int | None) -> None:
         """Ask the scheduler itself, which needs no control."""
         with self._call():
@@ -418,12 +403,6 @@ class Scope:
             if not response.ok:
                 raise refused(kind, response, self._link.name)
 
-    def _value_in(self, response: Response, asked: Parameter, unit: str | None) -> Value:
-        if not response.payload:  # a peer that only says that it did it
-            return from_parameter(asked, unit)
-        return from_parameter(wire.decode_parameter(response.payload), unit)
-
 
 def _changes(now: Feedback | None, wanted: Feedback) -> bool:
-    """Whether setting `wanted` changes anything."""
     return now is None or any(value is not None and value != getattr(now, name) for name, value in vars(wanted).items())

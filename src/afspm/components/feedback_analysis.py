@@ -5,19 +5,17 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from afspm import wire
-from afspm.client.component import Component
-from afspm.components.channel_pairs import ChannelPairing, HeightPair
-from afspm.components.feedback_metrics import FeedbackError, FeedbackLimits, FeedbackQuality
-from afspm.components.feedback_signal import FeedbackSignal
+from afspm.components.channel_pairs import ChannelPairing
+from afspm.components.feedback_metrics import FeedbackError, FeedbackQuality
+from afspm.components.feedback_signal import FeedbackObserver
 from afspm.components.missing_channels import MissingChannels
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import ControlState, Feedback, Problem, Scan
-from afspm.units import Length
 
 MESSAGE = "FeedbackAnalysis"
 
 
-class FeedbackAnalysis(Component):
+class FeedbackAnalysis(FeedbackObserver):
     """Publishes after each scan the shares of its pixels whose error is too large, as a `FeedbackAnalysis` message.
 
     Flags `feedback-non-optimal` when several scans in a row leave too much in the error, and removes the flag when
@@ -26,14 +24,6 @@ class FeedbackAnalysis(Component):
     the feedback off are not judged.
 
     Args:
-        channel: what the feedback holds at the setpoint, in a unit of the same kind.
-        height: the channel of the heights; empty if not recorded: a feedback that is a little slow is not seen then.
-        threshold: of the error, as a share of the setpoint, or, of a current, of its logarithm; by default 0.1, and 0.5
-            of a current.
-        limit: of the pixels that may lie beyond it.
-        relief_limit: of the relief that may be in the error instead of the height.
-        sensitivity: height for 1 V of the channel, or, of a current, for a factor of 2.7; by default 50 nm, and 50 pm.
-            Negative where the signal falls as the tip withdraws, as a deflection does. A channel in metres needs none.
         flag_after: bad scans in a row until the problem is flagged.
         clear_after: good scans in a row until it is cleared.
     """
@@ -42,23 +32,12 @@ class FeedbackAnalysis(Component):
     publishes: ClassVar = (MESSAGE,)
     listens: ClassVar = ("Scan2d", "ControlState", "ZCtrlParameters")
 
-    def __init__(
-        self,
-        channel: str = "Amplitude",
-        height: str = "Height",
-        threshold: float | None = None,
-        limit: float = FeedbackLimits.pixels,
-        relief_limit: float = FeedbackLimits.relief,
-        sensitivity: Length | None = None,
-        flag_after: int = 2,
-        clear_after: int = 1,
-    ) -> None:
-        if not (0.0 < limit < 1.0 and relief_limit > 0.0 and flag_after >= 1 and clear_after >= 1):
-            raise ConfigError("`limit` must be between 0 and 1, `relief_limit` above zero, the counts one at least")
-        self.limits = FeedbackLimits(limit, relief_limit)
+    def __init__(self, flag_after: int = 2, clear_after: int = 1, **observed: Any) -> None:
+        super().__init__(**observed)
+        if flag_after < 1 or clear_after < 1:
+            raise ConfigError("`flag_after` and `clear_after` must be one at least")
         self.flag_after, self.clear_after = flag_after, clear_after
-        self._pairing = ChannelPairing(channel, height)
-        self._signal = FeedbackSignal(threshold, sensitivity)
+        self._pairing = ChannelPairing(self.channel, self.height)
         self._feedback = Feedback()
         self._is_flagged = self._is_being_solved = False
 
@@ -81,7 +60,7 @@ class FeedbackAnalysis(Component):
         if time_ns is not None and time_ns <= self.memory.get("newest_ns", -1):
             return  # replayed after a restart
         try:
-            error = self._error(pair)
+            error = self.signal.error(pair.trace, pair.retrace, self._feedback.setpoint, self.scope)
         except InvalidValue as wrong:
             self.log.warning("%s: %s", pair.trace.channel, wrong)
             return
@@ -92,9 +71,6 @@ class FeedbackAnalysis(Component):
         self._count(error)
         self.memory["newest_ns"] = -1 if time_ns is None else time_ns
         self.memory.save()
-
-    def _error(self, pair: HeightPair) -> FeedbackError:
-        return self._signal.error(pair.trace, pair.retrace, self._feedback.setpoint, self.scope)
 
     def _count(self, error: FeedbackError) -> None:
         following = self.limits.judge(error)

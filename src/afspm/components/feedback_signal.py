@@ -1,14 +1,15 @@
-"""The error of the feedback from two channels of a scan: what it holds at the setpoint, and the height."""
+"""The error of the feedback in a scan, from the channel that it holds at the setpoint and the height."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from afspm.client.component import Component
 from afspm.client.scope import Scope
-from afspm.components.feedback_metrics import FeedbackError, feedback_error, relative_error
+from afspm.components.feedback_metrics import FeedbackError, FeedbackLimits, feedback_error, relative_error
 from afspm.errors import ConfigError, InvalidValue, Refused, RequestError, UnitError
 from afspm.model import Scan, names
-from afspm.units import convert, same_kind
+from afspm.units import Length, convert, same_kind
 
 ASKED_WITHIN_S = 5.0
 
@@ -19,8 +20,9 @@ _CURRENT_DECAY_M = 0.05e-9  # a tenth of the current for 0.1 nm: work functions 
 
 
 class FeedbackSignal:
-    """Compares a channel with the setpoint, which is told without a unit: whether it is of its kind is asked once for
-    each unit.
+    """Compares a channel with the setpoint, which comes without a unit.
+
+    Whether the channel is of the setpoint's kind is asked once for each unit.
 
     Args:
         threshold: of the error, as a share of the setpoint (of a current, of its logarithm); None: 0.1, and 0.5 of a
@@ -62,7 +64,7 @@ class FeedbackSignal:
         return feedback_error(error, threshold, height_m, self._gap_m(signal, setpoint))
 
     def _gap_m(self, signal: Scan, setpoint: float | None) -> float:
-        """By how much the tip is too high where the relative error is one; 0 where that is not known."""
+        """Return by how much the tip is too high where the relative error is one; 0 where that is not known."""
         if same_kind(signal.unit, "A"):
             return -(self._sensitivity or _CURRENT_DECAY_M)
         unit, metres = ("m", 1.0) if same_kind(signal.unit, "m") else ("V", self._sensitivity or _M_PER_V)
@@ -81,3 +83,33 @@ class FeedbackSignal:
         except RequestError as error:
             raise InvalidValue(f"its unit is not known yet: {error.what}") from error
         return ""
+
+
+class FeedbackObserver(Component):
+    """A component that judges scans by how well the feedback followed.
+
+    Args:
+        channel: what the feedback holds at the setpoint, in a unit of the same kind.
+        height: the channel of the heights; empty if not recorded: a feedback that is a little slow is not seen then.
+        threshold: of the error, as a share of the setpoint, or, of a current, of its logarithm; by default 0.1, and 0.5
+            of a current.
+        limit: of the pixels that may lie beyond it.
+        relief_limit: of the relief that may be in the error instead of the height.
+        sensitivity: height for 1 V of the channel, or, of a current, for a factor of 2.7; by default 50 nm, and 50 pm.
+            Negative where the signal falls as the tip withdraws, as a deflection does. A channel in metres needs none.
+    """
+
+    def __init__(
+        self,
+        channel: str = "Amplitude",
+        height: str = "Height",
+        threshold: float | None = None,
+        limit: float = FeedbackLimits.pixels,
+        relief_limit: float = FeedbackLimits.relief,
+        sensitivity: Length | None = None,
+    ) -> None:
+        if not (0.0 < limit < 1.0 and relief_limit > 0.0):
+            raise ConfigError("`limit` must be between 0 and 1, `relief_limit` above zero")
+        self.channel, self.height = channel, height
+        self.limits = FeedbackLimits(limit, relief_limit)
+        self.signal = FeedbackSignal(threshold, sensitivity)

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from afspm.client.component import Component
-from afspm.components.feedback_metrics import FeedbackLimits, FeedbackQuality, gain_search
-from afspm.components.feedback_signal import FeedbackSignal
+from afspm.components.feedback_metrics import FeedbackQuality, gain_search
+from afspm.components.feedback_signal import FeedbackObserver
 from afspm.errors import ConfigError, ControlLost, InvalidValue, Refused
 from afspm.model import Problem, names
-from afspm.units import Length
 
 BACK_WITHIN_S = 60.0
 
 
-class FeedbackTuner(Component):
+class FeedbackTuner(FeedbackObserver):
     """Solves `feedback-non-optimal`: scans the region set, raises the integral gain while the feedback is too slow and
     lowers it while it oscillates, until it follows well, or as well as it can.
 
@@ -26,14 +24,6 @@ class FeedbackTuner(Component):
         lowest_gain, highest_gain: of the integral gain; never left.
         factor: of one step.
         most_tries: test scans of one search.
-        channel: what the feedback holds at the setpoint, in a unit of the same kind.
-        height: the channel of the heights.
-        threshold: of the error, as a share of the setpoint, or, of a current, of its logarithm; by default 0.1, and 0.5
-            of a current.
-        limit: of the pixels that may lie beyond it.
-        relief_limit: of the relief that may be in the error instead of the height.
-        sensitivity: height for 1 V of the channel, or, of a current, for a factor of 2.7; by default 50 nm, and 50 pm.
-            Negative where the signal falls as the tip withdraws, as a deflection does. A channel in metres needs none.
     """
 
     solves: ClassVar = ("feedback-non-optimal",)
@@ -46,21 +36,12 @@ class FeedbackTuner(Component):
         highest_gain: float,
         factor: float = 2.0,
         most_tries: int = 14,
-        channel: str = "Amplitude",
-        height: str = "Height",
-        threshold: float | None = None,
-        limit: float = FeedbackLimits.pixels,
-        relief_limit: float = FeedbackLimits.relief,
-        sensitivity: Length | None = None,
+        **observed: Any,
     ) -> None:
+        super().__init__(**observed)
         if not (0.0 < lowest_gain < highest_gain and factor > 1.0 and most_tries >= 2):
             raise ConfigError("needs 0 < lowest_gain < highest_gain, factor > 1, most_tries >= 2")
-        if not (0.0 < limit < 1.0 and relief_limit > 0.0):
-            raise ConfigError("`limit` must be between 0 and 1, `relief_limit` above zero")
         self.lowest, self.highest, self.factor, self.most_tries = lowest_gain, highest_gain, factor, most_tries
-        self.channel, self.height = channel, height
-        self.limits = FeedbackLimits(limit, relief_limit)
-        self._signal = FeedbackSignal(threshold, sensitivity)
 
     def run(self) -> None:
         while True:
@@ -123,7 +104,7 @@ class FeedbackTuner(Component):
             if name not in scans:
                 raise InvalidValue(f"the scans have no channel {name!r}, there are {', '.join(scans)}")
         setpoint = self.scope.feedback.setpoint if self.scope.feedback else None
-        error = self._signal.error(scans[self.channel], scans[self.height], setpoint, self.scope)
+        error = self.signal.error(scans[self.channel], scans[self.height], setpoint, self.scope)
         following = self.limits.judge(error)
         self.log.info("integral gain %g: the feedback %s: %s", gain, following.value, error)
         return following

@@ -1,16 +1,16 @@
-"""Scans by plan: one region again and again, a list of regions, or a grid of them. Each is taken exactly once."""
+"""Scans by plan: one region repeatedly, a list of regions, or a grid of them. Each is taken exactly once."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC
 from typing import Any
 
 from afspm.client.component import Component
 from afspm.clock import NS_PER_S
-from afspm.components.scan_plan import XY, PlanStep, RoundSchedule, ScanPlan, grid_centers, rounds_within, squares
+from afspm.components.scan_plan import XY, PlanStep, RoundSchedule, ScanPlan, grid_centers, rounds_within
 from afspm.errors import ConfigError, InvalidValue
 from afspm.formatting import day_and_time
 from afspm.model import Region, names
@@ -21,38 +21,35 @@ _FRAME = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.SCAN_SIZE_X, names
 
 
 class PlannedScans(Component):
-    """What takes the scans of a plan. Derive from it for a plan of your own: call its `__init__` with the plan.
+    """Takes the scans of a plan. Derive from it for a plan of your own, and set `plan` (and `beat_s`) in `__init__`.
 
     Each scan has a key, so that whatever process is killed, and whenever, no scan is left out or taken twice. While
     control is lost (to the repair of a tip, to a person) the scan waits; what was interrupted is said in the log.
 
     Args:
-        plan: the regions, and how often.
-        period_s: between the beginnings of two rounds, experiment time; 0 for one right after the other.
         keep_control: whether to keep control between the scans; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment after the last scan.
-        parameters: set before the first scan, e.g. {"scan-speed": "2 um/s"}.
+        parameters: set before the first scan, e.g. {scan-speed = "2 um/s"}.
+
+    Attributes:
+        plan: the regions, and how often.
+        beat_s: between the beginnings of two rounds, experiment time; 0 for one right after the other.
         missed_count: whether rounds that are left out, because one takes longer than the period or control was lost,
             count as taken, so that the plan ends when it should. Those while nothing ran, before a restart, don't.
     """
 
     needs_actions = (names.START_SCAN,)
+    plan: ScanPlan
+    beat_s = 0.0
+    missed_count = False
 
     def __init__(
         self,
-        plan: ScanPlan,
-        *,
-        period_s: float = 0.0,
         keep_control: bool = False,
         end_when_done: bool = False,
-        parameters: Mapping[str, str | float] | None = None,
-        missed_count: bool = False,
+        parameters: dict[str, str | float] | None = None,
     ) -> None:
-        self.missed_count = missed_count
-        self.keep_control = keep_control
-        self.plan = plan
-        self.beat_s = period_s
-        self.end_when_done = end_when_done
+        self.keep_control, self.end_when_done = keep_control, end_when_done
         self.parameters = dict(parameters or {})
         self.needs_parameters = (*_FRAME, *self.parameters)
 
@@ -80,7 +77,7 @@ class PlannedScans(Component):
                 self.scope.set(name, quantity)
 
     def _await(self, step: PlanStep, rhythm: RoundSchedule) -> bool:
-        """Until it is due; False: the rounds that were left out were the last."""
+        """Wait until a step is due. Returns False if the rounds that were left out were the last."""
         if not step.starts_round or self.memory.get("begun") == step.index:
             return True
         due_s = rhythm.next_due_s(self.memory.get("done_s"))
@@ -110,16 +107,17 @@ class PlannedScans(Component):
             self.log.warning("%s was interrupted and taken again: %s", step.key, interruption)
         if (total := self._total) is not None:
             self.scope.progress(step.index + 1, total, left_s=self._left_s(step.index + 1, total))
-        self.log.info("scan %d%s %s", step.index + 1, self._of_total(), _told(scans.time))
+        at = "" if scans.time is None else f"at {day_and_time(round(scans.time.timestamp() * NS_PER_S), UTC)}"
+        self.log.info("scan %d%s %s", step.index + 1, self._of_total(), at)
 
     def _left_s(self, done: int, total: int) -> float:
-        """What the rest takes as fast as so far, but no faster than the beat."""
+        """Return how long the rest takes, as fast as so far, but no faster than the beat."""
         per_scan_s = (self.clock.now_s() - float(self.memory["start_s"])) / done
         return (total - done) * max(per_scan_s, self.beat_s / len(self.plan.regions))
 
     @property
     def _total(self) -> int | None:
-        """How many scans it will be, as far as is known; None: without end."""
+        """The number of scans, as far as it is known; None: without end."""
         missed = int(self.memory.get("missed", 0)) * len(self.plan.regions)
         return None if self.plan.total is None else max(self.plan.total - missed, int(self.memory.get("done", 0)))
 
@@ -140,9 +138,6 @@ class ScanSeries(PlannedScans):
         every: from the beginning of one scan to that of the next, experiment time; 0 for no pause.
         scans: how many.
         duration: for how long scans are begun (instead of `scans`).
-        keep_control: whether to keep control between the scans; by default others may measure meanwhile.
-        end_when_done: whether to end the whole experiment then.
-        parameters: set before the first scan, e.g. {scan-speed = "2 um/s"}.
     """
 
     def __init__(
@@ -154,24 +149,17 @@ class ScanSeries(PlannedScans):
         every: Duration = 0.0,
         scans: int | None = None,
         duration: Duration | None = None,
-        keep_control: bool = False,
-        end_when_done: bool = False,
-        parameters: dict[str, str | float] | None = None,
+        **planned: Any,
     ) -> None:
+        super().__init__(**planned)
         if scans is not None and duration is not None:
             raise ConfigError("both `scans` and `duration` are given", hint="one of them says when to end")
         rounds = scans if duration is None else rounds_within(duration, every)
-        if end_when_done and rounds is None:
+        if self.end_when_done and rounds is None:
             raise ConfigError("`end_when_done` without an end", hint="give `scans` or `duration`")
-        plan = _plan((Region(pair(center), pair(size), angle),), pixels, rounds)
-        super().__init__(
-            plan,
-            period_s=every,
-            keep_control=keep_control,
-            end_when_done=end_when_done,
-            parameters=parameters,
-            missed_count=duration is not None,
-        )
+        self.plan = _plan((Region(pair(center), pair(size), angle),), pixels, rounds)
+        self.beat_s = every
+        self.missed_count = duration is not None
 
 
 @dataclass(frozen=True)
@@ -181,11 +169,6 @@ class ListedRegion:
     center: tuple[Length, Length]
     size: tuple[Length, Length]
     angle: Angle = 0.0
-
-    @classmethod
-    def of(cls, given: ListedRegion | Mapping[str, Any]) -> ListedRegion:
-        """From the table that a process is given."""
-        return given if isinstance(given, ListedRegion) else cls(**given)
 
     @property
     def region(self) -> Region:
@@ -200,9 +183,6 @@ class ScanList(PlannedScans):
         pixels: (columns, rows) of each.
         rounds: how often the list is gone through.
         every: from the beginning of one round to that of the next, experiment time.
-        keep_control: whether to keep control between the scans; by default others may measure meanwhile.
-        end_when_done: whether to end the whole experiment then.
-        parameters: set before the first scan.
     """
 
     def __init__(
@@ -211,14 +191,12 @@ class ScanList(PlannedScans):
         pixels: Pixels = (128, 128),
         rounds: int = 1,
         every: Duration = 0.0,
-        keep_control: bool = False,
-        end_when_done: bool = False,
-        parameters: dict[str, str | float] | None = None,
+        **planned: Any,
     ) -> None:
-        plan = _plan(tuple(ListedRegion.of(place).region for place in regions), pixels, rounds)
-        super().__init__(
-            plan, period_s=every, keep_control=keep_control, end_when_done=end_when_done, parameters=parameters
-        )
+        super().__init__(**planned)
+        listed = (given if isinstance(given, ListedRegion) else ListedRegion(**given) for given in regions)
+        self.plan = _plan(tuple(one.region for one in listed), pixels, rounds)
+        self.beat_s = every
 
 
 class RegionGrid(PlannedScans):
@@ -233,9 +211,6 @@ class RegionGrid(PlannedScans):
         pixels: (columns, rows) of each scan.
         rounds: how often the grid is gone through.
         every: from the beginning of one round to that of the next, experiment time.
-        keep_control: whether to keep control between the scans; by default others may measure meanwhile.
-        end_when_done: whether to end the whole experiment then.
-        parameters: set before the first scan.
     """
 
     def __init__(
@@ -248,19 +223,16 @@ class RegionGrid(PlannedScans):
         pixels: Pixels = (128, 128),
         rounds: int = 1,
         every: Duration = 0.0,
-        keep_control: bool = False,
-        end_when_done: bool = False,
-        parameters: dict[str, str | float] | None = None,
+        **planned: Any,
     ) -> None:
+        super().__init__(**planned)
         points = grid_centers(pair(center), (counts[0], counts[1]), pair(spacing or size), angle)
-        plan = _plan(squares(points, pair(size), angle), pixels, rounds)
-        super().__init__(
-            plan, period_s=every, keep_control=keep_control, end_when_done=end_when_done, parameters=parameters
-        )
+        self.plan = _plan(tuple(Region(point, pair(size), angle) for point in points), pixels, rounds)
+        self.beat_s = every
 
 
 def pair(values: Sequence[float]) -> XY:
-    """Two numbers as a tuple: from JSON they come as a list."""
+    """Return two numbers as a tuple: from JSON they come as a list."""
     if len(values) != 2:
         raise InvalidValue(f"{list(values)!r} is not a pair of x and y")
     return float(values[0]), float(values[1])
@@ -269,7 +241,3 @@ def pair(values: Sequence[float]) -> XY:
 def _plan(regions: tuple[Region, ...], pixels: Sequence[int], rounds: int | None) -> ScanPlan:
     columns, rows = pixels
     return ScanPlan(regions, (int(rows), int(columns)), rounds)
-
-
-def _told(time: datetime | None) -> str:
-    return "" if time is None else f"at {day_and_time(round(time.timestamp() * NS_PER_S), UTC)}"

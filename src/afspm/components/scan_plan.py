@@ -1,9 +1,9 @@
-"""What is to be measured, where and when: plans as plain values, so that they can be checked without a microscope."""
+"""Plans of scans and the times when they are due, as plain values that need no microscope."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from afspm.errors import InvalidValue
@@ -58,13 +58,11 @@ class ScanPlan:
         return None if self.rounds is None else self.rounds * len(self.regions)
 
     def step(self, index: int) -> PlanStep:
-        """The step with this place in the plan."""
         turn, place = divmod(index, len(self.regions))
         key = f"scan-{turn}" if len(self.regions) == 1 else f"scan-{turn}-{place}"
         return PlanStep(index, key, self.regions[place], self.shape, starts_round=place == 0)
 
     def steps(self, start: int = 0) -> Iterator[PlanStep]:
-        """All steps from `start` on."""
         index = start
         while self.total is None or index < self.total:
             yield self.step(index)
@@ -73,7 +71,7 @@ class ScanPlan:
 
 @dataclass(frozen=True)
 class RoundSchedule:
-    """When the rounds of a plan are due: multiples of a period after the beginning, in experiment time.
+    """The times when the rounds of a plan are due: multiples of a period after the beginning, in experiment time.
 
     Rounds whose time goes by while one is taken, or waits for the repair of a tip, are not made up for in a burst: the
     next is due on the old beat.
@@ -91,19 +89,19 @@ class RoundSchedule:
             raise InvalidValue(f"a period of {self.period_s} s")
 
     def next_due_s(self, done_s: float | None) -> float:
-        """When the round after the one that was done at `done_s` is due; None: none was."""
+        """Return when the round after the one that was done at `done_s` is due; None: none was."""
         if done_s is None or self.period_s == 0.0:
             return self.start_s
         beats = math.floor((done_s - self.start_s) / self.period_s) + 1
         return self.start_s + max(beats, 0) * self.period_s
 
     def left_out(self, due_s: float, next_due_s: float) -> int:
-        """How many rounds lie between two that were due one after the other."""
+        """Return how many rounds lie between two that were due one after the other."""
         return max(0, round((next_due_s - due_s) / self.period_s) - 1) if self.period_s else 0
 
 
 def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad: float = 0.0) -> tuple[XY, ...]:
-    """The points of a grid about a centre, from the row of smallest y on; every other row runs backwards.
+    """Return the points of a grid about a centre, from the row of smallest y on; every other row runs backwards.
 
     Args:
         counts: (columns, rows).
@@ -125,12 +123,7 @@ def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad
 
 
 def rounds_within(duration_s: float, period_s: float) -> int:
-    """How many rounds begin within a duration; the first begins at once."""
+    """Return how many rounds begin within a duration; the first begins at once."""
     if period_s <= 0.0:
         raise InvalidValue("a series with a duration needs a period", hint='e.g. every = "15 min"')
     return math.floor(duration_s / period_s * (1 + 1e-12)) + 1
-
-
-def squares(points: Sequence[XY], size_m: XY, angle_rad: float = 0.0) -> tuple[Region, ...]:
-    """A region of the same size about each point."""
-    return tuple(Region(point, size_m, angle_rad) for point in points)

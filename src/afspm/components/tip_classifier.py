@@ -64,7 +64,7 @@ class TipClassifier(Component):
         self.expected = MissingChannels(self.pairing.channels, self.log)
         if "judge" in self.memory:
             self.judge.restore(self.memory["judge"])
-            self.counter.restore(self.memory["counter"])
+            self.counter.bad, self.counter.good = self.memory["counter"]
 
     def on_control(self, control_state: ControlState) -> None:
         was, self._problems = self._is_flagged, control_state.problems
@@ -117,7 +117,7 @@ class TipClassifier(Component):
     def _remember(self, scan: Scan) -> None:
         if scan.time_ns is not None:
             self.memory["newest_ns"] = scan.time_ns
-        self.memory["counter"] = self.counter.state
+        self.memory["counter"] = [self.counter.bad, self.counter.good]
         self.memory["judge"] = self.judge.state()
         self.memory.save()
 

@@ -1,4 +1,4 @@
-"""Is the tip still what it was? Scans against a reference that was learnt from the first ones.
+"""Compares scans with a reference that was learnt from the first ones: is the tip still what it was?
 
 At a place that it knows the judge compares like with like, and sees small changes. What it knows follows the good
 scans there, since the sample drifts; the first scans stay as the measure of slow wear. Elsewhere it can tell only what
@@ -16,7 +16,7 @@ Measured on simulated nights (128 x 128 pixels, 8 seeds, slow drift, one scan ju
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
 from typing import Any
@@ -26,19 +26,21 @@ import numpy as np
 from afspm.components.tip_metrics import LEAST_CONTRAST, Array, TipMetrics, autocorrelation, metrics, slopes
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Region
+from afspm.model.snapshot import from_plain, to_plain
 
 REACH_PX = 32  # how far beside the first the second apex of a double tip is looked for
 MAD_TO_SIGMA = 1.4826  # of normally distributed values
 SAME_SIZE = 0.02  # relative difference of sizes that are still called the same
 SAME_PLACE = 0.2  # of the size: how far a place may have moved and still be the same
 MOST_PLACES = 16
+DECIMALS = 4  # of an autocorrelation, which is kept on disk
 MOST_KINDS = 4  # of scans that are learnt from side by side, until one kind is known
 FOLLOW = 0.25  # weight of a new good scan in what is known of its place
 FLOORS = TipMetrics(detail=0.02, ghost=0.01, unrest_m=0.15, contrast=0.0)  # spreads that few scans can't be better than
 
 
 class Opinion(Enum):
-    """What is thought of the tip after a scan."""
+    """The opinion on the tip after a scan."""
 
     LEARNING = "learning"
     GOOD = "good"
@@ -102,9 +104,9 @@ class KnownPlace:
     scans: int = 1
 
     def follow(self, seen: TipMetrics, correlation: Array) -> None:
-        """One more good scan: a mean at first, then forgetting."""
+        """Take in one more good scan: a mean at first, then forgetting."""
         weight = max(FOLLOW, 1.0 / (self.scans + 1))
-        self.expected = self.expected + weight * (correlation - self.expected)
+        self.expected = np.round(self.expected + weight * (correlation - self.expected), DECIMALS)
         now, new = asdict(self.usual), asdict(seen)
         self.usual = TipMetrics(**{name: now[name] + weight * (new[name] - now[name]) for name in now})
         self.scans += 1
@@ -129,27 +131,30 @@ class TipReference:
     deviations: list[TipMetrics] = field(default_factory=list)
 
     def fits(self, region: Region, shape: tuple[int, int]) -> bool:
-        """Whether a scan can be compared at all."""
+        """Return whether a scan can be compared at all."""
         sizes = zip(region.size_m, self.size_m, strict=True)
         same_size = all(abs(a / b - 1.0) < SAME_SIZE for a, b in sizes)
         turned_rad = math.remainder(region.angle_rad - self.angle_rad, math.tau)
         return same_size and abs(turned_rad) < SAME_SIZE and shape == self.shape
 
     def place(self, region: Region) -> KnownPlace | None:
-        """What is known of where a scan was taken."""
+        """Return what is known of where a scan was taken."""
         for place in reversed(self.places):
             away = (abs(a - b) / size for a, b, size in zip(region.center_m, place.center_m, self.size_m, strict=True))
             if max(away) < SAME_PLACE:
                 return place
         return None
 
-    def add(self, region: Region, seen: TipMetrics, correlation: Array) -> None:
-        """A place that was not known, seen with a good tip."""
-        self.places.append(KnownPlace(region.center_m, replace(seen, ghost=0.0), correlation))
+    def note(self, place: KnownPlace | None, region: Region, seen: TipMetrics, correlation: Array) -> None:
+        """Note what a good tip shows at a place; None: at one that was not known."""
+        if place is not None:
+            place.follow(seen, correlation)
+            return
+        self.places.append(KnownPlace(region.center_m, replace(seen, ghost=0.0), np.round(correlation, DECIMALS)))
         del self.places[:-MOST_PLACES]
 
     def spread(self, name: str) -> float:
-        """Of good scans at the same place: relative for detail and unrest."""
+        """Return the spread of good scans at the same place: relative for detail and unrest."""
         floor: float = getattr(FLOORS, name)
         if len(self.deviations) < 2:
             return floor
@@ -157,43 +162,18 @@ class TipReference:
         return max(floor, MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values)))))
 
     def usual_anywhere(self) -> TipMetrics:
-        """The median of the scans that were learnt from."""
+        """Return the median of the scans that were learnt from."""
         names = asdict(self.first[0])
         return TipMetrics(**{name: float(np.median([getattr(seen, name) for seen in self.first])) for name in names})
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return {
-            "size_m": list(self.size_m),
-            "angle_rad": self.angle_rad,
-            "shape": list(self.shape),
-            "first": [seen.to_dict() for seen in self.first],
-            "deviations": [seen.to_dict() for seen in self.deviations],
-            "places": [
-                {
-                    "center_m": list(place.center_m),
-                    "usual": place.usual.to_dict(),
-                    "scans": place.scans,
-                    "expected": np.round(place.expected, 4).tolist(),
-                }
-                for place in self.places
-            ],
-        }
 
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> TipReference:
-        (width, height), (rows, columns) = values["size_m"], values["shape"]
-        places = [
-            KnownPlace(
-                (place["center_m"][0], place["center_m"][1]),
-                TipMetrics.from_dict(place["usual"]),
-                np.asarray(place["expected"]),
-                place["scans"],
-            )
-            for place in values["places"]
-        ]
-        first, deviations = ([TipMetrics.from_dict(seen) for seen in values[key]] for key in ("first", "deviations"))
-        return cls((width, height), values["angle_rad"], (rows, columns), places, first, deviations)
+@dataclass
+class JudgeState:
+    """What survives a restart: the reference, those begun of scans of other sizes, and whether the tip is suspect."""
+
+    reference: TipReference | None = None
+    others: list[TipReference] = field(default_factory=list)
+    suspect: bool = False
 
 
 class TipJudge:
@@ -210,27 +190,27 @@ class TipJudge:
             raise ConfigError(f"{reference_scans} reference scans have no spread", hint="2 at least", where="tip")
         self.reference_scans = reference_scans
         self.tolerance = tolerance or TipTolerance()
-        self.reference: TipReference | None = None
-        self._others: list[TipReference] = []  # begun, of scans of other sizes: an overview may come first
-        self._suspect = False
+        self._state = JudgeState()
+
+    @property
+    def reference(self) -> TipReference | None:
+        return self._state.reference
 
     @property
     def has_learnt(self) -> bool:
         return self.reference is not None and len(self.reference.first) >= self.reference_scans
 
     def state(self) -> dict[str, Any]:
-        """What must survive a restart, JSON-able."""
-        reference = self.reference.to_dict() if self.reference else None
-        return {"reference": reference, "others": [one.to_dict() for one in self._others], "suspect": self._suspect}
+        """Return what must survive a restart, in JSON's types."""
+        plain: dict[str, Any] = to_plain(self._state, lists=True)
+        return plain
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Take up what `state` gave."""
-        self.reference = TipReference.from_dict(state["reference"]) if state["reference"] else None
-        self._others = [TipReference.from_dict(one) for one in state.get("others", ())]
-        self._suspect = state["suspect"]
+        """Continue from what `state` returned."""
+        self._state = from_plain(JudgeState, state)
 
     def judge(self, trace: Array, retrace: Array | None, region: Region) -> Verdict:
-        """What a scan tells of the tip.
+        """Return what a scan says about the tip.
 
         Args:
             trace, retrace: heights in m, [y, x]; retrace None where it is not recorded.
@@ -244,7 +224,8 @@ class TipJudge:
         except InvalidValue as error:
             return Verdict(Opinion.UNCLEAR, error.what)
         if self.reference is None or not self.reference.fits(region, shape):
-            self.reference = self._begun(region, shape)
+            self._state.reference = self._begun(region, shape)
+        assert self.reference is not None
         place = self.reference.place(region)
         correlation = autocorrelation(seen_slopes, min(REACH_PX, min(shape) // 3))
         seen = metrics(seen_slopes, correlation, place.expected if place else None)
@@ -254,14 +235,14 @@ class TipJudge:
             return self._learn(self.reference, place, seen, correlation, region)
         verdict = self._compare(self.reference, place, seen)
         if verdict.opinion is Opinion.GOOD:
-            self._know(self.reference, place, seen, correlation, region)
+            self.reference.note(place, region, seen, correlation)
         return verdict
 
     def _begun(self, region: Region, shape: tuple[int, int]) -> TipReference:
-        """What is known so far of scans like this one, which the last was not; that is put by."""
-        known = next((one for one in self._others if one.fits(region, shape)), None)
-        self._others = [one for one in (*self._others, self.reference) if one is not None and one is not known]
-        del self._others[: -MOST_KINDS + 1]
+        """Return what is known so far of scans like this one, which the last was not; that is put by."""
+        begun = [one for one in (*self._state.others, self.reference) if one is not None]
+        known = next((one for one in begun if one.fits(region, shape)), None)
+        self._state.others = [one for one in begun if one is not known][-MOST_KINDS + 1 :]
         return known or TipReference(region.size_m, region.angle_rad, shape)
 
     def _learn(
@@ -270,18 +251,10 @@ class TipJudge:
         if place is not None:
             reference.deviations.append(_relative(seen, place.usual))
         reference.first.append(seen)
-        self._know(reference, place, seen, correlation, region)
+        reference.note(place, region, seen, correlation)
         if self.has_learnt:
-            self._others.clear()
+            self._state.others.clear()
         return Verdict(Opinion.LEARNING, f"reference {len(reference.first)} of {self.reference_scans}", seen)
-
-    def _know(
-        self, reference: TipReference, place: KnownPlace | None, seen: TipMetrics, correlation: Array, region: Region
-    ) -> None:
-        if place is None:
-            reference.add(region, seen, correlation)
-        else:
-            place.follow(seen, correlation)
 
     def _compare(self, reference: TipReference, place: KnownPlace | None, seen: TipMetrics) -> Verdict:
         faults = self._faults_anywhere(reference, seen)
@@ -289,16 +262,16 @@ class TipJudge:
             faults += self._faults_here(reference, place, seen)
         worst = max(way for way, _ in faults)
         if worst >= 1.0:
-            self._suspect = self._suspect or place is not None
+            self._state.suspect = self._state.suspect or place is not None
             return Verdict(Opinion.BAD, "; ".join(why for way, why in faults if way >= 1.0), seen)
         if worst > self.tolerance.margin:
             return Verdict(
                 Opinion.UNCLEAR, "nearly " + "; ".join(why for way, why in faults if way > self.tolerance.margin), seen
             )
-        if place is None and self._suspect:
+        if place is None and self._state.suspect:
             # what was found by comparing like with like can only be found to be over in the same way
             return Verdict(Opinion.UNCLEAR, "nothing wrong here, but only a place known from before can tell", seen)
-        self._suspect = False
+        self._state.suspect = False
         return Verdict(Opinion.GOOD, _summary(seen, place.usual if place else reference.usual_anywhere()), seen)
 
     def _faults_anywhere(self, reference: TipReference, seen: TipMetrics) -> list[tuple[float, str]]:
@@ -349,18 +322,9 @@ class VerdictCounter:
     def wants_clear(self) -> bool:
         return self.good >= self.clear_after
 
-    @property
-    def state(self) -> Sequence[int]:
-        """JSON-able."""
-        return [self.bad, self.good]
-
-    def restore(self, state: Sequence[int]) -> None:
-        """Take up what `state` gave."""
-        self.bad, self.good = state
-
 
 def _relative(seen: TipMetrics, usual: TipMetrics) -> TipMetrics:
-    """Detail and unrest as parts of the usual ones, 1 where there is usually none; ghost and contrast as they are."""
+    """Return detail and unrest as parts of the usual ones, 1 where there is usually none, and the rest as it is."""
     unrest = seen.unrest_m / usual.unrest_m if usual.unrest_m > 0 else 1.0
     return TipMetrics(seen.detail / usual.detail if usual.detail > 0 else 1.0, seen.ghost, unrest, seen.contrast)
 

@@ -1,4 +1,4 @@
-"""What a scan says about the tip that took it, in numbers that depend little on where it was taken.
+"""Metrics of the tip from the scans that it took, in numbers that depend little on where it was taken.
 
 Whatever the tip touches it blunts, doubles or shakes in the same way, so that three properties of a scan tell of the
 tip rather than of the place:
@@ -15,8 +15,7 @@ tip rather than of the place:
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +35,7 @@ LEAST_CONTRAST = 0.1  # slopes common to trace and retrace against those of nois
 
 @dataclass(frozen=True)
 class TipMetrics:
-    """Of one scan.
+    """What one scan says about the tip.
 
     Attributes:
         detail: short-wave against long-wave power of the slopes.
@@ -49,14 +48,6 @@ class TipMetrics:
     ghost: float
     unrest_m: float
     contrast: float
-
-    def to_dict(self) -> dict[str, float]:
-        """JSON-able."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> TipMetrics:
-        return cls(**{f.name: float(values[f.name]) for f in fields(cls)})
 
 
 @dataclass(frozen=True)
@@ -94,7 +85,7 @@ def slopes(trace: Array, retrace: Array | None = None) -> Slopes:
 
 
 def autocorrelation(of: Slopes, reach_px: int) -> Array:
-    """How much the slopes look like themselves elsewhere, 1 at no distance.
+    """Return how much the slopes look like themselves elsewhere, 1 at no distance.
 
     Returns:
         Lags of 0 … reach rows by -reach … reach columns; the other half is the same by symmetry.
@@ -119,7 +110,7 @@ def autocorrelation(of: Slopes, reach_px: int) -> Array:
 
 
 def metrics(of: Slopes, correlation: Array, expected: Array | None = None) -> TipMetrics:
-    """The numbers of one scan.
+    """Return the metrics of one scan.
 
     Args:
         correlation: its `autocorrelation`.
@@ -135,7 +126,7 @@ def metrics(of: Slopes, correlation: Array, expected: Array | None = None) -> Ti
 
 
 def ghost(correlation: Array, expected: Array | None = None) -> float:
-    """The largest correlation beside the centre, less what was expected there."""
+    """Return the largest correlation beside the centre, less what was expected there."""
     beyond = _smoothed(correlation if expected is None else correlation - expected)
     reach = correlation.shape[0] - 1
     rows, columns = np.mgrid[0 : reach + 1, -reach : reach + 1]

@@ -24,24 +24,24 @@ _MOST_ADDRESSES = 1000
 
 
 def hashed(password: str) -> str:
-    """A password as it may be written down: "scrypt:<salt>:<hash>"."""
+    """Return a password as it may be written down: "scrypt:<salt>:<hash>"."""
     salt = os.urandom(16)
     return f"scrypt:{_text(salt)}:{_text(_scrypt(password, salt))}"
 
 
 def matches(password: str, kept: str) -> bool:
-    """Whether a password is the one of `kept`, a result of `hashed`."""
+    """Return whether a password is the one of `kept`, a result of `hashed`."""
     _, salt, digest = kept.split(":")
     return hmac.compare_digest(_scrypt(password, base64.b64decode(salt)), base64.b64decode(digest))
 
 
 def is_hash(text: str) -> bool:
-    """Whether a text is what `hashed` makes."""
+    """Return whether a text is what `hashed` makes."""
     return re.fullmatch(r"scrypt:[A-Za-z0-9+/=]{24}:[A-Za-z0-9+/=]{44,88}", text) is not None
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address to listen at is reached from this computer only."""
+    """Return whether an address to listen at is reached from this computer only."""
     if host == "localhost":
         return True
     try:
@@ -51,7 +51,7 @@ def is_loopback(host: str) -> bool:
 
 
 def check_name(name: str) -> str:
-    """The name of a person as it may stand in the record; empty if it may not."""
+    """Return the name of a person as it may stand in the record; empty if it may not."""
     name = " ".join(name.split())
     return name if len(name) <= LONGEST_NAME and _NAME.fullmatch(name) else ""
 
@@ -62,11 +62,11 @@ class Visitor:
 
     Attributes:
         person: the name; empty: only looks.
-        session: the key of the session; empty for a program that shows its password with each request.
+        cookie: of the session; empty for a program that shows its password with each request.
     """
 
     person: str = ""
-    session: str = ""
+    cookie: str = ""
 
     @property
     def may_steer(self) -> bool:
@@ -119,31 +119,31 @@ class Access:
 
     @property
     def is_open(self) -> bool:
-        """Whether a name alone is enough to steer."""
+        """True if a name alone is enough to steer."""
         return self._local and not any(self._hashes.values())
 
     @property
     def lets_look(self) -> bool:
-        """Whether everybody may look."""
+        """True if everybody may look."""
         return self._local and not self._hashes[""]
 
     def visitor(self, cookie: str | None) -> Visitor | None:
         """Return who shows a cookie; None: nobody who may come in."""
         session = self._sessions.find(cookie or "")
         if session is not None and session.proof == self._proof_of(session.person):
-            return Visitor(session.person, session.key)
+            return Visitor(session.person, cookie or "")
         return Visitor() if self.lets_look else None
 
     def is_signed_in(self, visitor: Visitor) -> bool:
-        """Return whether the session of a visitor still stands: it ends when the person signs out anywhere."""
-        return not visitor.session or self._sessions.has(visitor.session)
+        """Return whether the session of a visitor goes on: it ends when the person signs out anywhere."""
+        return not visitor.cookie or self._sessions.find(visitor.cookie) is not None
 
     def by_password(self, person: str, password: str, address: str) -> Visitor | None:
         """Return who shows a name and a password with a request; None if that is wrong, or was wrong too often."""
         return Visitor(person) if not self.wait_s(address) and self._proves(person, password, address) else None
 
     def wait_s(self, address: str) -> float:
-        """How long an address that was wrong too often has to wait until it may try again; 0 if it needn't."""
+        """Return how long an address that was wrong too often has to wait; 0 if it needn't."""
         failures = self._failures.get(address)
         if failures is None or len(failures) < _TRIES:
             return 0.0
@@ -168,7 +168,7 @@ class Access:
         self._sessions.end(cookie or "", everywhere=everywhere)
 
     def _proof_of(self, person: str) -> str:
-        """What a session was begun with: with another password it counts no more."""
+        """Return what stands for a person's password: with another one the session ends."""
         if self.is_open:
             return ""
         return hashlib.sha256(self._hashes.get(person, "nobody").encode()).hexdigest()

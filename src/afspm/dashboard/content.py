@@ -3,23 +3,38 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from html import escape
 
 from afspm.clock import NS_PER_S
-from afspm.dashboard.curves import drift_html
+from afspm.dashboard.charts import Chart, drift_chart
 from afspm.dashboard.sample_map import MapContent, map_html
-from afspm.dashboard.time_line import NOT_HEARD_OF, time_line_html
-from afspm.dashboard.watch import OLD_AFTER_S, Watch
-from afspm.dashboard.words import colour_class, date_and_clock, escape, position
-from afspm.formatting import duration_text, time_of_day
+from afspm.dashboard.watch import Watch
+from afspm.dashboard.words import colour_class, position
+from afspm.drawing.timeline import TimelineRow, timeline_html
+from afspm.formatting import day_and_time, duration_text, time_of_day
 from afspm.model import ControlMode, JournalEntry, LogLine, ProcessState, Region
 from afspm.record.overview import OVER, Overview
+from afspm.record.timeline import Span, Timeline
 
 ANEW_S = 0.4  # at most that often, however much is published
-SLOWLY_S = 2.0  # what takes longer to make
-MOST_LINES = 300
-LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
+SLOWLY_S = 2.0  # for what takes longer to make
+OLD_AFTER_S = 8.0  # a supervisor tells of its processes every 2 s
+NOT_HEARD_OF = "not heard of"
+Flag = tuple[int, str, str]
+"""Number and name of a problem, and who flagged it."""
+
+
+@dataclass(frozen=True)
+class SlowContent:
+    """What takes longer to make; `sample_map_near` is the part where something was measured."""
+
+    sample_map: str = ""
+    sample_map_near: str = ""
+    time_line: str = ""
+    drift: Chart = field(default_factory=lambda: Chart(""))
 
 
 @dataclass(frozen=True)
@@ -28,35 +43,20 @@ class Content:
 
     Attributes:
         trouble: why it should not be trusted; empty: it may be.
-        problems: the flagged ones, (number, name, who flagged it).
-        unheard: for how long, in ns, nobody has told of a process while others are told of.
+        unheard: for how long, in ns, a process has not been told of while others are.
     """
 
     status: str = ""
     trouble: str = ""
-    sample_map: str = ""
-    sample_map_near: str = ""
-    time_line: str = ""
-    drift: str = ""
+    slow: SlowContent = field(default_factory=SlowContent)
     refusals: str = ""
     channels: tuple[str, ...] = ()
-    problems: tuple[tuple[int, str, str], ...] = ()
+    problems: tuple[Flag, ...] = ()
     processes: tuple[ProcessState, ...] = ()
     unheard: Mapping[str, int] = field(default_factory=dict)
     log: tuple[LogLine, ...] = ()
-    spectra: int = 0
     is_manual: bool = False
     ended: bool = False
-
-
-@dataclass(frozen=True)
-class _Slow:
-    """What takes longer to make."""
-
-    sample_map: str = ""
-    sample_map_near: str = ""
-    time_line: str = ""
-    drift: str = ""
 
 
 class Contents:
@@ -72,10 +72,9 @@ class Contents:
         self._lock = threading.Lock()
         self._content = Content()
         self._made_s = self._drawn_s = -1e9
-        self._slow = _Slow()
 
     def get(self) -> Content:
-        """How it is now, or was a moment ago."""
+        """Return how it is now, or was a moment ago."""
         with self._lock:
             now_s = self._watch.clock.monotonic_s()
             if now_s - self._made_s >= ANEW_S or self._watch.ended != self._content.ended:
@@ -84,56 +83,49 @@ class Contents:
             return self._content
 
     def _make(self, now_s: float) -> Content:
-        watch = self._watch
+        watch, slow = self._watch, self._content.slow
         with watch.reading() as overview:
+            silent = unheard(watch, overview)
             if now_s - self._drawn_s >= SLOWLY_S:
                 self._drawn_s = now_s
-                self._slow = self._draw(overview)
+                slow = self._draw(overview, silent)
             control = overview.control
             return Content(
                 status=status_html(watch, overview),
                 trouble=trouble(watch),
-                sample_map=self._slow.sample_map,
-                sample_map_near=self._slow.sample_map_near,
-                time_line=self._slow.time_line,
-                drift=self._slow.drift,
+                slow=slow,
                 refusals=refusals_html(overview.refusals),
                 channels=watch.frames.channels,
-                problems=_problems(overview),
+                problems=tuple(_flags(overview)),
                 processes=tuple(overview.processes.values()),
-                unheard=unheard(watch, overview),
+                unheard=silent,
                 log=tuple(overview.log),
-                spectra=len(overview.spectra),
                 is_manual=control is not None and control.mode is ControlMode.MANUAL,
                 ended=watch.ended,
             )
 
-    def _draw(self, overview: Overview) -> _Slow:
-        parameters, watch = overview.scan_parameters, self._watch
-        current = parameters.region if parameters and isinstance(parameters.region, Region) else None
+    def _draw(self, overview: Overview, silent: Mapping[str, int]) -> SlowContent:
+        parameters = overview.scan_parameters
         newest = overview.scans[-1] if overview.scans else None
         content = MapContent(
             overview.scans,
             overview.spectra,
-            current,
+            parameters.region if parameters and isinstance(parameters.region, Region) else None,
             self._limits,
-            watch.tip_to_sample,
+            self._watch.tip_to_sample,
             overview.probe_position.xy_m if overview.probe_position else None,
-            (newest.time_ns, newest.channel) if newest else None,
+            newest.time_ns if newest else None,
         )
-        return _Slow(
-            map_html(content),
-            map_html(content, whole=False),
-            time_line_html(overview, self._now_ns(), unheard(watch, overview)),
-            drift_html(overview.drift),
-        )
+        time_line = timeline_html(rows_of(overview, silent), None, _now_ns(self._watch, overview))
+        return SlowContent(map_html(content), map_html(content, whole=False), time_line, drift_chart(overview.drift))
 
-    def _now_ns(self) -> int:
-        return self._watch.overview.newest_ns if self._watch.ended else self._watch.clock.now_ns()
+
+def _now_ns(watch: Watch, overview: Overview) -> int:
+    return overview.newest_ns if watch.ended else watch.clock.now_ns()
 
 
 def unheard(watch: Watch, overview: Overview) -> dict[str, int]:
-    """For how long nobody has told of a process, in ns, where others are told of: its computer is gone."""
+    """Return for how long, in ns, each process has not been told of while others are: its computer is gone."""
     if watch.ended:
         return {}
     speed = 1.0 / watch.clock.real_s(1.0)
@@ -142,7 +134,7 @@ def unheard(watch: Watch, overview: Overview) -> dict[str, int]:
 
 
 def trouble(watch: Watch) -> str:
-    """Why what is shown may not be how it is; empty if it is."""
+    """Return why what is shown may not be how it is; empty if it is."""
     if watch.ended:
         return "The experiment has ended. What is shown is how it ended."
     if not watch.connected:
@@ -154,64 +146,79 @@ def trouble(watch: Watch) -> str:
     return ""
 
 
+def rows_of(overview: Overview, silent: Mapping[str, int]) -> Iterator[TimelineRow]:
+    """Yield the rows of the time line: control, mode, scope state, each problem, each process."""
+    yield TimelineRow("control", overview.controls.spans, colour_class)
+    yield TimelineRow("mode", overview.modes.spans, lambda label: f"mode-{label}")
+    yield TimelineRow("microscope", overview.states.spans, lambda label: f"state-{label.replace('_', '-')}")
+    for number, lane in sorted(overview.problem_timelines.items()):
+        if lane.spans:
+            yield TimelineRow(overview.problems.name(number), lane.spans, lambda label: "problem")
+    for name, lane in overview.process_timelines.items():
+        spans = _until_told(lane, overview.processes_told_ns[name]) if name in silent else lane.spans
+        yield TimelineRow(name, spans, lambda label: f"process-{label.replace(' ', '-')}")
+
+
+def _until_told(lane: Timeline, told_ns: int) -> Iterator[Span]:
+    for span in lane.spans:
+        yield replace(span, end_ns=max(told_ns, span.start_ns)) if span.end_ns is None else span
+    if lane.now is not None:
+        yield Span(NOT_HEARD_OF, told_ns)
+
+
 def status_html(watch: Watch, overview: Overview) -> str:
-    """Mode, who is in control, what the microscope does, problems, and what time it is in the experiment."""
+    """Return mode, holder, the microscope's state, problems, and what time it is in the experiment."""
     control = overview.control
     if control is None:
         return '<span class="chip">waiting for the scheduler</span>'
-    since_ns = overview.control_since_ns
-    now_ns = overview.newest_ns if watch.ended else watch.clock.now_ns()
+    since_ns, now_ns = overview.control_since_ns, _now_ns(watch, overview)
     since = (
         "" if since_ns is None else f" since {time_of_day(since_ns)} ({duration_text((now_ns - since_ns) / NS_PER_S)})"
     )
     mode = control.mode.name
-    parts = [f'<span class="chip mode-{mode.lower()}" data-part="mode">{mode}</span>']
-    if control.holder:
-        who = f'<b class="{colour_class(control.holder)}">{escape(control.holder)}</b>'
-        parts.append(f'<span class="chip" data-part="holder">{who} is in control<small>{since}</small></span>')
-    else:
-        parts.append(f'<span class="chip" data-part="holder">nobody is in control<small>{since}</small></span>')
-    parts += _microscope(overview, now_ns)
-    for _, name, who in _problems(overview):
-        by = f" (flagged by {escape(who)})" if who else ""
-        parts.append(f'<span class="chip problem" data-part="problem">{escape(name)}{by}</span>')
+    who = f'<b class="{colour_class(control.holder)}">{escape(control.holder)}</b>' if control.holder else "nobody"
+    parts = [
+        _chip(mode, "mode", f"mode-{mode.lower()}"),
+        _chip(f"{who} is in control<small>{since}</small>", "holder"),
+        *_microscope(overview, now_ns),
+    ]
+    for _, name, by in _flags(overview):
+        parts.append(_chip(f"{escape(name)}{f' (flagged by {escape(by)})' if by else ''}", "problem", "problem"))
     for name, (done, of) in overview.progress.items():
-        parts.append(f'<span class="chip"><b>{escape(name)}</b> {done} of {of}</span>')
-    parts.append(f'<span class="chip time" data-part="clock">{date_and_clock(now_ns)}</span>')
+        parts.append(_chip(f"<b>{escape(name)}</b> {done} of {of}", "progress"))
+    zone = datetime.fromtimestamp(now_ns / NS_PER_S).astimezone().tzname()
+    parts.append(_chip(f"{day_and_time(now_ns)} {zone}", "clock", "time"))
     return "".join(parts)
 
 
-def _microscope(overview: Overview, now_ns: int) -> list[str]:
-    """Its state, how far the scan is, where the probe stands, and its feedback."""
+def _chip(html: str, part: str, style: str = "") -> str:
+    return f'<span class="{f"chip {style}".strip()}" data-part="{part}">{html}</span>'
+
+
+def _microscope(overview: Overview, now_ns: int) -> Iterator[str]:
+    """Yield its state, how far the scan is, where the probe stands, and its feedback."""
     status = overview.status
-    state = status.state.name.lower().replace("_", " ") if status else "not heard of"
+    state = status.state.name.lower().replace("_", " ") if status else NOT_HEARD_OF
     paused = " (paused)" if status and status.paused else ""
     done = overview.scan_progress(now_ns)
     far = "" if done is None else f" {100 * done[0]:.0f} %, {duration_text(done[1] / NS_PER_S)} left"
-    found = [
-        f'<span class="chip state-{state.replace(" ", "-")}" data-part="state">microscope {state}{paused}{far}</span>'
-    ]
+    yield _chip(f"microscope {state}{paused}{far}", "state", f"state-{state.replace(' ', '-')}")
     if overview.probe_position is not None:
-        found.append(f'<span class="chip quiet">probe {position(overview.probe_position.xy_m)}</span>')
+        yield _chip(f"probe {position(overview.probe_position.xy_m)}", "probe", "quiet")
     feedback = overview.feedback
     if feedback is not None and feedback.on is not None:
-        word = "feedback on" if feedback.on else "FEEDBACK OFF"
         at = "" if feedback.setpoint is None else f", setpoint {feedback.setpoint:.4g}"
-        found.append(f'<span class="chip quiet">{word}{at}</span>')
-    return found
+        yield _chip(f"{'feedback on' if feedback.on else 'FEEDBACK OFF'}{at}", "feedback", "quiet")
 
 
-def _problems(overview: Overview) -> tuple[tuple[int, str, str], ...]:
-    flagged = overview.control.problems if overview.control else ()
-    found = []
-    for number in flagged:
+def _flags(overview: Overview) -> Iterator[Flag]:
+    for number in overview.control.problems if overview.control else ():
         now = overview.problem_timelines[number].now if number in overview.problem_timelines else None
-        found.append((number, overview.problems.name(number), now.by if now else ""))
-    return tuple(found)
+        yield number, overview.problems.name(number), now.by if now else ""
 
 
 def refusals_html(refusals: Iterable[JournalEntry], most: int = 40) -> str:
-    """The last refusals, newest first."""
+    """Return the last refusals, newest first."""
     newest = list(refusals)[-most:][::-1]
     if not newest:
         return '<p class="nothing">Nothing has been refused.</p>'
@@ -221,49 +228,3 @@ def refusals_html(refusals: Iterable[JournalEntry], most: int = 40) -> str:
         for one in newest
     )
     return f'<ul class="refusals">{rows}</ul>'
-
-
-def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: str = "") -> str:
-    """Log lines, newest first.
-
-    Args:
-        names: of components; empty: all.
-        level: the least that is shown.
-        text: that a line has to contain, in lower or upper case.
-    """
-    least = LEVELS.index(level) if level in LEVELS else 0
-    wanted = [
-        line
-        for line in lines
-        if (not names or line.name in names)
-        and (LEVELS.index(line.level) if line.level in LEVELS else 1) >= least
-        and text.lower() in line.text.lower()
-    ]
-    if not wanted:
-        return '<p class="nothing">No such line.</p>'
-    rows = "".join(
-        f'<li class="level-{escape(line.level.lower())}"><time>{time_of_day(line.time_ns)}</time>'
-        f'<b class="{colour_class(line.name)}">{escape(line.name)}</b><i>{escape(line.level)}</i>'
-        f"<span>{escape(line.text)}</span></li>"
-        for line in wanted[: -MOST_LINES - 1 : -1]
-    )
-    return f'<ul class="log">{rows}</ul>'
-
-
-def process_words(state: ProcessState, unheard_ns: int | None = None) -> tuple[str, str, str]:
-    """(condition, since when or busy for how long, restarts) of a process, in words.
-
-    Args:
-        unheard_ns: for how long nobody has told of it, if others are told of.
-    """
-    condition = state.condition.name.lower().replace("_", " ")
-    since = f"since {time_of_day(state.since_ns)}"
-    if unheard_ns is not None:
-        gone = f"for {duration_text(unheard_ns / NS_PER_S)}: whoever started it is gone, or can't be reached"
-        condition, since = NOT_HEARD_OF, gone
-    elif state.step_age_s >= 1.0:
-        since = f"on its step for {duration_text(state.step_age_s)}"
-    restarts = "" if state.starts <= 1 else f"restarted {state.starts - 1} time{'s' if state.starts > 2 else ''}"
-    if state.last_exit and state.starts > 1:
-        restarts += f" (last: {state.last_exit})"
-    return condition, since, restarts

@@ -1,4 +1,4 @@
-"""`Dashboard`: the component that shows an experiment in the browser, and steers it for whoever may."""
+"""`Dashboard`: the component that shows an experiment in the browser, and steers it."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from afspm.addresses import Listens
 from afspm.client.component import Component
 from afspm.clock import ExperimentClock
 from afspm.dashboard.access import Access, is_loopback
-from afspm.dashboard.allowed import allowed_region
-from afspm.dashboard.record import Archive
+from afspm.dashboard.archive import Archive, allowed_region
 from afspm.dashboard.server import USUAL_PORT, PageServer, listening, url_of
 from afspm.dashboard.sessions import Sessions
 from afspm.dashboard.watch import Watch
@@ -82,7 +81,7 @@ class Dashboard(Component):
         problems = self._context.problems
         self._watch = Watch(self.clock, problems, archive.past(problems), lambda: cut_off_message(self.run_dir))
         self._steering = Steering(launch, self.clock, self._watch, access)
-        app, self._farewell = application(
+        app, self._wait_told = application(
             self._watch,
             self._steering,
             access,
@@ -104,13 +103,13 @@ class Dashboard(Component):
     def on_end(self) -> None:
         if self._server is None:
             return
-        self._watch.tell(ended=True)
-        self._farewell(TOLD_WITHIN_S)
+        self._watch.end()
+        self._wait_told(TOLD_WITHIN_S)
         self._steering.close()
         self._server.stop()
 
     def _usual_ports(self) -> tuple[int, ...]:
-        """The one of our earlier life, where the page in a browser looks for us."""
+        """Return the port of the last start, where the page in a browser looks for us."""
         before = self.memory.get("port")
         earlier = (before,) if isinstance(before, int) else ()
         return earlier if self._port == 0 else (*earlier, USUAL_PORT)

@@ -12,19 +12,19 @@ from afspm.model import Region, Scan, ScanLines
 
 MEMORY_BYTES = 192 << 20
 MOST_CHANNELS = 64
-Key = tuple[int, str]
+FrameKey = tuple[int, str]
 """Time in ns and channel."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Frame:
+class ChannelFrame:
     """One channel of a scan, as far as it has come.
 
     Attributes:
         number: higher than that of every frame of any channel before.
         values: [y, x], y ascending, as published; NaN in rows that have not come yet.
         time_ns: when it was finished; None while it grows.
-        began_ns: the time that its lines carry; None if it came whole.
+        began_ns: the time that its lines carry; None if it came in one piece.
         rows: how many have come.
         newest_row: index of the one that came last; None where it is finished.
     """
@@ -36,13 +36,11 @@ class Frame:
     values: NDArray[np.float64]
     time_ns: int | None
     began_ns: int | None = None
-    filename: str = ""
     rows: int = 0
     newest_row: int | None = None
 
     @property
     def complete(self) -> bool:
-        """Whether it is finished."""
         return self.time_ns is not None
 
 
@@ -54,29 +52,20 @@ class FrameStore:
     """
 
     def __init__(self, memory_bytes: int = MEMORY_BYTES) -> None:
+        self.kept_bytes = 0
         self._memory_bytes = memory_bytes
         self._number = 0
-        self._newest: dict[str, Frame] = {}
+        self._newest: dict[str, ChannelFrame] = {}
         self._came: dict[str, NDArray[np.bool_]] = {}
-        self._kept: OrderedDict[Key, Frame] = OrderedDict()
-        self._kept_bytes = 0
+        self._kept: OrderedDict[FrameKey, ChannelFrame] = OrderedDict()
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """In the order in which they were first seen."""
+        """The channels in the order in which they were first seen."""
         return tuple(self._newest)
 
-    @property
-    def number(self) -> int:
-        """Of the newest frame; 0 before the first."""
-        return self._number
-
-    @property
-    def kept_bytes(self) -> int:
-        return self._kept_bytes
-
     def take_scan(self, scan: Scan, time_ns: int) -> None:
-        """A finished channel; `time_ns` is the packet's, for scans that say none. Without values it is no picture."""
+        """Add a finished channel; `time_ns` is the packet's, for scans that say none. Without values it is none."""
         if not scan.values.size:
             return
         before = self._newest.get(scan.channel)
@@ -85,17 +74,19 @@ class FrameStore:
             return  # a replay: what is there is newer
         self._came.pop(scan.channel, None)
         began_ns = before.began_ns if before is not None and not before.complete else None
-        frame = Frame(
-            self._next(), scan.channel, scan.unit, scan.region, scan.values, time_ns, began_ns, scan.filename,
-            scan.shape[0],
-        )  # fmt: skip
+        frame = ChannelFrame(
+            self._next(), scan.channel, scan.unit, scan.region, scan.values, time_ns, began_ns, scan.shape[0]
+        )
         self._put(frame)
-        self._keep(frame)
+        self._kept[time_ns, frame.channel] = frame
+        self.kept_bytes += frame.values.nbytes
+        while self.kept_bytes > self._memory_bytes and len(self._kept) > 1:
+            self.kept_bytes -= self._kept.popitem(last=False)[1].values.nbytes
 
     def take_lines(self, lines: ScanLines) -> None:
-        """Lines of a running scan; those of one that is finished already are passed over."""
+        """Add lines of a running scan; those of one that is finished already are passed over."""
         before = self._newest.get(lines.channel)
-        if before is not None and self._is_over(before, lines):
+        if before is not None and before.complete and self._is_over(before, lines):
             return
         grows = (
             before is not None
@@ -111,60 +102,48 @@ class FrameStore:
         downwards = last < len(came) and bool(came[last])
         came[lines.first_row : last] = True
         self._came[lines.channel] = came
-        self._put(Frame(
+        self._put(ChannelFrame(
             self._next(), lines.channel, lines.unit, lines.region, picture, None, lines.began_ns,
             rows=int(came.sum()), newest_row=lines.first_row if downwards else last - 1,
         ))  # fmt: skip
 
-    def newest(self, channel: str | None = None) -> Frame | None:
-        """The newest frame of a channel; None: of the channel seen first. A growing one is a copy as it is now."""
-        if channel is None:
-            channel = next(iter(self._newest), None)
-        frame = self._newest.get(channel) if channel is not None else None
-        return frame if frame is None or frame.complete else _copied(frame)
+    def newest(self, channel: str | None = None) -> ChannelFrame | None:
+        """Return the newest frame of a channel (None: of the one seen first); a growing one is a copy as it is now."""
+        frame = self._of(channel)
+        return frame if frame is None or frame.complete else replace(frame, values=frame.values.copy())
 
     def newest_number(self, channel: str | None = None) -> tuple[int, bool]:
-        """(number, whether it is finished) of the newest frame, without a copy; 0 if there is none."""
-        if channel is None:
-            channel = next(iter(self._newest), None)
-        frame = self._newest.get(channel) if channel is not None else None
+        """Return (number, True if it is finished) of the newest frame, without a copy; 0 if there is none."""
+        frame = self._of(channel)
         return (0, False) if frame is None else (frame.number, frame.complete)
 
-    def kept(self, time_ns: int, channel: str) -> Frame | None:
-        """A finished frame from before; None if it is not kept here any more."""
+    def kept(self, time_ns: int, channel: str) -> ChannelFrame | None:
+        """Return a finished frame from before; None if it is not kept here any more."""
         return self._kept.get((time_ns, channel))
 
+    def _of(self, channel: str | None) -> ChannelFrame | None:
+        return next(iter(self._newest.values()), None) if channel is None else self._newest.get(channel)
+
     def _has_room(self, lines: ScanLines) -> bool:
-        """Whether the whole scan that these lines announce fits: a few lines may be said to be of millions."""
+        """Return whether the scan that these lines announce fits: a few lines may be said to be of millions."""
         rows, columns = lines.shape
         others = (one for one in self._newest.values() if not one.complete and one.channel != lines.channel)
         return 8 * rows * columns + sum(one.values.nbytes for one in others) <= self._memory_bytes
 
-    def _put(self, frame: Frame) -> None:
+    def _put(self, frame: ChannelFrame) -> None:
         self._newest[frame.channel] = frame
         if len(self._newest) > MOST_CHANNELS:
             oldest = min(self._newest.values(), key=lambda one: one.number).channel
             del self._newest[oldest]
             self._came.pop(oldest, None)
 
-    def _is_over(self, before: Frame, lines: ScanLines) -> bool:
-        if not before.complete or lines.began_ns is None:
+    def _is_over(self, finished: ChannelFrame, lines: ScanLines) -> bool:
+        if lines.began_ns is None:
             return False
-        if before.began_ns is not None:
-            return lines.began_ns <= before.began_ns
-        return before.time_ns is not None and lines.began_ns < before.time_ns
+        if finished.began_ns is not None:
+            return lines.began_ns <= finished.began_ns
+        return finished.time_ns is not None and lines.began_ns < finished.time_ns
 
     def _next(self) -> int:
         self._number += 1
         return self._number
-
-    def _keep(self, frame: Frame) -> None:
-        assert frame.time_ns is not None
-        self._kept[frame.time_ns, frame.channel] = frame
-        self._kept_bytes += frame.values.nbytes
-        while self._kept_bytes > self._memory_bytes and len(self._kept) > 1:
-            self._kept_bytes -= self._kept.popitem(last=False)[1].values.nbytes
-
-
-def _copied(frame: Frame) -> Frame:
-    return replace(frame, values=frame.values.copy())

@@ -1,4 +1,4 @@
-"""A dashboard beside an experiment that runs already, as somebody who joins it."""
+"""A dashboard that joins an experiment that runs already."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from afspm.process.context import ProcessActivity, ProcessContext, new_session
 from afspm.process.memory import Memory
 from afspm.process.message_types import register_all
 from afspm.record.run_json import STATE_DIR
-from afspm.transport.launching import open_port
 from afspm.transport.port import ParentGone, Port
+from afspm.transport.zmq_port import open_port
 
 
 def join(folder: Path, dashboard: Dashboard, name: str) -> int:
@@ -50,7 +50,7 @@ def join(folder: Path, dashboard: Dashboard, name: str) -> int:
 
 @contextmanager
 def _ended_by_ctrl_c(port: Port) -> Iterator[None]:
-    """While in the block Ctrl-C is what the end of the parent is to a component: the page says good-bye."""
+    """Treat Ctrl-C in the block as a component treats the end of its parent."""
 
     def end(_number: int, _frame: FrameType | None) -> None:
         port.wake_up(ParentGone())
@@ -64,7 +64,7 @@ def _ended_by_ctrl_c(port: Port) -> Iterator[None]:
 
 
 def url_in(launch_facts: object, folder: Path, name: str) -> str | None:
-    """Where the dashboard that the run was started with is; None if it has none of this name."""
+    """Return where the dashboard that the run was started with is; None if it has none of this name."""
     if not isinstance(launch_facts, dict) or name not in launch_facts:
         return None
     try:

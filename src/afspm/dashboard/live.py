@@ -7,26 +7,37 @@ out, and nothing waits for it here.
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from fastapi import Depends, FastAPI, Response
+from fastapi.responses import PlainTextResponse
 
-from afspm.dashboard.bell import Bell
-from afspm.dashboard.drawing import Drawer, Drawn, Look, number_or_none
-from afspm.dashboard.frames import Frame
-from afspm.dashboard.levelling import Levelling
-from afspm.dashboard.palettes import LEVELS, PALETTES
-from afspm.dashboard.pictures import Contrast, png
-from afspm.dashboard.profiles import profile
-from afspm.dashboard.record import Archive
+from afspm.dashboard.archive import Archive
+from afspm.dashboard.pictures import Look, Picture, PictureCache, number_or_none, profile
+from afspm.dashboard.signals import Bell
 from afspm.dashboard.watch import Watch
-
-if TYPE_CHECKING:
-    from fastapi import FastAPI, Response
+from afspm.drawing.palette import LEVELS, PALETTES
+from afspm.drawing.raster import png
 
 POLL_S = 20.0  # then the browser asks anew: what is in between may close connections that say nothing for longer
 GROWING_S = 0.2  # between two pictures of a growing scan
 FINISHED_S = 0.004  # between two of finished ones, for each who looks on, and ten times that at least
+
+
+@dataclass(frozen=True)
+class PictureRequest:
+    """The picture that is meant; `time` in ns of a finished scan, 0: the newest."""
+
+    channel: str = ""
+    time: int = 0
+    levelling: str = ""
+    contrast: str = ""
+    palette: str = ""
+
+
+Asked = Annotated[PictureRequest, Depends()]
 
 
 class Live:
@@ -40,12 +51,12 @@ class Live:
         self._watch = watch
         self._bell = bell
         self._archive = archive
-        self._drawer = Drawer()
+        self._cache = PictureCache()
         self._waiting = 0
         self._closing = False
 
     def close(self) -> None:
-        """Whoever waits for a picture is answered at once, and nobody waits any more. From any thread."""
+        """Answer all requests that wait for a picture, and let none wait any more. From any thread."""
         self._closing = True
         self._bell.ring()
 
@@ -56,27 +67,19 @@ class Live:
         app.get("/live/value", response_model=None)(self._value)
         app.get("/live/profile", response_model=None)(self._profile)
 
-    async def _image(
-        self, channel: str = "", time: int = 0, after: int = 0, levelling: str = "", contrast: str = "",
-        palette: str = "",
-    ) -> Response:  # fmt: skip
-        """A picture newer than number `after`; of one finished scan if a `time` is given. 204: nothing new yet."""
-        from fastapi.responses import PlainTextResponse, Response
-
-        if not time and not await self._wait_for_newer(channel, after):
+    async def _image(self, asked: Asked, after: int = 0) -> Response:
+        """Answer with a picture newer than number `after`, or of one finished scan. 204: nothing new yet."""
+        if not asked.time and not await self._wait_for_newer(asked.channel, after):
             return Response(status_code=204)
-        drawn = await asyncio.to_thread(self._drawn, channel, time, look_of(levelling, contrast, palette))
+        drawn = await asyncio.to_thread(self._drawn, asked)
         if drawn is None:
             return PlainTextResponse("the values of this scan are not kept here any more", 404)
         headers = {"X-Frame": drawn.head(), "Cache-Control": "no-store"}
         return Response(drawn.png, media_type="image/png", headers=headers)
 
-    async def _value(
-        self, column: int, row: int, channel: str = "", time: int = 0, levelling: str = "", contrast: str = "",
-        palette: str = "",
-    ) -> dict[str, Any]:  # fmt: skip
-        """The value of one pixel, as published and as levelled."""
-        drawn = await asyncio.to_thread(self._drawn, channel, time, look_of(levelling, contrast, palette))
+    async def _value(self, asked: Asked, column: int, row: int) -> dict[str, object]:
+        """Answer with the value of one pixel, as published and as levelled."""
+        drawn = await asyncio.to_thread(self._drawn, asked)
         if drawn is None or not (0 <= row < drawn.values.shape[0] and 0 <= column < drawn.values.shape[1]):
             return {"value": None, "levelled": None, "unit": ""}
         return {
@@ -86,25 +89,20 @@ class Live:
             "number": drawn.frame.number,
         }
 
-    async def _profile(
-        self, x0: float, y0: float, x1: float, y1: float, channel: str = "", time: int = 0, levelling: str = "",
-        contrast: str = "", palette: str = "",
-    ) -> dict[str, Any]:  # fmt: skip
-        """Levelled values along a line between two (column, row)."""
-        drawn = await asyncio.to_thread(self._drawn, channel, time, look_of(levelling, contrast, palette))
+    async def _profile(self, asked: Asked, x0: float, y0: float, x1: float, y1: float) -> dict[str, object]:
+        """Answer with levelled values along a line between two (column, row)."""
+        drawn = await asyncio.to_thread(self._drawn, asked)
         if drawn is None:
             return {"distances_m": [], "values": [], "unit": ""}
-        found = profile(drawn.values, drawn.frame.region, (x0, y0), (x1, y1))
+        distances_m, values = profile(drawn.values, drawn.frame.region, (x0, y0), (x1, y1))
         return {
-            "distances_m": found.distances_m.tolist(),
-            "values": [number_or_none(value) for value in found.values.tolist()],
+            "distances_m": distances_m.tolist(),
+            "values": [number_or_none(value) for value in values.tolist()],
             "unit": drawn.frame.unit,
         }
 
     async def _palette(self, name: str) -> Response:
-        """A colour map as a picture one pixel wide, the highest value on top."""
-        from fastapi.responses import Response
-
+        """Answer with a colour map as a picture one pixel wide, the highest value on top."""
         if name not in PALETTES:
             return Response(status_code=404)
         return Response(png(np.arange(LEVELS, dtype=np.uint8)[:, None], name), media_type="image/png")
@@ -133,23 +131,11 @@ class Live:
         with self._watch.reading():
             return self._watch.frames.newest_number(channel or None)
 
-    def _drawn(self, channel: str, time_ns: int, look: Look) -> Drawn | None:
-        frame = self._frame(channel, time_ns)
-        return None if frame is None else self._drawer.draw(frame, look)
-
-    def _frame(self, channel: str, time_ns: int) -> Frame | None:
+    def _drawn(self, asked: PictureRequest) -> Picture | None:
         with self._watch.reading():
-            if not time_ns:
-                return self._watch.frames.newest(channel or None)
-            kept = self._watch.frames.kept(time_ns, channel)
-        return kept or self._archive.frame(time_ns, channel)
-
-
-def look_of(levelling: str, contrast: str, palette: str) -> Look:
-    """As the page names it; what it doesn't name, or nobody knows, is as by default."""
-    usual = Look()
-    return Look(
-        Levelling(levelling) if levelling in Levelling._value2member_map_ else usual.levelling,
-        Contrast(contrast) if contrast in Contrast._value2member_map_ else usual.contrast,
-        palette if palette in PALETTES else usual.palette,
-    )
+            frames = self._watch.frames
+            frame = frames.kept(asked.time, asked.channel) if asked.time else frames.newest(asked.channel or None)
+        if frame is None and asked.time:
+            frame = self._archive.frame(asked.time, asked.channel)
+        look = Look.named(asked.levelling, asked.contrast, asked.palette)
+        return None if frame is None else self._cache.draw(frame, look)

@@ -6,26 +6,25 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from html import escape
 
-from nicegui import events, ui
+from nicegui import ui
 
 from afspm.dashboard.access import Access, Visitor
-from afspm.dashboard.audience import Audience
 from afspm.dashboard.content import Content, Contents
-from afspm.dashboard.curves import spectrum_html
-from afspm.dashboard.guard import ENTRANCE
-from afspm.dashboard.health_panel import HealthPanel
-from afspm.dashboard.log_panel import LogPanel
-from afspm.dashboard.palettes import PALETTES
+from afspm.dashboard.panels import ChartPanel, HealthPanel, LogPanel, SpectraPanel
+from afspm.dashboard.sign_in import SIGN_IN
+from afspm.dashboard.signals import Audience
 from afspm.dashboard.steering import Steering
 from afspm.dashboard.steering_panel import SteeringPanel
 from afspm.dashboard.watch import Watch
-from afspm.dashboard.words import escape
+from afspm.drawing import timeline
+from afspm.drawing.palette import PALETTES
 
 REFRESH_S = 0.5
 ANSWER_S = 5.0  # a browser that has not drawn the last for so long gets nothing more until it has
 THEMES = {"": None, "light": False, "dark": True}
-_HEAD = """<link rel="stylesheet" href="/assets/dashboard.css">
+_HEAD = f"""<style>{timeline.CSS}</style><link rel="stylesheet" href="/assets/dashboard.css">
 <script type="module" src="/assets/page.js"></script>"""
 SIMULATED = "SIMULATED: this is no real microscope"
 
@@ -36,7 +35,7 @@ class Services:
 
     Attributes:
         title: the name of the experiment.
-        simulated: whether the microscope is none.
+        simulated: True if the microscope is none.
     """
 
     watch: Watch
@@ -56,21 +55,14 @@ class Page:
         self._visitor = visitor
         services.audience.join(self)
         ui.context.client.on_delete(lambda: services.audience.leave(self))
-        self._content = Content()
-        self._spectrum_ns: int | None = None
-        self._spectra_shown: tuple[object, ...] = ()
         ui.page_title(services.title)
         ui.add_head_html(_HEAD)
         ui.colors(primary="#0b6e72", negative="#b3261e", positive="#2f7d46")
-        self._dark = ui.dark_mode(None)
-        self._theme = ""
+        self._theme = Theme()
         self._header()
         with ui.element("main").classes("grid"):
-            self._sections()
-        ui.on("spectrum_picked", self._pick_spectrum)
+            self._sections = Sections(services, visitor)
         self._timer = ui.timer(REFRESH_S, self._refresh)
-
-    # --- what is on it ---
 
     def _header(self) -> None:
         services = self._services
@@ -80,9 +72,8 @@ class Page:
             ui.html(f"<h1>{escape(services.title)}</h1>", sanitize=False)
             self._status = ui.html("", sanitize=False).classes("chips").props('role="status" aria-live="off"')
             with ui.element("nav").classes("who"):
-                ui.button(icon="contrast", on_click=self._next_theme).props(
-                    'flat round dense aria-label="Light or dark"'
-                )
+                button = ui.button(icon="contrast", on_click=self._theme.next)
+                button.props('flat round dense aria-label="Light or dark"')
                 self._sign_in_or_out()
         ui.html('<div id="trouble" role="alert" hidden></div>', sanitize=False)
 
@@ -90,20 +81,73 @@ class Page:
         if not self._visitor.may_steer:
             ui.html('<a class="sign" href="/login">Sign in to steer</a>', sanitize=False)
             return
-        name = escape(self._visitor.person)
         ui.html(
-            f'<form method="post" action="/logout"><span class="person">{name}</span> '
+            f'<form method="post" action="/logout"><span class="person">{escape(self._visitor.person)}</span> '
             '<button type="submit" class="sign">Sign out</button> '
             '<button type="submit" class="sign" name="everywhere" value="yes">everywhere</button></form>',
             sanitize=False,
         )
 
-    def _sections(self) -> None:
-        services = self._services
+    async def _refresh(self) -> None:
+        """Bring the page up to date, and wait until the browser has drawn that: nothing is queued for a slow one."""
+        if not self._services.access.is_signed_in(self._visitor):
+            self._stop()
+            ui.navigate.to(SIGN_IN)
+            return
+        content = self._services.contents.get()
+        self._status.set_content(content.status)
+        self._sections.show(content)
+        state = {
+            "channels": content.channels,
+            "trouble": content.trouble,
+            "ended": content.ended,
+            "may_measure": self._sections.may_measure,
+        }
+        try:
+            theme = await ui.run_javascript(f"return window.afspm?.update({json.dumps(state)})", timeout=ANSWER_S)
+        except TimeoutError:
+            return
+        self._theme.remember(theme)
+        if content.ended:
+            self._stop()
+
+    def _stop(self) -> None:
+        self._timer.deactivate()
+        self._services.audience.leave(self)
+
+
+class Theme:
+    """Light, dark, or as the viewer's system has it; the browser keeps the choice."""
+
+    def __init__(self) -> None:
+        self._dark = ui.dark_mode(None)
+        self._name = ""
+
+    def next(self) -> None:
+        """Choose the next of the three."""
+        names = list(THEMES)
+        self._set(names[(names.index(self._name) + 1) % len(names)])
+        ui.run_javascript(f"window.afspm?.keepTheme({json.dumps(self._name)})")
+
+    def remember(self, name: object) -> None:
+        """Take what the browser has kept."""
+        if isinstance(name, str) and name != self._name and name in THEMES:
+            self._set(name)
+
+    def _set(self, name: str) -> None:
+        self._name = name
+        self._dark.set_value(THEMES[name])
+
+
+class Sections:
+    """The sections below the header."""
+
+    def __init__(self, services: Services, visitor: Visitor) -> None:
+        self._content = Content()
         with _section("Scan", "scan"):
             ui.html(_image_html(), sanitize=False)
         with _section("Steering", "steer"):
-            self._steering = SteeringPanel(services.watch, services.steering, self._visitor)
+            self._steering = SteeringPanel(services.watch, services.steering, visitor)
         with _section("Sample", "sample"):
             self._whole_map = ui.switch("with all of the limits", on_change=self._draw_map).props("dense")
             self._map = ui.html("", sanitize=False)
@@ -112,87 +156,33 @@ class Page:
         with _section("Processes", "health"):
             self._health = HealthPanel(self._steering)
         with _section("Spectra", "spectra"):
-            self._variable = ui.select([], label="variable", on_change=self._draw_spectrum).props("dense outlined")
-            self._spectrum = ui.html("", sanitize=False)
+            self._spectra = SpectraPanel(services.watch)
         with _section("Drift", "drift"):
-            self._drift = ui.html("", sanitize=False)
+            self._drift = ChartPanel()
         with _section("Last refusals", "refused"):
             self._refusals = ui.html("", sanitize=False).classes("scrolled").props('tabindex="0"')
         with _section("Log", "log"):
             self._log = LogPanel()
 
-    # --- what changes ---
+    @property
+    def may_measure(self) -> bool:
+        return self._steering.may_measure
 
-    async def _refresh(self) -> None:
-        """Bring the page up to date, and wait until the browser has drawn that: nothing is queued for a slow one."""
-        if not self._services.access.is_signed_in(self._visitor):
-            self._timer.deactivate()
-            self._services.audience.leave(self)
-            ui.navigate.to(ENTRANCE)
-            return
-        content = self._services.contents.get()
-        self._status.set_content(content.status)
+    def show(self, content: Content) -> None:
+        """Bring all of them up to date."""
         self._content = content
         self._draw_map()
-        self._time_line.set_content(content.time_line)
-        self._drift.set_content(content.drift)
+        self._time_line.set_content(content.slow.time_line)
+        self._drift.show(content.slow.drift)
         self._refusals.set_content(content.refusals)
         self._health.show(content.processes, content.unheard)
-        self._log.show(content.log, tuple(process.name for process in content.processes))
+        self._log.show(content.log, (process.name for process in content.processes))
         self._steering.show(content)
-        self._draw_spectrum()
-        await self._tell_browser(content)
-
-    async def _tell_browser(self, content: Content) -> None:
-        state = {
-            "channels": content.channels,
-            "trouble": content.trouble,
-            "ended": content.ended,
-            "may_measure": self._steering.may_measure,
-        }
-        try:
-            theme = await ui.run_javascript(f"return window.afspm?.update({json.dumps(state)})", timeout=ANSWER_S)
-        except TimeoutError:
-            return
-        if isinstance(theme, str) and theme != self._theme and theme in THEMES:
-            self._set_theme(theme)
-        if content.ended:
-            self._timer.deactivate()
-            self._services.audience.leave(self)
+        self._spectra.show()
 
     def _draw_map(self) -> None:
-        content = self._content
-        self._map.set_content(content.sample_map if self._whole_map.value else content.sample_map_near)
-
-    def _draw_spectrum(self) -> None:
-        with self._services.watch.reading():
-            store = self._services.watch.spectra
-            spectra = store.newest(8)
-            if self._spectrum_ns is not None and (one := store.at(self._spectrum_ns)) is not None:
-                spectra = [(self._spectrum_ns, one)]
-        shown = (tuple(time_ns for time_ns, _ in spectra), self._variable.value)
-        if spectra:
-            names = list(spectra[-1][1].names[1:])
-            if self._variable.options != names:
-                self._variable.set_options(names, value=names[0] if names else None)
-                shown = (shown[0], self._variable.value)
-        self._variable.set_visibility(bool(spectra))
-        if shown != self._spectra_shown or not spectra:
-            self._spectra_shown = shown
-            self._spectrum.set_content(spectrum_html(spectra, str(self._variable.value or "")))
-
-    def _pick_spectrum(self, event: events.GenericEventArguments) -> None:
-        self._spectrum_ns = int(event.args["time"])
-        self._draw_spectrum()
-
-    def _next_theme(self) -> None:
-        names = list(THEMES)
-        self._set_theme(names[(names.index(self._theme) + 1) % len(names)])
-        ui.run_javascript(f"window.afspm?.keepTheme({json.dumps(self._theme)})")
-
-    def _set_theme(self, theme: str) -> None:
-        self._theme = theme
-        self._dark.set_value(THEMES[theme])
+        slow = self._content.slow
+        self._map.set_content(slow.sample_map if self._whole_map.value else slow.sample_map_near)
 
 
 @contextmanager
@@ -202,13 +192,13 @@ def _section(title: str, name: str) -> Iterator[None]:
         yield
 
 
+def _choice(part: str, label: str, options: dict[str, str]) -> str:
+    inner = "".join(f'<option value="{value}">{text}</option>' for value, text in options.items())
+    return f'<label>{label}<select data-part="{part}">{inner}</select></label>'
+
+
 def _image_html() -> str:
-    """What assets/image.js brings to life."""
-
-    def choice(part: str, label: str, options: dict[str, str]) -> str:
-        inner = "".join(f'<option value="{value}">{text}</option>' for value, text in options.items())
-        return f'<label>{label}<select data-part="{part}">{inner}</select></label>'
-
+    """Return what assets/image.js brings to life."""
     levelling = {"plane": "plane", "lines": "line by line", "none": "none"}
     contrast = {"robust": "99 %", "full": "all values"}
     tools = {"look": "Look", "profile": "Profile", "scan": "Scan here", "spectrum": "Spectrum here"}
@@ -224,8 +214,8 @@ def _image_html() -> str:
     )
     return (
         '<div id="image" class="image"><div class="tools">'
-        f"{choice('channel', 'Channel', {})}{choice('levelling', 'Level', levelling)}"
-        f"{choice('contrast', 'Colours for', contrast)}{choice('palette', 'Map', {p: p for p in PALETTES})}</div>"
+        f"{_choice('channel', 'Channel', {})}{_choice('levelling', 'Level', levelling)}"
+        f"{_choice('contrast', 'Colours for', contrast)}{_choice('palette', 'Map', {p: p for p in PALETTES})}</div>"
         f'<div class="tools"><div class="group" role="group" aria-label="What the pointer does">{buttons}</div>'
         f'<div class="group" role="group" aria-label="Zoom">{zooms}</div>'
         '<button type="button" class="live" data-part="live">Back to the newest scan</button></div>'

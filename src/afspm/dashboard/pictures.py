@@ -1,97 +1,144 @@
-"""From values to what a browser draws: PNGs of one byte a pixel, with the colour map in them."""
+"""Frames as pictures for the browser, each made once however many look at it, and values along a line."""
 
 from __future__ import annotations
 
-import struct
-import zlib
+import json
+import math
+import threading
+from collections import OrderedDict
 from dataclasses import dataclass
-from enum import Enum
-from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from afspm.dashboard.levelling import Array
-from afspm.dashboard.palettes import LEVELS, UNMEASURED, colours
+from afspm.dashboard.frames import ChannelFrame
+from afspm.drawing.levelling import Array, Levelling, levelled
+from afspm.drawing.palette import PALETTES
+from afspm.drawing.raster import Contrast, ValueRange, indices, png, value_range
+from afspm.model import Region
 
-_SAMPLED = 65_536  # values that the contrast is found from, of a larger picture evenly chosen ones
-_OUTLIERS_PERCENT = 0.5
-_FAST = 1  # of zlib: pictures are made by the dozen, and looked at once
-
-
-class Contrast(Enum):
-    """Which values the ends of the colour map stand for."""
-
-    ROBUST = "robust"
-    """All but the lowest and the highest half percent."""
-    FULL = "full"
-    """The lowest and the highest."""
+KEPT = 8
+MOST_POINTS = 1024
+Pixel = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
-    """The values at the ends of the colour map."""
+class Look:
+    """How a viewer wants to see a scan."""
 
-    low: float
-    high: float
+    levelling: Levelling = Levelling.PLANE
+    contrast: Contrast = Contrast.ROBUST
+    palette: str = PALETTES[0]
 
-
-def span_of(values: Array, contrast: Contrast) -> Span:
-    """Of the finite values; 0 to 1 where there are none, something around the value where there is only one."""
-    stride = max(1, values.size // _SAMPLED)
-    # a stride that shares no divisor with the width, or it would look at a few columns only
-    while stride > 1 and np.gcd(stride, max(values.shape[-1], 1)) != 1:
-        stride += 1
-    some = values.ravel()[::stride] if contrast is Contrast.ROBUST else values.ravel()
-    finite = some[np.isfinite(some)]
-    if not finite.size:
-        finite = values[np.isfinite(values)]
-    if not finite.size:
-        return Span(0.0, 1.0)
-    if contrast is Contrast.FULL:
-        low, high = float(finite.min()), float(finite.max())
-    else:
-        low, high = (float(v) for v in np.percentile(finite, (_OUTLIERS_PERCENT, 100.0 - _OUTLIERS_PERCENT)))
-    if not high > low:
-        around = abs(low) * 1e-3 or 0.5
-        low, high = low - around, high + around
-    return Span(low, high)
-
-
-def indices(values: Array, span: Span) -> NDArray[np.uint8]:
-    """Each value as an index into the colour map; beyond the span its ends, UNMEASURED where it is not finite."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        scaled = (values - span.low) * ((LEVELS - 1) / (span.high - span.low))
-        np.clip(scaled, 0.0, LEVELS - 1, out=scaled)
-        scaled += 0.5
-        measured = np.isfinite(values)
-        if not measured.all():
-            scaled[~measured] = UNMEASURED
-        return scaled.astype(np.uint8)
-
-
-def png(levels: NDArray[np.uint8], palette: str) -> bytes:
-    """Indices [y, x], y ascending, as a PNG whose first row is the highest y; UNMEASURED is transparent."""
-    ny, nx = levels.shape
-    rows = np.zeros((ny, nx + 1), np.uint8)  # each row begins with its filter: none
-    rows[:, 1:] = levels[::-1]
-    return b"".join(
-        (
-            b"\x89PNG\r\n\x1a\n",
-            _chunk(b"IHDR", struct.pack(">IIBBBBB", nx, ny, 8, 3, 0, 0, 0)),
-            *_palette_chunks(palette),
-            _chunk(b"IDAT", zlib.compress(rows.data, _FAST)),
-            _chunk(b"IEND", b""),
+    @classmethod
+    def named(cls, levelling: str, contrast: str, palette: str) -> Look:
+        """Return the look that the page names; what it doesn't name, or is not known, is as by default."""
+        usual = cls()
+        return cls(
+            Levelling(levelling) if levelling in Levelling._value2member_map_ else usual.levelling,
+            Contrast(contrast) if contrast in Contrast._value2member_map_ else usual.contrast,
+            palette if palette in PALETTES else usual.palette,
         )
-    )
 
 
-@lru_cache(16)
-def _palette_chunks(palette: str) -> tuple[bytes, bytes]:
-    table = colours(palette).tobytes() + b"\0\0\0"
-    opacity = b"\xff" * LEVELS + b"\0"
-    return _chunk(b"PLTE", table), _chunk(b"tRNS", opacity)
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A frame as it is seen.
+
+    Attributes:
+        values: levelled, [y, x].
+        png: highest y on top.
+    """
+
+    frame: ChannelFrame
+    look: Look
+    values: Array
+    span: ValueRange
+    png: bytes
+
+    def head(self) -> str:
+        """Return what has to be known to draw it with axes, as ASCII JSON. Lengths in m."""
+        frame, region = self.frame, self.frame.region
+        return json.dumps(
+            {
+                "number": frame.number,
+                "channel": frame.channel,
+                "unit": frame.unit,
+                "center": region.center_m,
+                "size": region.size_m,
+                "angle": region.angle_rad,
+                "shape": frame.values.shape,
+                "low": self.span.low,
+                "high": self.span.high,
+                "time_ns": None if frame.time_ns is None else str(frame.time_ns),
+                "rows": frame.rows,
+                "newest_row": frame.newest_row,
+                "levelling": self.look.levelling.value,
+                "palette": self.look.palette,
+            }
+        )
 
 
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+class PictureCache:
+    """Draws, from any thread; keeps the newest few pictures."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._drawn: OrderedDict[tuple[int, Look], Picture] = OrderedDict()
+
+    def draw(self, frame: ChannelFrame, look: Look) -> Picture:
+        """Return the picture of a frame."""
+        key = (frame.number, look)
+        with self._lock:  # two that want the same wait for one; two that want others share a core anyway
+            drawn = self._drawn.get(key)
+            if drawn is None:
+                drawn = self._drawn[key] = _draw(frame, look)
+                while len(self._drawn) > KEPT:
+                    self._drawn.popitem(last=False)
+            else:
+                self._drawn.move_to_end(key)
+            return drawn
+
+
+def _draw(frame: ChannelFrame, look: Look) -> Picture:
+    values = levelled(frame.values, look.levelling)
+    span = value_range(values, look.contrast)
+    return Picture(frame, look, values, span, png(indices(values, span), look.palette))
+
+
+def number_or_none(value: float) -> float | None:
+    """Return a number as JSON has it, which knows no NaN."""
+    return value if math.isfinite(value) else None
+
+
+def profile(values: Array, region: Region, begin: Pixel, end: Pixel) -> tuple[Array, Array]:
+    """Return (distances in m, values) along a line in the scan, linear between pixels, about one point a pixel.
+
+    Args:
+        values: [y, x], y ascending; NaN where nothing was measured.
+        begin, end: (column, row), fractions of pixels allowed; what lies outside is moved to the border.
+    """
+    ny, nx = values.shape
+    (x0, y0), (x1, y1) = ((min(max(x, 0.0), nx - 1.0), min(max(y, 0.0), ny - 1.0)) for x, y in (begin, end))
+    count = min(MOST_POINTS, max(2, round(math.hypot(x1 - x0, y1 - y0)) + 1))
+    column_m, row_m = region.size_m[0] / max(nx - 1, 1), region.size_m[1] / max(ny - 1, 1)
+    length_m = math.hypot((x1 - x0) * column_m, (y1 - y0) * row_m)
+    found = _interpolated(values, np.linspace(x0, x1, count), np.linspace(y0, y1, count))
+    return np.linspace(0.0, length_m, count), found
+
+
+def _interpolated(values: Array, x: Array, y: Array) -> Array:
+    ny, nx = values.shape
+    left = np.clip(np.floor(x).astype(int), 0, max(nx - 2, 0))
+    low = np.clip(np.floor(y).astype(int), 0, max(ny - 2, 0))
+    right, high = np.minimum(left + 1, nx - 1), np.minimum(low + 1, ny - 1)
+    u, v = x - left, y - low
+    total = np.zeros(x.shape)
+    # a neighbour of no weight must not spoil it with its NaN
+    for rows, columns, weights in (
+        (low, left, (1 - u) * (1 - v)),
+        (low, right, u * (1 - v)),
+        (high, left, (1 - u) * v),
+        (high, right, u * v),
+    ):
+        total += np.where(weights > 0.0, values[rows, columns] * weights, 0.0)
+    return total

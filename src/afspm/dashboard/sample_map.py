@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from html import escape
 
 import numpy as np
 
-from afspm.dashboard.levelling import Array
-from afspm.dashboard.plots import round_ticks
-from afspm.dashboard.words import area, escape, scale
-from afspm.formatting import time_of_day
+from afspm.dashboard.words import area
+from afspm.drawing.curves import Array, round_ticks
+from afspm.formatting import scale, time_of_day
 from afspm.model import Region
 from afspm.record.overview import ScanSummary, SpectrumSummary
 
@@ -28,7 +28,7 @@ class MapContent:
         limits: where scans may lie at all, in tip coordinates.
         tip_to_sample: 2 x 3; None where the two are the same.
         probe_m: where the probe stands.
-        shown: (time, channel) of the scan in the image; None: the newest.
+        shown_ns: time of the newest scan.
     """
 
     scans: Sequence[ScanSummary] = ()
@@ -37,7 +37,7 @@ class MapContent:
     limits: Region | None = None
     tip_to_sample: Array | None = None
     probe_m: tuple[float, float] | None = None
-    shown: tuple[int, str] | None = None
+    shown_ns: int | None = None
 
 
 def map_html(content: MapContent, *, whole: bool = True) -> str:
@@ -53,7 +53,7 @@ def map_html(content: MapContent, *, whole: bool = True) -> str:
         return '<p class="nothing">No place is known yet.</p>'
     shapes = [
         "" if content.limits is None else _polygon(frame, _limits(content), "limits"),
-        *(_scan(frame, one, count, content.shown) for one, count in places),
+        *(_scan(frame, one, count, content.shown_ns) for one, count in places),
         "" if content.current is None else _polygon(frame, content.current.corners_m(), "current"),
         *(_spectrum(frame, one) for one in spectra),
         "" if content.probe_m is None else _probe(frame, content.probe_m),
@@ -91,7 +91,7 @@ def _place(region: Region) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True)
-class _Frame:
+class _MapFrame:
     """The part of the plane that is shown, in a unit that makes handy numbers. y is upwards, unlike on the screen."""
 
     left_m: float
@@ -111,7 +111,7 @@ def _frame(
     spectra: Sequence[SpectrumSummary],
     *,
     whole: bool,
-) -> _Frame | None:
+) -> _MapFrame | None:
     points = [one.region.corners_m() for one, _ in places]
     points += [np.array([one.position_m]) for one in spectra]
     if content.current is not None:
@@ -133,7 +133,7 @@ def _frame(
             low[axis], high[axis] = low[axis] - lacking / 2, high[axis] + lacking / 2
     per_m = 1000.0 / float((high - low).max())
     width, height = (float(v) * per_m for v in high - low)
-    return _Frame(float(low[0]), float(low[1]), width, height, per_m)
+    return _MapFrame(float(low[0]), float(low[1]), width, height, per_m)
 
 
 def _limits(content: MapContent) -> Array:
@@ -145,34 +145,34 @@ def _limits(content: MapContent) -> Array:
     return np.asarray(corners @ content.tip_to_sample[:, :2].T + content.tip_to_sample[:, 2])
 
 
-def _polygon(frame: _Frame, corners_m: Array, style: str, inside: str = "", data: str = "") -> str:
+def _polygon(frame: _MapFrame, corners_m: Array, style: str, inside: str = "", data: str = "") -> str:
     points = " ".join("{:.2f},{:.2f}".format(*frame.at(corner)) for corner in corners_m)
     return f'<polygon class="{style}" points="{points}"{data}>{inside}</polygon>'
 
 
-def _scan(frame: _Frame, one: ScanSummary, count: int, shown: tuple[int, str] | None) -> str:
+def _scan(frame: _MapFrame, one: ScanSummary, count: int, shown_ns: int | None) -> str:
     often = f", {count} scans" if count > 1 else ""
     cut = ", interrupted" if one.interrupted else ""
     who = f" by {one.holder}" if one.holder else ""
     title = f"{area(one.region.size_m)} at {time_of_day(one.time_ns)}{who}{often}{cut}"
-    style = "scan" + (" cut" if one.interrupted else "") + (" shown" if shown and shown[0] == one.time_ns else "")
+    style = "scan" + (" cut" if one.interrupted else "") + (" shown" if shown_ns == one.time_ns else "")
     data = f' data-time="{one.time_ns}" data-channel="{escape(one.channel)}"'
     return _polygon(frame, one.region.corners_m(), style, f"<title>{escape(title)}</title>", data)
 
 
-def _spectrum(frame: _Frame, one: SpectrumSummary) -> str:
+def _spectrum(frame: _MapFrame, one: SpectrumSummary) -> str:
     assert one.position_m is not None
     x, y = frame.at(one.position_m)
     title = escape(f"{one.kind or 'spectrum'} at {time_of_day(one.time_ns)}")
     return f'<path class="spectrum" d="M{x:.2f} {y:.2f}h0" data-spectrum="{one.time_ns}"><title>{title}</title></path>'
 
 
-def _probe(frame: _Frame, xy_m: tuple[float, float]) -> str:
+def _probe(frame: _MapFrame, xy_m: tuple[float, float]) -> str:
     x, y = frame.at(xy_m)
     return f'<path class="probe" d="M{x - 14:.2f} {y:.2f}h28M{x:.2f} {y - 14:.2f}v28"><title>the probe</title></path>'
 
 
-def _ticks(frame: _Frame) -> str:
+def _ticks(frame: _MapFrame) -> str:
     low = np.array([frame.left_m, frame.low_m])
     high = low + np.array([frame.width, frame.height]) / frame.per_m
     factor, unit = scale(float(np.abs(np.concatenate([low, high])).max()), "m")

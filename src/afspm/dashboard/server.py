@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING
 from afspm.errors import ConfigError
 
 if TYPE_CHECKING:
-    from afspm.dashboard.guard import App
+    from afspm.dashboard.sign_in import AsgiApp
 
 USUAL_PORT = 8080
 _STARTED_S, _STOPPED_S = 20.0, 3.0
 
 
 def listening(host: str, port: int | None, wanted: Iterable[int] = (USUAL_PORT,)) -> socket.socket:
-    """A socket that listens at `host`.
+    """Return a socket that listens at `host`.
 
     Args:
         port: None: the first of `wanted` that is free, or any.
@@ -58,7 +58,7 @@ def _bound(host: str, port: int) -> socket.socket:
 
 
 def url_of(host: str, port: int, *, encrypted: bool) -> str:
-    """Where the page is found, from other computers too if it listens at all addresses of this one."""
+    """Return where the page is found, from other computers too if it listens at all addresses of this one."""
     with contextlib.suppress(ValueError):  # a name
         if ipaddress.ip_address(host).is_unspecified:
             host = socket.gethostname()
@@ -75,7 +75,7 @@ class PageServer:
         ConfigError: the files are no certificate and its key.
     """
 
-    def __init__(self, app: App, bound: socket.socket, certificate: Path | None, key: Path | None) -> None:
+    def __init__(self, app: AsgiApp, bound: socket.socket, certificate: Path | None, key: Path | None) -> None:
         import uvicorn
 
         logging.getLogger("uvicorn").setLevel(logging.WARNING)
@@ -113,7 +113,7 @@ class PageServer:
 
     @property
     def has_failed(self) -> bool:
-        """Whether it ended without being told to."""
+        """True if it ended without being told to."""
         return self._over.is_set() and not self._server.should_exit
 
     def _run(self) -> None:

@@ -1,46 +1,57 @@
-"""Who has signed in: sessions that are kept here and named by a cookie, so that they can be ended."""
+"""Sessions: signed cookies, and which of them ended before their time."""
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import secrets
 import threading
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from afspm.storage.atomic import replace_file
 
+if TYPE_CHECKING:
+    from itsdangerous import URLSafeSerializer
+
 COOKIE = "afspm_dashboard"
 REMEMBERED_S = 30 * 24 * 3600
-MOST = 1000
-"""Sessions that are kept; of more the oldest end."""
+MOST_ENDED = 1000
+"""Ended sessions that are remembered; with one more all sessions end."""
 
 
 @dataclass(frozen=True)
 class Session:
-    """A sign-in.
+    """What a cookie says.
 
     Attributes:
-        key: the hash of the cookie: what is on the disk opens nothing.
         person: empty for one who only looks.
         proof: stands for the password that it was begun with.
+        generation: of the person's sessions: signing out everywhere begins the next.
         since_s: when it began, real time.
     """
 
-    key: str
     person: str
     proof: str
+    number: str
+    generation: int
     since_s: float
 
 
+@dataclass
+class _Kept:
+    key: str = field(default_factory=lambda: secrets.token_urlsafe(32))
+    ended: dict[str, float] = field(default_factory=dict)
+    generations: dict[str, int] = field(default_factory=dict)
+
+
 class Sessions:
-    """All sessions, in a file that outlives a restart. From any thread.
+    """Signs cookies and checks them. From any thread.
 
     Args:
-        file: readable by its owner alone; None: they end with this process.
+        file: keeps key and endings over a restart, readable by its owner alone; None: they end with this process.
         now_s: the time in real seconds.
     """
 
@@ -48,60 +59,57 @@ class Sessions:
         self._file = file
         self._now_s = now_s
         self._lock = threading.Lock()
-        self._sessions = _read(file)
+        self._kept = _read(file)
+        self._save()
 
     def begin(self, person: str, proof: str) -> str:
-        """Begin a session; returns its cookie."""
-        cookie = secrets.token_urlsafe(32)
-        session = Session(_key(cookie), person, proof, self._now_s())
+        """Begin a session; return its cookie."""
         with self._lock:
-            self._sessions[session.key] = session
-            while len(self._sessions) > MOST:
-                del self._sessions[next(iter(self._sessions))]
-            self._keep()
-        return cookie
+            generation = self._kept.generations.get(person, 0)
+            session = Session(person, proof, secrets.token_hex(8), generation, self._now_s())
+            return str(self._signer().dumps(list(asdict(session).values())))
 
     def find(self, cookie: str) -> Session | None:
-        """Return the session of a cookie, as long as it stands."""
-        key = _key(cookie)
+        """Return the session of a cookie; None if it was not signed here, or has ended."""
         with self._lock:
-            return self._sessions[key] if self._stands(key) else None
-
-    def has(self, key: str) -> bool:
-        """Return whether the session of this key stands."""
-        with self._lock:
-            return self._stands(key)
+            is_signed, said = self._signer().loads_unsafe(cookie)
+            if not is_signed or not cookie.isascii():  # base64 passes over letters that it doesn't know
+                return None
+            session, kept = Session(*said), self._kept
+            is_over = session.number in kept.ended or session.generation != kept.generations.get(session.person, 0)
+            return None if is_over or self._now_s() - session.since_s >= REMEMBERED_S else session
 
     def end(self, cookie: str, *, everywhere: bool = False) -> None:
         """End the session of a cookie, or all of its person."""
+        session = self.find(cookie)
+        if session is None:
+            return
         with self._lock:
-            ended = self._sessions.pop(_key(cookie), None)
-            if ended is None:
-                return
+            kept = self._kept
             if everywhere:
-                self._sessions = {k: one for k, one in self._sessions.items() if one.person != ended.person}
-            self._keep()
+                kept.generations[session.person] = kept.generations.get(session.person, 0) + 1
+            oldest_s = self._now_s() - REMEMBERED_S
+            kept.ended = {number: since_s for number, since_s in kept.ended.items() if since_s > oldest_s}
+            kept.ended[session.number] = session.since_s
+            if len(kept.ended) > MOST_ENDED:
+                self._kept = _Kept()
+            self._save()
 
-    def _stands(self, key: str) -> bool:
-        session = self._sessions.get(key)
-        return session is not None and self._now_s() - session.since_s < REMEMBERED_S
+    def _signer(self) -> URLSafeSerializer:
+        from itsdangerous import URLSafeSerializer
 
-    def _keep(self) -> None:
+        return URLSafeSerializer(self._kept.key, salt="session")
+
+    def _save(self) -> None:
         if self._file is not None:
-            text = json.dumps([asdict(session) for session in self._sessions.values()])
             with contextlib.suppress(OSError):  # on a full disk they end with this process
-                replace_file(self._file, [text.encode()], mode=0o600)
+                replace_file(self._file, [json.dumps(asdict(self._kept)).encode()], mode=0o600)
 
 
-def _read(file: Path | None) -> dict[str, Session]:
+def _read(file: Path | None) -> _Kept:
     if file is None:
-        return {}
+        return _Kept()
     try:
-        found = [Session(**one) for one in json.loads(file.read_bytes())]
+        return _Kept(**json.loads(file.read_bytes()))
     except (OSError, ValueError, TypeError):
-        return {}  # none yet, or damaged: everybody signs in anew
-    return {session.key: session for session in found}
-
-
-def _key(cookie: str) -> str:
-    return hashlib.sha256(cookie.encode()).hexdigest()
+        return _Kept()  # none yet, or damaged: everybody signs in anew

@@ -1,4 +1,4 @@
-"""What persons do: each asks the scheduler in the own name, and is told what came of it."""
+"""Connections to the scheduler, one for each person, through which actions are carried out."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from afspm.client.link import ExperimentLink
 from afspm.clock import Clock
 from afspm.dashboard.access import Access, Visitor, check_name
-from afspm.dashboard.acts import Acts, Outcome
+from afspm.dashboard.actions import ActionResult, Actions
 from afspm.dashboard.watch import Watch
 from afspm.errors import AfspmError
 from afspm.launch import Launch
@@ -23,7 +23,7 @@ from afspm.transport.port import ParentGone
 from afspm.transport.zmq_port import ZmqPort
 
 MOST_PERSONS = 32
-Act = Callable[[Acts], Outcome]
+Action = Callable[[Actions], ActionResult]
 
 
 @dataclass
@@ -31,12 +31,18 @@ class _Person:
     """A person's connection to the scheduler, used by one thread."""
 
     thread: ThreadPoolExecutor
-    acts: Acts | None = None
+    actions: Actions | None = None
     port: ZmqPort | None = None
+
+    def close(self) -> None:
+        if self.port is not None:
+            self.port.wake_up(ParentGone())
+            self.thread.submit(self.port.close)
+        self.thread.shutdown(wait=False)
 
 
 class Steering:
-    """Carries out what persons ask for, one thing after the other for each.
+    """Carries out what persons ask for, each in the own name, one thing after the other for each.
 
     Args:
         launch: the line that the dashboard was started with; persons reach the scheduler as it does, with its keys.
@@ -52,63 +58,46 @@ class Steering:
         self._persons: OrderedDict[str, _Person] = OrderedDict()
         self._log = logging.getLogger("afspm.dashboard")
 
-    def do(self, visitor: Visitor, act: Act) -> Future[Outcome]:
-        """Carry out an act in the name of a person, who must have one and not have signed out."""
+    def do(self, visitor: Visitor, action: Action) -> Future[ActionResult]:
+        """Carry out an action in the name of a person, who must have one and not have signed out."""
         person = check_name(visitor.person)
         if not person or not self._access.is_signed_in(visitor):
-            done: Future[Outcome] = Future()
-            done.set_result(Outcome("Sign in first: what is done is in the record with a name.", ok=False))
+            done: Future[ActionResult] = Future()
+            done.set_result(ActionResult("Sign in first: what is done is in the record with a name.", ok=False))
             return done
         with self._lock:
             one = self._persons.get(person)
             if one is None:
-                self._forget_some()
+                while len(self._persons) >= MOST_PERSONS:
+                    self._persons.popitem(last=False)[1].close()
                 one = self._persons[person] = _Person(ThreadPoolExecutor(1, thread_name_prefix="person"))
             self._persons.move_to_end(person)
-        return one.thread.submit(self._carry_out, person, one, act)
+        return one.thread.submit(self._carry_out, person, one, action)
 
     def close(self) -> None:
         """End all connections; what is under way ends without an answer."""
         with self._lock:
             persons, self._persons = list(self._persons.values()), OrderedDict()
         for one in persons:
-            _close(one)
+            one.close()
 
-    def _carry_out(self, person: str, one: _Person, act: Act) -> Outcome:
+    def _carry_out(self, person: str, one: _Person, action: Action) -> ActionResult:
         try:
-            if one.acts is None:
-                one.port, one.acts = self._connect(person)
-            outcome = act(one.acts)
+            if one.actions is None:
+                one.port, one.actions = self._connect(person)
+            result = action(one.actions)
         except AfspmError as error:
-            outcome = Outcome(str(error), ok=False)
+            result = ActionResult(str(error), ok=False)
         except Exception as error:
-            self._log.exception("an act of %s failed", person)
-            outcome = Outcome(f"that failed: {type(error).__name__}: {error}", ok=False)
-        self._log.debug("%s: %s%s", person, outcome.text, "" if outcome.ok else " (not done)")
-        return outcome
+            self._log.exception("an action of %s failed", person)
+            result = ActionResult(f"that failed: {type(error).__name__}: {error}", ok=False)
+        self._log.debug("%s: %s%s", person, result.text, "" if result.ok else " (not done)")
+        return result
 
-    def _connect(self, person: str) -> tuple[ZmqPort, Acts]:
+    def _connect(self, person: str) -> tuple[ZmqPort, Actions]:
         launch = self._launch
         name = f"{launch.name}{PERSON}{person}"
         network = Network.from_launch(launch.name, launch.keys)
         port = ZmqPort(network, name, self._clock, control=launch.sockets.control)
-        link = ExperimentLink(
-            port,
-            name,
-            session=new_session(launch.run),
-            request_timeout_s=launch.request_timeout_s,
-            request_retries=launch.request_retries,
-            log=self._log,
-        )
-        return port, Acts(link, self._watch)
-
-    def _forget_some(self) -> None:
-        while len(self._persons) >= MOST_PERSONS:
-            _close(self._persons.popitem(last=False)[1])
-
-
-def _close(one: _Person) -> None:
-    if one.port is not None:
-        one.port.wake_up(ParentGone())
-        one.thread.submit(one.port.close)
-    one.thread.shutdown(wait=False)
+        link = ExperimentLink.of_launch(launch, port, new_session(launch.run), name=name, log=self._log)
+        return port, Actions(link, self._watch)

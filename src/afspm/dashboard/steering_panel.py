@@ -1,4 +1,4 @@
-"""What a person can do, as buttons and dialogs. What came of it is said, and the reason where it was refused."""
+"""Buttons and dialogs for what a person can do. The result is shown, with the reason of a refusal."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ import asyncio
 import math
 from collections.abc import Callable
 from functools import partial
+from html import escape
 
 from nicegui import background_tasks, context, events, ui
 
 from afspm.dashboard.access import Visitor
-from afspm.dashboard.acts import Acts, Outcome
+from afspm.dashboard.actions import ActionResult, Actions
 from afspm.dashboard.content import Content
-from afspm.dashboard.steering import Act, Steering
+from afspm.dashboard.steering import Action, Steering
 from afspm.dashboard.watch import Watch
-from afspm.dashboard.words import area, escape, position
+from afspm.dashboard.words import area, position
 from afspm.formatting import time_of_day
 from afspm.model import ControlMode, Region, names
 
@@ -36,18 +37,18 @@ class SteeringPanel:
         self._mode_buttons()
         self._problem_buttons()
         self._microscope_buttons()
-        self._outcomes = ui.html("", sanitize=False).classes("outcomes").props('role="status" aria-live="polite"')
+        self._results = ui.html("", sanitize=False).classes("outcomes").props('role="status" aria-live="polite"')
         ui.on("scan_here", self._ask_scan)
         ui.on("spectrum_here", self._ask_spectrum)
 
     @property
     def may_steer(self) -> bool:
-        """Whether the viewer has signed in."""
+        """True if the viewer has signed in, and the experiment goes on."""
         return self._visitor.may_steer and not self._content.ended
 
     @property
     def may_measure(self) -> bool:
-        """Whether the viewer can ask the microscope for something."""
+        """True if the viewer can ask the microscope for something."""
         return self.may_steer and self._content.is_manual
 
     def show(self, content: Content) -> None:
@@ -79,15 +80,15 @@ class SteeringPanel:
         with ui.element("div").classes("acts"):
             options = {number: name for name, number in self._watch.problems.items()}
             self._problem = ui.select(options, label="problem", value=next(iter(options))).props("dense outlined")
-            _button("Raise", lambda: self._do(partial(Acts.flag, problem=int(self._problem.value))))
+            _button("Raise", lambda: self._do(partial(Actions.flag, problem=int(self._problem.value))))
 
     def _offer_problems(self) -> None:
         self._flagged.clear()
         with self._flagged:
             for number, name, _ in self._content.problems:
-                _button(f"Clear {name}", partial(self._do, partial(Acts.clear, problem=number)))
+                _button(f"Clear {name}", partial(self._do, partial(Actions.clear, problem=number)))
             if len(numbers := [number for number, *_ in self._content.problems]) > 1:
-                _button("Clear all problems", partial(self._do, partial(Acts.clear_all, problems=numbers)))
+                _button("Clear all problems", partial(self._do, partial(Actions.clear_all, problems=numbers)))
 
     async def _ask_end(self) -> None:
         if await _asked("End the experiment?", "All components stop; what was measured is kept.", "End it") and (
@@ -134,18 +135,18 @@ class SteeringPanel:
         if not name:
             return
         self._in_force.set_text("…")
-        outcome = await self._carry_out(lambda a: a.read(str(name)))
-        self._in_force.set_text(f"{name} is {outcome.text}" if outcome.ok else outcome.text)
+        result = await self._carry_out(lambda a: a.read(str(name)))
+        self._in_force.set_text(f"{name} is {result.text}" if result.ok else result.text)
 
     async def _set(self) -> None:
         name, text = self._parameter.value, str(self._value.value or "").strip()
         if not name or not text:
-            self._say(Outcome("Choose a parameter, and write a value with its unit.", ok=False))
+            self._say(ActionResult("Choose a parameter, and write a value with its unit.", ok=False))
             return
-        outcome = await self._carry_out(lambda a: a.set(str(name), text))
-        self._say(outcome)
-        if outcome.ok:
-            self._in_force.set_text(outcome.text)
+        result = await self._carry_out(lambda a: a.set(str(name), text))
+        self._say(result)
+        if result.ok:
+            self._in_force.set_text(result.text)
 
     async def _ask_scan(self, event: events.GenericEventArguments) -> None:
         place = event.args
@@ -164,27 +165,27 @@ class SteeringPanel:
 
     # --- within ---
 
-    def _do(self, act: Act) -> None:
-        """Carry out an act; the page goes on meanwhile."""
+    def _do(self, action: Action) -> None:
+        """Carry out an action; the page goes on meanwhile."""
 
         async def doing() -> None:
-            outcome = await self._carry_out(act)
+            result = await self._carry_out(action)
             with self._client:
-                self._say(outcome)
+                self._say(result)
 
         background_tasks.create(doing())
 
-    async def _carry_out(self, act: Act) -> Outcome:
-        return await asyncio.wrap_future(self._steering.do(self._visitor, act))
+    async def _carry_out(self, action: Action) -> ActionResult:
+        return await asyncio.wrap_future(self._steering.do(self._visitor, action))
 
-    def _say(self, outcome: Outcome) -> None:
-        style = "done" if outcome.ok else "refused"
+    def _say(self, result: ActionResult) -> None:
+        style = "done" if result.ok else "refused"
         time = time_of_day(self._watch.clock.now_ns())
-        self._outcomes.set_content(f'<p class="{style}"><time>{time}</time> {escape(outcome.text)}</p>')
-        if outcome.ok:
-            ui.notify(outcome.text, type="positive", position="bottom-right", timeout=4000)
+        self._results.set_content(f'<p class="{style}"><time>{time}</time> {escape(result.text)}</p>')
+        if result.ok:
+            ui.notify(result.text, type="positive", position="bottom-right", timeout=4000)
         else:  # stays until it is read
-            ui.notify(outcome.text, type="negative", position="bottom-right", timeout=0, close_button="Close")
+            ui.notify(result.text, type="negative", position="bottom-right", timeout=0, close_button="Close")
 
 
 def _button(text: str, on_click: Callable[..., object], colour: str | None = None) -> ui.button:

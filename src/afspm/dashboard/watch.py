@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -11,12 +12,38 @@ import numpy as np
 
 from afspm.clock import Clock
 from afspm.dashboard.frames import FrameStore
-from afspm.dashboard.levelling import Array
-from afspm.dashboard.spectra import SpectrumStore
+from afspm.drawing.levelling import Array
 from afspm.model import ProblemNames, Scan, ScanLines, ScopeState, Spectrum
 from afspm.record.overview import Overview
 
-OLD_AFTER_S = 8.0  # a supervisor tells of its processes every 2 s
+MOST_SPECTRA, SPECTRA_BYTES = 200, 64 << 20
+
+
+class SpectrumStore:
+    """The newest spectra, in the order in which they came. Not for several threads at once."""
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[int, Spectrum]] = deque()
+        self._bytes = 0
+        self._newest_ns = -1
+
+    def take(self, spectrum: Spectrum, time_ns: int) -> None:
+        """Add one that was published; what is not newer (a replay) is passed over."""
+        if time_ns <= self._newest_ns:
+            return
+        self._newest_ns = time_ns
+        self._kept.append((spectrum.time_ns or time_ns, spectrum))
+        self._bytes += spectrum.values.nbytes
+        while len(self._kept) > MOST_SPECTRA or (self._bytes > SPECTRA_BYTES and len(self._kept) > 1):
+            self._bytes -= self._kept.popleft()[1].values.nbytes
+
+    def newest(self, count: int = 1) -> list[tuple[int, Spectrum]]:
+        """Return (time_ns, spectrum), newest last."""
+        return list(self._kept)[-count:]
+
+    def at(self, time_ns: int) -> Spectrum | None:
+        """Return the one of that time; None if it is not kept any more."""
+        return next((spectrum for at_ns, spectrum in self._kept if at_ns == time_ns), None)
 
 
 class Watch:
@@ -25,7 +52,7 @@ class Watch:
     Args:
         clock: of the experiment.
         past: what was so before; None: nothing is known of that.
-        cut_off: what to say if nobody runs it any more; it gives an empty text if somebody does.
+        cut_off: returns what to say if nothing runs the experiment any more, else an empty text.
     """
 
     def __init__(
@@ -42,22 +69,22 @@ class Watch:
         self.frames = FrameStore()
         self.spectra = SpectrumStore()
         self.tip_to_sample: Array | None = None
-        """The newest mapping of drift, 2 x 3; None where nobody corrects drift."""
+        """The newest mapping of drift, 2 x 3; None where nothing corrects drift."""
         self.connected = False
         self.ended = False
         self.changes = 0
         self._heard_s = clock.monotonic_s()
         self._changed = threading.Condition()
-        self._bells: list[Callable[[], None]] = []
+        self._callbacks: list[Callable[[], None]] = []
 
     @contextmanager
     def reading(self) -> Iterator[Overview]:
-        """Nothing changes while in the block; be brief in it."""
+        """Keep everything as it is while in the block; be brief in it."""
         with self._changed:
             yield self.overview
 
     def take(self, message: str, thing: Any, time_ns: int, envelope: str = "") -> None:
-        """Something was published."""
+        """Take in what was published."""
         with self._changed:
             self.overview.take(message, thing, time_ns, envelope)
             if isinstance(thing, Scan):
@@ -67,30 +94,28 @@ class Watch:
             elif isinstance(thing, Spectrum):
                 self.spectra.take(thing, time_ns)
             elif message == "DriftMapping":
-                self.tip_to_sample = _matrix(thing)
+                is_mapping = len(thing.matrix) == 6 and thing.correcting
+                self.tip_to_sample = np.array(thing.matrix, dtype=np.float64).reshape(2, 3) if is_mapping else None
             self._heard_s = self.clock.monotonic_s()
             self.connected = True
             self._announce()
 
-    def tell(self, *, connected: bool | None = None, ended: bool | None = None) -> None:
-        """How it is with the connection to the scheduler."""
+    def end(self) -> None:
+        """Note that the experiment has ended."""
         with self._changed:
-            before = (self.connected, self.ended)
-            self.connected = self.connected if connected is None else connected
-            self.ended = self.ended if ended is None else ended
-            if (self.connected, self.ended) != before:
-                self._announce()
+            self.ended = True
+            self._announce()
 
     def silent_s(self) -> float:
-        """Real seconds since anything was heard."""
+        """Return the real seconds since anything was heard."""
         return self.clock.monotonic_s() - self._heard_s
 
-    def on_change(self, bell: Callable[[], None]) -> None:
-        """`bell` is called after each change, in the thread that brings it; it must not wait for anything."""
-        self._bells.append(bell)
+    def on_change(self, callback: Callable[[], None]) -> None:
+        """Call `callback` after each change, in the thread that brings it; it must not wait for anything."""
+        self._callbacks.append(callback)
 
     def wait_for(self, condition: Callable[[Overview], bool], within_s: float) -> bool:
-        """Wait in another thread until `condition`; False when the time is up."""
+        """Wait in another thread until `condition`; return False when the time is up."""
         with self._changed:
             return self._changed.wait_for(lambda: condition(self.overview), within_s)
 
@@ -101,11 +126,5 @@ class Watch:
     def _announce(self) -> None:
         self.changes += 1
         self._changed.notify_all()
-        for bell in self._bells:
-            bell()
-
-
-def _matrix(mapping: Any) -> Array | None:
-    if len(mapping.matrix) != 6 or not mapping.correcting:
-        return None
-    return np.array(mapping.matrix, dtype=np.float64).reshape(2, 3)
+        for callback in self._callbacks:
+            callback()

@@ -39,7 +39,7 @@ class Occupied:
 
 
 @dataclass
-class SimulatedScan:
+class ScanActivity:
     """A scan that was started: with the values that were in force then, whatever is changed later.
 
     Attributes:
@@ -160,7 +160,7 @@ class SimulatedScan:
 
 
 @dataclass(frozen=True)
-class SimulatedSpectrum:
+class SpectrumActivity:
     """A curve that was started.
 
     Attributes:

@@ -20,9 +20,9 @@ from afspm.emulators.activities import (
     RETRACE,
     NoValues,
     Occupied,
+    ScanActivity,
     ScanValues,
-    SimulatedScan,
-    SimulatedSpectrum,
+    SpectrumActivity,
     ValuesInAir,
     noise_in_air,
 )
@@ -32,7 +32,7 @@ from afspm.simulation import World
 from afspm.simulation.feedback import Loop
 from afspm.simulation.scanning import Course
 
-Doing = SimulatedScan | SimulatedSpectrum | Occupied
+Doing = ScanActivity | SpectrumActivity | Occupied
 _MOST_AVERAGED = 32  # of more sweeps the noise is no less
 _FASTEST_DRIFT_M_S = 1e-6
 _SMALLEST_M, _LARGEST_M, _LONGEST_PIXEL = 1e-12, 200e-6, 1e4
@@ -84,8 +84,8 @@ class Rig:
         self.move_speed_m_s = 5e-6
         self.approach_s = 1.0
         self.engaged = True
-        self.scan: SimulatedScan | None = None
-        self.spectrum: SimulatedSpectrum | None = None
+        self.scan: ScanActivity | None = None
+        self.spectrum: SpectrumActivity | None = None
         self.wake: Callable[[], None] = lambda: None
         self.log = logging.getLogger(__name__)
         self._background = background
@@ -114,12 +114,12 @@ class Rig:
         """Return when it will be free; None if it is free or paused, or if `wake` will be called."""
         if self._doing is None or not self._doing.running(now_s) or self._doing.end_s <= now_s:
             return None
-        return None if isinstance(self._doing, SimulatedScan) and self._doing.paused else self._doing.end_s
+        return None if isinstance(self._doing, ScanActivity) and self._doing.paused else self._doing.end_s
 
     def probe_at(self, now_s: float) -> tuple[float, float]:
         """Return the position of the tip, also during a move or a scan."""
         doing = self._doing
-        if isinstance(doing, SimulatedScan) and doing.running(now_s):
+        if isinstance(doing, ScanActivity) and doing.running(now_s):
             return doing.tip_m(now_s)
         if isinstance(doing, Occupied) and doing.what == "move" and doing.running(now_s):
             part = (now_s - doing.start_s) / (doing.end_s - doing.start_s)
@@ -162,7 +162,7 @@ class Rig:
 
     # -- what it can be told to do
 
-    def start_scan(self) -> SimulatedScan:
+    def start_scan(self) -> ScanActivity:
         """Scan the frame.
 
         Raises:
@@ -170,7 +170,7 @@ class Rig:
         """
         now_s = self._free_now_s()
         drawn: Future[ScanValues] = Future()
-        scan = SimulatedScan(
+        scan = ScanActivity(
             self._scans + 1,
             self.region,
             self.shape,
@@ -195,7 +195,7 @@ class Rig:
         if self.scan is not None:
             self.scan.stop(self.clock.now_s())
 
-    def start_spectrum(self, kind: str, sweeps: int = 1) -> SimulatedSpectrum:
+    def start_spectrum(self, kind: str, sweeps: int = 1) -> SpectrumActivity:
         """Take a curve of a kind ("IV", "force") where the probe is, the mean of so many.
 
         Raises:
@@ -214,7 +214,7 @@ class Rig:
             for column, unit in list(enumerate(units))[1:]:  # the first is what is swept
                 values[:, column] = noise_in_air(random, values.shape[:1], unit)
         end_s = now_s + sweeps * self.world.spectrum_s(kind)
-        self.spectrum = SimulatedSpectrum(self._spectra, kind, self._probe_m, now_s, end_s, names, units, values)
+        self.spectrum = SpectrumActivity(self._spectra, kind, self._probe_m, now_s, end_s, names, units, values)
         self._doing = self.spectrum
         return self.spectrum
 
@@ -225,7 +225,7 @@ class Rig:
 
     def stop_spectrum(self) -> None:
         """Break the spectrum off, if one is running: it is gone."""
-        if isinstance(self._doing, SimulatedSpectrum) and self._doing.running(self.clock.now_s()):
+        if isinstance(self._doing, SpectrumActivity) and self._doing.running(self.clock.now_s()):
             self._doing = self.spectrum = None
 
     def move_probe(self, xy_m: tuple[float, float]) -> None:
@@ -323,7 +323,7 @@ class Rig:
         if self.scan is not None:
             wait([self.scan._drawn])
 
-    def _drawer(self, scan: SimulatedScan) -> Callable[[], ScanValues]:
+    def _drawer(self, scan: ScanActivity) -> Callable[[], ScanValues]:
         _scannable(scan)
         direction, slope = ("up" if scan.upwards else "down"), self.slope
         course = Course(scan.region, scan.shape, scan.line_s, scan.start_s, direction)
@@ -343,7 +343,7 @@ class Rig:
             slope=slope,
         )
 
-    def _in_background(self, draw: Callable[[], ScanValues], scan: SimulatedScan) -> None:
+    def _in_background(self, draw: Callable[[], ScanValues], scan: ScanActivity) -> None:
         def work() -> None:
             try:
                 drawn = draw()
@@ -357,7 +357,7 @@ class Rig:
         Thread(target=work, daemon=True, name="simulated scan").start()
 
 
-def _scannable(scan: SimulatedScan) -> None:
+def _scannable(scan: ScanActivity) -> None:
     """Raises InvalidValue: no scanner has such a frame; simulating it takes minutes, or more memory than there is."""
     pixels = [size_m / count for size_m, count in zip(scan.region.size_m, scan.shape[::-1], strict=True)]
     reach = all(_SMALLEST_M <= size_m <= _LARGEST_M for size_m in scan.region.size_m)

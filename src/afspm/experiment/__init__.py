@@ -2,6 +2,6 @@
 
 from afspm.experiment.experiment import Experiment, ProcessStart, load, load_expanded
 from afspm.experiment.findings import Finding, Level, SourceLocation
-from afspm.experiment.parts import Role
+from afspm.model import Role
 
 __all__ = ["Experiment", "Finding", "Level", "ProcessStart", "Role", "SourceLocation", "load", "load_expanded"]

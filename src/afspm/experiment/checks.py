@@ -8,14 +8,14 @@ from typing import Any, Final
 
 from afspm.addresses import EXAMPLE, hint_on, is_address, reaches
 from afspm.errors import InvalidValue
-from afspm.experiment import notifying, wiring
+from afspm.experiment import wiring
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.handlers import check_handlers
+from afspm.experiment.implied_parts import check_notify, is_program
 from afspm.experiment.known import WIRE_SETTINGS
-from afspm.experiment.parts import Role
 from afspm.experiment.published import wire_of
 from afspm.experiment.resolution import ResolvedExperiment
-from afspm.model import component_of, is_process_name
+from afspm.model import Role, component_of, is_process_name
 from afspm.model.events import LONGEST_PROCESS_NAME, PERSON
 from afspm.transport.network import is_local
 
@@ -39,6 +39,10 @@ LIVE: Final = "ScanLines"
 ADDRESS: Final = "address"
 """By convention the setting of a translator that says where its controller is."""
 _WORD = re.compile(r"[A-Za-z_][\w-]*")
+_MISSING = {
+    Role.SCHEDULER: 'add [scheduler] with component = true and class = "Scheduler"',
+    Role.TRANSLATOR: 'add e.g. [microscope] with component = true and class = "Simulator"',
+}
 
 
 def check(resolved: ResolvedExperiment) -> None:
@@ -49,55 +53,37 @@ def check(resolved: ResolvedExperiment) -> None:
 
 def check_roles(resolved: ResolvedExperiment) -> None:
     """One scheduler, one translator, and no two names that only differ in upper and lower case."""
-    whole = resolved.document.place()
-    for role in (Role.SCHEDULER, Role.TRANSLATOR):
+    # a class that can't be loaded may be the one that is looked for
+    all_loaded = all(process.part.command or process.component for process in resolved.processes.values())
+    for role, hint in _MISSING.items():
         having = resolved.with_role(role)
-        if not having and len(resolved.roles) == len(resolved.parts.components) and _all_loaded(resolved):
-            hint = {
-                Role.SCHEDULER: 'add [scheduler] with component = true and class = "Scheduler"',
-                Role.TRANSLATOR: 'add e.g. [microscope] with component = true and class = "Simulator"',
-            }[role]
-            resolved.findings.error(f"there is no {role.value}", whole, hint)
+        if not having and all_loaded and len(resolved.processes) == len(resolved.parts.components):
+            resolved.error(f"there is no {role.value}", hint=hint)
         for extra in having[1:]:
-            resolved.findings.error(
-                f"[{extra.name}] is a second {role.value} beside [{having[0].name}]", extra.place, "one is enough"
-            )
+            what = f"[{extra.name}] is a second {role.value} beside [{having[0].name}]"
+            resolved.error(what, extra.name, hint="one is enough")
     seen: dict[str, str] = {}
-    for part in resolved.parts.components:
-        other = seen.setdefault(part.name.casefold(), part.name)
-        if other != part.name:
-            resolved.findings.error(
-                f"[{part.name}] and [{other}] are the same name but for upper and lower case",
-                part.place,
-                "their files would be the same on some computers",
-            )
-
-
-def _all_loaded(resolved: ResolvedExperiment) -> bool:
-    """A class that can't be loaded may be the one that is looked for."""
-    return all(part.command or part.name in resolved.classes for part in resolved.parts.components)
+    for name in resolved.processes:
+        other = seen.setdefault(name.casefold(), name)
+        if other != name:
+            what = f"[{name}] and [{other}] are the same name but for upper and lower case"
+            resolved.error(what, name, hint="their files would be the same on some computers")
 
 
 def check_names(resolved: ResolvedExperiment) -> None:
     """A component's name is also that of files, on every system, and of a connection."""
-    for part in resolved.parts.components:
-        if not is_process_name(part.name):
-            resolved.findings.error(
-                f"[{part.name}] can't be the name of a component",
-                part.place,
-                f"letters, digits, _, - and spaces, at most {LONGEST_PROCESS_NAME} bytes, as in [tip_corrector]",
-            )
+    for name in resolved.processes:
+        if not is_process_name(name):
+            hint = f"letters, digits, _, - and spaces, at most {LONGEST_PROCESS_NAME} bytes, as in [tip_corrector]"
+            resolved.error(f"[{name}] can't be the name of a component", name, hint=hint)
 
 
 def check_commands(resolved: ResolvedExperiment) -> None:
     """The program of a command can be found."""
     for part in resolved.parts.components:
-        if part.command and not notifying.is_program(part.command[0], resolved.document.folders[0]):
-            resolved.findings.error(
-                f"[{part.name}] there is no program {part.command[0]!r}",
-                resolved.document.place(part.name, "command"),
-                "give its path, or install it",
-            )
+        if part.command and not is_program(part.command[0], resolved.document.folders[0]):
+            what = f"[{part.name}] there is no program {part.command[0]!r}"
+            resolved.error(what, part.name, "command", hint="give its path, or install it")
 
 
 def check_intermediaries(resolved: ResolvedExperiment) -> None:
@@ -108,33 +94,32 @@ def check_intermediaries(resolved: ResolvedExperiment) -> None:
         if kind is None:
             continue
         for key, value in table.items():
-            place = resolved.document.place(name, key)
             if key != "class" and key not in WIRE_SETTINGS[kind]:
-                hint = nearest(key, WIRE_SETTINGS[kind])
-                resolved.findings.error(f"[{name}] a {kind.value} has no setting {key!r}", place, hint)
+                what = f"[{name}] a {kind.value} has no setting {key!r}"
+                resolved.error(what, name, key, hint=nearest(key, WIRE_SETTINGS[kind]))
             elif key in ("request_timeout_ms", "request_retries") and not isinstance(value, int | float):
                 hint = "is it in a second file, to be laid over this one?"
-                resolved.findings.error(f"[{name}] {key} = {value!r} is no number", place, hint)
+                resolved.error(f"[{name}] {key} = {value!r} is no number", name, key, hint=hint)
             elif key.endswith("url"):
                 for url in value if isinstance(value, list) else [value]:
                     if not isinstance(url, str) or not is_address(url):
                         near = closest(str(url), names, 0.7)
                         hint = f"did you mean {near!r}?" if near else hint_on(str(url)) or EXAMPLE
-                        resolved.findings.error(f"[{name}] {key} = {url!r} is not an address", place, hint)
+                        resolved.error(f"[{name}] {key} = {url!r} is not an address", name, key, hint=hint)
 
 
 def check_addresses(resolved: ResolvedExperiment) -> None:
     """No address is bound twice; none is open to the network without keys; every connection has somebody at its end."""
     bound: dict[str, wiring.BoundSocket] = {}
-    secure = resolved.security.keys is not None or resolved.security.insecure
+    security = resolved.sections.security
+    secure = security.keys is not None or security.insecure
     for slot in (*resolved.net.slots.values(), *resolved.listening):
         if slot.address is None:
             continue
         for address, other in bound.items():
             if reaches(slot.address, address) or reaches(address, slot.address):
-                resolved.findings.error(
-                    f"[{slot.owner}] and [{other.owner}] both bind {slot.address} ({slot.use}, {other.use})", slot.place
-                )
+                what = f"[{slot.owner}] and [{other.owner}] both bind {slot.address} ({slot.use}, {other.use})"
+                resolved.findings.error(what, slot.place)
         bound[slot.address] = slot
         if slot.keyed and is_address(slot.address) and not is_local(slot.address) and not secure:
             resolved.findings.error(
@@ -149,63 +134,57 @@ def check_addresses(resolved: ResolvedExperiment) -> None:
             if target is None or target in resolved.net.slots or not is_address(target):
                 continue
             if not any(reaches(target, b) for b in bound):
-                resolved.findings.error(
-                    f"[{name}] connects to {target}, which nobody binds",
-                    resolved.document.place(name),
-                    nearest(target, bound, 0.8),
-                )
+                what = f"[{name}] connects to {target}, which nobody binds"
+                resolved.error(what, name, hint=nearest(target, bound, 0.8))
 
 
 def check_self_subscription(resolved: ResolvedExperiment) -> None:
     """Nobody listens to itself: each packet would be the cause of the next."""
     for name, links in resolved.net.links.items():
         own = resolved.net.slots.get(links.publish or "")
-        if own is None or resolved.roles[name] is not Role.COMPONENT:
+        if own is None or resolved.processes[name].role is not Role.COMPONENT:
             continue
         key = f"{own.owner}/{own.use}"
         if key in links.subscribe or (own.address and any(reaches(s, own.address) for s in links.subscribe)):
-            resolved.findings.error(f"[{name}] subscribes to itself", resolved.document.place(name, "subscriber"))
+            resolved.error(f"[{name}] subscribes to itself", name, "subscriber")
 
 
 def check_listens_to(resolved: ResolvedExperiment) -> None:
     """`listens_to` names others that publish."""
     publishers = {slot.owner for slot in resolved.net.slots.values() if slot.use == "publish"}
-    for part in resolved.parts.components:
-        wanted = part.own.get("listens_to", [])
+    for name, process in resolved.processes.items():
+        wanted = process.part.own.get("listens_to", [])
         for i, other in enumerate(wanted if isinstance(wanted, list) else [wanted]):
-            place = resolved.document.place(part.name, "listens_to", i)
-            if other == part.name:
-                resolved.findings.error(f"[{part.name}] subscribes to itself", place)
-            elif other not in resolved.roles:
-                resolved.findings.error(
-                    f"[{part.name}] listens_to: there is no component {other!r}", place, nearest(str(other), publishers)
-                )
+            path = (name, "listens_to", i)
+            if other == name:
+                resolved.error(f"[{name}] subscribes to itself", *path)
+            elif other not in resolved.processes:
+                what = f"[{name}] listens_to: there is no component {other!r}"
+                resolved.error(what, *path, hint=nearest(str(other), publishers))
             elif other not in publishers:
-                resolved.findings.error(f"[{part.name}] listens to [{other}], which publishes nothing", place)
+                resolved.error(f"[{name}] listens to [{other}], which publishes nothing", *path)
 
 
 def check_problems(resolved: ResolvedExperiment) -> None:
     """Problems named by components exist, and each that is flagged is solved by somebody."""
-    solved = {_number(resolved, p) for said in resolved.declared.values() for p in said.solves}
-    solved |= {_number(resolved, p) for p in resolved.control.solved_by_hand}
-    for name, said in resolved.declared.items():
-        place = resolved.document.place(name)
-        for verb, problems in (("solves", said.solves), ("flags", said.flags)):
+    by_hand = resolved.sections.control.solved_by_hand
+    solvers = (problem for process in resolved.processes.values() for problem in process.declared.solves)
+    solved = {_number(resolved, problem) for problem in (*solvers, *by_hand)}
+    for name, process in resolved.processes.items():
+        for verb, problems in (("solves", process.declared.solves), ("flags", process.declared.flags)):
             for problem in problems:
                 number = _number(resolved, problem)
                 if number is None:
                     hint = nearest(problem, resolved.problems) + ", or name it under [problems]"
-                    resolved.findings.error(f"[{name}] {verb} {problem!r}, which is no problem", place, hint)
+                    resolved.error(f"[{name}] {verb} {problem!r}, which is no problem", name, hint=hint)
                 elif verb == "flags" and number not in solved:
-                    resolved.findings.error(
-                        f"[{name}] flags {problem!r}, which nobody solves: the experiment would stand still",
-                        place,
-                        "add a component that solves it, or [control] solved_by_hand",
-                    )
-    for i, problem in enumerate(resolved.control.solved_by_hand):
+                    what = f"[{name}] flags {problem!r}, which nobody solves: the experiment would stand still"
+                    hint = "add a component that solves it, or [control] solved_by_hand"
+                    resolved.error(what, name, hint=hint)
+    for i, problem in enumerate(by_hand):
         if _number(resolved, problem) is None:
-            place = resolved.document.place("control", "solved_by_hand", i)
-            resolved.findings.error(f"{problem!r} is no problem", place, nearest(problem, resolved.problems))
+            hint = nearest(problem, resolved.problems)
+            resolved.error(f"{problem!r} is no problem", "control", "solved_by_hand", i, hint=hint)
 
 
 def _number(resolved: ResolvedExperiment, problem: str) -> int | None:
@@ -217,23 +196,23 @@ def _number(resolved: ResolvedExperiment, problem: str) -> int | None:
 
 def check_envelopes(resolved: ResolvedExperiment) -> None:
     """Every envelope subscribed to is published by somebody."""
-    published = {*PUBLISHED, *(e for said in resolved.declared.values() for e in said.publishes)}
-    published |= set(resolved.caching.envelopes)
-    if any(part.command or part.settings.get("live_lines_s") for part in resolved.with_role(Role.TRANSLATOR)):
+    processes, made = resolved.processes.values(), resolved.caching.envelopes
+    published = {*PUBLISHED, *(e for process in processes for e in process.declared.publishes), *made}
+    if any(t.part.command or t.part.settings.get("live_lines_s") for t in resolved.with_role(Role.TRANSLATOR)):
         published.add(LIVE)
-    for part in resolved.parts.components:
-        for i, prefix in enumerate(resolved.envelopes(part) or ()):
-            key = next((k for k in ("envelopes", "subscriber") if k in part.own), "class")
-            place = resolved.document.place(part.name, key, *([i] if key == "envelopes" else []))
-            if _is_published(prefix, published, resolved.caching.envelopes):
+    for name, process in resolved.processes.items():
+        for i, prefix in enumerate(process.envelopes or ()):
+            if _is_published(prefix, published, made):
                 continue
+            key = next((k for k in ("envelopes", "subscriber") if k in process.part.own), "class")
+            path = (name, key, i) if key == "envelopes" else (name, key)
             live = LIVE.startswith(prefix)
             hint = 'give the microscope live_lines_s = "1 s"' if live else nearest(prefix, published)
-            what = f"[{part.name}] subscribes to {prefix!r}, which nobody publishes"
+            what = f"[{name}] subscribes to {prefix!r}, which nobody publishes"
             if resolved.caching.mapping is not None:
-                resolved.findings.warning(what + ", unless the mapping of [cache] makes it", place, hint)
+                resolved.warning(f"{what}, unless the mapping of [cache] makes it", *path, hint=hint)
             else:
-                resolved.findings.error(what, place, hint)
+                resolved.error(what, *path, hint=hint)
 
 
 def _is_published(prefix: str, published: set[str], made: Collection[str]) -> bool:
@@ -247,73 +226,59 @@ def check_controller(resolved: ResolvedExperiment) -> None:
     """One emulated controller at most, and no other address for its translator."""
     for name in resolved.emulators[1:]:
         what = f"[{name}] is a second emulated controller beside [{resolved.emulators[0]}]"
-        resolved.findings.error(what, resolved.document.place(name), "one is enough")
-    names = [part.name for part in resolved.parts.components]
-    for part in resolved.with_role(Role.TRANSLATOR):
-        controller = resolved.controller_of(part.name, names)
-        if controller and ADDRESS in part.settings:
-            resolved.findings.warning(
-                f"[{part.name}] {ADDRESS} is not used: it talks to [{controller}], which is emulated",
-                resolved.document.place(part.name, ADDRESS),
-                f"[{controller}] component = false, for the controller at this address",
-            )
+        resolved.error(what, name, hint="one is enough")
+    for translator in resolved.with_role(Role.TRANSLATOR):
+        controller = resolved.controller_of(translator.name, resolved.processes)
+        if controller and ADDRESS in translator.part.settings:
+            what = f"[{translator.name}] {ADDRESS} is not used: it talks to [{controller}], which is emulated"
+            hint = f"[{controller}] component = false, for the controller at this address"
+            resolved.warning(what, translator.name, ADDRESS, hint=hint)
 
 
 def check_clock(resolved: ResolvedExperiment) -> None:
     """Only a simulation's time may be other than real."""
-    table = resolved.parts.sections.get("clock", {})
     if not resolved.with_role(Role.TRANSLATOR) or resolved.simulated:
         return
-    if resolved.clock.speed != 1.0:
-        resolved.findings.error(
-            f"[clock] speed = {resolved.clock.speed:g} on a microscope that is not simulated",
-            resolved.document.place("clock", "speed"),
-            "time can't be made faster there: leave it out, or set it to 1 in the file for this microscope",
-        )
-    if "start" in table:
-        resolved.findings.error(
-            "[clock] start on a microscope that is not simulated", resolved.document.place("clock", "start")
-        )
+    if (speed := resolved.sections.clock.speed) != 1.0:
+        hint = "time can't be made faster there: leave it out, or set it to 1 in the file for this microscope"
+        what = f"[clock] speed = {speed:g} on a microscope that is not simulated"
+        resolved.error(what, "clock", "speed", hint=hint)
+    if "start" in resolved.parts.sections.get("clock", {}):
+        resolved.error("[clock] start on a microscope that is not simulated", "clock", "start")
 
 
 def check_names_of_people(resolved: ResolvedExperiment) -> None:
     """Roles name components, or people who have a key."""
-    names = {part.name for part in resolved.parts.components}
-    keys = resolved.keys_folder
+    names, keys, security = set(resolved.processes), resolved.keys_folder, resolved.sections.security
     if keys is not None:
         names |= {file.stem for file in (keys / "public").glob("*.key")}
     any_role = False
-    for role, members in resolved.control.roles:
+    for role, members in resolved.sections.control.roles:
         for i, member in enumerate(members or ()):
-            any_role = True
+            any_role, path = True, ("control", "roles", role, i)
             if not {member, component_of(member)} & names:
-                place = resolved.document.place("control", "roles", role, i)
                 what = f"[control.roles] {role}: there is no {member!r} among components and keys"
-                resolved.findings.error(what, place, nearest(member, names))
+                resolved.error(what, *path, hint=nearest(member, names))
             elif not _has_password(resolved, member):
-                resolved.findings.warning(
-                    f"[control.roles] {role}: {member!r} has no password, whoever types the name has the role",
-                    resolved.document.place("control", "roles", role, i),
-                    f"`afspm dashboard --make-password` makes a line of people for [{component_of(member)}]",
-                )
-    if any_role and (resolved.security.plain or resolved.security.insecure):
-        resolved.findings.warning(
-            "[control.roles] without keys: whoever takes the name has the role",
-            resolved.document.place("control", "roles"),
-            "leave [security] plain away, or make keys with `afspm keys` and set [security] keys",
-        )
+                what = f"[control.roles] {role}: {member!r} has no password, whoever types the name has the role"
+                hint = f"`afspm dashboard --make-password` makes a line of people for [{component_of(member)}]"
+                resolved.warning(what, *path, hint=hint)
+    if any_role and (security.plain or security.insecure):
+        hint = "leave [security] plain away, or make keys with `afspm keys` and set [security] keys"
+        what = "[control.roles] without keys: whoever takes the name has the role"
+        resolved.warning(what, "control", "roles", hint=hint)
     if keys is not None and not keys.is_dir():
-        resolved.findings.error(
-            f"[security] keys: there is no folder {str(keys)!r}", resolved.document.place("security", "keys"),
-            "`afspm keys` makes it"
-        )  # fmt: skip
+        what = f"[security] keys: there is no folder {str(keys)!r}"
+        resolved.error(what, "security", "keys", hint="`afspm keys` makes it")
 
 
 def _has_password(resolved: ResolvedExperiment, member: str) -> bool:
     """False for a person of a dashboard that does not know the password of this person."""
-    component, _, person = member.partition(PERSON)
-    operates = getattr(resolved.classes.get(component), "operates", False) is True
-    return not (person and operates) or person in (resolved.settings[component].get("people") or {})
+    name, _, person = member.partition(PERSON)
+    process = resolved.processes.get(name)
+    if not person or process is None or not process.says("operates"):
+        return True
+    return person in (process.settings.get("people") or {})
 
 
 def check_likely_typos(resolved: ResolvedExperiment) -> None:
@@ -323,42 +288,33 @@ def check_likely_typos(resolved: ResolvedExperiment) -> None:
         for path, text in _texts(part.settings, (part.name,)):
             near = closest(text, names, 0.85) if _WORD.fullmatch(text) and len(text) > 3 else None
             if near:
-                resolved.findings.warning(
-                    f"[{part.name}] {path[1]} = {text!r} is nearly the name of a variable",
-                    resolved.document.place(*path),
-                    f"did you mean {near!r}?",
-                )
+                what = f"[{part.name}] {path[1]} = {text!r} is nearly the name of a variable"
+                resolved.warning(what, *path, hint=f"did you mean {near!r}?")
 
 
 def _texts(value: Any, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], str]]:
     if isinstance(value, str):
         yield path, value
-    elif isinstance(value, dict):
-        for key, item in value.items():
+    elif isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
             yield from _texts(item, (*path, key))
-    elif isinstance(value, list):
-        for i, item in enumerate(value):
-            yield from _texts(item, (*path, i))
 
 
 def check_needs(resolved: ResolvedExperiment) -> None:
     """The microscope has the actions and parameters that components say they need, where it tells before it runs."""
-    for part in resolved.with_role(Role.TRANSLATOR):
-        has = resolved.abilities(part)
+    for translator in resolved.with_role(Role.TRANSLATOR):
+        has = translator.capabilities()
         if has is None:
             continue
-        for name, said in resolved.declared.items():
+        for name, process in resolved.processes.items():
+            said = process.declared
             for kind, needed, offered in (
                 ("action", said.needs_actions, has.actions),
                 ("parameter", said.needs_parameters, has.parameters),
             ):
-                for one in needed:
-                    if one not in offered:
-                        resolved.findings.error(
-                            f"[{name}] needs the {kind} {one!r}, which [{part.name}] does not have",
-                            resolved.document.place(name),
-                            nearest(one, offered),
-                        )
+                for one in [one for one in needed if one not in offered]:
+                    what = f"[{name}] needs the {kind} {one!r}, which [{translator.name}] does not have"
+                    resolved.error(what, name, hint=nearest(one, offered))
 
 
 CHECKS: Final[tuple[Callable[[ResolvedExperiment], None], ...]] = (
@@ -377,5 +333,5 @@ CHECKS: Final[tuple[Callable[[ResolvedExperiment], None], ...]] = (
     check_likely_typos,
     check_needs,
     check_handlers,
-    notifying.check,
+    check_notify,
 )

@@ -15,8 +15,9 @@ from typing import Any
 
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.known import SHORT_NAME_PACKAGES
-from afspm.experiment.parts import DECLARED_KEYS, Role
+from afspm.experiment.parts import DECLARED_KEYS
 from afspm.experiment.published import GUIDE
+from afspm.model import Role
 
 # By where they come from: a class of the user is recognised by what it is derived from.
 _ROLE_BY_BASE = (

@@ -12,10 +12,10 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import document as documents
 from afspm.experiment import parts as sorting
-from afspm.experiment import recording
 from afspm.experiment.findings import Finding, Findings
-from afspm.experiment.parts import Role
+from afspm.experiment.implied_parts import RECORDS
 from afspm.launch import Launch
+from afspm.model import Role
 
 if TYPE_CHECKING:
     from afspm.experiment.resolution import ResolvedExperiment
@@ -91,7 +91,7 @@ class Experiment:
     @property
     def recorders(self) -> list[str]:
         """Those who keep the record of a run: by default one."""
-        return [name for name, component in self.resolved.classes.items() if recording.records(component)]
+        return self.resolved.saying(RECORDS)
 
     def check(self) -> list[Finding]:
         """Everything that is wrong or doubtful; nothing is started. Errors first, then by line."""
@@ -179,7 +179,7 @@ class Experiment:
         from afspm.logic.supervision.liveness import LivenessPolicy
         from afspm.logic.supervision.restart import RestartPolicy
 
-        r = self.resolved.restart
+        r = self.resolved.sections.restart
         return ChildPolicy(
             LivenessPolicy(r.beat_period, r.missed_beats, r.start, r.longest_step, r.closing),
             RestartPolicy(r.budget, r.window, r.first_delay, longest_delay_s=r.longest_delay, healthy_s=r.healthy),
@@ -187,7 +187,7 @@ class Experiment:
 
     def clock(self) -> ExperimentClock:
         """The clock of a run that begins now, from [clock]."""
-        settings = self.resolved.clock
+        settings = self.resolved.sections.clock
         return ExperimentClock.starting_now(settings.start.timestamp() if settings.start else None, settings.speed)
 
     def expanded(self, *, secrets: bool = True) -> str:

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from afspm.experiment.parts import ExperimentPart, Role
+from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.svg import Svg, text_width
+from afspm.model import Role
 
 if TYPE_CHECKING:
     from afspm.experiment.experiment import Experiment
@@ -103,8 +104,8 @@ class _Drawing:
             self._component(box)
         for i, lane in enumerate(self.lanes):
             self._lane(lane, self._top() - LANE * (i + 0.75))
-        for part in self.resolved.with_role(Role.SCHEDULER)[:1]:
-            self._scheduler(part)
+        for scheduler in self.resolved.with_role(Role.SCHEDULER)[:1]:
+            self._scheduler(scheduler.part)
         bottom = self.bar_y + BAR_HEIGHT
         for part in self.resolved.with_role(Role.TRANSLATOR)[:1]:
             bottom = self._translator(self.boxes[part.name])
@@ -116,7 +117,7 @@ class _Drawing:
     # --- what there is ------------------------------------------------------------------------------------------
 
     def _box(self, part: ExperimentPart) -> ProcessBox:
-        said = self.resolved.declared[part.name]
+        said = self.resolved.processes[part.name].declared
         what = part.class_path.rpartition(".")[2] if part.class_path else " ".join(part.command)
         lines = [(what if len(what) <= 34 else what[:33] + "…", GREY)]
         lines += [(f"flags {problem}", RED) for problem in said.flags]
@@ -129,10 +130,10 @@ class _Drawing:
 
     def _from_scheduler(self, part: ExperimentPart) -> list[str]:
         """What it hears from the scheduler: not what only other components publish; at least that it is over."""
-        prefixes = self.resolved.envelopes(part)
+        prefixes = self.resolved.processes[part.name].envelopes
         if prefixes is None or "" in prefixes:
             return ["all envelopes"]
-        others = {e for p in self.components_of_file for e in self.resolved.declared[p.name].publishes}
+        others = {e for p in self.components_of_file for e in self.resolved.processes[p.name].declared.publishes}
         return [p for p in prefixes if not any(e.startswith(p) for e in others)] or ["KILL"]
 
     def _lanes(self) -> list[PublisherLane]:
@@ -147,7 +148,7 @@ class _Drawing:
                 for other in self.components
                 if any(s in (key, slot.address) for s in self.resolved.net.links[other.part.name].subscribe)
             )
-            label = ", ".join(self.resolved.declared[box.part.name].publishes) or "messages of its own"
+            label = ", ".join(self.resolved.processes[box.part.name].declared.publishes) or "messages of its own"
             lanes.append(PublisherLane(box, listeners, f"{label} {_at(slot.address)}"))
         # short ways near the boxes, long ways above them: fewer crossings
         return sorted(lanes, key=lambda lane: len(lane.listeners))
@@ -173,7 +174,7 @@ class _Drawing:
     # --- drawn ----------------------------------------------------------------------------------------------------
 
     def _process(self, box: ProcessBox) -> None:
-        fill, stroke = FILLS[self.resolved.roles[box.part.name]]
+        fill, stroke = FILLS[self.resolved.processes[box.part.name].role]
         self.svg.box(box.x - box.width / 2, box.y, box.width, box.height, fill=fill, stroke=stroke)
         y = box.y + 22
         self.svg.text(box.x, y, box.part.name, size=NAME_SIZE, bold=True)

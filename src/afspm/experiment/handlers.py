@@ -10,8 +10,8 @@ from afspm import wire
 from afspm.client.component import Component
 from afspm.client.dispatch import HANDLERS, snake_case
 from afspm.experiment.findings import closest
-from afspm.experiment.parts import ExperimentPart, Role
 from afspm.experiment.resolution import ResolvedExperiment
+from afspm.model import Role
 
 _NEARLY = 0.8
 _CALLED = ("run", *(name for name in vars(Component) if name.startswith("on_")))
@@ -19,13 +19,18 @@ _CALLED = ("run", *(name for name in vars(Component) if name.startswith("on_")))
 
 def check_handlers(resolved: ResolvedExperiment) -> None:
     """What looks like a handler is called by that name, with what it takes."""
-    for part in resolved.with_role(Role.COMPONENT):
-        component = resolved.classes.get(part.name)
+    for process in resolved.with_role(Role.COMPONENT):
+        component = process.component
         if component is None or not issubclass(component, Component):
             continue
         for name, method in _methods(component):
-            _check_name(part, component, name, resolved)
-            _check_signature(part, component, name, method, resolved)
+            shown, path = f"[{process.name}] {component.__name__}.{name}", (process.name, "class")
+            if hint := _hint_on_name(name, resolved):
+                resolved.warning(f"{shown} is never called: there is no such handler", *path, hint=hint)
+            wanted = _arguments(name)
+            if wrong := _wrong_signature(method, wanted):
+                hint = f"write `def {name}({', '.join(wanted)})`"
+                resolved.error(f"{shown} can't be called as it will be: {wrong}", *path, hint=hint)
 
 
 def _methods(component: type[Component]) -> Iterator[tuple[str, Callable[..., Any]]]:
@@ -39,39 +44,25 @@ def _methods(component: type[Component]) -> Iterator[tuple[str, Callable[..., An
                 yield name, method
 
 
-def _check_name(part: ExperimentPart, component: type[Component], name: str, resolved: ResolvedExperiment) -> None:
+def _hint_on_name(name: str, resolved: ResolvedExperiment) -> str:
+    """What to do about a handler that is never called; empty: it is."""
     valid = {*_CALLED, *(f"on_{snake_case(message)}" for message in wire.known_messages() if message not in HANDLERS)}
     near = closest(name, valid, _NEARLY)
     if name in valid or (near is None and resolved.messages):  # a handler of a message of the user's own
-        return
-    hint = f"did you mean {near!r}?" if near else "on_scan, on_state, …; of a message of your own after its name"
-    resolved.findings.warning(
-        f"[{part.name}] {component.__name__}.{name} is never called: there is no such handler",
-        resolved.document.place(part.name, "class"),
-        hint,
-    )
+        return ""
+    return f"did you mean {near!r}?" if near else "on_scan, on_state, …; of a message of your own after its name"
 
 
-def _check_signature(
-    part: ExperimentPart,
-    component: type[Component],
-    name: str,
-    method: Callable[..., Any],
-    resolved: ResolvedExperiment,
-) -> None:
+def _arguments(name: str) -> list[str]:
     base = getattr(Component, name, None)
-    wanted = list(inspect.signature(base).parameters) if base is not None else ["self", "message"]
-    wrong = ""
+    return list(inspect.signature(base).parameters) if base is not None else ["self", "message"]
+
+
+def _wrong_signature(method: Callable[..., Any], arguments: list[str]) -> str:
     if inspect.iscoroutinefunction(method) or inspect.isgeneratorfunction(method):
-        wrong = "calling it does nothing yet, since it is async or has a yield"
-    else:
-        try:
-            inspect.signature(method).bind(*wanted)
-        except TypeError as error:
-            wrong = str(error)
-    if wrong:
-        resolved.findings.error(
-            f"[{part.name}] {component.__name__}.{name} can't be called as it will be: {wrong}",
-            resolved.document.place(part.name, "class"),
-            f"write `def {name}({', '.join(wanted)})`",
-        )
+        return "calling it does nothing yet, since it is async or has a yield"
+    try:
+        inspect.signature(method).bind(*arguments)
+    except TypeError as error:
+        return str(error)
+    return ""

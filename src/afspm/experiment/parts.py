@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from enum import Enum
 from typing import Any, Final
 
 from afspm.errors import AfspmError
@@ -29,14 +28,6 @@ SIMULATED = "simulated"
 EMULATED = "emulated"
 """An attribute by which a class says that it is the controller, emulated: the translator then talks to it."""
 DECLARED_KEYS: Final = ("solves", "flags", "publishes", "listens", "needs_actions", "needs_parameters")
-
-
-class Role(Enum):
-    """What a process is in the experiment."""
-
-    TRANSLATOR = "translator"
-    SCHEDULER = "scheduler"
-    COMPONENT = "component"
 
 
 @dataclass(frozen=True)

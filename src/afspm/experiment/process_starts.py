@@ -13,16 +13,16 @@ from afspm.experiment import limits_section, wiring
 from afspm.experiment.experiment import ProcessStart
 from afspm.experiment.findings import nearest
 from afspm.experiment.known import DASHBOARD, DASHBOARD_PASSWORD
-from afspm.experiment.parts import ExperimentPart, Role
+from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.toml_writer import SECRET
 from afspm.launch import Launch, Sockets
 from afspm.logic.microscope_status import FEEDBACK_OFF
 from afspm.logic.watchdog import WatchdogSettings
-from afspm.model import Frame
+from afspm.model import Frame, Role
 
 if TYPE_CHECKING:
     from afspm.experiment.experiment import Experiment
-    from afspm.experiment.resolution import ResolvedExperiment
+    from afspm.experiment.resolution import ResolvedExperiment, ResolvedProcess
 
 _ORDER = (Role.TRANSLATOR, Role.SCHEDULER, Role.COMPONENT)
 
@@ -39,18 +39,15 @@ def starts(
             links[part.name] = _reachable(links[part.name], resolved, chosen)
     _require_addresses(resolved, links, chosen, piecemeal=bool(only))
     addresses = resolved.net.addresses(take_address)
-    parts = sorted(
-        (part for part in resolved.parts.components if part.name in chosen),
-        key=lambda part: _ORDER.index(resolved.roles[part.name]),
-    )
-    return [_start(part, experiment, links[part.name], addresses, chosen) for part in parts]
+    processes = [process for role in _ORDER for process in resolved.with_role(role) if process.name in chosen]
+    return [_start(process, experiment, links[process.name], addresses, chosen) for process in processes]
 
 
 def knowing_the_run(resolved: ResolvedExperiment) -> set[str]:
     """The processes that are told the identity of the run: all, unless the scheduler is of another language."""
-    if all(not part.command for part in resolved.with_role(Role.SCHEDULER)):
-        return {part.name for part in resolved.parts.components}
-    return {*resolved.emulators, *(part.name for part in resolved.with_role(Role.TRANSLATOR))}
+    if all(not scheduler.part.command for scheduler in resolved.with_role(Role.SCHEDULER)):
+        return set(resolved.processes)
+    return {*resolved.emulators, *(translator.name for translator in resolved.with_role(Role.TRANSLATOR))}
 
 
 def simulated(experiment: Experiment, only: Collection[str], without: Collection[str]) -> bool:
@@ -80,7 +77,7 @@ def _without_gone(
     gone = {
         key
         for key, slot in resolved.net.slots.items()
-        if slot.owner in without and slot.address is None and resolved.roles[slot.owner] is Role.COMPONENT
+        if slot.owner in without and slot.address is None and resolved.processes[slot.owner].role is Role.COMPONENT
     }
     return replace(links, subscribe=tuple(source for source in links.subscribe if source not in gone))
 
@@ -119,14 +116,13 @@ def _require_addresses(
 
 
 def _start(
-    part: ExperimentPart,
+    process: ResolvedProcess,
     experiment: Experiment,
     links: wiring.ProcessSockets,
     addresses: Mapping[str, str],
     chosen: Collection[str],
 ) -> ProcessStart:
-    resolved = experiment.resolved
-    wires, role = resolved.wires[part.name], resolved.roles[part.name]
+    resolved, part, role, wires = experiment.resolved, process.part, process.role, process.wires
 
     def bound(key: str | None) -> str | None:
         return None if key is None else addresses.get(key, key)
@@ -136,22 +132,24 @@ def _start(
 
     launch = Launch(
         name=part.name,
-        class_=resolved.class_paths.get(part.name, ""),
-        settings={**resolved.settings[part.name], **(_for_scheduler(resolved) if role is Role.SCHEDULER else {})},
+        class_=process.class_path,
+        settings={
+            **resolved.processes[part.name].settings,
+            **(_for_scheduler(resolved) if role is Role.SCHEDULER else {}),
+        },
         sockets=Sockets(
             publish=bound(links.publish),
             subscribe=tuple(met(source) for source in links.subscribe),
             serve=bound(links.serve),
             control=met(links.control) if links.control else None,
-            log=_log(resolved)[0],
         ),
-        envelopes=resolved.envelopes(part),
+        envelopes=process.envelopes,
         problems=resolved.named_problems,
-        request_timeout_s=wires.request_timeout_s or resolved.control.request_timeout,
-        request_retries=_first(wires.request_retries, resolved.control.request_retries),
+        request_timeout_s=wires.request_timeout_s or resolved.sections.control.request_timeout,
+        request_retries=_first(wires.request_retries, resolved.sections.control.request_retries),
         keys=_keys(resolved, links, addresses),
         messages=resolved.messages,
-        beat_period_s=resolved.restart.beat_period,
+        beat_period_s=resolved.sections.restart.beat_period,
         simulated=resolved.simulated_with(chosen),
         controller=resolved.controller_of(part.name, chosen) if role is Role.TRANSLATOR else "",
         sample_coordinates=role is Role.COMPONENT and _in_sample_coordinates(resolved),
@@ -164,7 +162,7 @@ def _start(
 
 def _hidden(resolved: ResolvedExperiment, name: str) -> tuple[str, ...]:
     """Environment variables that hold secrets, but for those of the component `name`."""
-    webhook = str(resolved.notify.webhook)
+    webhook = str(resolved.sections.notify.webhook)
     every = {DASHBOARD_PASSWORD, *([webhook[1:]] if webhook.startswith("$") else [])}
     every.update(*(_secrets(resolved, part.name) for part in resolved.parts.components))
     return tuple(sorted(every - _secrets(resolved, name)))
@@ -172,8 +170,8 @@ def _hidden(resolved: ResolvedExperiment, name: str) -> tuple[str, ...]:
 
 def _secrets(resolved: ResolvedExperiment, name: str) -> set[str]:
     """Environment variables of which a component has to know the value."""
-    webhook = str(resolved.settings[name].get(SECRET, ""))
-    operates = getattr(resolved.classes.get(name), "operates", False) is True
+    webhook = str(resolved.processes[name].settings.get(SECRET, ""))
+    operates = resolved.processes[name].says("operates")
     return {*([webhook[1:]] if webhook.startswith("$") else []), *([DASHBOARD_PASSWORD] if operates else [])}
 
 
@@ -188,11 +186,11 @@ def asking(experiment: Experiment, names: Collection[str]) -> Launch | None:
     None where it is not said where it is, or it is of another language and perhaps knows nothing of our requests.
     """
     resolved = experiment.resolved
-    part = next((part for part in resolved.parts.components if resolved.roles[part.name] is Role.SCHEDULER), None)
-    if part is None or part.command:
+    scheduler = next(iter(resolved.with_role(Role.SCHEDULER)), None)
+    if scheduler is None or scheduler.part.command:
         return None
     # as those that are started here reach it; a translator, which asks nobody, by what the scheduler binds
-    known = [*(resolved.net.links[name].control for name in names), f"{part.name}/serve"]
+    known = [*(resolved.net.links[name].control for name in names), f"{scheduler.name}/serve"]
     addresses = {key: slot.address for key, slot in resolved.net.slots.items()}
     address = next((found for key in known if key and (found := addresses.get(key, key)) is not None), None)
     if address is None:
@@ -202,7 +200,7 @@ def asking(experiment: Experiment, names: Collection[str]) -> Launch | None:
         resolved, wiring.ProcessSockets(), {key: found for key, found in addresses.items() if found is not None}
     )
     if keys is not None and "folder" in keys:
-        keys = {**keys, target: part.name}
+        keys = {**keys, target: scheduler.name}
     return Launch(next(iter(names)), sockets=Sockets(control=target), keys=keys)
 
 
@@ -211,13 +209,12 @@ def _keys(
 ) -> dict[str, str] | None:
     """The folder of the keys, and whose key to expect at each address; see `transport.network.Network.from_launch`."""
     if resolved.keys_folder is None:
-        return {"insecure": "true"} if resolved.security.insecure else None
+        return {"insecure": "true"} if resolved.sections.security.insecure else None
     slots = resolved.net.slots.items()
     owners = {connectable(addresses[key]): slot.owner for key, slot in slots if key in addresses}
     keys = {"folder": str(resolved.keys_folder)}
-    scheduler = next((name for name, role in resolved.roles.items() if role is Role.SCHEDULER), None)
-    if scheduler is not None:
-        keys["scheduler"] = scheduler  # whom alone a translator obeys
+    for scheduler in resolved.with_role(Role.SCHEDULER)[:1]:
+        keys["scheduler"] = scheduler.name  # whom alone a translator obeys
     for key in (links.control, *links.subscribe):
         if key is None:
             continue
@@ -225,29 +222,18 @@ def _keys(
         owner = owners.get(target) or next((o for bind, o in owners.items() if reaches(target, bind)), None)
         if owner is not None:
             keys[target] = owner
-    log, collector = _log(resolved)
-    if log is not None:
-        keys[log] = collector
     return keys
-
-
-def _log(resolved: ResolvedExperiment) -> tuple[str | None, str]:
-    """Where a component collects the log lines of all others, and its name."""
-    for name, component in resolved.classes.items():
-        if getattr(component, "collects_logs", False) is True:
-            return connectable(str(resolved.settings[name]["address"])), name
-    return None, ""
 
 
 def _in_sample_coordinates(resolved: ResolvedExperiment) -> bool:
     """Whether the scheduler maps places, as its class says."""
     schedulers = resolved.with_role(Role.SCHEDULER)
-    return any(getattr(resolved.classes.get(part.name), "frame", None) is Frame.SAMPLE for part in schedulers)
+    return any(getattr(scheduler.component, "frame", None) is Frame.SAMPLE for scheduler in schedulers)
 
 
 def _retracts(resolved: ResolvedExperiment) -> bool:
     """Whether a tip without feedback is to be retracted when nobody is in control any more."""
-    control = resolved.control
+    control = resolved.sections.control
     dangerous = WatchdogSettings().dangerous if control.dangerous is None else control.dangerous
     return control.retract and FEEDBACK_OFF in dangerous
 
@@ -261,8 +247,8 @@ def _operators(resolved: ResolvedExperiment) -> list[str]:
 
     And a dashboard that joins the run later, which is under no other's name.
     """
-    operators = [n for n, component in resolved.classes.items() if getattr(component, "operates", False) is True]
-    return operators if DASHBOARD in resolved.classes else [*operators, DASHBOARD]
+    operators = resolved.saying("operates")
+    return operators if DASHBOARD in resolved.processes else [*operators, DASHBOARD]
 
 
 def _for_scheduler(resolved: ResolvedExperiment) -> dict[str, Any]:
@@ -272,7 +258,7 @@ def _for_scheduler(resolved: ResolvedExperiment) -> dict[str, Any]:
         spectra_by_variable, roles (name of the role -> names; None: everyone).
     limits: see `limits.to_settings`; cache: see `caching.Caching.to_settings`.
     """
-    control = resolved.control
+    control = resolved.sections.control
     return {
         "control": {
             "lease_s": control.lease,

@@ -13,10 +13,9 @@ from afspm.experiment import (
     cache_section,
     capabilities,
     class_loader,
+    implied_parts,
     limits_section,
-    notifying,
     planned_measurements,
-    recording,
     sections,
     settings,
     wiring,
@@ -26,10 +25,11 @@ from afspm.experiment.capabilities import MicroscopeCapabilities
 from afspm.experiment.class_loader import ComponentDeclaration
 from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings, nearest
-from afspm.experiment.parts import EMULATED, SIMULATED, ExperimentPart, ExperimentParts, Role
+from afspm.experiment.parts import EMULATED, SIMULATED, ExperimentPart, ExperimentParts
+from afspm.experiment.sections import ExperimentSections, read_sections
 from afspm.experiment.wiring import BoundSocket, Wiring, WiringKeys
 from afspm.logic.limits import ExperimentLimits
-from afspm.model import ProblemNames
+from afspm.model import ProblemNames, Role
 
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 FROM_SECTIONS = ("control", "limits", "cache")
@@ -37,159 +37,176 @@ FROM_SECTIONS = ("control", "limits", "cache")
 
 
 @dataclass
+class ResolvedProcess:
+    """One process with all that is known of it before it starts.
+
+    Attributes:
+        component: its class, and `class_path` where that is; None and empty for a command, or what can't be loaded.
+        settings: as its constructor gets them: in SI, of JSON's types.
+        wrong: the settings that were refused; None where all are right.
+    """
+
+    part: ExperimentPart
+    wires: WiringKeys
+    role: Role = Role.COMPONENT
+    declared: ComponentDeclaration = field(default_factory=ComponentDeclaration)
+    settings: dict[str, Any] = field(default_factory=dict)
+    component: type | None = None
+    class_path: str = ""
+    wrong: frozenset[str] | None = None
+
+    @property
+    def name(self) -> str:
+        return self.part.name
+
+    def says(self, attribute: str) -> bool:
+        """Whether its class has an attribute that is true."""
+        return getattr(self.component, attribute, False) is True
+
+    @property
+    def is_microscope(self) -> bool:
+        """Whether it is a simulated microscope, as its class (a command: its table) says."""
+        return self.part.own.get(SIMULATED) is True if self.part.command else self.says(SIMULATED)
+
+    @property
+    def envelopes(self) -> tuple[str, ...] | None:
+        """The prefixes that it subscribes to: as the file says, else as its class declares; None: all."""
+        wanted = self.part.own.get("envelopes", self.wires.envelopes)
+        if wanted is None:
+            return self.declared.listens
+        return (wanted,) if isinstance(wanted, str) else tuple(map(str, wanted))
+
+    def capabilities(self) -> MicroscopeCapabilities | None:
+        """Return what a translator can do; None where that is not known before it runs."""
+        return None if self.component is None else capabilities.of_class(self.component, self.settings)
+
+
+@dataclass
 class ResolvedExperiment:
-    """Everything about the experiment that is known before it starts. Mappings are by the component's name."""
+    """Everything about the experiment that is known before it starts.
+
+    Attributes:
+        processes: by name, in the order of the file.
+        listening: where components listen by settings of their own, beside the wiring.
+    """
 
     parts: ExperimentParts
     document: Document
     findings: Findings
-    clock: sections.ClockSection
-    control: sections.ControlSection
-    security: sections.SecuritySection
+    sections: ExperimentSections
     messages: tuple[str, ...]
-    restart: sections.RestartSection
-    notify: sections.NotifySection
-    problems: ProblemNames
     named_problems: dict[str, int]
-    refused: dict[str, frozenset[str]] = field(default_factory=dict)
-    """Of those whose settings are wrong: which of them."""
-    classes: dict[str, type] = field(default_factory=dict)
-    class_paths: dict[str, str] = field(default_factory=dict)
-    roles: dict[str, Role] = field(default_factory=dict)
-    declared: dict[str, ComponentDeclaration] = field(default_factory=dict)
-    settings: dict[str, dict[str, Any]] = field(default_factory=dict)
-    wires: dict[str, WiringKeys] = field(default_factory=dict)
+    processes: dict[str, ResolvedProcess] = field(default_factory=dict)
     net: Wiring = field(default_factory=Wiring)
     listening: list[BoundSocket] = field(default_factory=list)
-    """Where components listen by settings of their own, beside the wiring."""
     limits: ExperimentLimits = field(default_factory=ExperimentLimits)
     caching: CacheSettings = field(default_factory=CacheSettings)
 
-    def with_role(self, role: Role) -> list[ExperimentPart]:
-        return [part for part in self.parts.components if self.roles.get(part.name) is role]
+    @property
+    def problems(self) -> ProblemNames:
+        return ProblemNames(self.named_problems)
+
+    def error(self, what: str, *path: str | int, hint: str = "") -> None:
+        """Report an error at the line where `path` is set."""
+        self.findings.error(what, self.document.place(*path), hint)
+
+    def warning(self, what: str, *path: str | int, hint: str = "") -> None:
+        """Report a warning at the line where `path` is set."""
+        self.findings.warning(what, self.document.place(*path), hint)
+
+    def with_role(self, role: Role) -> list[ResolvedProcess]:
+        return [process for process in self.processes.values() if process.role is role]
+
+    def saying(self, attribute: str) -> list[str]:
+        """Return the names of the processes whose class has an attribute that is true."""
+        return [name for name, process in self.processes.items() if process.says(attribute)]
 
     @property
     def keys_folder(self) -> Path | None:
         """The folder of [security] keys, absolute."""
-        keys = self.security.keys
+        keys = self.sections.security.keys
         return None if keys is None else self.document.folder_of("security", "keys") / keys
-
-    def envelopes(self, part: ExperimentPart) -> tuple[str, ...] | None:
-        """The prefixes a component subscribes to: as the file says, else as its class declares; None: all."""
-        wanted = part.own.get("envelopes", self.wires[part.name].envelopes)
-        if wanted is None:
-            return self.declared[part.name].listens
-        return (wanted,) if isinstance(wanted, str) else tuple(map(str, wanted))
-
-    def abilities(self, part: ExperimentPart) -> MicroscopeCapabilities | None:
-        """What a translator can do; None where that is not known before it runs."""
-        microscope = self.classes.get(part.name)
-        return None if microscope is None else capabilities.of_class(microscope, self.settings[part.name])
 
     @property
     def simulated(self) -> bool:
         """True if the microscope is simulated for certain, where all of the file is started on this computer."""
-        return self.simulated_with([part.name for part in self.parts.components])
+        return self.simulated_with(self.processes)
 
     def simulated_with(self, started: Collection[str]) -> bool:
-        """True if the microscope is simulated for certain, where these processes are started together.
+        """Return whether the microscope is simulated for certain, where these processes are started together.
 
-        Either the translator is the microscope itself, as its class (a command: its table) says, or it is wired to an
-        emulator that is started with it.
+        Either the translator is the microscope itself, or it is wired to an emulator that is started with it.
         """
         translators = self.with_role(Role.TRANSLATOR)
         return bool(translators) and all(
-            self._is_the_microscope(part) or bool(self.controller_of(part.name, started)) for part in translators
+            translator.is_microscope or bool(self.controller_of(translator.name, started)) for translator in translators
         )
 
     def controller_of(self, translator: str, started: Collection[str]) -> str:
-        """The name of the emulator that a translator is wired to; empty: none that is started with it.
+        """Return the name of the emulator that a translator is wired to; empty: none that is started with it.
 
         A translator of another language can't be: nothing proves to whom it talks.
         """
-        part = next(part for part in self.parts.components if part.name == translator)
-        if self._is_the_microscope(part) or part.command or translator not in started:
+        process = self.processes[translator]
+        if process.is_microscope or process.part.command or translator not in started:
             return ""
         return next((name for name in self.emulators if name in started), "")
 
     @property
     def emulators(self) -> list[str]:
         """The emulated controllers among the components."""
-        return [part.name for part in self.parts.components if self._says(part, EMULATED)]
-
-    def _is_the_microscope(self, part: ExperimentPart) -> bool:
-        return part.own.get(SIMULATED) is True if part.command else self._says(part, SIMULATED)
-
-    def _says(self, part: ExperimentPart, attribute: str) -> bool:
-        return getattr(self.classes.get(part.name), attribute, False) is True
+        return self.saying(EMULATED)
 
 
 def resolve(parts: ExperimentParts, document: Document, findings: Findings) -> ResolvedExperiment:
     """Resolve all that can be; what can't is reported and left out."""
-
-    def section(model: type[sections.S], name: str) -> sections.S:
-        return sections.parse(model, name, parts.sections.get(name, {}), document, findings)
-
-    named = _problems(parts.sections.get("problems", {}), document, findings)
     resolved = ResolvedExperiment(
         parts=parts,
         document=document,
         findings=findings,
-        clock=section(sections.ClockSection, "clock"),
-        control=section(sections.ControlSection, "control"),
-        security=section(sections.SecuritySection, "security"),
+        sections=read_sections(parts.sections, document, findings),
         messages=_messages(parts.variables.get("messages", []), document, findings),
-        restart=section(sections.RestartSection, "restart"),
-        notify=section(sections.NotifySection, "notify"),
-        problems=ProblemNames(named),
-        named_problems=named,
+        named_problems=_problems(parts.sections.get("problems", {}), document, findings),
     )
-    for part in parts.components:
-        resolved.wires[part.name] = wiring.read_wires(part, document.place, findings)
     with class_loader.importing_from(document.folders):
         for part in parts.components:
-            _resolve_part(part, resolved)
-        recorder = recording.implied(resolved, section(sections.RecordSection, "record"))
-        notifier = notifying.implied(resolved, resolved.notify)
-        for added in filter(None, (recorder, notifier)):
+            _add(part, resolved)
+        for added in filter(None, (implied_parts.recorder(resolved), implied_parts.notifier(resolved))):
             parts.components.append(added)
-            resolved.wires[added.name] = wiring.read_wires(added, document.place, findings)
-            _resolve_part(added, resolved)
+            _add(added, resolved)
         _resolve_sections(resolved)
-    resolved.net = wiring.connect(parts.components, resolved.roles, resolved.declared, resolved.wires, document.place)
+    resolved.net = wiring.connect(resolved.processes, document.place)
     return resolved
 
 
-def _resolve_part(part: ExperimentPart, resolved: ResolvedExperiment) -> None:
+def _add(part: ExperimentPart, resolved: ResolvedExperiment) -> None:
     name, document, findings = part.name, resolved.document, resolved.findings
-    resolved.declared[name] = ComponentDeclaration.of_table(part.own)
-    resolved.roles[name] = _written_role(part, resolved)
-    resolved.settings[name] = settings.jsonable(part.settings, document.folder_of(name))
+    process = ResolvedProcess(part, wiring.read_wires(part, document.place, findings))
+    resolved.processes[name] = process
+    process.declared = ComponentDeclaration.of_table(part.own)
+    process.role = _written_role(part, resolved)
+    process.settings = settings.jsonable(part.settings, document.folder_of(name))
     if part.command:
         return
     try:
         path = class_loader.full_path(part.class_path)
         component = class_loader.load(path)
     except class_loader.Unloadable as error:
-        findings.error(f"[{name}] class: {error.what}", document.place(name, "class"), error.hint)
+        resolved.error(f"[{name}] class: {error.what}", name, "class", hint=error.hint)
         return
     role = class_loader.role_of(component) if isinstance(component, type) else None
     if role is None:
-        findings.error(
-            f"[{name}] {path} is not a component",
-            document.place(name, "class"),
-            "derive it from afspm.Component",
-        )
+        resolved.error(f"[{name}] {path} is not a component", name, "class", hint="derive it from afspm.Component")
         return
-    resolved.classes[name], resolved.class_paths[name], resolved.roles[name] = component, path, role
-    resolved.declared[name] = _declared(component, part)
+    process.component, process.class_path, process.role = component, path, role
+    process.declared = _declared(component, part)
     errors = findings.errors
     given = FROM_SECTIONS if role is Role.SCHEDULER else ()
     wrong: set[str] = set()
-    resolved.settings[name] = settings.check(component, part.settings, (name,), document, findings, given, wrong)
+    process.settings = settings.check(component, part.settings, (name,), document, findings, given, wrong)
     if findings.errors > errors:
-        resolved.refused[name] = frozenset(wrong)
-    for setting, address, keyed in settings.listening(component, resolved.settings[name]):
+        process.wrong = frozenset(wrong)
+    for setting, address, keyed in settings.listening(component, process.settings):
         resolved.listening.append(BoundSocket(name, setting, address, setting, document.place(name, setting), keyed))
 
 
@@ -209,9 +226,11 @@ def _declared(component: type, part: ExperimentPart) -> ComponentDeclaration:
 def _resolve_sections(resolved: ResolvedExperiment) -> None:
     """The sections whose meaning depends on the components: what is kept, what is allowed, what is planned."""
     parts, document, findings = resolved.parts, resolved.document, resolved.findings
-    logic = next((wires.cache_logic for wires in resolved.wires.values() if wires.cache_logic), None)
+    processes = resolved.processes.values()
+    logic = next((process.wires.cache_logic for process in processes if process.wires.cache_logic), None)
     resolved.caching = cache_section.read(parts.sections.get("cache", {}), logic, document, findings)
-    has = next((has for part in resolved.with_role(Role.TRANSLATOR) if (has := resolved.abilities(part))), None)
+    translators = resolved.with_role(Role.TRANSLATOR)
+    has = next((has for translator in translators if (has := translator.capabilities())), None)
     reader = limits_section.LimitsReader(
         document,
         findings,
@@ -222,31 +241,32 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
         sets={} if has is None else has.sets,
     )
     resolved.limits = reader.read(parts.sections.get("limits", {}))
-    for part in resolved.with_role(Role.TRANSLATOR):
+    for translator in translators:
         for action, reason in planned_measurements.refused_actions(resolved.limits):
-            place = document.place(part.name, "actions", action)
-            findings.error(f"[{part.name}] actions: the limits would always refuse {reason}", place)
-    for part in parts.components:
-        if part.name in resolved.refused:
-            _look_inside(part.name, resolved)
-        elif part.name in resolved.classes:
-            _resolve_plan(part.name, resolved)
+            what = f"[{translator.name}] actions: the limits would always refuse {reason}"
+            resolved.error(what, translator.name, "actions", action)
+    for process in processes:
+        if process.component is None:
+            continue
+        if process.wrong is not None:
+            _look_inside(process, process.component, resolved)
+        else:
+            _resolve_plan(process, process.component, resolved)
 
 
-def _look_inside(name: str, resolved: ResolvedExperiment) -> None:
-    """What is wrong within the tables of a component some of whose other settings are wrong already.
+def _look_inside(process: ResolvedProcess, component: type, resolved: ResolvedExperiment) -> None:
+    """Report errors within the tables of a component some of whose other settings are wrong already.
 
-    Only that counts which lies within a setting of the file that is right as far as was seen: what does not fit
-    together may do so when the others are mended.
+    Only settings that are right as far as was seen count: what does not fit together may do so when others are mended.
     """
-    sound = resolved.settings[name].keys() - resolved.refused[name]
+    sound = process.settings.keys() - (process.wrong or ())
     try:
-        planned_measurements.plan_of(resolved.classes[name], resolved.settings[name])
+        planned_measurements.plan_of(component, process.settings)
     except AfspmError as error:
         for one in individual_errors(error):
             inside = _inside(one)
             if len(inside) > 1 and inside[0] in sound:
-                _report(name, one, resolved)
+                _report(process.name, one, resolved)
     except Exception:  # made of what is wrong, it may fail in any way
         return
 
@@ -254,7 +274,7 @@ def _look_inside(name: str, resolved: ResolvedExperiment) -> None:
 def _report(name: str, error: AfspmError, resolved: ResolvedExperiment) -> None:
     inside = _inside(error)
     said = f"{sections.name_of((name, *inside))}{':' if inside else ''} {error.what}"
-    resolved.findings.error(said, resolved.document.place(name, *inside), error.hint)
+    resolved.error(said, name, *inside, hint=error.hint)
 
 
 def _inside(error: AfspmError) -> tuple[str | int, ...]:
@@ -263,25 +283,25 @@ def _inside(error: AfspmError) -> tuple[str | int, ...]:
     return tuple(int(index) if index else key for key, index in _STEP.findall(where))
 
 
-def _resolve_plan(name: str, resolved: ResolvedExperiment) -> None:
-    """A ready-made component is made once: it knows best whether its settings fit together."""
-    place = resolved.document.place(name)
+def _resolve_plan(process: ResolvedProcess, component: type, resolved: ResolvedExperiment) -> None:
+    """Make a ready-made component once: it knows best whether its settings fit together."""
+    name = process.name
     try:
-        plan = planned_measurements.plan_of(resolved.classes[name], resolved.settings[name])
+        plan = planned_measurements.plan_of(component, process.settings)
     except AfspmError as error:
         for one in individual_errors(error):
             _report(name, one, resolved)
         return
     except Exception as error:
-        resolved.findings.error(f"[{name}] refuses its settings: {type(error).__name__}: {error}", place)
+        resolved.error(f"[{name}] refuses its settings: {type(error).__name__}: {error}", name)
         return
     if plan is None:
         return
-    resolved.declared[name] = replace(
-        resolved.declared[name], needs_actions=plan.needs_actions, needs_parameters=plan.needs_parameters
+    process.declared = replace(
+        process.declared, needs_actions=plan.needs_actions, needs_parameters=plan.needs_parameters
     )
     for reason in planned_measurements.refusals(name, plan, resolved.limits):
-        resolved.findings.error(f"[{name}] plans what its limits refuse: {reason}", place)
+        resolved.error(f"[{name}] plans what its limits refuse: {reason}", name)
 
 
 def _written_role(part: ExperimentPart, resolved: ResolvedExperiment) -> Role:
@@ -290,11 +310,8 @@ def _written_role(part: ExperimentPart, resolved: ResolvedExperiment) -> Role:
     if written is not None:
         if written in [role.value for role in Role]:
             return Role(written)
-        resolved.findings.error(
-            f"[{part.name}] has no role {written!r}",
-            resolved.document.place(part.name, "role"),
-            nearest(str(written), [role.value for role in Role]),
-        )
+        hint = nearest(str(written), [role.value for role in Role])
+        resolved.error(f"[{part.name}] has no role {written!r}", part.name, "role", hint=hint)
     if "control_server" in part.own:
         return Role.TRANSLATOR
     return Role.SCHEDULER if {"router", "pubsubcache"} & part.own.keys() else Role.COMPONENT

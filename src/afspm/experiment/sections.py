@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from datetime import datetime
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
@@ -108,6 +108,27 @@ class NotifySection(Section):
     )  # fmt: skip
     unsolved_after: PositiveDuration = 900.0
     """Experiment time for which a problem may be flagged before it counts as unsolved."""
+
+
+class ExperimentSections(Section):
+    """The sections that mean the same whatever components there are."""
+
+    clock: ClockSection = ClockSection()
+    control: ControlSection = ControlSection()
+    security: SecuritySection = SecuritySection()
+    restart: RestartSection = RestartSection()
+    record: RecordSection = RecordSection()
+    notify: NotifySection = NotifySection()
+
+
+def read_sections(tables: Mapping[str, dict[str, Any]], document: Document, findings: Findings) -> ExperimentSections:
+    """Read them all; what is wrong with one is reported, and its defaults taken."""
+    return ExperimentSections.model_construct(
+        **{
+            name: parse(type(field.default), name, tables.get(name, {}), document, findings)
+            for name, field in ExperimentSections.model_fields.items()
+        }
+    )
 
 
 S = TypeVar("S", bound=Section)

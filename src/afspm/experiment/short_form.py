@@ -10,10 +10,11 @@ from afspm.addresses import is_address
 from afspm.errors import UnitError
 from afspm.experiment.findings import SourceLocation
 from afspm.experiment.known import WIRE_KEYS, WiringClass
-from afspm.experiment.parts import ExperimentPart, Role
+from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.published import INSTEAD, envelope, last, wire_of
 from afspm.experiment.toml_writer import dumps
 from afspm.experiment.toml_writer import value as toml
+from afspm.model import Role
 from afspm.transport.network import is_local
 
 if TYPE_CHECKING:
@@ -106,10 +107,10 @@ def _shown(path: tuple[str, ...]) -> str:
 def _table(part: ExperimentPart, resolved: ResolvedExperiment) -> dict[str, Any]:
     what: dict[str, Any] = {"class": part.class_path} if part.class_path else {"command": list(part.command)}
     own = {key: value for key, value in part.own.items() if key not in {"class", "command", *WIRE_KEYS}}
-    wires = resolved.wires[part.name]
+    wires = resolved.processes[part.name].wires
     if wires.envelopes is not None and "envelopes" not in own:
         own["envelopes"] = wires.envelopes
-    return {"component": True, **what, **own, **_remote(wires, resolved.roles[part.name]), **part.settings}
+    return {"component": True, **what, **own, **_remote(wires, resolved.processes[part.name].role), **part.settings}
 
 
 def _remote(wires: WiringKeys, role: Role) -> dict[str, Any]:
@@ -133,13 +134,14 @@ def _is_remote(address: str) -> bool:
 
 def _sections(resolved: ResolvedExperiment) -> dict[str, dict[str, Any]]:
     sections = {name: dict(table) for name, table in resolved.parts.sections.items()}
-    timeouts = [wires.request_timeout_s for wires in resolved.wires.values() if wires.request_timeout_s]
-    retries = [wires.request_retries for wires in resolved.wires.values() if wires.request_retries is not None]
+    wirings = [process.wires for process in resolved.processes.values()]
+    timeouts = [wires.request_timeout_s for wires in wirings if wires.request_timeout_s]
+    retries = [wires.request_retries for wires in wirings if wires.request_retries is not None]
     given = {"request_timeout": f"{max(timeouts):g} s"} if timeouts else {}
     asked = {"request_retries": max(retries)} if retries else {}
     if control := {**given, **asked, **sections.get("control", {})}:
         sections["control"] = control
-    if any(wires.cache_logic for wires in resolved.wires.values()):
+    if any(wires.cache_logic for wires in wirings):
         sections["cache"] = {**_cache(resolved), **sections.get("cache", {})}
     return sections
 

@@ -7,16 +7,19 @@ listen to what it publishes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from afspm.addresses import hint_on, is_address
-from afspm.experiment.class_loader import ComponentDeclaration
 from afspm.experiment.findings import Findings, SourceLocation
 from afspm.experiment.known import WIRE_KEYS, WiringClass
-from afspm.experiment.parts import ExperimentPart, Role
+from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.published import wire_of
+from afspm.model import Role
+
+if TYPE_CHECKING:
+    from afspm.experiment.resolution import ResolvedProcess
 
 
 @dataclass(frozen=True)
@@ -150,75 +153,61 @@ def _apply_timeouts(wires: WiringKeys, table: Mapping[str, Any]) -> None:
         wires.request_retries = retries
 
 
-def connect(
-    parts: Sequence[ExperimentPart],
-    roles: Mapping[str, Role],
-    declared: Mapping[str, ComponentDeclaration],
-    wires: Mapping[str, WiringKeys],
-    placed: Callable[..., SourceLocation],
-) -> Wiring:
+def connect(processes: Mapping[str, ResolvedProcess], placed: Callable[..., SourceLocation]) -> Wiring:
     """Fill in what the wiring keys leave out."""
     net = Wiring()
-    scheduler = next((p.name for p in parts if roles.get(p.name) is Role.SCHEDULER), None)
-    translator = next((p.name for p in parts if roles.get(p.name) is Role.TRANSLATOR), None)
-    above = wires[scheduler] if scheduler else WiringKeys()
+    scheduler = next((p for p in processes.values() if p.role is Role.SCHEDULER), None)
+    translator = next((p for p in processes.values() if p.role is Role.TRANSLATOR), None)
+    above = scheduler.wires if scheduler else WiringKeys()
 
     def slot(owner: str, use: str, address: str | None, key: str) -> str:
         net.slots[f"{owner}/{use}"] = BoundSocket(owner, use, address, key, placed(owner, key))
         return f"{owner}/{use}"
 
+    source, target = above.cache_in, above.control
     if translator:
-        own = wires[translator]
-        data = slot(translator, "publish", own.publish or above.cache_in, "publisher")
-        asked = slot(translator, "serve", own.serve or above.control, "control_server")
-        net.links[translator] = ProcessSockets(publish=data, serve=asked)
+        own, name = translator.wires, translator.name
+        data = slot(name, "publish", own.publish or above.cache_in, "publisher")
+        asked = slot(name, "serve", own.serve or above.control, "control_server")
+        net.links[name] = ProcessSockets(publish=data, serve=asked)
+        source, target = source or data, target or asked
     if scheduler:
-        out = slot(scheduler, "publish", above.cache_out, "pubsubcache")
-        router = slot(scheduler, "serve", above.serve, "router")
-        source, target = above.cache_in, above.control
-        if translator:
-            source = source or f"{translator}/publish"
-            target = target or f"{translator}/serve"
-        net.links[scheduler] = ProcessSockets(out, (source,) if source else (), router, target)
-    others = [p for p in parts if roles.get(p.name) is Role.COMPONENT]
-    for part in others:
-        if wires[part.name].publish or declared[part.name].publishes:
-            slot(part.name, "publish", wires[part.name].publish, "publisher")
-    for part in others:
-        own = wires[part.name]
-        publish = f"{part.name}/publish"
-        net.links[part.name] = ProcessSockets(
+        out = slot(scheduler.name, "publish", above.cache_out, "pubsubcache")
+        router = slot(scheduler.name, "serve", above.serve, "router")
+        net.links[scheduler.name] = ProcessSockets(out, (source,) if source else (), router, target)
+    others = [p for p in processes.values() if p.role is Role.COMPONENT]
+    for process in others:
+        if process.wires.publish or process.declared.publishes:
+            slot(process.name, "publish", process.wires.publish, "publisher")
+    for process in others:
+        publish = f"{process.name}/publish"
+        net.links[process.name] = ProcessSockets(
             publish=publish if publish in net.slots else None,
-            subscribe=_sources(part, own, scheduler, above, declared, net),
-            control=own.control or (f"{scheduler}/serve" if scheduler else None),
+            subscribe=_sources(process, scheduler, processes, net),
+            control=process.wires.control or (f"{scheduler.name}/serve" if scheduler else None),
         )
     return net
 
 
 def _sources(
-    part: ExperimentPart,
-    own: WiringKeys,
-    scheduler: str | None,
-    above: WiringKeys,
-    declared: Mapping[str, ComponentDeclaration],
-    net: Wiring,
+    process: ResolvedProcess, scheduler: ResolvedProcess | None, processes: Mapping[str, ResolvedProcess], net: Wiring
 ) -> tuple[str, ...]:
     """Where a component subscribes: as said, else at the scheduler and at those who publish what it listens to."""
+    own = process.wires
+    published = f"{scheduler.name}/publish" if scheduler else ""
     if own.subscribe is not None:
         # a publisher of the scheduler's own (rescans in the published form) is its one publisher here
-        extra = {above.publish: f"{scheduler}/publish"} if scheduler and above.publish else {}
+        extra = {scheduler.wires.publish: published} if scheduler and scheduler.wires.publish else {}
         return tuple(dict.fromkeys(extra.get(url, url) for url in own.subscribe))
-    sources = [f"{scheduler}/publish"] if scheduler else []
-    wanted = part.own.get("listens_to")
-    prefixes = own.envelopes if own.envelopes is not None else declared[part.name].listens
-    for other, said in declared.items():
-        slot = f"{other}/publish"
-        if other == part.name or slot not in net.slots or slot in sources:
+    sources = [published] if scheduler else []
+    wanted = process.part.own.get("listens_to")
+    prefixes = own.envelopes if own.envelopes is not None else process.declared.listens
+    for name, other in processes.items():
+        slot = f"{name}/publish"
+        if other is process or slot not in net.slots or slot in sources:
             continue
-        if isinstance(wanted, list):
-            if other in wanted:
-                sources.append(slot)
-        elif other != scheduler and said.publishes and _overlap(said.publishes, prefixes):
+        is_wanted = other.declared.publishes and _overlap(other.declared.publishes, prefixes)
+        if name in wanted if isinstance(wanted, list) else other is not scheduler and is_wanted:
             sources.append(slot)
     return tuple(sources)
 

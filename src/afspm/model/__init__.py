@@ -26,6 +26,7 @@ from afspm.model.events import (
     ProcessStates,
     Progress,
     RelayedMessage,
+    Role,
     component_of,
     is_process_name,
 )
@@ -73,6 +74,7 @@ __all__ = [
     "RescanKind",
     "Response",
     "ResponseDetail",
+    "Role",
     "Scan",
     "ScanLines",
     "ScanParameters",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import Enum, IntEnum
 
 from afspm.model.enums import ControlMode
 
@@ -23,6 +23,14 @@ def is_process_name(name: str) -> bool:
 def component_of(who: str) -> str:
     """The component in whose name something was asked; the same without a person."""
     return who.partition(PERSON)[0]
+
+
+class Role(Enum):
+    """What a process is in the experiment."""
+
+    TRANSLATOR = "translator"
+    SCHEDULER = "scheduler"
+    COMPONENT = "component"
 
 
 class ProcessCondition(IntEnum):

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from afspm import garbage, wire
+from afspm import wire
 from afspm.clock import Clock, ExperimentClock
 from afspm.errors import ConfigError
 from afspm.exit_codes import ExitCode
@@ -28,11 +28,10 @@ from afspm.process.context import (
 )
 from afspm.process.loading import load
 from afspm.process.message_types import register_all
-from afspm.process.parent import ParentWatch, end_within, read_launch_line
-from afspm.process.stopping import StopRequested
+from afspm.process.parent import ParentWatch, StopRequested, end_within, read_launch_line
 from afspm.transport.heartbeat import HeartbeatSender
-from afspm.transport.launching import open_port
 from afspm.transport.port import ParentGone, Port
+from afspm.transport.zmq_port import open_port
 
 LOADED_WITHIN_S = 300.0  # a large library off a slow disk, the weights of a network
 FAREWELL_S = 1.0  # that exit handlers and threads of libraries have, once everything of ours is done
@@ -74,11 +73,10 @@ def _host(launch: Launch, logger: logging.Logger, parent: ParentWatch) -> int:
     clock = ExperimentClock.from_dict(launch.clock)
     activity = ProcessActivity(clock)
     activity.longest_step_s = LOADED_WITHIN_S  # before the first beat: it may be the last until all is loaded
-    with _beating(launch, activity, logger), _telling(launch, clock):
+    with _beating(launch, activity, logger):
         with activity.step():
             register_all(launch.messages)
             process = load(launch)
-        garbage.loaded()
         activity.longest_step_s = DEFAULT_LONGEST_STEP_S
         context = ProcessContext(
             launch,
@@ -127,25 +125,6 @@ class _Watch:
             longest = f"longer than longest_step_s = {self._activity.longest_step_s:g} s"
             self._log.error("a step takes %s, and counts as frozen; it is at\n%s", longest, where)
         return age_s
-
-
-@contextmanager
-def _telling(launch: Launch, clock: Clock) -> Iterator[None]:
-    """While in the block, a log collector is told what is logged, too."""
-    if launch.sockets.log is None:
-        yield
-        return
-    from afspm.transport.log_link import LogSender
-    from afspm.transport.network import Network
-
-    sender = LogSender(Network.from_launch(launch.name, launch.keys), launch.sockets.log, launch.name)
-    handler = log.PublishingHandler(lambda level, text: sender.send(level, clock.now_ns(), text))
-    logging.getLogger().addHandler(handler)
-    try:
-        yield
-    finally:
-        logging.getLogger().removeHandler(handler)
-        sender.close()
 
 
 def _open_port(launch: Launch, clock: Clock, parent: ParentWatch) -> Port:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Callable
 
 ROOT = "afspm"
 
@@ -17,20 +16,6 @@ class LineFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         return super().format(record).replace("\n", "\n  ")
-
-
-class PublishingHandler(logging.Handler):
-    """Gives records, as (level, text), to `publish`: for a log collector on another computer, say."""
-
-    def __init__(self, publish: Callable[[int, str], None]) -> None:
-        super().__init__()
-        self._publish = publish
-
-    def emit(self, record: logging.LogRecord) -> None:
-        try:
-            self._publish(record.levelno, self.format(record))
-        except Exception:
-            self.handleError(record)
 
 
 def set_up(name: str, level: str) -> logging.Logger:

@@ -26,6 +26,13 @@ def read_launch_line() -> bytes:
     return bytes(line + chunk).partition(b"\n")[0]
 
 
+class StopRequested(BaseException):
+    """The parent has gone or wants us to stop.
+
+    Not an `Exception`, like KeyboardInterrupt: a script's `except Exception` must not keep a process alive.
+    """
+
+
 class ParentWatch:
     """Watches over the parent. What was registered is called, from another thread, when it has gone or lets us go.
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM, colour_map
 from afspm.formatting import period_text, time_of_day
 from afspm.model import names
 from afspm.record.night_record import BAD, NightMark, NightRecord, Shot, Span
@@ -30,16 +31,11 @@ MOST_SHOTS = 98
 MOST_LOOKS = 3
 AROUND_NS = 8 * 60 * 1_000_000_000
 HOUR_NS = 3600 * 1_000_000_000
-# of Paul Tol's bright scheme: told apart by everybody, red kept for problems
-COLOURS = ("#4477AA", "#228833", "#AA3377", "#66CCEE", "#CCBB44")
-PROBLEM = "#EE6677"
-NOBODY = "#BBBBBB"
 PAPER = (255, 255, 255)
 
 
 def prepare() -> None:
     """Load what takes long to load: modules, fonts, colours."""
-    _palette()
     figure = _figure(1.0)
     figure.add_axes((0.0, 0.0, 1.0, 1.0)).text(0.5, 0.5, "a", weight="bold")
     figure.savefig(io.BytesIO(), dpi=50)
@@ -63,7 +59,7 @@ def draw(
     looks_in = bands_in if repairs else 0.0
     height_in = 0.32 + sheet_in + 0.42 + bands_in + (0.62 + looks_in if repairs else 0.0) + 0.42
     figure = _figure(height_in)
-    colours = {holder: COLOURS[i % len(COLOURS)] for i, holder in enumerate(record.holders)}
+    colours = {holder: CATEGORICAL[i % len(CATEGORICAL)] for i, holder in enumerate(record.holders)}
 
     def axes(left_in: float, top_in: float, width_in: float, tall_in: float) -> Axes:
         box = (left_in / WIDTH_IN, 1 - (top_in + tall_in) / height_in, width_in / WIDTH_IN, tall_in / height_in)
@@ -119,12 +115,12 @@ def _sheet(ax: Axes, record: NightRecord, shots: Sequence[Shot], colours: Mappin
     """All pictures as one image, which is much faster than an image each; under each a bar of who took it."""
     pitch, tall = THUMB_PX + GAP_PX, THUMB_PX + GAP_PX + BAR_PX
     canvas = np.full((rows * tall, COLUMNS * pitch, 3), PAPER, np.uint8)
-    palette = _palette()
+    palette = np.vstack([colour_map("gold"), colour_map("gold")[-1:]])  # for each of 256 greys
     for i, shot in enumerate(shots):
         y, x = i // COLUMNS * tall, i % COLUMNS * pitch + GAP_PX // 2
         picture = palette[_fitted(shot.picture)[::-1]]  # drawn with y upwards
         canvas[y : y + THUMB_PX, x : x + THUMB_PX] = picture
-        bar = _rgb(colours.get(record.holder_of(shot) or "", NOBODY))
+        bar = _rgb(colours.get(record.holder_of(shot) or "", NEUTRAL))
         canvas[y + THUMB_PX + 1 : y + THUMB_PX + BAR_PX, x : x + THUMB_PX] = bar
         if record.verdict(shot) == BAD:
             _frame(canvas[y : y + THUMB_PX, x : x + THUMB_PX], _rgb(PROBLEM))
@@ -160,7 +156,7 @@ def _bands(
         by = " or ".join(dict.fromkeys(filter(None, (flagged_by(record, span) for span in spans))))
         labels.append(problems.get(problem, f"problem {problem}") + (f"\nflagged by {by}" if by else ""))
     for span in record.manual_spans():
-        ax.axvspan(*_clipped(span, limits), color=NOBODY, alpha=0.5, linewidth=0)
+        ax.axvspan(*_clipped(span, limits), color=NEUTRAL, alpha=0.5, linewidth=0)
     _actions(ax, record, {holder: lane for lane, holder in enumerate(record.holders)}, limits)
     ax.axhline(first - 0.5, color="black", linewidth=0.5)
     ax.set_xlim(*limits)
@@ -292,14 +288,6 @@ def _fitted(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _frame(picture: NDArray[np.uint8], colour: tuple[int, int, int]) -> None:
     for edge in (picture[:3], picture[-3:], picture[:, :3], picture[:, -3:]):
         edge[...] = colour
-
-
-def _palette() -> NDArray[np.uint8]:
-    """Gold on dark, as height maps are usually shown, for each of 256 greys."""
-    from matplotlib import colormaps
-
-    rgb: NDArray[np.uint8] = (colormaps["afmhot"](np.linspace(0.05, 0.95, 256))[:, :3] * 255).astype(np.uint8)
-    return rgb
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:

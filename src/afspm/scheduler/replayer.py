@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
 
 from afspm import wire
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import TransportError, WireError
 from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlResponse, Packet, Response
-from afspm.transport.complaints import Complaints
-from afspm.transport.history import Published
 from afspm.transport.network import Network
-from afspm.transport.polling import milliseconds, poller
+from afspm.transport.polling import Poller, milliseconds
 from afspm.transport.publisher import Publisher
+from afspm.transport.rate_limited_log import RateLimitedLog
+from afspm.transport.replay import Published
 from afspm.transport.router import PeerAsked, Router
 from afspm.transport.wakeup import WakeUp
 
@@ -39,7 +38,7 @@ class Replayer:
         self,
         packets: Iterator[Packet],
         clock: ExperimentClock,
-        complaints: Complaints,
+        log: RateLimitedLog,
         *,
         publish: str,
         serve: str,
@@ -51,14 +50,15 @@ class Replayer:
         self._wake_up: WakeUp[None] = WakeUp()
         try:
             self._publisher = Publisher(self._network, publish, self._published)
-            self._router = Router(self._network, serve, complaints)
+            self._router = Router(self._network, serve, log)
         except TransportError:
             self.close()
             raise
-        self._poller = poller(self._wake_up)
-        self._poller.register(self._publisher.socket, self._publisher.serve, self._publisher)
-        self._poller.register(self._router.socket, self._answer, self._router)
-        self._poller.register(self._router.monitor.socket, self._router.follow, None)
+        self._poller: Poller[Callable[[], object]] = Poller(self._wake_up)
+        for socket in (self._publisher.socket, self._publisher.monitor.socket):
+            self._poller.register(socket, self._publisher.serve)
+        for socket in (self._router.socket, self._router.monitor.socket):
+            self._poller.register(socket, self._answer)
         self._next = next(self._packets, None)
         self._ended = self._stopping = False
         self.count = 0
@@ -126,12 +126,11 @@ class Replayer:
         if self._ended and self._publisher.serve():
             self._publisher.kill()
 
-    def _answer(self) -> list[Any]:
+    def _answer(self) -> None:
         for event in self._router.receive():
             if isinstance(event, PeerAsked) and event.frames:
                 number = int.from_bytes(event.frames[0][:1])
                 self._router.reply(event.connection, wire.encode_answer(self._response(event), number))
-        return []
 
     def _response(self, asked: PeerAsked) -> Response:
         try:

@@ -21,12 +21,12 @@ from afspm.scheduler.settings import scheduler_settings
 from afspm.scheduler.shell import Core, SchedulerShell
 from afspm.scheduler.state_file import StateFile
 from afspm.scheduler.wire_codec import WireCodec
-from afspm.transport.complaints import Complaints
-from afspm.transport.launching import Launched
+from afspm.transport.port import LaunchedProcess
+from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.scheduler_sockets import SchedulerSockets
 
 
-class SchedulerLaunch(Launched, Protocol):
+class SchedulerLaunch(LaunchedProcess, Protocol):
     """The part of `afspm.launch.Launch` that is needed here."""
 
     @property
@@ -98,8 +98,8 @@ class Scheduler:
         journal = Journal(folder and folder / f"{launch.name}.cache", clock, log)
         core = self._core(context)
         _restore(core, state, journal)
-        complaints = Complaints(log, clock)
-        sockets = SchedulerSockets(launch, complaints, since_ns=core.newest_source_ns, epoch=_epoch(context))
+        warnings = RateLimitedLog(log, clock)
+        sockets = SchedulerSockets(launch, warnings, since_ns=core.newest_source_ns, epoch=_epoch(context))
         stopping = threading.Event()
 
         def stop() -> None:
@@ -107,7 +107,7 @@ class Scheduler:
             sockets.wake_up()
 
         context.when_stopping(stop)
-        shell = self._shell(core, sockets, clock, state, journal, complaints, log)
+        shell = self._shell(core, sockets, clock, state, journal, warnings, log)
         try:
             shell.start()
             while not (shell.over or stopping.is_set()):

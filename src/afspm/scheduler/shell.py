@@ -23,7 +23,6 @@ from afspm.model import (
 )
 from afspm.storage.atomic import OutageLog
 from afspm.storage.disk import DEADLINE_S, SYNCER, DiskThread
-from afspm.transport.fair_queue import FairQueue
 from afspm.transport.hold_back import STATE, HoldBack
 from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from afspm.logic.arbitration import ArbitrationState
     from afspm.scheduler.journal import Journal
     from afspm.scheduler.state_file import StateFile
-    from afspm.transport.complaints import Complaints
+    from afspm.transport.rate_limited_log import RateLimitedLog
     from afspm.transport.scheduler_sockets import SchedulerSockets, Source
 
 _LEVELS = logging.getLevelNamesMapping()
@@ -44,9 +43,6 @@ _LATE_S = 0.005
 """How late a deadline may be noticed while messages come: to ask for the next one after each takes as long as some of
 them do."""
 _CLOSED_WITHIN_S = 5.0
-_MOST_A_TURN = 20
-"""Requests that are handled before everything else is looked at again: the component in control waits no longer."""
-_TOO_MANY = "too many requests of this client wait to be answered: ask again once others are"
 _TELL = bytes([RELAY_REQUEST])
 
 
@@ -78,7 +74,7 @@ class SchedulerShell:
         clock: Clock,
         state: StateFile,
         journal: Journal,
-        complaints: Complaints,
+        warnings: RateLimitedLog,
         log: logging.Logger,
     ) -> None:
         self._core = core
@@ -89,9 +85,8 @@ class SchedulerShell:
         self._disk = DiskThread()
         self._told = OutageLog("what is told now would be lost in a crash", log)
         self._problems: frozenset[str] = frozenset()
-        self._complaints = complaints
+        self._warnings = warnings
         self._log = log
-        self._requests = FairQueue()
         self._replay: tuple[Packet, ...] = ()
         self._hold_back = HoldBack()
         self._look_at_s = 0.0  # at the deadlines, in real monotonic time
@@ -104,8 +99,6 @@ class SchedulerShell:
 
     def wait(self) -> list[Source]:
         """Wait for whatever comes first, a message or a deadline."""
-        if self._requests:
-            return self._sockets.wait(0)
         timeout_s = (self._core.leave_at_s if self.ended else self._look_at_s) - self._clock.monotonic_s()
         return self._sockets.wait(None if timeout_s == math.inf else milliseconds(timeout_s))
 
@@ -121,8 +114,8 @@ class SchedulerShell:
             return
         sockets = self._sockets
         for source in ready:
-            if source is sockets.router:
-                self._admit(sockets.router.receive())
+            if source in (sockets.router, sockets.router.monitor):
+                self._requests()
             elif source is sockets.link:
                 heard = sockets.link.receive()
                 if isinstance(heard, LinkUp):
@@ -131,16 +124,13 @@ class SchedulerShell:
                     self._take(events.TranslatorReply(heard.number, _response(heard)))
             elif source is sockets.subscriber:
                 self._packets()
-            elif source is sockets.publisher:
+            elif source in (sockets.publisher, sockets.publisher.monitor):
                 sockets.publisher.serve()
-            elif source is sockets.router.monitor:
-                self._admit(sockets.router.follow())
             elif source is sockets.subscriber.monitor:
                 sockets.subscriber.follow()
             else:
                 for _ in sockets.link.follow():
                     self._take(events.TranslatorDown())
-        self._handle_requests()
         now_s = self._clock.monotonic_s()
         if now_s >= self._look_at_s:
             self._deadlines(now_s)
@@ -151,13 +141,11 @@ class SchedulerShell:
         """After the end: nothing happens any more, but whoever comes is told so."""
         sockets = self._sockets
         for source in ready:
-            if source is sockets.publisher:
+            if source in (sockets.publisher, sockets.publisher.monitor):
                 if sockets.publisher.serve():
                     sockets.publisher.kill()
-            elif source is sockets.router:
-                self._admit(sockets.router.receive())
-            elif source is sockets.router.monitor:
-                self._admit(sockets.router.follow())
+            elif source in (sockets.router, sockets.router.monitor):
+                self._requests()
             elif source is sockets.link:
                 if isinstance(sockets.link.receive(), LinkUp):
                     self._let_translator_go()
@@ -167,7 +155,6 @@ class SchedulerShell:
                 sockets.subscriber.receive()
             else:
                 sockets.subscriber.follow()
-        self._handle_requests()
 
     def _let_translator_go(self, stop: str = "") -> None:
         """It subscribes to nobody. One of version 1 goes on until it is stopped, but not with its scan.
@@ -209,13 +196,8 @@ class SchedulerShell:
     def _take(self, event: events.Input) -> None:
         self._carry_out(self._core.step(event, self._clock.monotonic_s(), self._clock.now_ns()))
 
-    def _admit(self, received: list[RouterEvent]) -> None:
-        for asked in self._requests.put(received):
-            self._complaints.say(f"refused a request of {asked.name or 'a nameless peer'}: {_TOO_MANY}")
-            self._answer(asked, Response(ControlResponse.FAILURE, reason=_TOO_MANY, id=_id_of(asked)))
-
-    def _handle_requests(self) -> None:
-        for event in self._requests.take(_MOST_A_TURN, self._core.control.holder):
+    def _requests(self) -> None:
+        for event in self._sockets.router.receive():
             if self.ended:
                 self._asked_late(event)
             elif isinstance(event, PeerAsked):
@@ -233,7 +215,7 @@ class SchedulerShell:
         try:
             request = wire.decode_request(asked.frames)
         except WireError as error:
-            self._complaints.say(f"refused a request of {name or 'a nameless peer'}: {error}")
+            self._warnings.warning(f"refused a request of {name or 'a nameless peer'}: {error}")
             response = Response(error.response, reason=str(error), id=_id_of(asked))
             self._answer(asked, response)
             self._take(events.Unreadable(name, response))
@@ -254,7 +236,7 @@ class SchedulerShell:
             try:
                 header = wire.header(packet.envelope, packet.payload)
             except WireError as error:
-                self._complaints.say(f"dropped a packet of the translator: {error}")
+                self._warnings.warning(f"dropped a packet of the translator: {error}")
                 continue
             self._take(events.PacketIn(packet, header))
 
@@ -316,7 +298,7 @@ class SchedulerShell:
 
     def _publish(self, packet: Packet) -> None:
         publisher, now_s = self._sockets.publisher, self._clock.monotonic_s()
-        for one in self._hold_back.take(packet, now_s, wanted=publisher.plain.want(STATE)):
+        for one in self._hold_back.take(packet, now_s, wanted=publisher.has_plain_subscriber(STATE)):
             publisher.publish(one)
         if self._hold_back.due_s is not None:
             self._look_at_s = min(self._look_at_s, self._hold_back.due_s)

@@ -7,12 +7,13 @@ loading of a large one off a slow disk, lets none through, and yet it works.
 from __future__ import annotations
 
 import math
-import os
 import sys
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
+
+import psutil
 
 LEAST_SHARE = 0.05
 """Of a processor's time, to count as work. Threads that wait for Python's lock look for it 200 times a second, which
@@ -87,64 +88,25 @@ class ActivityMonitor:
 
 
 def of_process(pid: int) -> ActivitySample | None:
-    """What can be seen of a process here; None: nothing, or there is none."""
-    if sys.platform == "linux":
-        return _on_linux(pid)
-    if sys.platform == "win32":
-        return _on_windows(pid)
-    return None
+    """Return what the operating system says of a process; None: nothing, or there is none."""
+    try:
+        process = psutil.Process(pid)
+        with process.oneshot():
+            times, status = process.cpu_times(), process.status()
+            waits_for_disk = sys.platform == "linux" and any(map(_waits_for_disk, process.threads()))
+    except psutil.Error:
+        return None
+    return ActivitySample(
+        processor_s=times.user + times.system,
+        waits_for_disk=waits_for_disk,
+        stopped=status in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP),
+        # elsewhere it is not told apart from waiting
+        runs=sys.platform == "linux" and status == psutil.STATUS_RUNNING,
+    )
 
 
-if sys.platform == "linux":
-    _WAITS_FOR_DISK = "D"
-    _STOPPED = "Tt"
-    _RUNS = "R"
-
-    def _on_linux(pid: int) -> ActivitySample | None:
-        folder = Path("/proc") / str(pid)
-        try:
-            state, processor_s = _stat(folder)
-            threads = list((folder / "task").iterdir())
-        except (OSError, ValueError, IndexError):  # it ends at this moment
-            return None
-        return ActivitySample(processor_s, any(map(_waits_for_disk, threads)), state in _STOPPED, state == _RUNS)
-
-    def _waits_for_disk(thread: Path) -> bool:
-        try:
-            return _stat(thread)[0] == _WAITS_FOR_DISK
-        except (OSError, ValueError, IndexError):  # threads come and go
-            return False
-
-    def _stat(folder: Path) -> tuple[str, float]:
-        """The state of a process or a thread, as a letter, and the processor time that it has used."""
-        text = (folder / "stat").read_text(encoding="utf-8", errors="replace")
-        fields = text[text.rindex(")") + 1 :].split()  # the name, in brackets, may have anything in it
-        return fields[0], (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-elif sys.platform == "win32":
-    import ctypes
-    from ctypes import wintypes
-
-    _MAY_ASK = 0x1000  # PROCESS_QUERY_LIMITED_INFORMATION
-    _TICK_S = 1e-7
-
-    def _on_windows(pid: int) -> ActivitySample | None:
-        """Windows says of no thread of another process what it waits for; whoever has stopped it, it uses no time."""
-        system = ctypes.WinDLL("kernel32", use_last_error=True)
-        system.OpenProcess.restype = wintypes.HANDLE
-        system.OpenProcess.argtypes = (wintypes.DWORD, wintypes.BOOL, wintypes.DWORD)
-        system.GetProcessTimes.argtypes = (wintypes.HANDLE, *[ctypes.POINTER(wintypes.FILETIME)] * 4)
-        system.CloseHandle.argtypes = (wintypes.HANDLE,)
-        process = system.OpenProcess(_MAY_ASK, False, pid)  # noqa: FBT003
-        if not process:
-            return None
-        try:
-            begun, ended, kernel, user = (wintypes.FILETIME() for _ in range(4))
-            times = (ctypes.byref(time) for time in (begun, ended, kernel, user))
-            if not system.GetProcessTimes(process, *times):
-                return None
-        finally:
-            system.CloseHandle(process)
-        return ActivitySample(
-            sum((time.dwHighDateTime << 32) + time.dwLowDateTime for time in (kernel, user)) * _TICK_S
-        )
+def _waits_for_disk(thread: Any) -> bool:
+    try:
+        return bool(psutil.Process(thread.id).status() == psutil.STATUS_DISK_SLEEP)  # Linux knows threads as processes
+    except psutil.Error:  # threads come and go
+        return False

@@ -59,7 +59,7 @@ def hand_over(experiment: Experiment, starts: Sequence[ProcessStart]) -> KeyHand
     """
     if experiment.keys_folder is not None:
         return KeyHandout([_with(start, _of_file(experiment, start), _scheduler(experiment)) for start in starts])
-    security = experiment.resolved.security
+    security = experiment.resolved.sections.security
     guarded = {} if security.plain or security.insecure else _guarded(experiment, starts)
     return _made(starts, guarded, _scheduler(experiment)) if guarded else KeyHandout(starts)
 
@@ -79,8 +79,7 @@ def _of_file(experiment: Experiment, start: ProcessStart) -> Keys | None:
     """The keys of a process out of the folder, with those of others only where it has to know them."""
     launch = start.launch
     own = keys.from_launch(launch.name, launch.keys)
-    collects = getattr(experiment.resolved.classes.get(launch.name), "collects_logs", False) is True
-    if own is None or launch.sockets.publish or launch.sockets.serve or collects or start.command:
+    if own is None or launch.sockets.publish or launch.sockets.serve or start.command:
         return own
     known = {key: name for key, name in own.peers.items() if name in own.servers.values()}
     return replace(own, peers=known, folder=None)

@@ -8,52 +8,75 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Literal
+from typing import IO
 
-from afspm.clock import ExperimentClock
 from afspm.errors import AfspmError
-from afspm.exit_codes import ExitCode
-from afspm.supervisor.output_limit import PAUSE_S, OutputLimit
+from afspm.experiment import ProcessStart
+from afspm.launch import Launch
+from afspm.logic.supervision.supervisor_events import Exited
+from afspm.model import Role
+from afspm.supervisor.child_output import ChildOutput, OutputDropped, Printed, Stream
 from afspm.supervisor.windows_job import WindowsJob
 
 LONGEST_LINE = 1 << 16  # a child that prints without end of line must not fill our memory
 FED_S = 0.2  # a pipe takes a launch line at once, unless it is long and the child does not read
 LAST_WORDS_S = 3.0  # how long its output may still be read after an exit; a grandchild that left can hold the pipe open
 
-Stream = Literal["stdout", "stderr"]
+ChildEvent = Printed | OutputDropped | Exited
+HOST = "afspm.process.host"
+GUARD = "afspm.process.foreign"
 
 
-@dataclass(frozen=True, slots=True)
-class Printed:
-    """A child wrote a line."""
+@dataclass(frozen=True)
+class Task:
+    """One process to start, to watch, and to start again.
 
-    name: str
-    pid: int
-    stream: Stream
-    line: str
+    Attributes:
+        launch: the line for its standard input; the heartbeat's address is the supervisor's to add.
+        command: the program and its arguments.
+        role: what it is in the experiment; without scheduler or translator nothing can go on.
+        folder: where to start it; None: where we are.
+        environment: what it gets besides our own environment.
+        hidden: what it does not get of that.
+        beats: whether it sends heartbeats; what doesn't is only known by its exit.
+    """
+
+    launch: Launch
+    command: tuple[str, ...]
+    role: Role = Role.COMPONENT
+    folder: Path | None = None
+    environment: Mapping[str, str] = field(default_factory=dict)
+    beats: bool = True
+    hidden: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        return self.launch.name
+
+    @property
+    def essential(self) -> bool:
+        """Whether the experiment can't go on without it."""
+        return self.role is not Role.COMPONENT
 
 
-@dataclass(frozen=True, slots=True)
-class LeftOut:
-    """A child writes more than can be kept: so many lines of it are left out here."""
-
-    name: str
-    lines: int
-
-
-@dataclass(frozen=True, slots=True)
-class Exited:
-    """A child is gone; a negative code is the number of the signal that ended it, as in `subprocess`."""
-
-    name: str
-    pid: int
-    code: int
-
-
-ChildEvent = Printed | LeftOut | Exited
+def from_start(start: ProcessStart) -> Task:
+    """A task of what the experiment file says: Python classes by our host, other languages by our guard."""
+    # -P: modules are those beside the experiment file, and never what happens to lie where the run was started
+    python = (sys.executable, "-P", "-m")
+    ours = (*python, GUARD, "--", *start.command) if start.command else (*python, HOST)
+    before = [*start.python_path, *filter(None, [os.environ.get("PYTHONPATH", "")])]
+    return Task(
+        launch=start.launch,
+        command=ours,
+        role=start.role,
+        folder=start.folder if start.command else None,
+        environment={"PYTHONPATH": os.pathsep.join(before)} if before else {},
+        beats=start.beats,
+        hidden=start.hidden,
+    )
 
 
 class ChildProcess:
@@ -64,7 +87,6 @@ class ChildProcess:
     child that its parent wants it to stop, or is dead (then the system closes it).
 
     Args:
-        environment: what it gets besides our own; hidden: what it does not get of that.
         has_tip: it may have a tip to see to when we are killed.
         may_begin: awaited before the launch line is given to it; None: it may at once.
 
@@ -74,34 +96,28 @@ class ChildProcess:
 
     def __init__(
         self,
-        name: str,
-        command: Sequence[str],
-        first_line: str,
+        task: Task,
         tell: Callable[[ChildEvent], None],
-        environment: Mapping[str, str],
-        folder: Path | None = None,
-        hidden: Collection[str] = (),
         *,
         has_tip: bool = False,
         may_begin: threading.Event | None = None,
     ) -> None:
-        self.name = name
+        self.name = name = task.name
         self._may_begin = may_begin
         self._tell = tell
-        ours = {key: value for key, value in os.environ.items() if key not in hidden}
+        ours = {key: value for key, value in os.environ.items() if key not in task.hidden}
         try:
-            self._popen = _start(command, {**ours, **environment}, folder)
+            self._popen = _start(task.command, {**ours, **task.environment}, task.folder)
         except (OSError, ValueError) as error:
             raise AfspmError(
-                f"{command[0]} can't be started: {error}", where=name, hint="is it installed and executable?"
+                f"{task.command[0]} can't be started: {error}", where=name, hint="is it installed and executable?"
             ) from error
         self.pid = self._popen.pid
         self._job = WindowsJob(self._popen, has_tip=has_tip)
         self._fed = threading.Event()
         readers = [self._reader("stdout", self._popen.stdout), self._reader("stderr", self._popen.stderr)]
-        threading.Thread(
-            target=self._feed_and_wait, args=(first_line, readers), name=f"{name}-wait", daemon=True
-        ).start()
+        feeding = (task.launch.to_json(), readers)
+        threading.Thread(target=self._feed_and_wait, args=feeding, name=f"{name}-wait", daemon=True).start()
 
     def close_stdin(self) -> None:
         """Ask the child to end. One that hasn't even taken its launch line is killed instead."""
@@ -145,73 +161,11 @@ class ChildProcess:
 
     def _read(self, stream: Stream, pipe: IO[bytes] | None) -> None:
         assert pipe is not None
-        output = _Output(self.name, self.pid, stream, self._tell)
+        output = ChildOutput(self.name, self.pid, stream, self._tell)
         with contextlib.suppress(OSError, ValueError), pipe:
             while line := pipe.readline(LONGEST_LINE):
                 output.take(line)
         output.end()
-
-
-class _Output:
-    """Tells what a stream of a child says, as far as that can be kept.
-
-    The child never has to wait for us: a driver that says much must not become slow.
-    """
-
-    def __init__(self, name: str, pid: int, stream: Stream, tell: Callable[[ChildEvent], None]) -> None:
-        self._name, self._pid, self._stream, self._tell = name, pid, stream, tell
-        self._clock = ExperimentClock.real()
-        self._thinning = OutputLimit(self._clock.monotonic_s())
-        self._lock = threading.Lock()
-        self._pause: threading.Timer | None = None
-
-    def take(self, line: bytes) -> None:
-        with self._lock:
-            was_pausing = self._thinning.pausing
-            if self._thinning.passes(line, self._clock.monotonic_s()):
-                self._tell_line(line)
-            elif not was_pausing:
-                # a timer, and not the next line: after a flood there may be silence
-                self._pause = threading.Timer(PAUSE_S, self._go_on)
-                self._pause.daemon = True
-                self._pause.start()
-
-    def end(self) -> None:
-        """Nothing more comes."""
-        if self._pause is not None:
-            self._pause.cancel()
-        self._go_on()
-
-    def _go_on(self) -> None:
-        with self._lock:
-            left_out, last = self._thinning.go_on()
-            if left_out:
-                self._tell(LeftOut(self._name, left_out))
-            for line in last:
-                self._tell_line(line)
-
-    def _tell_line(self, line: bytes) -> None:
-        text = line.decode("utf-8", errors="replace").rstrip("\r\n")
-        self._tell(Printed(self._name, self._pid, self._stream, text))
-
-
-_IN_WORDS = {
-    ExitCode.DONE: "done",
-    ExitCode.CRASHED: "crashed",
-    ExitCode.CONFIG: "its settings can't work",
-    ExitCode.ENDED: "ended with the experiment",
-    ExitCode.ORPHAN: "ended as it was asked to",
-}
-
-
-def describe_exit(code: int) -> str:
-    """Why a process ended, as its exit code says."""
-    if code < 0:
-        try:
-            return f"killed by {signal.Signals(-code).name}"
-        except ValueError:
-            return f"killed by signal {-code}"
-    return next((words for known, words in _IN_WORDS.items() if known == code), f"exit code {code}")
 
 
 def _start(command: Sequence[str], environment: Mapping[str, str], folder: Path | None) -> subprocess.Popen[bytes]:

@@ -27,7 +27,7 @@ from afspm.scheduler.replayer import Replayer
 from afspm.supervisor import run_folder, signals
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.run import now
-from afspm.transport.complaints import Complaints
+from afspm.transport.rate_limited_log import RateLimitedLog
 
 BEFORE_S = 1.0
 """Real: those who join at once find the beginning still to come."""
@@ -78,11 +78,11 @@ def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> 
             raise ConfigError("there is nothing to replay", where=str(run.folder))
         clock = _clock(run, options.speed, first)
         publish, serve = _addresses(run, options)
-        complaints = Complaints(logging.getLogger("afspm.replay"), clock)
+        complaints = RateLimitedLog(logging.getLogger("afspm.replay"), clock)
         replayer = Replayer(chain([first], packets), clock, complaints, publish=publish, serve=serve)
         try:
             with (
-                signals.told(lambda _: replayer.stop(), replayer.wakeup_fileno()),
+                signals.caught(lambda _: replayer.stop(), replayer.wakeup_fileno()),
                 _folder(run, options.runs, guest, clock, publish, serve) as folder,
             ):
                 told = f"replay of {run.folder.name} at {clock.speed:g} experiment seconds a second, in {folder}"

@@ -7,16 +7,23 @@ from __future__ import annotations
 
 import logging
 import math
+import os
+import platform
+import re
 import threading
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 from afspm import wire
+from afspm.addresses import connectable
 from afspm.clock import Clock, ExperimentClock
 from afspm.errors import AfspmError, WireError
-from afspm.launch import Launch
-from afspm.logic.supervisor_registry import LONGEST
+from afspm.experiment import Experiment, ProcessStart, Role
+from afspm.launch import Launch, Sockets
+from afspm.logic.supervision.supervisor_events import RestartOrdered, SchedulerAnswered
+from afspm.logic.supervisor_registry import LONGEST, SUPERVISOR
 from afspm.model import (
     OTHER_RUN_RESPONSE,
     RELAY_REQUEST,
@@ -30,9 +37,8 @@ from afspm.model import (
     Response,
 )
 from afspm.process.context import new_session
-from afspm.transport.launching import open_port
 from afspm.transport.port import ControlConnected, ControlDisconnected, Incoming, ReplyReceived
-from afspm.transport.zmq_port import ZmqPort
+from afspm.transport.zmq_port import ZmqPort, open_port
 
 STATES_S = 2.0
 """Real time between two times that all states are told, at most."""
@@ -46,18 +52,6 @@ LONGEST_LINE = 2000
 """Characters."""
 _BATCH_BYTES = LONGEST // 4
 _CLOSED_S = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class RestartOrdered:
-    """A process is to be started anew."""
-
-    name: str
-
-
-@dataclass(frozen=True, slots=True)
-class SchedulerAnswered:
-    """The scheduler of this run has answered: components may ask it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,3 +244,42 @@ class _Talk:
 
     def is_answer(self, response: Response) -> bool:
         return self.asked is not None and response.id == self.asked.id
+
+
+_LONGEST_COMPUTER_NAME = 60
+
+
+def reporter_of(
+    experiment: Experiment,
+    starts: Sequence[ProcessStart],
+    clock: Clock,
+    run: str = "",
+    keys: Mapping[str, Any] | None = None,
+) -> Reporter | None:
+    """One for what is started here; None where the scheduler can't be asked, or is perhaps none of ours.
+
+    Args:
+        keys: that were made for it; None: the file says where they are, or there are none.
+    """
+    scheduler = next((start for start in starts if start.role is Role.SCHEDULER), None)
+    here = re.sub(r"[^\w.-]+", "-", platform.node())[:_LONGEST_COMPUTER_NAME] or "computer"
+    if scheduler is None:
+        launch = experiment.asking([start.launch.name for start in starts])
+        launch = launch and replace(launch, run=run)
+        here = f"{here}-{os.getpid()}"  # there may be several parts on one computer
+    else:
+        launch = _local(scheduler)
+    if launch is None:
+        return None
+    return Reporter(replace(launch, name=f"{SUPERVISOR}:{here}", keys=keys or launch.keys), clock, here)
+
+
+def _local(scheduler: ProcessStart) -> Launch | None:
+    """How a scheduler is asked that is started here."""
+    launch = scheduler.launch
+    if scheduler.command or launch.sockets.serve is None:
+        return None
+    address, keys = connectable(launch.sockets.serve), launch.keys
+    if keys is not None and "folder" in keys:
+        keys = {"folder": keys["folder"], address: launch.name}
+    return Launch(SUPERVISOR, sockets=Sockets(control=address), keys=keys, run=launch.run)

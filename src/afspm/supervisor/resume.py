@@ -6,6 +6,8 @@ import json
 import re
 import socket
 import sqlite3
+import tomllib
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
@@ -15,14 +17,13 @@ from typing import Any, TextIO
 from afspm.client.connect import find_run
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
-from afspm.experiment import Experiment, load_expanded
+from afspm.experiment import Experiment, load, load_expanded
 from afspm.logic.supervision.run_end import EndReason
 from afspm.record import ahead
 from afspm.record.journal import open_to_read
 from afspm.record.run_json import EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, read_run_json
-from afspm.record.run_lock import lock_run
+from afspm.record.run_lock import lock_run, quoted, resume_command
 from afspm.storage.atomic import load_checkpoint
-from afspm.supervisor import config_diff
 from afspm.supervisor import run as running
 from afspm.supervisor.ports import require_free
 from afspm.supervisor.run import FILES, HOMES, HOW, ONLY, RUN, WITHOUT, FinishedRun, RunOptions
@@ -87,7 +88,7 @@ def find(where: Path) -> ResumableRun:
     experiment = load_expanded(file, homes)
     if where.suffix == ".toml":
         begun_with = [Path(name) for name in facts.get(FILES, ())]
-        config_diff.refuse_edited(begun_with if where.resolve() in begun_with else [where], experiment, folder)
+        refuse_edited(begun_with if where.resolve() in begun_with else [where], experiment, folder)
     return ResumableRun(folder, str(facts.get("name", folder.name)), experiment, facts, homes)
 
 
@@ -180,3 +181,47 @@ def _is_gone(port: int, until_s: float) -> bool:
         except OSError:
             return True
     return False
+
+
+def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> None:
+    """Refuse to go on with the run in `folder` if that would not be by the files as they are: limits, for instance.
+
+    Args:
+        files: those that it was begun with.
+        begun: what they said then.
+
+    Raises:
+        ConfigError: they say something else now.
+    """
+    differs = differing(_whole(begun), _whole(load(*files)))
+    if differs:
+        named = " ".join(map(quoted, files))
+        raise ConfigError(
+            f"was edited since this run was begun, which goes on as it was: {'; '.join(differs)}",
+            where=", ".join(map(str, files)),
+            hint=f"{resume_command(folder)} goes on without what was edited, "
+            f"`afspm run {named}` begins a new run with it",
+        )
+
+
+def _whole(experiment: Experiment) -> dict[str, Any]:
+    """What is in force, defaults too, whoever wrote it down."""
+    experiment.resolved  # noqa: B018  (adds what the file leaves open)
+    return tomllib.loads(experiment.expanded(secrets=False))
+
+
+def differing(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Where two experiments differ: each section with its keys."""
+    found = []
+    for name in {**before, **now}:
+        then, later = before.get(name), now.get(name)
+        if then == later:
+            continue
+        if isinstance(then, dict) and isinstance(later, dict):
+            keys = [key for key in {**then, **later} if then.get(key) != later.get(key)]
+            found.append(f"[{name}] {', '.join(keys)}")
+        elif isinstance(then, dict) or isinstance(later, dict):
+            found.append(f"[{name}] is {'new' if then is None else 'gone'}")
+        else:
+            found.append(name)
+    return found

@@ -20,13 +20,14 @@ from afspm.record import ahead
 from afspm.record.run_json import ENDED, STATE_DIR, run_json_or_empty
 from afspm.record.run_lock import lock_run
 from afspm.storage.disk import run_bounded
-from afspm.supervisor import key_handout, post_run, reporting, run_folder, run_identity
+from afspm.supervisor import key_handout, post_run, run_folder, run_identity
 from afspm.supervisor.log import RunLog
 from afspm.supervisor.ports import FreePorts, require_free
 from afspm.supervisor.post_run import EndedRun
+from afspm.supervisor.process import from_start
+from afspm.supervisor.reporter import reporter_of
 from afspm.supervisor.run_identity import RunIdentity
 from afspm.supervisor.supervisor import RunOutcome, Supervisor
-from afspm.supervisor.task import from_start
 
 TAKES_WHO_COMES = ""
 """The identity of a run of a real microscope's translator alone, which obeys the scheduler that comes."""
@@ -101,7 +102,7 @@ def go(
     Args:
         name: of the experiment; names: of its processes.
     """
-    if experiment.resolved.clock.waits:
+    if experiment.resolved.sections.clock.waits:
         common = replace(common, clock=common.clock.waiting_in(folder / STATE_DIR / CLOCK_FILE))
     clock = common.clock
     log = RunLog(folder / run_folder.LOG_FILE, clock, terminal=terminal, level=options.log_level, names=names)
@@ -114,7 +115,7 @@ def go(
             ahead.expect_record(folder / STATE_DIR)
         log.write(LOGGED_AS, logging.INFO, f"{name}: {len(starts)} processes, into {folder}")
         handed = key_handout.hand_over(experiment, starts)
-        reporter = reporting.reporter(experiment, starts, clock, common.run, handed.supervisor)
+        reporter = reporter_of(experiment, starts, clock, common.run, handed.supervisor)
         tasks = [from_start(start) for start in handed.starts]
         supervisor = Supervisor(tasks, log, clock, experiment.policy(), reporter)
         with handed.laid_down(folder):
@@ -257,7 +258,7 @@ def _common(
 
 
 def _require_real_time(clock: ExperimentClock, experiment: Experiment) -> None:
-    if clock.speed != 1.0 or experiment.resolved.clock.start is not None:
+    if clock.speed != 1.0 or experiment.resolved.sections.clock.start is not None:
         raise ConfigError(
             "the experiment has a simulation's time, and nothing here proves that its microscope is simulated",
             where="[clock]",

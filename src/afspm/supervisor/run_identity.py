@@ -13,8 +13,8 @@ from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, WireError
 from afspm.launch import Launch
 from afspm.model import CLOCK_REQUEST, ControlResponse, Request, Response
-from afspm.transport.launching import open_port
 from afspm.transport.port import ControlConnected, ReplyReceived
+from afspm.transport.zmq_port import open_port
 
 AGAIN_S = 1.0
 _SAME_S = 1e-3  # two processes of one computer agree on real time to that

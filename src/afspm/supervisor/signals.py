@@ -6,28 +6,17 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from types import FrameType
 
-
-@dataclass(frozen=True, slots=True)
-class EndSignal:
-    """Somebody wants the run to end."""
-
-    number: int
-
-    @property
-    def name(self) -> str:
-        return "Ctrl-C" if self.number == signal.SIGINT else signal.Signals(self.number).name
-
+from afspm.logic.supervision.supervisor_events import EndSignal
 
 # SIGBREAK is Windows' Ctrl-Break and the closing of its console, SIGHUP that of a POSIX terminal
 _NAMES = ("SIGINT", "SIGTERM", "SIGBREAK", "SIGHUP")
 
 
 @contextmanager
-def told(tell: Callable[[EndSignal], None], wakeup_fd: int) -> Iterator[None]:
-    """While in this block, signals that end a program are told instead; `wakeup_fd` is written to with each.
+def caught(tell: Callable[[EndSignal], None], wakeup_fd: int) -> Iterator[None]:
+    """Hand signals that end a program to `tell` instead, while in this block; write to `wakeup_fd` with each.
 
     A signal that is ignored already (SIGHUP under nohup) stays ignored. Away from the main thread Python gives no
     signals: then this does nothing.

@@ -16,6 +16,7 @@ from afspm.errors import AfspmError, ConfigError, InvalidValue, Refused
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.translator.parameters import ParameterTable, Value
 from afspm.translator.polling import EAGER_S
+from afspm.translator.settings import SettingsGroup
 from afspm.units import Duration
 
 if TYPE_CHECKING:
@@ -143,6 +144,7 @@ class Driver(ABC):
             others can reach.
         prove: to be called by `connect` once a connection stands, before anything is asked: it raises ControllerLost if
             an emulated controller is not that of this run.
+        groups: the parameters that the controller has in another form than the table can say.
         lacking: actions that this controller turned out not to have, and why; set it when connecting.
         memory: a dict of JSON values, kept on disk: saved with every request and result, there after a restart.
     """
@@ -150,9 +152,6 @@ class Driver(ABC):
     parameters_file: ClassVar[Path]
     translated: ClassVar[Collection[str]] = ()
     """The parameters that `read` and `write` of the class translate, rather than `get` and `set` by a row."""
-    kept: ClassVar[Mapping[str, Value]] = MappingProxyType({})
-    """Parameters that the translator keeps itself, and their values at first, unless a row says what the controller
-    calls them."""
     eager_poll_s: ClassVar[float] = EAGER_S
     """Real seconds between two looks when a scan may end at any moment."""
     max_pixels: ClassVar[int] = 4096 * 4096
@@ -172,6 +171,7 @@ class Driver(ABC):
     for_a_while: Callable[[Mapping[str, Value], float], None]
     controller_at: str = ""
     lacking: Mapping[str, str] = MappingProxyType({})
+    groups: Sequence[SettingsGroup] = ()
     memory: dict[str, Any]
 
     def __init__(
@@ -275,15 +275,44 @@ class Driver(ABC):
         return None
 
     def read(self, wanted: Collection[str]) -> dict[str, Value]:
-        """The values of parameters by their generic names, in SI; others may be among them.
+        """Return the values of parameters by their generic names, in SI; others may be among them.
 
-        To be written only where a table can't say how the controller has it (a frame given by its centre …).
+        To be written only where neither the table nor `groups` can say how the controller has it.
         """
+        found: dict[str, Value] = {}
+        for group in self.groups:
+            if not set(group.names).isdisjoint(wanted):
+                found |= group.read()
+        return found | self.read_rows([name for name in wanted if name not in found])
+
+    def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
+        """Return the values of parameters that the table alone says how to get."""
         return {name: self.table[name].from_vendor(self.get(self.table[name].vendor)) for name in wanted}
 
     def write(self, values: Mapping[str, Value]) -> None:
-        """Set parameters by their generic names, in SI; the counterpart of `read`."""
-        self.set({self.table[name].vendor: self.table[name].to_vendor(value) for name, value in values.items()})
+        """Set parameters by their generic names, in SI: each group at once, in their order, and then the rest."""
+        left = dict(values)
+        for group in self.groups:
+            asked = {name: left.pop(name) for name in group.names if name in left}
+            if asked:
+                group.write(asked)
+        if left:
+            self.set({self.table[name].vendor: self.table[name].to_vendor(value) for name, value in left.items()})
+
+    def wait_for(self, condition: Callable[[], bool], at_most_s: float) -> bool:
+        """Ask the controller until something holds, which it does with a delay. Return False after so long, real time.
+
+        Each question takes as long as the controller takes to answer it.
+        """
+        until_s = self.clock.monotonic_s() + at_most_s
+        while not (holds := condition()) and self.clock.monotonic_s() < until_s:
+            pass
+        return holds
+
+    def pulse_bias(self) -> None:
+        """Do a bias pulse of `x-pulse-voltage` for `x-pulse-duration` by setting the bias, which is put back."""
+        wanted = self.in_force([names.PULSE_VOLTAGE, names.PULSE_DURATION])
+        self.for_a_while({names.TIP_BIAS_VOLTAGE: wanted[names.PULSE_VOLTAGE]}, float(wanted[names.PULSE_DURATION]))
 
     def same(self, name: str, a: Value, b: Value, among: Mapping[str, Value]) -> bool:
         """Whether two values of a parameter are one to the controller's precision.

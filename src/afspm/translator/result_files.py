@@ -1,12 +1,15 @@
-"""Which measurement is running, which has ended and is awaited, and which results there are: what every controller
-that saves files needs to remember, also over a restart of the translator."""
+"""Finds the files that a controller saves: which measurement is running, which has ended, and which results there are.
+
+What is known of them outlives a restart of the translator.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,41 +19,68 @@ from afspm.errors import FileError
 from afspm.model import Region, Scan, Spectrum
 
 SCAN: Final = "scan"
-"""What a measurement is called that is no spectrum; of a spectrum it is the kind."""
+"""The kind of a measurement that is no spectrum; that of a spectrum is its own."""
 _LISTED: Final = 16
 _OF_A_RESULT: Final = ("what", "frame", "position", "end_ns")
 
-Content = list[Scan | Spectrum]
+XY = tuple[float, float]
+Content = Sequence[Scan | Spectrum]
+Entry = dict[str, Any]
+"""Of a measurement, in JSON: "what" it is, "frame" or "position" as they were set, "end_ns", and what a driver adds."""
 
 
-class ResultFiles:
-    """To be derived from by what knows one controller's files.
+class ResultFiles(ABC):
+    """The measurements of one controller.
 
     Args:
-        kept: JSON-able, and lasts. What is "running" or has "ended" is there with "what" it is, "frame" (`as_list`) or
-            "position" as they were set, "end_ns" once it has ended, and whatever else a controller needs; "results"
-            have a name, by "result", and the same.
+        kept: JSON-able, and lasts. What is "running" or has "ended" is there as an `Entry`; "results" have a name, by
+            "result", and the same.
 
     Attributes:
-        broken_off: it turned out that what has ended was broken off at the controller; until results are asked for.
+        broken_off: True if it turned out that what has ended was broken off at the controller; until results are asked
+            for.
     """
 
-    def __init__(self, kept: dict[str, Any], log: logging.Logger) -> None:
+    def __init__(self, kept: Entry, log: logging.Logger) -> None:
         self._kept = kept
         self._log = log
+        self._content: dict[str, Content] = {}
         self.broken_off = False
         for key, empty in (("running", None), ("ended", None), ("results", [])):
             kept.setdefault(key, empty)
 
+    @abstractmethod
+    def read(self, entry: Entry) -> Content:
+        """Return the content of a result, with the parameters that it was taken with. Raises FileError."""
+
     @property
     def what(self) -> str:
-        """Which measurement is running: `SCAN`, the kind of a spectrum, or nothing."""
+        """The measurement that is running: `SCAN`, the kind of a spectrum, or empty."""
         running = self._kept["running"]
         return running["what"] if running else ""
+
+    @property
+    def frame(self) -> list[float] | None:
+        """The frame of the scan that is running (`as_list`); None: none is."""
+        running = self._kept["running"]
+        return None if running is None else running.get("frame")
 
     def forget(self) -> None:
         """What is running or has ended was broken off: nothing comes of it."""
         self._kept["running"] = self._kept["ended"] = None
+
+    def load(self, result: str) -> Content:
+        """Read one of the results.
+
+        Raises:
+            FileError: it is no result any more, or its file has gone.
+        """
+        entry = next((one for one in self._kept["results"] if one["result"] == result), None)
+        if entry is None:
+            raise FileError("is not among the last results", where=result)
+        if result not in self._content:
+            self._content = {result: self.read(entry)}
+        return self._content[result]
 
     def _begins(self, what: str, facts: Mapping[str, Any]) -> None:
         self._kept["running"], self._kept["ended"] = {"what": what, **facts}, None
@@ -58,64 +88,84 @@ class ResultFiles:
     def _ends(self, facts: Mapping[str, Any]) -> None:
         self._kept["running"], self._kept["ended"] = None, {**self._kept["running"], **facts}
 
-    def _comes(self, result: str, measured: Mapping[str, Any], facts: Mapping[str, Any]) -> None:
+    def _add(self, result: str, measured: Entry, facts: Mapping[str, Any], content: Content) -> None:
         """It is a result, by this name."""
         taken = {key: measured[key] for key in _OF_A_RESULT if key in measured}
         self._kept["results"] = [*self._kept["results"], {"result": result, **taken, **facts}][-_LISTED:]
+        self._content = {result: content}
 
     def _listed(self) -> list[str]:
-        """The last results, oldest first."""
+        """Return the last results, oldest first."""
         return [entry["result"] for entry in self._kept["results"]]
 
-    def _found(self, result: str) -> dict[str, Any]:
-        """What is known of a result. Raises FileError: it is none, or no longer."""
-        for entry in self._kept["results"]:
-            if entry["result"] == result:
-                found: dict[str, Any] = entry
-                return found
-        raise FileError("is not among the last results", where=result)
+
+@dataclass(frozen=True)
+class Printed:
+    """What a controller's files leave out of the numbers that were set.
+
+    Attributes:
+        part: of the largest length, what is left out of each.
+        angle_rad: what is left out of the angle.
+        positions: True if the file of a spectrum has its position as it was set.
+    """
+
+    part: float
+    angle_rad: float
+    positions: bool = False
+
+    def same(self, a: Region, b: Region) -> bool:
+        """Return True if two frames are one to the digits of a file."""
+        lengths_m = [*a.center_m, *a.size_m]
+        scale_m = self.part * max(*map(abs, a.center_m), *a.size_m)
+        close = np.allclose(lengths_m, [*b.center_m, *b.size_m], rtol=0.0, atol=scale_m)
+        return bool(close) and abs(math.remainder(a.angle_rad - b.angle_rad, math.tau)) <= self.angle_rad
+
+    def as_set(self, one: Scan | Spectrum, measured: Entry) -> Scan | Spectrum:
+        """Return a scan or spectrum of a file with the frame or position that was set, where the file has the same,
+        and our time."""
+        time_ns = measured["end_ns"]
+        if isinstance(one, Scan):
+            wanted = as_region(measured["frame"])
+            return replace(one, region=wanted if self.same(wanted, one.region) else one.region, time_ns=time_ns)
+        position_m = self._position_m(one.position_m, measured["position"])
+        return replace(one, kind=measured["what"], position_m=position_m, time_ns=time_ns)
+
+    def _position_m(
+        self, told: tuple[float, float] | None, place: Sequence[float] | None
+    ) -> tuple[float, float] | None:
+        if place is None:
+            return told
+        x, y = place
+        slack_m = 10 * self.part * max(abs(x), abs(y)) + 1e-12
+        elsewhere = self.positions and told is not None and math.dist(told, (x, y)) > slack_m
+        return told if elsewhere else (x, y)
 
 
 def as_list(region: Region) -> list[float]:
-    """A frame as it is kept."""
+    """Return a frame as it is kept."""
     return [*region.center_m, *region.size_m, region.angle_rad]
 
 
 def as_region(kept: Sequence[float]) -> Region:
-    """The reverse of `as_list`."""
+    """Return the frame that was kept by `as_list`."""
     x, y, width, height, angle_rad = kept
     return Region((x, y), (width, height), angle_rad)
 
 
-def region_of(measured: Mapping[str, Any]) -> Region:
-    """The frame that a scan was to be of."""
-    return as_region(measured["frame"])
-
-
-def as_set(scan: Scan, measured: Mapping[str, Any], *, part: float, angle_rad: float) -> Scan:
-    """A scan out of a file with our time, and with the frame that was set where the file has the same.
-
-    Args:
-        part: of the largest length, what the file leaves out of each.
-        angle_rad: what it leaves out of the angle.
-    """
-    wanted, told = region_of(measured), scan.region
-    lengths_m = [*told.center_m, *told.size_m]
-    scale_m = part * max(*map(abs, wanted.center_m), *wanted.size_m)
-    close = np.allclose([*wanted.center_m, *wanted.size_m], lengths_m, rtol=0.0, atol=scale_m)
-    turned_rad = abs(math.remainder(wanted.angle_rad - told.angle_rad, math.tau))
-    region = wanted if close and turned_rad <= angle_rad else told
-    return replace(scan, region=region, time_ns=measured["end_ns"])
-
-
-def lines_missing(one: Scan | Spectrum) -> int:
-    """How many lines of a scan have no value at all: it was broken off."""
-    return one.lines_missing if isinstance(one, Scan) else 0
+def lines_missing(content: Iterable[Scan | Spectrum]) -> int:
+    """Return how many lines of the scans have no value at all: they were broken off."""
+    return max((one.lines_missing for one in content if isinstance(one, Scan)), default=0)
 
 
 def modified_ns(path: Path) -> int:
-    """When a file was written last; 0: it is not there."""
+    """Return when a file was written last; 0: it is not there."""
     try:
         return path.stat().st_mtime_ns
     except OSError:
         return 0
+
+
+def newest(files: Iterable[Path], after_ns: int = 0) -> tuple[int, Path | None]:
+    """Return the file that was written last, after a time, and when; (0, None): there is none."""
+    times = [(modified_ns(file), file) for file in files]
+    return max((one for one in times if one[0] > after_ns), default=(0, None))

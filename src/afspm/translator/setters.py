@@ -1,102 +1,33 @@
-"""What a request asks to be set, as generic parameters: only the fields that are present (wire format).
-
-The messages are read here as they came, each number with the unit that its peer gave: a refusal is told in that.
-"""
+"""Sets parameters: checks all that was asked for first, then sets it, then reads it back; or changes nothing."""
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Final
 
-from google.protobuf.message import DecodeError, Message
-
 from afspm.errors import Refused
-from afspm.model import ControlRequest, ControlResponse, names
-from afspm.translator.parameters import FEEDBACK_ON, ParameterSpec, ParameterTable, Value
-from afspm.wire.convert import shortest
-from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
+from afspm.logic.positions import scan_values
+from afspm.model import (
+    ControlResponse,
+    Feedback,
+    Parameter,
+    PositionChange,
+    ProbePosition,
+    Request,
+    ScanParameters,
+)
+from afspm.translator.driver import LOST, Driver
+from afspm.translator.parameters import ParameterSpec, Value, refuse_value
+from afspm.translator.settings import FEEDBACK, FRAME, POSITION, check_together
 
-_ANY: Final = (-math.inf, math.inf)
-
-
-@dataclass(frozen=True)
-class AskedValue:
-    """One value as the peer gave it; a text is parsed by the parameter's own type."""
-
-    name: str
-    value: str | float | bool
-    unit: str | None
-
-
-def _scan_parameters(message: scan_pb2.ScanParameters2d) -> Iterator[AskedValue]:
-    spatial, roi, shape = message.spatial, message.spatial.roi, message.data.shape
-    length, angle = spatial.length_units or None, spatial.angular_units or None
-    for name, part, axis, unit in (
-        (names.SCAN_TOP_LEFT_X, roi.top_left, "x", length),
-        (names.SCAN_TOP_LEFT_Y, roi.top_left, "y", length),
-        (names.SCAN_SIZE_X, roi.size, "x", length),
-        (names.SCAN_SIZE_Y, roi.size, "y", length),
-        (names.SCAN_ANGLE, roi, "angle", angle),
-        (names.SCAN_RESOLUTION_X, shape, "x", None),
-        (names.SCAN_RESOLUTION_Y, shape, "y", None),
-    ):
-        if part.HasField(axis):
-            yield AskedValue(name, getattr(part, axis), unit)
+_UNBOUNDED: Final = (-math.inf, math.inf)
 
 
-def _feedback(message: feedback_pb2.ZCtrlParameters) -> Iterator[AskedValue]:
-    for name, field in (
-        (FEEDBACK_ON, "feedbackOn"),
-        (names.ZCTRL_PGAIN, "proportionalGain"),
-        (names.ZCTRL_IGAIN, "integralGain"),
-        (names.ZCTRL_SETPOINT, "setPoint"),
-    ):
-        if message.HasField(field):
-            value = getattr(message, field)
-            yield AskedValue(name, value if isinstance(value, bool) else shortest(value), None)
-
-
-def _probe_position(message: spectroscopy_pb2.ProbePosition) -> Iterator[AskedValue]:
-    for name, axis in ((names.PROBE_POS_X, "x"), (names.PROBE_POS_Y, "y")):
-        if message.point.HasField(axis):
-            yield AskedValue(name, getattr(message.point, axis), message.units or None)
-
-
-def _parameter(message: control_pb2.ParameterMsg) -> Iterator[AskedValue]:
-    if message.HasField("value"):
-        yield AskedValue(message.parameter, message.value, message.units or None)
-
-
-_READERS = {
-    ControlRequest.SET_SCAN_PARAMS: (scan_pb2.ScanParameters2d, _scan_parameters),
-    ControlRequest.SET_ZCTRL_PARAMS: (feedback_pb2.ZCtrlParameters, _feedback),
-    ControlRequest.SET_PROBE_POS: (spectroscopy_pb2.ProbePosition, _probe_position),
-    ControlRequest.PARAM: (control_pb2.ParameterMsg, _parameter),
-}
-
-
-def asked_for(kind: int, payload: bytes) -> list[AskedValue]:
-    """What a request to set something asks for; empty if it only gets.
-
-    Raises:
-        Refused: PARAM_ERROR: the object is not what belongs to the request.
-    """
-    message_class, reader = _READERS[ControlRequest(kind)]
-    message: Message = message_class()
-    try:
-        message.ParseFromString(payload)
-    except DecodeError as error:
-        reason = f"the object of the request is not a {message.DESCRIPTOR.name}: {error}"
-        raise Refused(ControlResponse.PARAM_ERROR, reason) from error
-    return list(reader(message))  # type: ignore[operator]
-
-
-def wanted_values(
-    asked: list[AskedValue], table: ParameterTable, is_in_force: Callable[[str, Value], bool]
-) -> dict[str, Value]:
-    """Return what is asked for in SI, each value checked by itself.
+def wanted_values(request: Request, driver: Driver) -> dict[str, Value] | None:
+    """Return the values in SI that a request sets, each checked by itself; None if it only asks.
 
     A value that can't be set, and is in force, is no change: peers send back a whole message in which they have changed
     one field.
@@ -104,25 +35,77 @@ def wanted_values(
     Raises:
         Refused: PARAM_NOT_SUPPORTED or PARAM_ERROR.
     """
+    asked = _asked(request.subject)
     values: dict[str, Value] = {}
-    for one in asked:
-        spec = table.find(one.name)
-        value = _value(one, replace(spec, range=_ANY, choices=()))
+    for name, given in asked.items():
+        spec = driver.table.find(name)
+        anything = replace(spec, range=_UNBOUNDED, choices=())
+        value = (
+            anything.parse(given.value or "", given.unit) if isinstance(given, Parameter) else anything.checked(given)
+        )
         try:
             values[spec.name] = _settable(spec, value)
         except Refused:
-            if not is_in_force(spec.name, value):
+            now = driver.in_force([spec.name])
+            if not driver.same(spec.name, now[spec.name], value, now):
                 raise
-    return values
+    return values if asked else None
 
 
-def _value(one: AskedValue, spec: ParameterSpec) -> Value:
-    if isinstance(one.value, str):
-        return spec.parse(one.value, one.unit)
-    return spec.checked(one.value if isinstance(one.value, bool) else spec.from_unit(one.value, one.unit))
+def apply(driver: Driver, values: Mapping[str, Value], about_to_act: Callable[[], None] = lambda: None) -> None:
+    """Set the values, or change nothing.
+
+    Args:
+        about_to_act: called once all is checked, right before anything is changed.
+
+    Raises:
+        Refused: PARAM_ERROR: they do not fit together, or the controller made something else of them.
+    """
+    table = driver.table
+    # all of a frame: setting a part of it, a controller may change the rest
+    framed = FRAME if not values.keys().isdisjoint(FRAME) else ()
+    whole = {*values, *(name for name in framed if name in table)}
+    before = driver.in_force(whole)
+    wanted = {**before, **values}
+    check_together(wanted, table, driver.max_pixels)
+    former = {name: value for name, value in before.items() if not table[name].read_only}
+    about_to_act()
+    try:
+        driver.put_in_force(values)
+        after = driver.in_force(whole)
+    except LOST:
+        raise
+    except Exception:
+        with contextlib.suppress(Exception):  # the first error is the one to tell
+            driver.put_in_force(former)
+        raise
+    for name, value in wanted.items():
+        if not driver.same(name, after[name], value, after):
+            driver.put_in_force(former)
+            made, asked = (table[name].quantity(one) for one in (after[name], value))
+            raise refuse_value(name, f"the controller made {made} of {asked}; nothing was changed")
+
+
+def _asked(subject: object) -> dict[str, Parameter | Value]:
+    """Return what the subject of a request sets, by generic names: a parameter's text, else values in SI."""
+    if isinstance(subject, Parameter):
+        return {} if subject.value is None else {subject.name: subject}
+    if isinstance(subject, ScanParameters):
+        return dict(scan_values(subject))
+    found: dict[str, Value | None] = {}
+    if isinstance(subject, Feedback):
+        gains = (subject.proportional_gain, subject.integral_gain, subject.setpoint)
+        found = dict(zip(FEEDBACK, (subject.on, *gains), strict=True))
+    elif isinstance(subject, ProbePosition):
+        found = dict(zip(POSITION, subject.xy_m, strict=True))
+    elif isinstance(subject, PositionChange):
+        found = dict(zip(POSITION, (subject.x_m, subject.y_m), strict=True))
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def _settable(spec: ParameterSpec, value: Value) -> Value:
     if spec.read_only:
         raise Refused(ControlResponse.PARAM_ERROR, f"{spec.name} can be asked for, not set")
+    if spec.name in FRAME and isinstance(value, float):  # the corner of a frame is reckoned from its centre
+        value = next((end for end in spec.range if math.isclose(value, end, rel_tol=1e-12)), value)
     return spec.checked(value)

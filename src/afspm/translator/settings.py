@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Final
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Mapping
+from typing import Any, Final
 
 from afspm.errors import InvalidValue, Refused
 from afspm.model import ControlResponse, Feedback, ProbePosition, Region, ScanParameters, names
@@ -26,6 +27,60 @@ FEEDBACK: Final = (FEEDBACK_ON, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN, names.ZCTR
 POSITION: Final = (names.PROBE_POS_X, names.PROBE_POS_Y)
 
 MOVES: Final = frozenset(FRAME + POSITION)
+
+
+class SettingsGroup(ABC):
+    """Parameters that belong together at a controller, which has them in another form than a table can say."""
+
+    names: Collection[str]
+
+    @abstractmethod
+    def read(self) -> dict[str, Value]:
+        """Return what is in force, by generic names, in SI."""
+
+    @abstractmethod
+    def write(self, values: Mapping[str, Value]) -> None:
+        """Change some of them.
+
+        Raises:
+            Refused: PARAM_ERROR: the controller would make something else of it.
+        """
+
+    def merged(self, values: Mapping[str, Value]) -> dict[str, Any]:
+        """Return all of the group's values, with these changed."""
+        return {**self.read(), **values}
+
+
+class KeptSettings(SettingsGroup):
+    """What a controller is told with an action, and does not keep itself.
+
+    Args:
+        at_first: the values before anybody sets them.
+    """
+
+    def __init__(self, at_first: Mapping[str, Value]) -> None:
+        self.names = tuple(at_first)
+        self._at_first = at_first
+        self._kept: dict[str, Value] = {}
+
+    def kept_in(self, memory: dict[str, Any]) -> None:
+        """Keep the values in a memory that lasts, from now on."""
+        self._kept = memory.setdefault("kept", {})
+        for name, value in self._at_first.items():
+            self._kept.setdefault(name, value)
+
+    def __getitem__(self, name: str) -> Value:
+        return self._kept[name]
+
+    def number(self, name: str) -> float:
+        """Return a value that is a number."""
+        return float(self._kept[name])
+
+    def read(self) -> dict[str, Value]:
+        return {name: self._kept[name] for name in self.names}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        self._kept.update(values)
 
 
 def watched(table: ParameterTable) -> list[str]:

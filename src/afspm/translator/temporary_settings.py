@@ -7,38 +7,25 @@ anew, or finds a lost controller again, does so first.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 from afspm.model import ScopeState, ScopeStatus
 from afspm.translator.driver import LOST, Driver
 from afspm.translator.parameters import Value
+from afspm.translator.setters import apply
 from afspm.translator.settings import MOVES
+from afspm.translator.state import TranslatorState
 
 _KEY = "temporary"
 
 
 class TemporarySettings:
-    """What is in force for a while, if anything is.
+    """The values that are in force for a while, if any are."""
 
-    Args:
-        kept: JSON-able, and lasts.
-        apply: sets values, or changes nothing and raises Refused.
-        save: writes `kept` down.
-    """
-
-    def __init__(
-        self,
-        microscope: Driver,
-        kept: dict[str, Any],
-        apply: Callable[[Mapping[str, Value]], None],
-        save: Callable[[], None],
-        log: logging.Logger,
-    ) -> None:
-        self._microscope = microscope
-        self._kept = kept
-        self._apply = apply
-        self._save = save
+    def __init__(self, driver: Driver, state: TranslatorState, log: logging.Logger) -> None:
+        self._driver = driver
+        self._state = state
+        self._kept = state.kept
         self._log = log
 
     def begin(self, values: Mapping[str, Value], for_s: float) -> None:
@@ -47,37 +34,35 @@ class TemporarySettings:
         Raises:
             Refused: nothing was changed.
         """
-        values = {name: self._microscope.table[name].checked(value) for name, value in values.items()}
-        former = self._microscope.in_force(values.keys())
-        self._kept[_KEY] = {"former": former, "until_s": self._microscope.clock.now_s() + for_s}
-        self._save()  # before anything is changed
+        values = {name: self._driver.table[name].checked(value) for name, value in values.items()}
+        former = self._driver.in_force(values.keys())
+        self._kept[_KEY] = {"former": former, "until_s": self._driver.clock.now_s() + for_s}
+        self._state.save()  # before anything is changed
         try:
             if values:
-                self._apply(values)
+                apply(self._driver, values)
         except LOST:
             raise  # whether it was set is not known: it is put back when the controller is found again
         except Exception:
             self._forget()
             raise
-        self._kept[_KEY]["until_s"] = self._microscope.clock.now_s() + for_s
+        self._kept[_KEY]["until_s"] = self._driver.clock.now_s() + for_s
 
     @property
     def until_s(self) -> float | None:
-        """When it is over, experiment time; None: nothing is temporary."""
+        """Experiment time at which it is over; None: nothing is temporary."""
         found = self._kept.get(_KEY)
         return None if found is None else float(found["until_s"])
 
     @property
     def status(self) -> ScopeStatus | None:
-        """What the microscope is in meanwhile; None: nothing is temporary."""
+        """The state of the microscope meanwhile; None: nothing is temporary."""
         found = self._kept.get(_KEY)
-        if found is None:
-            return None
-        return ScopeStatus(state_for(found["former"]))
+        return None if found is None else ScopeStatus(state_for(found["former"]))
 
     def end_if_due(self) -> None:
         """Put back what was there, once it is time. Raises what says that the controller is lost."""
-        if self.until_s is not None and self._microscope.clock.now_s() >= self.until_s:
+        if self.until_s is not None and self._driver.clock.now_s() >= self.until_s:
             self.end()
 
     def end(self) -> None:
@@ -87,7 +72,7 @@ class TemporarySettings:
             return
         try:
             if found["former"]:
-                self._apply(found["former"])
+                apply(self._driver, found["former"])
         except LOST:
             raise
         except Exception as error:
@@ -96,9 +81,9 @@ class TemporarySettings:
 
     def _forget(self) -> None:
         self._kept.pop(_KEY, None)
-        self._save()
+        self._state.save()
 
 
 def state_for(values: Mapping[str, Value]) -> ScopeState:
-    """Return what the microscope is in while such values are in force for a while."""
+    """Return the state of the microscope while such values are in force for a while."""
     return ScopeState.MOVING if MOVES & values.keys() else ScopeState.BUSY_PARAM

@@ -1,4 +1,4 @@
-"""Asks the scheduler."""
+"""A component's connection to the scheduler's control socket."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ from afspm import wire
 from afspm.errors import WireError
 from afspm.logic.sessions import token_of
 from afspm.model import CLOCK_REQUEST, Request, Response
-from afspm.transport.complaints import Complaints
-from afspm.transport.frames import receive_small, send
-from afspm.transport.monitor import CONNECTED, DISCONNECTED, Monitor
-from afspm.transport.network import Network
+from afspm.transport.frames import receive_frames, send_frames
+from afspm.transport.network import CONNECTED, DISCONNECTED, Monitor, Network
 from afspm.transport.port import ControlConnected, ControlDisconnected, Incoming, ReplyReceived
+from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.wire.version import ANSWER, QUESTION, Version, as_version_1, is_of_version_1, not_of_version_1
 
 
 class ControlClient:
-    """A component's connection to the scheduler: the same bytes as a REQ socket, without its lock step.
+    """Asks the scheduler: the same bytes as a REQ socket, without its lock step.
 
     Before the first request the scheduler is asked, in a way that all understand, whether it is one of ours. One of
-    version 1 is sent no ids, and nothing that it would end over: that is answered here.
+    version 1 is sent no ids, and nothing that it would end over: such requests are answered here.
 
     Args:
         name: of the component. Restarted, it is the same client to the scheduler.
@@ -31,25 +30,24 @@ class ControlClient:
         version: of the scheduler, once it has answered.
     """
 
-    def __init__(self, network: Network, name: str, address: str, complaints: Complaints) -> None:
-        self._complaints = complaints
+    def __init__(self, network: Network, name: str, address: str, log: RateLimitedLog) -> None:
+        self._log = log
         self._address = address
         self.version = Version.UNKNOWN
         self._until_known: list[Sequence[bytes]] | None = None
         self._connected = False
         self._unanswered = b""
         self._name, self._token = name, ""
-        self.touched = True
         self.socket = network.socket(zmq.DEALER)
         self.socket.setsockopt(zmq.ROUTING_ID, name.encode() if network.keys is None else network.keys.routing_id(name))
         self.monitor = Monitor(network, self.socket, CONNECTED | DISCONNECTED)
         network.connect(self.socket, address)
 
     def send(self, frames: Sequence[bytes]) -> Response | None:
-        """Ask; dropped while there is no scheduler. Returns the answer to what is not sent to one of version 1.
+        """Ask; dropped while there is no scheduler. Return the answer to what is not sent to one of version 1.
 
-        Asked again what was asked last, with no answer in between, it makes the connection anew: a connection that
-        stands but leads nowhere (cut off, or its name was taken by another process) would never lead anywhere again.
+        A request repeated without an answer in between makes the connection anew: a connection that stands but leads
+        nowhere (cut off, or its name was taken by another process) would never lead anywhere again.
         """
         if not self._connected:
             return None
@@ -72,8 +70,7 @@ class ControlClient:
         return None
 
     def _send(self, frames: Sequence[bytes]) -> None:
-        self.touched = True
-        send(self.socket, [b"", *frames])  # or not, if it is full: then the scheduler has stood still for thousands
+        send_frames(self.socket, [b"", *frames])  # or not, if it is full: the scheduler has stood still for thousands
 
     def _send_when_known(self, frames: Sequence[bytes]) -> None:
         if self._until_known is None:
@@ -94,9 +91,8 @@ class ControlClient:
         self.socket.connect(self._address)
 
     def receive(self) -> list[Incoming]:
-        """The next answer."""
-        self.touched = True
-        _, frames = receive_small(self.socket)
+        """Return the next answer."""
+        frames = [frame.bytes for frame in receive_frames(self.socket)]
         if not frames or frames == [b""]:  # an empty one: the scheduler has looked whether we are there
             return []
         if frames == [b"", *ANSWER]:
@@ -104,11 +100,11 @@ class ControlClient:
         try:
             return self._interpret(frames)
         except WireError as error:
-            self._complaints.say(f"dropped a reply from {self._address}: {error}")
+            self._log.warning(f"dropped a reply from {self._address}: {error}")
             return []
 
     def follow(self) -> list[Incoming]:
-        """The scheduler's coming and going."""
+        """Return the scheduler's coming and going."""
         found: list[Incoming] = []
         for event in self.monitor.drain():
             self._connected, self._unanswered, self._until_known = event.kind == CONNECTED, b"", None
@@ -116,9 +112,7 @@ class ControlClient:
                 self.version = Version.UNKNOWN  # what comes next may be one of ours
             if self._connected:
                 self._greet()
-                found.append(ControlConnected())
-            else:
-                found.append(ControlDisconnected())
+            found.append(ControlConnected() if self._connected else ControlDisconnected())
         return found
 
     def _interpret(self, frames: list[bytes]) -> list[Incoming]:
@@ -135,7 +129,7 @@ class ControlClient:
         """Say who we are to a scheduler that was restarted, or that has not yet seen our last connection close.
 
         It may be waiting for us, who are in control; and what we ask next may have an id that does not say who we are.
-        Only to ours, known by its answers: for one of version 1 a request that it does not know might be its last.
+        Only to ours, known by its answers: one of version 1 might end over a request that it does not know.
         """
         if self.version is Version.OURS and self._token:
             self._send(wire.encode_request(Request(CLOCK_REQUEST, id=f"{self._name}/{self._token}/0")))

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 import zmq
 
-from afspm.transport.frames import descriptor_of, readable, receive_small
+from afspm.transport.frames import receive_frames
 from afspm.transport.network import Network
+from afspm.transport.polling import milliseconds
 from afspm.transport.wakeup import WakeUp
 from afspm.wire import BEAT, CLOSING
 
@@ -77,8 +78,7 @@ class HeartbeatSender:
         poller.register(self._stop.fileno(), zmq.POLLIN)
         while True:
             ready = dict(poller.poll(self._period_ms))
-            while readable(self._socket):
-                self._socket.recv(zmq.NOBLOCK)
+            while receive_frames(self._socket):
                 self.heard.set()
             if self._stop.fileno() in ready:
                 break
@@ -143,13 +143,10 @@ class HeartbeatListener:
 
     def poll(self, timeout_s: float | None) -> list[Heartbeat]:
         """The beats that have come; waits up to `timeout_s` real seconds (None: as long as it takes)."""
-        timeout_ms = None if timeout_s is None else max(0, math.ceil(timeout_s * 1000.0))
         found = []
-        for ready, _ in self._poller.poll(timeout_ms):
+        for ready, _ in self._poller.poll(milliseconds(timeout_s)):
             expected = None if isinstance(ready, int) else self._expected.get(ready)
-            while expected is not None and readable(ready):
-                first, frames = receive_small(ready)
-                self._network.connections.settled({(first and descriptor_of(first)) or -1})
+            while expected is not None and (frames := [frame.bytes for frame in receive_frames(ready)]):
                 beat = read_beat(expected.name, frames)
                 if beat is not None and _is_by(expected, frames):
                     found.append(beat)

@@ -1,37 +1,39 @@
-"""One process's access to ZeroMQ: the context, what all of its sockets have in common, and what is let in."""
+"""One process's access to ZeroMQ: the context, the options that all sockets share, and who is let in."""
 
 from __future__ import annotations
 
 import ipaddress
+import itertools
+import struct
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import zmq
 
 from afspm.errors import ConfigError, TransportError
-from afspm.transport.connections import Connections
+from afspm.transport.tcp_guard import TcpGuard
 
 if TYPE_CHECKING:
     from afspm.transport.keys import Keys
 
 MAX_PACKET_BYTES = 256 * 1024 * 1024
-"""Of a published packet: a scan of 4096² in one channel is half of that."""
+"""Longest frame of a published packet: a scan of 4096² in one channel is half of that."""
 MAX_REQUEST_BYTES = 1024 * 1024
-"""Of each frame of a request or response, and of a subscription."""
+"""Longest frame of a request, response or subscription."""
 QUEUE_LENGTH = 4000
-"""Messages waiting for one peer; a publisher drops what is more."""
+"""Messages that may wait for one peer; a publisher drops what is more."""
 
 _LINGER_MS = 200
 # A peer that is frozen or cut off is found within seconds and not when the system gives up on it after hours.
 _ALIVE_CHECK_MS, _ALIVE_TIMEOUT_MS = 2_000, 8_000
 # libzmq 4.3.5 aborts the process (`Assertion failed: !_io_error`) if it sends or answers a heartbeat of ZMTP on a
-# connection that was lost while its receive queue was full. So the queues of these kinds have no length in messages:
-# `connections` bounds them in bytes. All others send no heartbeats, and rely on those of TCP.
-_ENDLESS = frozenset({zmq.ROUTER, zmq.DEALER, zmq.XPUB, zmq.SUB})
+# connection that was lost while its receive queue was full. So the queues of sockets with heartbeats have no length in
+# messages: `tcp_guard` bounds them in bytes. All others rely on the heartbeats of TCP.
 _WITH_HEARTBEATS = frozenset({zmq.ROUTER, zmq.DEALER})
+_UNLIMITED = frozenset({*_WITH_HEARTBEATS, zmq.XPUB, zmq.SUB})
 _KEEPALIVE_S, _KEEPALIVE_TRIES = 2, 3
 # A peer that takes nothing is disconnected after this time, and what waited for it is dropped. Connected again it asks
-# for what it missed. (Linux and Windows; how much may wait until then, see `connections`.)
+# for what it missed. (Linux and Windows; `tcp_guard` bounds how much may wait until then.)
 _STALLED_MS = 5_000
 _RECONNECT_MS, _RECONNECT_MAX_MS = 20, 200
 _HANDSHAKE_MS = 5_000
@@ -54,11 +56,11 @@ _HEARTBEATS = (
 
 
 class Network:
-    """Makes sockets, binds and connects them: to this computer only, or with keys, or after `insecure` was said.
+    """Makes sockets, binds and connects them: to this computer only, unless there are keys or `insecure` is set.
 
     Args:
-        keys: of this process. With keys connections are encrypted, and whose they are is known: all of them, or
-            those by which requests come (`Keys.everywhere`).
+        keys: of this process. With keys connections are encrypted and their owners known: all of them, or those by
+            which requests come (`Keys.everywhere`).
         insecure: bind and connect to other computers without keys. Anyone there can then move the tip.
     """
 
@@ -67,10 +69,10 @@ class Network:
         self._insecure = insecure
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._sockets: list[zmq.Socket[bytes]] = []
-        self.connections = Connections()
+        self._guards: list[TcpGuard] = []
         self._authenticator = None
         if keys is not None and keys.binds_encrypted(requests=True):
-            from afspm.transport.zap import Authenticator
+            from afspm.transport.authenticator import Authenticator
 
             self._authenticator = Authenticator(self._context, keys)
 
@@ -88,13 +90,13 @@ class Network:
         return cls(from_launch(name, entries), insecure=str(entries.get("insecure", "")).lower() == "true")
 
     def socket(self, kind: int, *, max_bytes: int = MAX_REQUEST_BYTES) -> zmq.Socket[bytes]:
-        """A socket with the house's limits; frames over `max_bytes` end the connection that they come by."""
+        """Return a socket with our limits; a frame over `max_bytes` ends the connection that it comes by."""
         socket = self._context.socket(kind)
-        self._sockets.append(socket)  # else one that its owner forgets is closed at some time or other
+        self._sockets.append(socket)  # else a forgotten one would be closed by the garbage collector, at any time
         options = _OPTIONS + (_HEARTBEATS if kind in _WITH_HEARTBEATS else ())
         for option, value in (
             *options,
-            (zmq.RCVHWM, 0 if kind in _ENDLESS else QUEUE_LENGTH),
+            (zmq.RCVHWM, 0 if kind in _UNLIMITED else QUEUE_LENGTH),
             (zmq.MAXMSGSIZE, max_bytes),
             (zmq.TCP_MAXRT, _STALLED_MS),
         ):
@@ -102,10 +104,10 @@ class Network:
         return socket
 
     def bind(self, socket: zmq.Socket[bytes], address: str, *, requests: bool = False) -> str:
-        """Bind; returns the address with the port that was found, where `address` asks for any (port 0).
+        """Bind, and return the address with the port that was found, where `address` asks for any (port 0).
 
         Args:
-            requests: who sends something by this socket is to be known.
+            requests: peers send requests by this socket, so that it has to be known whose they are.
 
         Raises:
             TransportError: the address is taken or malformed.
@@ -122,10 +124,7 @@ class Network:
             raise TransportError(
                 f"can't bind: {zmq.strerror(error.errno or 0)}", where=address, hint=_bind_hint(error)
             ) from error
-        bound = socket.getsockopt_string(zmq.LAST_ENDPOINT).rstrip("\0")
-        if socket.type in _ENDLESS:
-            self.connections.guard(bound)
-        return bound
+        return socket.getsockopt_string(zmq.LAST_ENDPOINT).rstrip("\0")
 
     def connect(self, socket: zmq.Socket[bytes], address: str) -> None:
         """Connect, and again whenever the connection is lost.
@@ -144,11 +143,18 @@ class Network:
         except zmq.ZMQError as error:
             raise TransportError(f"can't connect: {error}", where=address) from error
 
+    def watch(self, address: str, guard: TcpGuard) -> TcpGuard:
+        """Have `guard` watch those who connect to a bound address, until we close."""
+        guard.start(address)
+        self._guards.append(guard)
+        return guard
+
     def close(self) -> None:
         """Close all sockets, once what was sent has gone out or a fraction of a second has passed."""
         if self._context.closed:
             return
-        self.connections.close()
+        for guard in self._guards:
+            guard.close()
         if self._authenticator is not None:
             self._authenticator.close()
         self._context.destroy(linger=_LINGER_MS)
@@ -165,7 +171,7 @@ class Network:
 
 
 def is_local(address: str) -> bool:
-    """Whether only processes of this computer can be at `address`."""
+    """Return whether only processes of this computer can be at `address`."""
     scheme, _, rest = address.partition("://")
     if scheme in ("ipc", "inproc"):
         return True
@@ -190,3 +196,50 @@ def _bind_hint(error: zmq.ZMQError) -> str:
     if error.errno == zmq.EADDRNOTAVAIL:
         return "this computer has no such address: is this process meant to run on another one (--only)?"
     return ""
+
+
+CONNECTED = int(zmq.EVENT_HANDSHAKE_SUCCEEDED)
+DISCONNECTED = int(zmq.EVENT_DISCONNECTED)
+ACCEPTED = int(zmq.EVENT_ACCEPTED)
+REFUSED = int(
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+)
+"""The peer has no key, or one that is not known. A peer without keys may hang up first, which has no detail."""
+_EVENT = struct.Struct("=hi")
+_numbers = itertools.count()
+
+
+class ConnectionEvent(NamedTuple):
+    """`kind` is one of the constants above; `value` the connection's descriptor if it was ACCEPTED or DISCONNECTED."""
+
+    kind: int
+    value: int
+
+
+class Monitor:
+    """The connection events of one socket, in the order in which they happened.
+
+    Events come from the thread that also delivers the messages: after a message was received, `drain` returns every
+    event that came before that message.
+    """
+
+    def __init__(self, network: Network, socket: zmq.Socket[bytes], events: int) -> None:
+        self._watched = socket
+        address = f"inproc://monitor-{next(_numbers)}"
+        socket.monitor(address, events)
+        self.socket = network.socket(zmq.PAIR)
+        self.socket.setsockopt(zmq.RCVHWM, 0)
+        self.socket.connect(address)
+
+    def drain(self) -> list[ConnectionEvent]:
+        """Return all events that have come."""
+        events: list[ConnectionEvent] = []
+        while int(self.socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            kind, value = _EVENT.unpack(self.socket.recv_multipart(zmq.NOBLOCK)[0])
+            events.append(ConnectionEvent(kind & 0xFFFF, value))
+        return events
+
+    def close(self) -> None:
+        if not self._watched.closed:
+            self._watched.disable_monitor()
+        self.socket.close()

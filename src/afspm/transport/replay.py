@@ -1,4 +1,4 @@
-"""How one subscriber asks for what was published before it came, and is sent it alone.
+"""What a publisher keeps for those who join later, and how a subscriber asks to be sent it alone.
 
 A subscriber of ours subscribes to a marker, a topic of its own that also says what it wants:
 
@@ -11,13 +11,22 @@ that begins so, and ignores it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Callable, Hashable, Iterable
 from typing import NamedTuple
 
-_BEGIN = b"\0replay/"
+from afspm.clock import Clock
+from afspm.model import Packet
+
+History = Callable[[Hashable, tuple[str, ...], int], Iterable[Packet]]
+"""(who, prefixes, since_ns) -> what was published under these prefixes and is newer, oldest first."""
+
 LONGEST = 8 << 10
 """Bytes of a marker."""
+_BEGIN = b"\0replay/"
 _MOST_PREFIXES = 1000
+_MOST_PACKETS = 1000
+_MOST_BYTES = 256 << 20
 
 # An envelope is text: it begins with one of these. The empty prefix, "everything", is written as all of them, since as
 # it stands it would also match the replays that are meant for others.
@@ -37,17 +46,12 @@ class Marker(NamedTuple):
     since_ns: int
     prefixes: tuple[str, ...]
 
-    @property
-    def name(self) -> str:
-        """Of the subscriber."""
-        return self.topic[len(_BEGIN) :].rpartition(b"/")[0].decode("utf-8", "replace")
-
     def encode(self) -> bytes:
         return b"\0".join([self.topic, b"%d" % self.since_ns, *(prefix.encode() for prefix in self.prefixes)])
 
     @classmethod
     def decode(cls, subscription: bytes) -> Marker | None:
-        """None if the subscription is an ordinary prefix, or no proper marker."""
+        """Return the marker in a subscription; None if it is an ordinary prefix, or no proper marker."""
         if not subscription.startswith(_BEGIN) or len(subscription) > LONGEST:
             return None
         parts = subscription[1:].split(b"\0")
@@ -62,18 +66,65 @@ class Marker(NamedTuple):
 
 
 def topic(name: str, nonce: int) -> bytes:
-    """A topic of the subscriber `name`; another one every time it asks."""
+    """Return a topic of the subscriber `name`; another one every time it asks."""
     return _BEGIN + name.replace("\0", "").encode() + b"/%d" % nonce
 
 
 def is_reserved(subscription: bytes) -> bool:
-    """Whether this begins like a marker, well-formed or not."""
+    """Return whether this begins like a marker, well-formed or not."""
     return subscription.startswith(b"\0")
 
 
 def spelled_out(prefixes: Iterable[bytes]) -> list[bytes]:
-    """The prefixes to really subscribe to: the empty one as all that an envelope may begin with."""
+    """Return the prefixes to really subscribe to: the empty one as all that an envelope may begin with."""
     found: list[bytes] = []
     for prefix in prefixes:
         found.extend([prefix] if prefix else FIRST_BYTES)
     return found
+
+
+class Published:
+    """Gives packets their time, and keeps the last of them for those who join later.
+
+    Kept is the last packet of every envelope, and of all others as many of the newest as fit the bounds.
+    """
+
+    def __init__(self, clock: Clock, *, most_packets: int = _MOST_PACKETS, most_bytes: int = _MOST_BYTES) -> None:
+        self._clock = clock
+        self._most_packets = most_packets
+        self._most_bytes = most_bytes
+        self._packets: deque[Packet] = deque()
+        self._bytes = 0
+        self._last: dict[str, Packet] = {}
+        self._newest_ns = 0
+
+    def stamp(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> Packet:
+        """Return a packet that is newer than all before it; it is remembered, unless `keep` is False.
+
+        Args:
+            time_ns: a time that was given out already.
+        """
+        self._newest_ns = max(self._clock.now_ns() if time_ns is None else time_ns, self._newest_ns + 1)
+        packet = Packet(envelope, payload, self._newest_ns)
+        if keep:
+            self._keep(packet)
+        return packet
+
+    def _keep(self, packet: Packet) -> None:
+        self._packets.append(packet)
+        self._bytes += len(packet.payload)
+        self._last.pop(packet.envelope, None)
+        self._last[packet.envelope] = packet
+        while len(self._packets) > self._most_packets or (self._bytes > self._most_bytes and len(self._packets) > 1):
+            self._bytes -= len(self._packets.popleft().payload)
+        while len(self._last) > self._most_packets:
+            del self._last[next(iter(self._last))]
+
+    def __call__(self, _who: Hashable, prefixes: tuple[str, ...], since_ns: int) -> list[Packet]:
+        """Return what is kept under `prefixes` and newer than `since_ns`, oldest first."""
+        kept = {packet.time_ns or 0: packet for packet in (*self._last.values(), *self._packets)}
+        return [
+            kept[time_ns]
+            for time_ns in sorted(kept)
+            if time_ns > since_ns and kept[time_ns].envelope.startswith(prefixes)
+        ]

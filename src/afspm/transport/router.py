@@ -1,21 +1,24 @@
-"""Takes in the requests of all components: who asks, by which connection, and which connections there are."""
+"""The scheduler's control socket: who asks, by which connection, and which connections there are."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import zmq
 
-from afspm.transport.complaints import Complaints
-from afspm.transport.frames import descriptor_of, property_of, readable, receive_small, send, user_of
+from afspm.transport.frames import descriptor_of, property_of, receive_frames, send_frames, user_of
 from afspm.transport.keys import MARK
-from afspm.transport.monitor import ACCEPTED, DISCONNECTED, REFUSED, Monitor
-from afspm.transport.network import QUEUE_LENGTH, Network
+from afspm.transport.network import ACCEPTED, DISCONNECTED, REFUSED, Monitor, Network
+from afspm.transport.rate_limited_log import RateLimitedLog
+from afspm.transport.tcp_guard import TcpGuard
 from afspm.wire.version import ANSWER, QUESTION
 
-_MOST_ROUNDS = 100
-_BATCH = 100
+MOST_A_TURN = 20
+"""Messages taken before everything else is looked at again. The socket takes one of each client in turn."""
+_LAST_WORDS = 200
+"""Messages looked through for the last words of who has gone."""
 
 
 class PeerConnected(NamedTuple):
@@ -43,195 +46,161 @@ class PeerAsked(NamedTuple):
 RouterEvent = PeerConnected | PeerDisconnected | PeerAsked
 
 
-class _Peer:
-    """One connection."""
-
-    __slots__ = ("connection", "descriptor", "identity", "name", "user")
-
-    def __init__(self, connection: int, descriptor: int) -> None:
-        self.connection = connection
-        self.descriptor = descriptor
-        self.identity: bytes | None = None
-        self.name = ""
-        self.user: str | None = None
+@dataclass(slots=True)
+class _Connection:
+    number: int
+    descriptor: int
+    identity: bytes | None = None
+    name: str = ""
+    user: str | None = None
 
 
 class Router:
-    """The scheduler's control socket. REQ and DEALER peers, ours and of version 1.
+    """REQ and DEALER peers, ours and of version 1, each known by its connection.
 
     A name belongs to the newest connection that uses it, so that a restarted component is the same client.
     """
 
-    def __init__(self, network: Network, address: str, complaints: Complaints) -> None:
-        self._complaints = complaints
+    def __init__(self, network: Network, address: str, log: RateLimitedLog) -> None:
+        self._log = log
         keys = network.keys
         self._keys = keys if keys is not None and keys.binds_encrypted(requests=True) else None
         self._has_refused = False
-        self._guard = network.connections
-        self._heard: set[int] = set()
-        self._connections = 0
-        self.touched = True
-        self._by_descriptor: dict[int, _Peer] = {}
-        self._formers: dict[int, _Peer] = {}  # whose descriptor it was last, as long as words of theirs may come
-        self._identities: dict[int, bytes] = {}
+        self._numbers = 0
+        self._open: dict[int, _Connection] = {}  # by descriptor
+        self._formers: dict[int, _Connection] = {}  # the last to have had a descriptor that is closed, or given anew
+        self._identities: dict[int, bytes] = {}  # by number
         self.socket = network.socket(zmq.ROUTER)
         self.socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
         self.monitor = Monitor(network, self.socket, ACCEPTED | DISCONNECTED | REFUSED)
         self.address = network.bind(self.socket, address, requests=True)
+        self._guard = network.watch(self.address, TcpGuard())
 
     def receive(self) -> list[RouterEvent]:
-        """The next requests, a batch at most; the changes of connections that they have to do with; and all that came
-        with those."""
+        """Return the next requests, and the changes of connections that came before and with them, in order."""
+        messages = self._messages(MOST_A_TURN)
+        # drained after the messages were received: so every connection that they came by is known
+        changes = self._changes()
+        gone = [connection for connection, came in changes if not came]
+        if gone:  # what they said last comes before their end
+            messages += self._messages(_LAST_WORDS)
+        events: list[tuple[_Connection, RouterEvent]] = []
+        for frames in messages:
+            events += self._interpret(frames, gone, changes)
         told: list[RouterEvent] = []
-        for _ in range(_BATCH):
-            first, frames = self._receive()
-            if first is None:
-                return told
-            peer = self._by_descriptor.get(descriptor_of(first) or -1)
-            if peer is None or peer.identity != frames[0] or self.monitor.has_news():
-                self.touched = True
-                return told + self._settle([(first, frames)])
-            told += self._interpret(peer, frames)
-        self.touched = True
-        return told
-
-    def _receive(self) -> tuple[zmq.Frame | None, list[bytes]]:
-        first, frames = receive_small(self.socket)
-        if first is None:
-            self._guard.settled(self._heard)
-            self._heard.clear()
-        elif (descriptor := descriptor_of(first)) is not None:
-            self._heard.add(descriptor)
-        return first, frames
-
-    def follow(self) -> list[RouterEvent]:
-        """Connections that came and went, and what came with them."""
-        return self._settle([])
-
-    def _settle(self, messages: list[tuple[zmq.Frame, list[bytes]]]) -> list[RouterEvent]:
-        """Connections in the order in which they came and went, with what was said by each before it went."""
-        changes: list[tuple[_Peer, bool]] = []
-        for _ in range(_MOST_ROUNDS):
-            while len(messages) < QUEUE_LENGTH and readable(self.socket):
-                first, frames = self._receive()
-                if first is not None:
-                    messages.append((first, frames))
-            # The monitor tells everything in order: it knows of every connection that these came by, and once it has
-            # nothing new, they are all that was said by those that it said are gone.
-            news = self._changes()
-            if not news:
-                break
-            changes += news
-        said: list[tuple[_Peer, list[RouterEvent]]] = []
-        for first, frames in messages:
-            sender = self._sender(first, changes)
-            if sender is not None:
-                said.append((sender, self._interpret(sender, frames)))
-        told: list[RouterEvent] = []
-        for peer, came in changes:
+        for connection, came in changes:
             if came:
-                told.append(PeerConnected(peer.connection))
-                continue
-            for sender, events in said:
-                if sender is peer:
-                    told += events
-            told.append(PeerDisconnected(peer.connection))
-            self._identities.pop(peer.connection, None)
-        gone = {peer.connection for peer, came in changes if not came}
-        for sender, events in said:
-            if sender.connection not in gone:
-                told += events
-        if len(messages) < QUEUE_LENGTH:  # all was read that came before the descriptor was given out again
-            for peer, came in changes:
-                if came:
-                    self._formers.pop(peer.descriptor, None)
-        return told
-
-    def _sender(self, first: zmq.Frame, changes: list[tuple[_Peer, bool]]) -> _Peer | None:
-        """Whose message this is. A descriptor is given out again at once, so several may have had it."""
-        identity, descriptor = first.bytes, descriptor_of(first)
-        if descriptor is None:
-            return None
-        current = self._by_descriptor.get(descriptor)
-        gone = [peer for peer, came in changes if not came and peer.descriptor == descriptor]
-        if current is None or current.identity not in (identity, None):
-            former = next((peer for peer in gone if peer.identity in (identity, None)), None)
-            if former is not None or current is None:
-                return former and self._introduced(former, first, identity)
-            # what was left of an earlier connection had been taken for the first words of this one
-            changes += [(current, False), (current := self._new(descriptor), True)]
-        last = self._formers.get(descriptor)
-        if current.identity is None and last and last.identity == identity and not self._lives(first, identity):
-            # the last words of who had the descriptor before, and not the first of its next life
-            return last if last in gone else None
-        unheard = next((peer for peer in gone if peer.identity is None), None)
-        return self._introduced(unheard if current.identity is None and unheard else current, first, identity)
-
-    def _lives(self, first: zmq.Frame, identity: bytes) -> bool:
-        """Whether anybody has the identity of who said this now. Who has hears an empty frame; of REQ peers, whose
-        connection that would end, it is not asked."""
-        if property_of(first, "Socket-Type") != "DEALER":
-            return True
-        self.socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
-        try:
-            self.socket.send_multipart([identity, b""], zmq.NOBLOCK)
-        except zmq.ZMQError as error:
-            return error.errno != zmq.EHOSTUNREACH
-        finally:
-            self.socket.setsockopt(zmq.ROUTER_MANDATORY, 0)
-        return True
+                told.append(PeerConnected(connection.number))
+            else:
+                told += [event for sender, event in events if sender is connection]
+                told.append(PeerDisconnected(connection.number))
+                self._identities.pop(connection.number, None)
+        return told + [event for sender, event in events if all(sender is not one for one in gone)]
 
     def reply(self, connection: int, frames: Sequence[bytes]) -> None:
         """Answer by `connection`, if it is still there. Never blocks."""
         identity = self._identities.get(connection)
         if identity is not None:
-            self.touched = True
-            send(self.socket, [identity, b"", *frames])
+            send_frames(self.socket, [identity, b"", *frames])
 
-    def _interpret(self, peer: _Peer, frames: list[bytes]) -> list[RouterEvent]:
-        if len(frames) < 2 or frames[1]:
-            self._complaints.say(f"dropped a request of {peer.name or 'somebody'}: no empty frame before it")
-            return []
-        if frames[2:] == [*QUESTION]:  # whether we are one of ours; whose name it is does not matter for that
-            self.reply(peer.connection, ANSWER)
-            return []
-        return [PeerAsked(peer.connection, peer.name, peer.user, frames[2:])]
+    def _messages(self, most: int) -> list[list[zmq.Frame]]:
+        """The next messages, at most so many."""
+        messages: list[list[zmq.Frame]] = []
+        while len(messages) < most:
+            frames = receive_frames(self.socket)
+            if not frames:
+                break
+            messages.append(frames)
+        self._guard.settled({descriptor_of(frames[0]) for frames in messages})
+        return messages
 
-    def _changes(self) -> list[tuple[_Peer, bool]]:
-        """The monitor's events: who, and whether it came or went."""
-        changes = []
+    def _changes(self) -> list[tuple[_Connection, bool]]:
+        """Connections in the order in which they came (True) and went."""
+        changes: list[tuple[_Connection, bool]] = []
         for kind, descriptor in self.monitor.drain():
             if kind not in (ACCEPTED, DISCONNECTED):
-                self._tell_refused()
+                self._warn_refused()
                 continue
-            gone = self._by_descriptor.pop(descriptor, None)
-            if gone is not None:
+            if (gone := self._open.pop(descriptor, None)) is not None:
+                self._guard.closed(descriptor)
                 self._formers[descriptor] = gone
                 changes.append((gone, False))
             if kind == ACCEPTED:
+                self._guard.opened(descriptor)
                 changes.append((self._new(descriptor), True))
         return changes
 
-    def _tell_refused(self) -> None:
-        """Once: who is refused tries again without end."""
+    def _interpret(
+        self, frames: list[zmq.Frame], gone: list[_Connection], changes: list[tuple[_Connection, bool]]
+    ) -> list[tuple[_Connection, RouterEvent]]:
+        sender = self._sender(frames[0], gone, changes)
+        if sender is None:
+            return []
+        content = [frame.bytes for frame in frames]
+        if len(content) < 2 or content[1]:
+            self._log.warning(f"dropped a request of {sender.name or 'a nameless peer'}: no empty frame before it")
+            return []
+        if content[2:] == [*QUESTION]:  # whether we are one of ours; whose name it is does not matter for that
+            self.reply(sender.number, ANSWER)
+            return []
+        return [(sender, PeerAsked(sender.number, sender.name, sender.user, content[2:]))]
+
+    def _sender(
+        self, first: zmq.Frame, gone: list[_Connection], changes: list[tuple[_Connection, bool]]
+    ) -> _Connection | None:
+        """The connection that a message came by; its descriptor may have been given to several, one after the other."""
+        identity, descriptor = first.bytes, descriptor_of(first)
+        current = self._open.get(descriptor)
+        if current is not None and current.identity == identity:
+            return current
+        former = self._formers.get(descriptor)
+        if former is not None and former.identity == identity and not (current and self._is_there(first)):
+            return former if former in gone else None  # its last words; None: its end was told before they came
+        for connection in (former if former in gone else None, current):
+            if connection is not None and connection.identity is None:
+                return self._introduced(connection, first)
+        if current is None:
+            return None
+        # it was taken for another, whose last words had been left on this descriptor
+        gone.append(current)
+        changes += [(current, False), (new := self._new(descriptor), True)]
+        return self._introduced(new, first)
+
+    def _is_there(self, first: zmq.Frame) -> bool:
+        """Return whether the peer that said this is connected; a REQ peer is taken to be.
+
+        A DEALER peer of ours ignores the empty frame that is sent to find out. A REQ peer would hang up.
+        """
+        if property_of(first, "Socket-Type") != "DEALER":
+            return True
+        self.socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
+        try:
+            return send_frames(self.socket, [first.bytes, b""]) or True  # False: it is there, and takes nothing
+        except zmq.ZMQError as error:
+            return error.errno != zmq.EHOSTUNREACH
+        finally:
+            self.socket.setsockopt(zmq.ROUTER_MANDATORY, 0)
+
+    def _new(self, descriptor: int) -> _Connection:
+        self._numbers += 1
+        connection = self._open[descriptor] = _Connection(self._numbers, descriptor)
+        return connection
+
+    def _introduced(self, connection: _Connection, first: zmq.Frame) -> _Connection:
+        if connection.identity is None:
+            connection.identity = self._identities[connection.number] = first.bytes
+            connection.name = _name(first.bytes)
+            connection.user = None if self._keys is None else self._keys.user_as(user_of(first), connection.name)
+        return connection
+
+    def _warn_refused(self) -> None:
+        """Once: a peer that is refused tries again without end."""
         if self._keys is not None and not self._has_refused:
             self._has_refused = True
-            self._complaints.say(
+            self._log.warning(
                 f"refused a connection to {self.address}: it has shown no key that is known here; programs that know "
                 "nothing of keys are let in by [security] plain = true"
             )
-
-    def _new(self, descriptor: int) -> _Peer:
-        self._connections += 1
-        peer = self._by_descriptor[descriptor] = _Peer(self._connections, descriptor)
-        return peer
-
-    def _introduced(self, peer: _Peer, first: zmq.Frame, identity: bytes) -> _Peer:
-        if peer.identity is None:
-            peer.identity = self._identities[peer.connection] = identity
-            peer.name = _name(identity)
-            peer.user = None if self._keys is None else self._keys.user_as(user_of(first), peer.name)
-        return peer
 
     def close(self) -> None:
         self.monitor.close()
@@ -239,7 +208,7 @@ class Router:
 
 
 def _name(identity: bytes) -> str:
-    """What a peer calls itself; those that don't are given an identity by the socket that begins with a zero byte."""
+    """What a peer calls itself; the socket gives others an identity that begins with a zero byte."""
     if identity.startswith(b"\0"):
         return ""
     try:

@@ -6,12 +6,11 @@ from collections.abc import Hashable
 
 from afspm.errors import ConfigError
 from afspm.model import Packet
-from afspm.transport.complaints import Complaints
-from afspm.transport.launching import Launched
-from afspm.transport.monitor import Monitor
-from afspm.transport.network import Network
-from afspm.transport.polling import poller
+from afspm.transport.network import Monitor, Network
+from afspm.transport.polling import Poller
+from afspm.transport.port import LaunchedProcess
 from afspm.transport.publisher import Publisher
+from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.router import Router
 from afspm.transport.subscriber import Subscriber
 from afspm.transport.translator_link import TranslatorLink
@@ -32,7 +31,7 @@ class SchedulerSockets:
         ConfigError: one is missing.
     """
 
-    def __init__(self, launch: Launched, complaints: Complaints, *, since_ns: int, epoch: bytes = b"") -> None:
+    def __init__(self, launch: LaunchedProcess, log: RateLimitedLog, *, since_ns: int, epoch: bytes = b"") -> None:
         sockets = launch.sockets
         if sockets.publish is None or sockets.serve is None or sockets.control is None or not sockets.subscribe:
             raise ConfigError(
@@ -42,19 +41,19 @@ class SchedulerSockets:
         self._network = Network.from_launch(launch.name, launch.keys)
         self._wake_up: WakeUp[None] = WakeUp()
         self.publisher = Publisher(self._network, sockets.publish, _nothing)
-        self.router = Router(self._network, sockets.serve, complaints)
-        self.link = TranslatorLink(self._network, sockets.control, complaints, epoch)
+        self.router = Router(self._network, sockets.serve, log)
+        self.link = TranslatorLink(self._network, sockets.control, log, epoch)
         self.subscriber = Subscriber(
-            self._network, launch.name, sockets.subscribe[0], None, complaints, since_ns=since_ns, filtered=False
+            self._network, launch.name, sockets.subscribe[0], None, log, since_ns=since_ns, filtered=False
         )
-        self._poller = poller(self._wake_up)
+        self._poller: Poller[Source] = Poller(self._wake_up)
         for source in (self.router, self.link, self.publisher, self.subscriber):
-            self._poller.register(source.socket, source, source)
-        for monitor in (self.router.monitor, self.link.monitor, self.subscriber.monitor):
-            self._poller.register(monitor.socket, monitor, None)
+            self._poller.register(source.socket, source)
+        for monitor in (self.router.monitor, self.link.monitor, self.publisher.monitor, self.subscriber.monitor):
+            self._poller.register(monitor.socket, monitor)
 
     def wait(self, timeout_ms: int | None) -> list[Source]:
-        """Those that have something to receive; returns early, perhaps with none, after `wake_up`."""
+        """Return the sources that have something to receive; returns early, perhaps with none, after `wake_up`."""
         sources, woken = self._poller.wait(timeout_ms)
         if woken:
             self._wake_up.take()

@@ -9,13 +9,12 @@ import zmq
 
 from afspm import wire
 from afspm.errors import ConfigError, WireError
-from afspm.transport.complaints import Complaints
-from afspm.transport.frames import readable, receive
-from afspm.transport.monitor import CONNECTED, Monitor
-from afspm.transport.network import MAX_PACKET_BYTES, Network
+from afspm.transport.frames import contents, receive_frames
+from afspm.transport.network import CONNECTED, MAX_PACKET_BYTES, Monitor, Network
 from afspm.transport.port import CaughtUp, Incoming, Killed, PacketReceived
+from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.replay import LONGEST, Marker, topic
-from afspm.wire import decode_packet
+from afspm.wire import Buffer, decode_packet
 
 _MOST_ENVELOPES = 10_000
 # few: what waits in the library's queue costs nothing, what we hold keeps large buffers from being used again
@@ -30,7 +29,7 @@ class Subscriber:
         prefixes: of the envelopes wanted; None for all. The signal KILL always comes.
         since_ns: what is not newer is known already.
         filtered: drop what is not newer than the newest of its envelope, as is right where times always increase. A
-            translator's may not, if its clock is set back: then the one who listens has to tell doubles.
+            translator's may not, if its clock is set back: then the listener has to tell doubles.
 
     Raises:
         ConfigError: these are too many prefixes.
@@ -42,7 +41,7 @@ class Subscriber:
         name: str,
         address: str,
         prefixes: Sequence[str] | None,
-        complaints: Complaints,
+        log: RateLimitedLog,
         *,
         since_ns: int = -1,
         filtered: bool = True,
@@ -52,13 +51,11 @@ class Subscriber:
         self.address = address
         self._prefixes = _with_kill(prefixes)
         _check(self._prefixes, name)
-        self._complaints = complaints
-        self._newest_ns = since_ns
+        self._log = log
+        self._newest_ns = self._started_ns = since_ns
         self._newest_of: dict[str, int] = {}
-        self._started_ns = since_ns
         self._nonces = itertools.count()
         self._marker: Marker | None = None
-        self.touched = True
         # unlike SUB, XSUB takes what is sent to it under any topic, and lets the marker through as it is
         self.socket = network.socket(zmq.XSUB, max_bytes=MAX_PACKET_BYTES)
         self.monitor = Monitor(network, self.socket, CONNECTED)
@@ -67,78 +64,62 @@ class Subscriber:
         network.connect(self.socket, address)
 
     def receive(self) -> list[Incoming]:
-        """What has come, a batch at a time: the rest is still there for the next call."""
-        socket = self.socket
+        """Return what has come, a batch at a time: the rest is still there for the next call."""
         found: list[Incoming] = []
-        while frames := receive(socket):
+        for _ in range(_BATCH):
+            frames = receive_frames(self.socket)
+            if not frames:
+                break
             try:
-                incoming = self._interpret(frames)
+                incoming = self._interpret(contents(frames))
             except WireError as error:
-                self._complaints.say(f"dropped a packet from {self.address}: {error}")
+                self._log.warning(f"dropped a packet from {self.address}: {error}")
             else:
                 if incoming is not None:
                     found.append(incoming)
-            if not readable(socket):
-                break
-            if len(found) == _BATCH:
-                self.touched = True
-                break
         return found
 
     def follow(self) -> list[Incoming]:
-        """Connections were made: what was missed is asked for."""
+        """Ask for what was missed if a connection was made, the first or another."""
         if self.monitor.drain():
-            self._ask_for_missed()
+            self._forget_marker()
+            self._marker = Marker(topic(self._name, next(self._nonces)), self._newest_ns, self._prefixes)
+            self.socket.send(b"\1" + self._marker.encode())
         return []
-
-    def _ask_for_missed(self) -> None:
-        """A connection was made, the first or another: say what we have, and be sent the rest."""
-        self.touched = True
-        self._forget_marker()
-        self._marker = Marker(topic(self._name, next(self._nonces)), self._newest_ns, self._prefixes)
-        self.socket.send(b"\1" + self._marker.encode())
 
     def _forget_marker(self) -> None:
         """Else the socket would ask for the same again when the connection is next made."""
         if self._marker is not None:
-            self.touched = True
             self.socket.send(b"\0" + self._marker.encode())
             self._marker = None
 
-    def _interpret(self, frames: list[bytes | memoryview]) -> Incoming | None:
-        # The calls that are made for every packet are few: each costs a microsecond where many subscribers share a
-        # processor, since its code is in no cache.
-        if len(frames) != 3 or frames[0][:1] == b"\0" or not frames[2]:
-            signal, frames = self._signal(frames)
-            if not frames:
-                return signal
-        packet = decode_packet(frames)
-        time_ns = packet.time_ns
-        if time_ns is not None:
-            if self._filtered:
-                known = self._newest_of
-                if time_ns <= known.get(packet.envelope, self._started_ns):
-                    return None
-                known[packet.envelope] = time_ns
-                if len(known) > _MOST_ENVELOPES:
-                    del known[next(iter(known))]
-            if time_ns > self._newest_ns or not self._filtered:
-                self._newest_ns = time_ns
-        return PacketReceived(packet, self.address)
-
-    def _signal(self, frames: list[bytes | memoryview]) -> tuple[Incoming | None, list[bytes | memoryview]]:
-        """What the rarer messages say, or the packet in them: one that was missed, or has no time."""
+    def _interpret(self, frames: list[Buffer]) -> Incoming | None:
         if frames[0][:1] == b"\0":
             if self._marker is None or frames[0] != self._marker.topic:
-                return None, []  # of an earlier connection
-            frames = frames[1:]
+                return None  # of an earlier connection
+            del frames[0]
             if not frames:
                 self._forget_marker()
-                return CaughtUp(self.address), []
+                return CaughtUp(self.address)
         elif len(frames) == 1 and frames[0] == wire.KILL:
-            return Killed(), []
-        # the timestamp that is empty is none
-        return None, [frames[0], *(frames[1:2] or [b""]), *(frame for frame in frames[2:] if frame)]
+            return Killed()
+        if len(frames) == 3 and not frames[2]:
+            del frames[2]  # a replayed packet without a time
+        packet = decode_packet(frames)
+        return PacketReceived(packet, self.address) if self._is_new(packet.envelope, packet.time_ns) else None
+
+    def _is_new(self, envelope: str, time_ns: int | None) -> bool:
+        if time_ns is None:
+            return True
+        if self._filtered:
+            if time_ns <= self._newest_of.get(envelope, self._started_ns):
+                return False
+            self._newest_of[envelope] = time_ns
+            if len(self._newest_of) > _MOST_ENVELOPES:
+                del self._newest_of[next(iter(self._newest_of))]
+        if time_ns > self._newest_ns or not self._filtered:
+            self._newest_ns = time_ns
+        return True
 
     def close(self) -> None:
         self.monitor.close()

@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import zmq
 
-from afspm.transport.complaints import Complaints
-from afspm.transport.frames import receive_small, send
-from afspm.transport.monitor import CONNECTED, DISCONNECTED, Monitor
-from afspm.transport.network import Network
+from afspm.transport.frames import receive_frames, send_frames
+from afspm.transport.network import CONNECTED, DISCONNECTED, Monitor, Network
+from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.wire.version import ANSWER, QUESTION, Version, as_version_1, is_of_version_1
 
 _LONGEST_NUMBER = 18
@@ -48,11 +47,10 @@ class TranslatorLink:
         version: of the translator that is there now.
     """
 
-    def __init__(self, network: Network, address: str, complaints: Complaints, epoch: bytes = b"") -> None:
-        self._complaints = complaints
+    def __init__(self, network: Network, address: str, log: RateLimitedLog, epoch: bytes = b"") -> None:
+        self._log = log
         self._before = [epoch, b""] if epoch else [b""]
         self._address = address
-        self.touched = True
         self.version = Version.UNKNOWN
         self.socket = network.socket(zmq.DEALER)
         # nothing waits for a translator that is gone, to be carried out when it is back. (With this an answer may be
@@ -63,18 +61,16 @@ class TranslatorLink:
 
     def send(self, number: int, frames: Sequence[bytes]) -> bool:
         """Ask; False if there is no translator to ask, or it has no such request."""
-        self.touched = True
         if self.version is Version.ONE:
             if not is_of_version_1(frames[0][0]):
                 return False
             frames = as_version_1(frames)
         before = self._before if self.version is Version.OURS else [b""]
-        return send(self.socket, [b"%d" % number, *before, *frames])
+        return send_frames(self.socket, [b"%d" % number, *before, *frames])
 
     def receive(self) -> LinkReply | LinkUp | None:
-        """The next answer; None: there is none, or it is malformed."""
-        self.touched = True
-        _, frames = receive_small(self.socket)
+        """Return the next answer; None: there is none, or it is malformed."""
+        frames = [frame.bytes for frame in receive_frames(self.socket)]
         if not frames or frames == [b""]:  # an empty one: the translator has looked whether we are there
             return None
         if frames[0] == _VERSION:
@@ -84,18 +80,17 @@ class TranslatorLink:
         number = before[0] if before else b""
         is_ours = before[1:] in ([], self._before[:-1]) and number.isdigit() and len(number) <= _LONGEST_NUMBER
         if not content or not is_ours:
-            self._complaints.say(f"dropped a malformed answer from {self._address}")
+            self._log.warning(f"dropped a malformed answer from {self._address}")
             return None
         return LinkReply(int(number), content)
 
     def follow(self) -> list[LinkDown]:
-        """The translator's going. One that comes is asked for its version; `receive` tells its answer."""
+        """Return the translator's going. One that comes is asked for its version; `receive` tells its answer."""
         gone: list[LinkDown] = []
         for event in self.monitor.drain():
             self.version = Version.UNKNOWN
             if event.kind == CONNECTED:
-                self.touched = True
-                send(self.socket, [_VERSION, b"", *QUESTION])
+                send_frames(self.socket, [_VERSION, b"", *QUESTION])
             else:
                 gone.append(LinkDown())
         return gone

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from afspm.clock import Clock
 from afspm.errors import ConfigError
-from afspm.transport.complaints import Complaints
 from afspm.transport.control_client import ControlClient
-from afspm.transport.flood import REST_MS, Flood
-from afspm.transport.history import Published
 from afspm.transport.network import Network
-from afspm.transport.polling import milliseconds, poller
-from afspm.transport.port import Incoming, ReplyReceived
+from afspm.transport.polling import Poller, milliseconds
+from afspm.transport.port import Incoming, LaunchedProcess, ReplyReceived
 from afspm.transport.publisher import Publisher
+from afspm.transport.rate_limited_log import RateLimitedLog
+from afspm.transport.replay import Published
 from afspm.transport.subscriber import Subscriber
 from afspm.transport.wakeup import WakeUp
 
@@ -50,23 +49,23 @@ class ZmqPort:
         self._clock = clock
         self._wake_up: WakeUp[Incoming] = WakeUp()
         self._closed = False
-        complaints = Complaints(logging.getLogger("afspm.transport"), clock)
+        log = RateLimitedLog(logging.getLogger("afspm.transport"), clock)
         self._publisher = None
         self._published = Published(clock)
-        self._flood = Flood()
         self._control = None
-        self._poller = poller(self._wake_up)
+        self._poller: Poller[Callable[[], Sequence[Incoming]]] = Poller(self._wake_up)
         if publish is not None:
             self._publisher = Publisher(network, publish, self._published)
-            self._poller.register(self._publisher.socket, self._serve, self._publisher)
+            self._poller.register(self._publisher.socket, self._serve)
+            self._poller.register(self._publisher.monitor.socket, self._serve)
         if control is not None:
-            self._control = ControlClient(network, name, control, complaints)
-            self._poller.register(self._control.socket, self._control.receive, self._control)
-            self._poller.register(self._control.monitor.socket, self._control.follow, None)
+            self._control = ControlClient(network, name, control, log)
+            self._poller.register(self._control.socket, self._control.receive)
+            self._poller.register(self._control.monitor.socket, self._control.follow)
         for address in subscribe:
-            subscriber = Subscriber(network, name, address, envelopes, complaints)
-            self._poller.register(subscriber.socket, subscriber.receive, subscriber, urgent=False)
-            self._poller.register(subscriber.monitor.socket, subscriber.follow, None)
+            subscriber = Subscriber(network, name, address, envelopes, log)
+            self._poller.register(subscriber.socket, subscriber.receive)
+            self._poller.register(subscriber.monitor.socket, subscriber.follow)
 
     @property
     def clock(self) -> Clock:
@@ -86,16 +85,10 @@ class ZmqPort:
             self._wake_up.post(ReplyReceived(answer))
 
     def poll(self, timeout_s: float | None) -> list[Incoming]:
-        wait_ms = milliseconds(timeout_s)
-        if self._flood.is_on and (wait_ms is None or wait_ms >= REST_MS):
-            self._poller.rest(REST_MS)
-            wait_ms = None if wait_ms is None else wait_ms - REST_MS
-        drains, woken = self._poller.wait(wait_ms)
+        receivers, woken = self._poller.wait(milliseconds(timeout_s))
         found: list[Incoming] = self._wake_up.take() if woken else []
-        for drain in drains:
-            found += drain()
-        if found:
-            self._flood.came(len(found), self._clock.monotonic_s())
+        for receive in receivers:
+            found += receive()
         return found
 
     def publish(self, envelope: str, payload: bytes) -> None:
@@ -119,3 +112,17 @@ class ZmqPort:
         if self._publisher is not None:
             self._publisher.serve()
         return []
+
+
+def open_port(launch: LaunchedProcess, clock: Clock) -> ZmqPort:
+    """Open the port of a component as its launch line says. Raises TransportError."""
+    sockets = launch.sockets
+    return ZmqPort(
+        Network.from_launch(launch.name, launch.keys),
+        launch.name,
+        clock,
+        subscribe=sockets.subscribe,
+        envelopes=launch.envelopes,
+        control=sockets.control,
+        publish=sockets.publish,
+    )

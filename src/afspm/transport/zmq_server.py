@@ -1,19 +1,20 @@
-"""Answers requests, one at a time, and publishes: a translator's side of the network."""
+"""A translator's side of the network: answers requests, one at a time, and publishes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import zmq
 
 from afspm.clock import Clock
 from afspm.errors import ConfigError
-from afspm.transport.frames import descriptor_of, property_of, readable, receive_small, send, user_of
-from afspm.transport.history import Published
-from afspm.transport.network import Network
-from afspm.transport.polling import milliseconds, poller
-from afspm.transport.port import RequestReceived, Served, SubscriberJoined
+from afspm.transport.frames import descriptor_of, is_readable, property_of, receive_frames, send_frames, user_of
+from afspm.transport.network import ACCEPTED, DISCONNECTED, Monitor, Network
+from afspm.transport.polling import Poller, milliseconds
+from afspm.transport.port import LaunchedProcess, RequestReceived, Served, SubscriberJoined
 from afspm.transport.publisher import Publisher
+from afspm.transport.replay import Published
+from afspm.transport.tcp_guard import TcpGuard
 from afspm.transport.wakeup import WakeUp
 from afspm.wire.version import ANSWER, QUESTION, answer_as_version_1
 
@@ -30,7 +31,7 @@ class ZmqServerPort:
     Args:
         serve: the address to answer requests on.
         publish: the address to publish on.
-        allowed: with keys, the only one whose requests are answered (the scheduler); None: whoever is let in.
+        allowed: with keys, the only name whose requests are answered (the scheduler's); None: all that are let in.
 
     Raises:
         TransportError: an address can't be used.
@@ -42,25 +43,27 @@ class ZmqServerPort:
         self._network = network
         self._clock = clock
         self._allowed = allowed
-        self._guarded = network.keys is not None and network.keys.binds_encrypted(requests=True)
+        self._has_keys = network.keys is not None and network.keys.binds_encrypted(requests=True)
         self._asker: list[bytes] | None = None
-        self._heard: set[int] = set()
         self._asked_by_version_1: int | None = None
         self._closed = False
-        self.touched = True
         self._wake_up: WakeUp[Served] = WakeUp()
         self._published = Published(clock)
         self._publisher = None if publish is None else Publisher(network, publish, self._published)
         self._socket = network.socket(zmq.ROUTER)
-        # A name belongs to its newest connection, else who connects anew before the old connection is found dead is
-        # never heard. And what it says is never freed: the library keeps the queues of those that it does not hear.
+        # A name belongs to its newest connection, else a scheduler that connects anew before the old connection is
+        # found dead is never heard. And what it says is never freed: the library keeps the queues that nobody reads.
         self._socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
         self._socket.setsockopt(zmq.ROUTER_MANDATORY, 1)  # so that it can be seen who is there
+        self._monitor = Monitor(network, self._socket, ACCEPTED | DISCONNECTED)
         self.serve_address = network.bind(self._socket, serve, requests=True)
-        self._poller = poller(self._wake_up)
-        self._poller.register(self._socket, self._request, self)
+        self._guard = network.watch(self.serve_address, TcpGuard())
+        self._poller: Poller[Callable[[], Sequence[Served]]] = Poller(self._wake_up)
+        self._poller.register(self._socket, self._request)
+        self._poller.register(self._monitor.socket, self._follow)
         if self._publisher is not None:
-            self._poller.register(self._publisher.socket, self._serve, self._publisher)
+            self._poller.register(self._publisher.socket, self._serve)
+            self._poller.register(self._publisher.monitor.socket, self._serve)
 
     @property
     def clock(self) -> Clock:
@@ -72,46 +75,53 @@ class ZmqServerPort:
         return self._publisher.address if self._publisher else None
 
     def poll(self, timeout_s: float | None) -> list[Served]:
-        drains, woken = self._poller.wait(milliseconds(timeout_s))
+        if is_busy := self._asker is not None:
+            self._poller.pause(self._socket)
+        receivers, woken = self._poller.wait(milliseconds(timeout_s))
+        if is_busy:
+            self._poller.register(self._socket, self._request)
         found: list[Served] = self._wake_up.take() if woken else []
-        for drain in drains:
-            found += drain()
+        for receive in receivers:
+            found += receive()
         return found
 
     def _serve(self) -> list[Served]:
         return [SubscriberJoined()] if self._publisher is not None and self._publisher.serve() else []
 
+    def _follow(self) -> list[Served]:
+        for kind, descriptor in self._monitor.drain():
+            (self._guard.opened if kind == ACCEPTED else self._guard.closed)(descriptor)
+        return []
+
     def _request(self) -> list[Served]:
         """The next request, if the last one was answered."""
-        self.touched = True
-        while self._asker is None:
-            first, parts = receive_small(self._socket)
-            if first is None:
-                break
-            self._heard.add(descriptor_of(first) or -1)
-            if not readable(self._socket):
-                self._network.connections.settled(self._heard)
-                self._heard.clear()
-            try:
-                start = parts.index(b"", 1) + 1
-            except ValueError:
-                continue  # not what REQ or DEALER peers send: there is no telling where an answer would go
-            if start == len(parts):
-                continue  # somebody says its name, as to a scheduler
-            self._asker = parts[:start]
-            epoch = parts[start - 2] if start > _WITHOUT_EPOCH else b""
-            is_of_version_1 = not epoch and len(parts) - start < _WITH_ID
-            self._asked_by_version_1 = int.from_bytes(parts[start][:1]) if is_of_version_1 else None
-            user = user_of(first) if self._guarded else None
-            allowed = self._allowed is None or not self._guarded or user == self._allowed
-            if not allowed:
-                self._asked_by_version_1 = None  # who may not ask hears why, whoever it is
-                self.reply([b"\1", b"", f"only {self._allowed} may ask here, not {user}".encode()])
-            elif parts[start:] == [*QUESTION] and property_of(first, "Socket-Type") == "DEALER":
-                self.reply(ANSWER)  # a REQ socket is that of a scheduler of version 1, which passes on what it is asked
-            else:
-                return [RequestReceived(parts[start:], user, epoch, parts[0])]
+        while self._asker is None and (frames := receive_frames(self._socket)):
+            if not is_readable(self._socket):
+                self._guard.settled([descriptor_of(frames[0])])
+            request = self._accepted(frames)
+            if request is not None:
+                return [request]
         return []
+
+    def _accepted(self, frames: Sequence[zmq.Frame]) -> RequestReceived | None:
+        """A message as a request that is to be answered; None: it is none, or was answered here."""
+        parts = [frame.bytes for frame in frames]
+        start = parts.index(b"", 1) + 1 if b"" in parts[1:] else len(parts)
+        if start == len(parts):
+            return None  # no telling where an answer would go; or a peer says its name, as to a scheduler
+        self._asker = parts[:start]
+        epoch = parts[start - 2] if start > _WITHOUT_EPOCH else b""
+        is_of_version_1 = not epoch and len(parts) - start < _WITH_ID
+        self._asked_by_version_1 = int.from_bytes(parts[start][:1]) if is_of_version_1 else None
+        user = user_of(frames[0]) if self._has_keys else None
+        if self._allowed is not None and self._has_keys and user != self._allowed:
+            self._asked_by_version_1 = None  # it hears why, whichever version it is of
+            self.reply([b"\1", b"", f"only {self._allowed} may ask here, not {user}".encode()])
+        elif parts[start:] == [*QUESTION] and property_of(frames[0], "Socket-Type") == "DEALER":
+            self.reply(ANSWER)  # a REQ socket is that of a scheduler of version 1, which passes on what it is asked
+        else:
+            return RequestReceived(parts[start:], user, epoch, parts[0])
+        return None
 
     def reply(self, frames: Sequence[bytes] | None) -> None:
         asker, self._asker = self._asker, None
@@ -125,9 +135,8 @@ class ZmqServerPort:
 
     def _send(self, frames: list[bytes]) -> bool:
         """False if the peer is gone, or takes nothing."""
-        self.touched = True
         try:
-            return send(self._socket, frames)
+            return send_frames(self._socket, frames)
         except zmq.ZMQError as error:
             if error.errno != zmq.EHOSTUNREACH:
                 raise
@@ -139,7 +148,7 @@ class ZmqServerPort:
         self._publisher.publish(self._published.stamp(envelope, payload, time_ns, keep=keep))
 
     def kill(self) -> None:
-        """Tell those who subscribed that the experiment has ended."""
+        """Tell all subscribers that the experiment has ended."""
         if self._publisher is not None:
             self._publisher.kill()
 
@@ -152,3 +161,16 @@ class ZmqServerPort:
             self._closed = True
             self._network.close()
             self._wake_up.close()
+
+
+def open_server_port(launch: LaunchedProcess, clock: Clock) -> ZmqServerPort:
+    """Open the port of a translator. Raises TransportError, or ConfigError if it has no address to answer on."""
+    if launch.sockets.serve is None:
+        raise ConfigError("it has no address to answer requests on", where=launch.name, hint="serve = address")
+    return ZmqServerPort(
+        Network.from_launch(launch.name, launch.keys),
+        clock,
+        serve=launch.sockets.serve,
+        publish=launch.sockets.publish,
+        allowed=(launch.keys or {}).get("scheduler") or None,
+    )

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from experiment_lab import AFSPM, AfspmRun
 
-from afspm.microscopes.simulator import files
+from afspm.files import read
 
 EXPERIMENT = """
 [clock]
@@ -184,10 +184,10 @@ def surveyed(run: AfspmRun) -> Surveyed:
     scans = [Path(one["scan"]) for one in noted if "scan" in one]
     spectra = [Path(one["spectrum"]) for one in noted if "spectrum" in one]
     first = lay[scans[0].name]
-    regions = [files.load(path)[0].region for path in scans]  # type: ignore[union-attr]
+    regions = [next(iter(read(path))).region for path in scans]  # type: ignore[union-attr]
     true = [lay[path.name].to_tip_of(first, region.center_m) for path, region in zip(scans, regions, strict=True)]
     corners = [lay[path.name].to_tip_of(first, region.corners_m()) for path, region in zip(scans, regions, strict=True)]
-    positions = [files.load(path)[0].position_m for path in spectra]  # type: ignore[union-attr]
+    positions = [next(iter(read(path))).position_m for path in spectra]  # type: ignore[union-attr]
     at = [lay[path.name].to_tip_of(first, at_m) for path, at_m in zip(spectra, positions, strict=True)]
     return Surveyed(
         said_m=np.array([one["center_m"] for one in noted if "scan" in one]),

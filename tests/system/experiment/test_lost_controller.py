@@ -67,7 +67,7 @@ def test_a_controller_that_is_killed_while_it_scans_is_a_malfunction_until_it_is
     run.wait_for_next(" witness ", "state SCANNING")
     cleared_before = run.output.count("device-malfunction is cleared")
     run.signal("controller", signal.SIGKILL)
-    run.wait_for_next("ERROR the controller can't be reached or trusted, it is tried again: ")
+    run.wait_for_next("ERROR lost contact with the controller: ")
     run.wait_for_next("device-malfunction is flagged by translator; details is no longer in control")
     run.wait_up("controller", times=2)
     run.wait_for("device-malfunction is cleared by translator", count=cleared_before + 1)

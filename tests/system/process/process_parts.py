@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 import sys
 import threading
-import weakref
 from pathlib import Path
 
 from afspm.client.component import Component
@@ -26,25 +24,6 @@ class Diary(Component):
 
     def on_end(self) -> None:
         say("end")
-
-
-class Littering(Component):
-    """Leaves garbage behind until it is found."""
-
-    def run(self) -> None:
-        found: list[str] = []
-        for _ in range(100_000):
-            litter = _Litter()
-            litter.itself = litter
-            weakref.finalize(litter, found.append, "found")
-            if found:
-                break
-        say(*found[:1], "and not looked through:", gc.get_freeze_count())
-        self.scope.sleep(3600.0)
-
-
-class _Litter:
-    itself: _Litter
 
 
 class NeedsThreshold(Component):

@@ -16,7 +16,7 @@ import pytest
 from afspm import wire
 from afspm.logic.envelopes import DEFAULT_HISTORY
 from afspm.model import Region, Scan
-from afspm.transport.subscribers import MOST_WAITING_BYTES
+from afspm.transport.tcp_guard import MOST_UNSENT_BYTES
 
 pytestmark = pytest.mark.skipif(
     sys.platform != "linux", reason="a process is stopped by a signal, and its peak memory is read from /proc"
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.skipif(
 PIXELS = 2048
 SCAN_BYTES = 8 * PIXELS**2  # 32 MB
 SCANS = 36
-MOST_GROWTH_BYTES = MOST_WAITING_BYTES + 6 * SCAN_BYTES
+MOST_GROWTH_BYTES = MOST_UNSENT_BYTES + 6 * SCAN_BYTES
 """What may wait for a subscriber; and on their way at the same time: the scan in the cache and the one that replaces
 it, two being received, one being sent, and one between two looks at what waits."""
 

@@ -11,9 +11,9 @@ from supervisor_lab import DEADLINE_S, QUICK, Running, RunTasks, Terminal
 from afspm.clock import ExperimentClock
 from afspm.logic.supervision.child import ChildPolicy
 from afspm.supervisor.log import RunLog
+from afspm.supervisor.process import Task
 from afspm.supervisor.reporter import Reporter
 from afspm.supervisor.supervisor import RunOutcome, Supervisor
-from afspm.supervisor.task import Task
 
 
 @pytest.fixture

@@ -15,8 +15,8 @@ from afspm.launch import Launch
 from afspm.logic.supervision.child import ChildPolicy
 from afspm.logic.supervision.liveness import LivenessPolicy
 from afspm.logic.supervision.restart import RestartPolicy
+from afspm.supervisor.process import Task
 from afspm.supervisor.supervisor import RunOutcome, Supervisor
-from afspm.supervisor.task import Task
 
 DEADLINE_S = 20.0
 BEAT_S = 0.1

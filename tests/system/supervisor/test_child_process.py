@@ -9,15 +9,23 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from queue import Queue
 
 import pytest
 
 from afspm.errors import AfspmError
-from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, LeftOut, Printed
+from afspm.launch import Launch
+from afspm.logic.supervision.supervisor_events import Exited
+from afspm.supervisor.child_output import OutputDropped, Printed
+from afspm.supervisor.process import ChildEvent, ChildProcess, Task
 
 DEADLINE_S = 15.0
 Start = Callable[[str], ChildProcess]
+
+
+def python(code: str) -> Task:
+    return Task(Launch("child"), (sys.executable, "-c", code))
 
 
 @pytest.fixture
@@ -30,7 +38,7 @@ def start(events: Queue[ChildEvent]) -> Iterator[Start]:
     started: list[ChildProcess] = []
 
     def run(code: str) -> ChildProcess:
-        child = ChildProcess("child", [sys.executable, "-c", code], '{"name": "child"}', events.put, {})
+        child = ChildProcess(python(code), events.put)
         started.append(child)
         return child
 
@@ -41,7 +49,7 @@ def start(events: Queue[ChildEvent]) -> Iterator[Start]:
 
 def test_the_launch_line_arrives_and_the_answer_comes_back(start: Start, events: Queue[ChildEvent]) -> None:
     child = start("print(input())")
-    assert events.get(timeout=DEADLINE_S) == Printed("child", child.pid, "stdout", '{"name": "child"}')
+    assert events.get(timeout=DEADLINE_S) == Printed("child", child.pid, "stdout", Launch("child").to_json())
     assert events.get(timeout=DEADLINE_S) == Exited("child", child.pid, 0)
 
 
@@ -67,7 +75,7 @@ def test_closing_stdin_ends_a_child_that_waits_for_it(start: Start, events: Queu
 
 def test_a_child_that_does_not_read_its_launch_line_does_not_block_us(events: Queue[ChildEvent]) -> None:
     deaf = [sys.executable, "-c", "import time; print('up', flush=True); time.sleep(60)"]
-    child = ChildProcess("deaf", deaf, "x" * 1_000_000, events.put, {})
+    child = ChildProcess(Task(Launch("deaf", settings={"long": "x" * 1_000_000}), tuple(deaf)), events.put)
     assert isinstance(events.get(timeout=DEADLINE_S), Printed)
     child.close_stdin()
     exited = events.get(timeout=DEADLINE_S)
@@ -101,7 +109,7 @@ def test_a_frozen_child_can_be_killed(start: Start, events: Queue[ChildEvent]) -
 
 def test_a_program_that_is_not_there_is_named(events: Queue[ChildEvent]) -> None:
     with pytest.raises(AfspmError, match="no-such-program"):
-        ChildProcess("child", ["no-such-program"], "{}", events.put, {})
+        ChildProcess(Task(Launch("child"), ("no-such-program",)), events.put)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a pipe handed on by inheritance is a matter of POSIX")
@@ -127,7 +135,7 @@ def test_a_child_that_prints_without_end_is_not_kept_in_memory(start: Start, eve
     while not isinstance(got[-1], Exited):
         got.append(events.get(timeout=DEADLINE_S))
     printed = [event.line for event in got if isinstance(event, Printed)]
-    left_out = sum(event.lines for event in got if isinstance(event, LeftOut))
+    left_out = sum(event.lines for event in got if isinstance(event, OutputDropped))
     assert printed[0] == "waiting 0"
     assert {"waiting 199999", "no stage"} <= set(printed)
     assert len(printed) < 10_000
@@ -140,21 +148,23 @@ def test_a_secret_of_others_is_not_in_its_environment(
     monkeypatch.setenv("NIGHT_HOOK", "secret")
     monkeypatch.setenv("NIGHT_LAMP", "on")
     code = "import os; print(os.environ.get('NIGHT_HOOK'), os.environ.get('NIGHT_LAMP'))"
-    child = ChildProcess("child", [sys.executable, "-c", code], "{}", events.put, {}, hidden=("NIGHT_HOOK",))
+    child = ChildProcess(replace(python(code), hidden=("NIGHT_HOOK",)), events.put)
     assert events.get(timeout=DEADLINE_S) == Printed("child", child.pid, "stdout", "None on")
 
 
 KILLED_SUPERVISOR = """
 import signal, sys
+from afspm.launch import Launch
 from afspm.supervisor.process import ChildProcess
 from afspm.supervisor.reaper import Reaper
+from afspm.supervisor.process import Task
 port, holds_lock = int(sys.argv[1]), "import ctypes; ctypes.PyDLL(None).pause()"
 call = f"import socket; s = socket.create_connection(('127.0.0.1', {port})); s.sendall(b'x'); "
 child = "import subprocess, sys; subprocess.Popen([sys.executable, '-c', sys.argv[1] + 's.recv(1)']); " + call
 reaper = Reaper()
 reaper.begin()
 code = child + (holds_lock if sys.argv[2] == "holds" else "sys.stdin.read()")
-child = ChildProcess("child", [sys.executable, "-c", code, call], "{}", print, {})
+child = ChildProcess(Task(Launch("child"), (sys.executable, "-c", code, call)), print)
 reaper.watch(child.pid, has_tip=False)
 signal.pause()
 """

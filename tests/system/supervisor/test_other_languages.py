@@ -12,8 +12,9 @@ from queue import Queue
 import pytest
 from supervisor_lab import DEADLINE_S
 
-from afspm.supervisor.process import ChildEvent, ChildProcess, Exited
-from afspm.supervisor.task import GUARD
+from afspm.launch import Launch
+from afspm.logic.supervision.supervisor_events import Exited
+from afspm.supervisor.process import GUARD, ChildEvent, ChildProcess, Task
 
 # a command that listens to nobody, with a child of its own that doesn't either; each calls us for as long as it lives
 DEAF = "import socket; socket.create_connection(('127.0.0.1', {port})).recv(1)"
@@ -55,7 +56,7 @@ def family(calls: socket.socket) -> Family:
 
 def test_when_the_guard_is_asked_to_end(family: Family) -> None:
     events: Queue[ChildEvent] = Queue()
-    guard = ChildProcess("foreign", family.command, "{}", events.put, {})
+    guard = ChildProcess(Task(Launch("foreign"), tuple(family.command)), events.put)
     family.wait_there()
     guard.close_stdin()
     family.wait_gone()
@@ -64,7 +65,7 @@ def test_when_the_guard_is_asked_to_end(family: Family) -> None:
 
 def test_when_the_guard_is_killed(family: Family) -> None:
     events: Queue[ChildEvent] = Queue()
-    guard = ChildProcess("foreign", family.command, "{}", events.put, {})
+    guard = ChildProcess(Task(Launch("foreign"), tuple(family.command)), events.put)
     family.wait_there()
     os.kill(guard.pid, signal.SIGKILL)  # the guard alone
     family.wait_gone()

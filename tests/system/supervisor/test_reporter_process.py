@@ -28,8 +28,8 @@ from afspm.model import (
     Response,
 )
 from afspm.supervisor.ports import FreePorts
+from afspm.supervisor.process import HOST, Task
 from afspm.supervisor.reporter import Reporter
-from afspm.supervisor.task import HOST, Task
 from afspm.transport import keys
 from afspm.transport.network import Network
 from afspm.transport.port import ControlConnected, PacketReceived, ReplyReceived, RequestReceived

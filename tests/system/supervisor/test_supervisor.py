@@ -15,7 +15,7 @@ from afspm.clock import ExperimentClock
 from afspm.exit_codes import ExitCode
 from afspm.experiment import Role
 from afspm.logic.supervision.run_end import EndReason
-from afspm.supervisor.task import Task
+from afspm.supervisor.process import Task
 
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 look_only = pytest.mark.skipif(sys.platform not in ("linux", "win32"), reason="a process can't be looked at there")

@@ -10,25 +10,24 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 from afspm.errors import FileError, Refused
 from afspm.microscopes.simulator import Simulator
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
-from afspm.translator import parameters, requests, sequence, settings
+from afspm.translator import commands, parameters, sequence, settings
 from afspm.translator.driver import Action, action
+from afspm.translator.observer import Observer
 from afspm.translator.parameters import Value
-from afspm.translator.process import Translator, run_translator
+from afspm.translator.process import run_translator
 
 
 class Broken(Simulator):
     """A simulated microscope with something in between."""
 
-    translator: ClassVar[type[Translator]] = Translator
-
     def run_process(self, context: Any) -> int:
         self.spoil()
-        return run_translator(self, context, self.translator)
+        return run_translator(self, context)
 
     def spoil(self) -> None:
         """Change what is afspm's own, in this process."""
@@ -214,7 +213,7 @@ class Clamps(Broken):
 
         plainly = parameters.ParameterSpec.checked
         parameters.ParameterSpec.checked = checked  # type: ignore[method-assign]
-        requests.RequestHandler._apply = lambda self, values, _: self._microscope.write(values)  # type: ignore[method-assign]
+        commands.apply = lambda driver, values, about_to_act=None: driver.write(values)  # type: ignore[assignment]
 
 
 class AcceptsNaN(Broken):
@@ -241,17 +240,17 @@ class AnyUnit(Broken):
 
 class BusyNotRefused(Broken):
     def spoil(self) -> None:
-        requests.RequestHandler._refuse_if_busy = lambda self, allowed: None  # type: ignore[method-assign]
+        commands.Commands._refuse_if_busy = lambda self, allowed: None  # type: ignore[method-assign]
 
 
 class SuccessWithoutChange(Broken):
     def spoil(self) -> None:
-        requests.RequestHandler._apply = lambda self, values, about_to_act: None  # type: ignore[method-assign]
+        commands.apply = lambda driver, values, about_to_act=None: None  # type: ignore[assignment]
 
 
 class KnowsEveryAction(Broken):
     def spoil(self) -> None:
-        requests.RequestHandler._find_action = lambda self, name: (  # type: ignore[method-assign]
+        commands.Commands._find_action = lambda self, name: (  # type: ignore[method-assign]
             self.actions.get(name) or Action(name, lambda: None)
         )
 
@@ -267,26 +266,22 @@ class DiesOfNaN(Broken):
         parameters.ParameterSpec.parse = parse  # type: ignore[method-assign]
 
 
-class _Twice(Translator):
-    def _publish(self, thing: settings.Published | ScopeStatus) -> None:
-        super()._publish(thing)
-        if not isinstance(thing, ScopeStatus):
-            super()._publish(thing)
-
-
 class PublishesTwice(Broken):
-    translator = _Twice
+    def spoil(self) -> None:
+        def publish(self: Observer, thing: settings.Published | ScopeStatus) -> None:
+            plainly(self, thing)
+            if not isinstance(thing, ScopeStatus):
+                plainly(self, thing)
 
-
-class _NoStart(Translator):
-    """Tells what changes, and not what is there."""
-
-    def _publish_all(self) -> None:
-        self._publish(self._sequence.said)
+        plainly = Observer.publish
+        Observer.publish = publish  # type: ignore[method-assign]
 
 
 class SaysNothingAtTheStart(Broken):
-    translator = _NoStart
+    """Tells what changes, and not what is there."""
+
+    def spoil(self) -> None:
+        Observer.publish_all = lambda self: self.publish(self._state.sequence.said)  # type: ignore[method-assign]
 
 
 class InOtherCoordinates(Broken):

@@ -19,9 +19,9 @@ from afspm.drift.record import DriftRecord
 from afspm.drift.registration import DriftScan
 from afspm.errors import FileError
 from afspm.exit_codes import ExitCode
-from afspm.microscopes.simulator.files import Measured, encode_scan
 from afspm.model import Region
 from afspm.simulation import World
+from afspm.translator.own_files import FileFacts, encode_scan
 
 pytest.importorskip("matplotlib")
 SETTINGS = {"surface": {"kind": "particles"}, "drift": {"velocity_m_per_s": (60e-12, -30e-12, 0.0)}}
@@ -53,7 +53,7 @@ def scanned() -> list[tuple[bytes, Region, float]]:
         x, y, _ = world.drift_m(middle_s) - world.drift_m(PIXELS / 2)
         region = Region((float(x), float(y)) if k >= SWITCHED_ON else (0.0, 0.0), (1e-6, 1e-6))
         scan = world.scan(region, (PIXELS, PIXELS), 1.0, EVERY_S * k)
-        measured = Measured(int(scan.end_s * 1e9), {"scan-speed [m/s]": 2e-6})
+        measured = FileFacts(int(scan.end_s * 1e9), {"scan-speed [m/s]": 2e-6})
         found.append((encode_scan(region, scan.channels(), measured), region, middle_s))
     return found
 

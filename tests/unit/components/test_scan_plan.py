@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from afspm.components.planned_scans import RegionGrid, ScanList, ScanSeries
-from afspm.components.scan_plan import RoundSchedule, ScanPlan, grid_centers, rounds_within, squares
+from afspm.components.scan_plan import RoundSchedule, ScanPlan, grid_centers, rounds_within
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Region
@@ -90,11 +90,6 @@ def test_regions_of_a_grid_touch_by_default() -> None:
         (0.5e-6, 0.5e-6),
         (-0.5e-6, 0.5e-6),
     ]
-
-
-def test_squares_have_the_size_and_angle_asked_for() -> None:
-    (region,) = squares([(1.0, 2.0)], (3.0, 4.0), 0.5)
-    assert region == Region((1.0, 2.0), (3.0, 4.0), 0.5)
 
 
 def test_a_series_of_eight_hours_every_fifteen_minutes_has_a_scan_at_both_ends() -> None:

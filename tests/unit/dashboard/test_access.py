@@ -16,7 +16,7 @@ from afspm.dashboard.access import (
     is_loopback,
     matches,
 )
-from afspm.dashboard.sessions import MOST, Sessions
+from afspm.dashboard.sessions import MOST_ENDED, Sessions
 from afspm.errors import ConfigError
 
 KEPT = hashed("open sesame")
@@ -186,10 +186,14 @@ def test_a_damaged_file_of_sessions_means_signing_in_anew(tmp_path: Path) -> Non
         assert access(file=file).visitor("x") is None
 
 
-def test_sessions_are_no_more_than_can_be_kept() -> None:
-    guard = access()
-    first, last = guard.cookie("Ada"), [guard.cookie("Ada") for _ in range(MOST)][-1]
-    assert [who(guard, first), who(guard, last)] == [None, "Ada"]
+def test_more_endings_than_can_be_kept_end_all_sessions_and_revive_none(tmp_path: Path) -> None:
+    guard = access(file=tmp_path / "dashboard.sessions")
+    ended, other = [guard.cookie("Ada") for _ in range(MOST_ENDED + 1)], guard.cookie("")
+    for cookie in ended:
+        guard.leave(cookie)
+    assert {who(guard, cookie) for cookie in (*ended, other)} == {None}
+    assert who(guard, guard.cookie("Ada")) == "Ada"
+    assert (tmp_path / "dashboard.sessions").stat().st_size < 1000
 
 
 def test_a_session_ends_after_a_month() -> None:

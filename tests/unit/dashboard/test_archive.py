@@ -8,8 +8,8 @@ import pytest
 
 from afspm import wire
 from afspm.clock import ExperimentClock
+from afspm.dashboard.archive import Archive
 from afspm.dashboard.content import trouble
-from afspm.dashboard.record import Archive
 from afspm.dashboard.watch import Watch
 from afspm.model import (
     ControlMode,

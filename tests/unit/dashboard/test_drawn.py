@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-import itertools
+import json
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pytest
 
 from afspm.clock import ExperimentClock
-from afspm.dashboard.content import log_html, process_words, refusals_html, unheard
-from afspm.dashboard.curves import drift_html, spectrum_html
-from afspm.dashboard.plots import Axis, Curve, plot, round_ticks, thinned
+from afspm.dashboard.charts import drift_chart, spectrum_chart
+from afspm.dashboard.content import refusals_html, rows_of, unheard
+from afspm.dashboard.panels import log_html, process_words
 from afspm.dashboard.sample_map import MapContent, map_html, places_of
-from afspm.dashboard.time_line import COLUMNS, stretches, time_line_html
 from afspm.dashboard.watch import Watch
-from afspm.dashboard.words import position, quantity, scale
+from afspm.dashboard.words import position
+from afspm.drawing.timeline import timeline_html
 from afspm.model import (
     ControlMode,
     ControlState,
@@ -31,7 +34,7 @@ from afspm.model import (
     ScopeStatus,
     Spectrum,
 )
-from afspm.record.overview import DriftPoint, Overview, ScanSummary, Span, SpectrumSummary
+from afspm.record.overview import DriftPoint, Overview, ScanSummary, SpectrumSummary
 
 S = 1_000_000_000
 HERE = Region((0.0, 0.0), (1e-6, 1e-6))
@@ -44,6 +47,10 @@ def taken(time_s: float, region: Region = HERE, channel: str = "Height", **more:
 def shapes(html: str, style: str) -> list[ElementTree.Element]:
     found = ElementTree.fromstring(re.search(r"<svg.*?</svg>", html, re.DOTALL).group())  # type: ignore[union-attr]
     return [shape for shape in found if style in (shape.get("class") or "").split()]
+
+
+def time_line_html(overview: Overview, now_ns: int, silent: Mapping[str, int] = MappingProxyType({})) -> str:
+    return timeline_html(rows_of(overview, silent), None, now_ns)
 
 
 def corners(shape: ElementTree.Element) -> np.ndarray:
@@ -119,24 +126,6 @@ def test_an_empty_map_says_so() -> None:
 # --- the time line ---
 
 
-def test_a_stretch_is_where_its_time_is() -> None:
-    found = stretches([Span("a", 0, 50 * S), Span("b", 50 * S, None)], 0, 100 * S)
-    assert [(one.label, one.begin, one.end) for one in found] == [("a", 0, COLUMNS // 2), ("b", COLUMNS // 2, COLUMNS)]
-
-
-def test_a_night_of_many_changes_takes_no_more_room_than_the_picture_has() -> None:
-    spans = [Span("scanning" if i % 2 else "free", i * S, (i + 1) * S) for i in range(20_000)]
-    found = stretches(spans, 0, 20_000 * S)
-    assert len(found) <= COLUMNS
-    assert all(a.end <= b.begin for a, b in itertools.pairwise(found))
-    assert sum(one.count for one in found) == 20_000
-
-
-def test_of_several_in_one_column_the_longest_is_shown() -> None:
-    spans = [Span("short", 0, S // 1000), Span("long", S // 1000, S // 4), Span("rest", S // 4, None)]
-    assert stretches(spans, 0, 1000 * S)[0].label == "long"
-
-
 def test_the_time_line_has_control_mode_state_problems_and_processes() -> None:
     overview = Overview()
     overview.take("ControlState", ControlState(ControlMode.AUTOMATED, "series"), S)
@@ -157,7 +146,7 @@ def test_names_from_outside_are_text_and_never_html() -> None:
     spectrum = Spectrum((0.0, 0.0), evil, (evil, evil), ("V", evil), np.ones((3, 2)), S)
     for html in (
         time_line_html(overview, 9 * S), log_html([line], frozenset(), "INFO"), refusals_html([entry]),
-        map_html(MapContent([taken(1, channel=evil)])), spectrum_html([(S, spectrum)], ""),
+        map_html(MapContent([taken(1, channel=evil)])), spectrum_chart([(S, spectrum)], "").words,
     ):  # fmt: skip
         assert "<img" not in html
         assert "&lt;img" in html
@@ -244,79 +233,57 @@ def test_a_simulated_night_passes_faster_and_nobody_is_gone_for_that() -> None:
 # --- curves ---
 
 
+def lines(options: Any) -> list[list[list[float | None]]]:
+    """The points of each line of a chart, as the browser gets them."""
+    return [one["data"] for one in json.loads(json.dumps(options, allow_nan=False))["series"] if one["type"] == "line"]
+
+
 def test_drift_is_drawn_against_time_and_its_state_told() -> None:
     points = [DriftPoint(i * S, (i * 1e-9, -i * 1e-9), (1e-9, 0.0), correcting=True) for i in range(10)]
-    html = drift_html(points)
-    assert html.count("<path") == 2
-    assert "corrected" in html
-    lost = drift_html([*points, DriftPoint(11 * S, (0.0, 0.0), (0.0, 0.0), lost=True, reason="no overlap")])
-    assert "The sample is lost: no overlap" in lost
+    chart = drift_chart(points)
+    x, y = lines(chart.options)
+    assert x[-1] == [9000.0, 9.0]
+    assert y[-1] == [9000.0, -9.0]
+    assert "corrected" in chart.words
+    lost = drift_chart([*points, DriftPoint(11 * S, (0.0, 0.0), (0.0, 0.0), lost=True, reason="no overlap")])
+    assert "The sample is lost: no overlap" in lost.words
+    assert lines(lost.options)[0][-1] == [11000.0, None], "a gap, and no line to zero"
+
+
+def test_what_was_only_predicted_is_drawn_as_dots() -> None:
+    points = [DriftPoint(i * S, (1e-9, 2e-9), (0.0, 0.0), matched=i % 2 == 0) for i in range(4)]
+    options = drift_chart(points).options
+    assert options is not None
+    (dots,) = [one for one in options["series"] if one["type"] == "scatter"]
+    assert len(dots["data"]) == 4
 
 
 def test_no_drift_is_said() -> None:
-    assert "Nobody tracks drift" in drift_html([])
+    chart = drift_chart([])
+    assert "Nobody tracks drift" in chart.words
+    assert chart.options is None
 
 
 def test_a_spectrum_is_drawn_with_those_before_it_behind() -> None:
     values = np.stack([np.linspace(-1, 1, 50), np.linspace(0, 1e-9, 50)], axis=1)
     spectra = [(i * S, Spectrum((0.0, 0.0), "IV", ("V", "I"), ("V", "A"), values, i * S)) for i in range(1, 4)]
-    html = spectrum_html(spectra, "I")
-    assert html.count("<path") == 3
-    assert "I [nA]" in html or "I [pA]" in html
+    chart = spectrum_chart(spectra, "I")
+    assert chart.options is not None
+    assert len(lines(chart.options)) == 3
+    assert [one["lineStyle"].get("opacity") for one in chart.options["series"]] == [0.4, 0.4, None]
+    assert chart.options["yAxis"]["name"] == "I [nA]"
 
 
 def test_a_spectrum_of_one_variable_is_no_error() -> None:
     spectrum = Spectrum(None, "", ("V",), ("V",), np.ones((3, 1)), S)
-    assert "no curve" in spectrum_html([(S, spectrum)], "I")
+    assert "no curve" in spectrum_chart([(S, spectrum)], "I").words
 
 
-def test_peaks_survive_thinning() -> None:
-    y = np.zeros(100_000)
-    y[31_234] = 5.0
-    x, thin = thinned(np.arange(100_000.0), y)
-    assert thin.max() == 5.0
-    assert len(thin) <= 700
-    assert (np.diff(x) > 0).all()
-
-
-def test_a_gap_is_not_drawn_over() -> None:
-    y = np.array([0.0, 1.0, np.nan, 1.0, 0.0])
-    html = plot([Curve(np.arange(5.0), y, "curve-a")], Axis("x"), Axis("y"), "t")
-    path = re.search(r' d="(.*?)"', html)
-    assert path is not None
-    assert path.group(1).count("M") == 2
-
-
-@pytest.mark.parametrize("y", [np.full(3, np.nan), np.zeros(0)])
-def test_nothing_to_draw_is_said(y: np.ndarray) -> None:
-    assert "nothing yet" in plot([Curve(np.arange(float(len(y))), y, "a")], Axis("x"), Axis("y"), "t")
-
-
-def test_ticks_are_round_and_inside() -> None:
-    assert round_ticks(-0.26, 1.03) == [-0.2, 0.0, 0.2, 0.4, 0.6, 0.8, 1.0] or round_ticks(-0.26, 1.03) == [
-        0.0,
-        0.5,
-        1.0,
-    ]
-    for low, high in ((1e-9, 3e-9), (-7.0, 1000.0), (5.0, 5.0)):
-        assert all(low - 1e-9 * high <= tick <= high * (1 + 1e-9) for tick in round_ticks(low, high))
-
-
-# --- words ---
-
-
-@pytest.mark.parametrize(
-    ("value", "unit", "text"),
-    [(1.234e-8, "m", "12.34 nm"), (0.0, "m", "0 m"), (9.9999e-7, "m", "1 µm"), (-3.0, "V", "-3 V"), (5.0, "", "5"),
-     (0.001, "counts", "0.001 counts"), (float("nan"), "m", "–"), (None, "m", "–"), (2e-6, "m/s", "2 µm/s")],
-)  # fmt: skip
-def test_quantities_read_well(value: float | None, unit: str, text: str) -> None:
-    assert quantity(value, unit) == text
-
-
-def test_the_prefix_and_the_factor_belong_together() -> None:
-    factor, unit = scale(3e-7, "m")
-    assert (3e-7 * factor, unit) == (pytest.approx(300.0), "nm")
+@pytest.mark.parametrize("gone", [np.nan, np.inf])
+def test_what_is_not_finite_in_a_spectrum_is_a_gap(gone: float) -> None:
+    values = np.array([[0.0, 1.0], [1.0, gone], [gone, 2.0], [3.0, 3.0]])
+    chart = spectrum_chart([(S, Spectrum(None, "IV", ("V", "I"), ("", ""), values, S))], "I")
+    assert [point[1] for point in lines(chart.options)[0]] == [1.0, None, None, 3.0]
 
 
 def test_positions_read_well() -> None:

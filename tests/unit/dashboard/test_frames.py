@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from afspm.dashboard.drawing import Drawer, Look
 from afspm.dashboard.frames import MEMORY_BYTES, MOST_CHANNELS, FrameStore
-from afspm.dashboard.levelling import Levelling
+from afspm.dashboard.pictures import Look, PictureCache
+from afspm.drawing.levelling import Levelling
 from afspm.model import Region, Scan, ScanLines
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))
@@ -120,7 +120,7 @@ def test_a_scan_without_values_is_no_picture() -> None:
 
 
 def test_a_picture_is_drawn_once_for_all_who_look_at_it_alike() -> None:
-    store, drawer = FrameStore(), Drawer()
+    store, drawer = FrameStore(), PictureCache()
     store.take_scan(scan(1.0, 10 * S), 10 * S)
     frame = store.newest()
     assert frame is not None
@@ -135,7 +135,7 @@ def test_the_head_says_what_is_needed_for_axes_and_fits_a_header() -> None:
     store.take_scan(named, 0)
     frame = store.newest()
     assert frame is not None
-    head = Drawer().draw(frame, Look()).head()
+    head = PictureCache().draw(frame, Look()).head()
     assert head.isascii()
     assert head.isprintable()
     assert '"1763600000123456789"' in head  # as text: JavaScript's numbers are not that exact
@@ -148,7 +148,7 @@ def test_what_is_not_finite_can_be_drawn(value: float) -> None:
     store.take_scan(scan(value, 10 * S), 10 * S)
     frame = store.newest()
     assert frame is not None
-    assert Drawer().draw(frame, Look()).png.startswith(b"\x89PNG")
+    assert PictureCache().draw(frame, Look()).png.startswith(b"\x89PNG")
 
 
 def test_lines_that_are_said_to_be_of_millions_of_rows_take_no_memory() -> None:

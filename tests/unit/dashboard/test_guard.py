@@ -10,9 +10,8 @@ import pytest
 from fastapi import FastAPI, Request, WebSocket
 
 from afspm.dashboard.access import Access, hashed
-from afspm.dashboard.entrance import add_entrance
-from afspm.dashboard.guard import VISITOR, Guard
 from afspm.dashboard.sessions import Sessions
+from afspm.dashboard.sign_in import VISITOR, Guard, add_sign_in
 
 KEPT = hashed("open sesame")
 PEOPLE = {"Ada": hashed("analytical")}
@@ -73,7 +72,7 @@ def served() -> Served:
     def serve(host: str = "127.0.0.1", kept: str = "", at: str = "http://127.0.0.1:8080") -> Browser:
         access = Access(host, kept, PEOPLE if kept else {}, lambda: 1000.0, Sessions(None, lambda: 1000.0), {})
         app = FastAPI()
-        add_entrance(app, access, "night <1>", encrypted=at.startswith("https"), only_here=host == "127.0.0.1")
+        add_sign_in(app, access, "night <1>", encrypted=at.startswith("https"), only_here=host == "127.0.0.1")
 
         def who(request: Request) -> dict[str, str]:
             return {"person": getattr(request.state, VISITOR).person}

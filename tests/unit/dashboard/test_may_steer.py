@@ -8,7 +8,7 @@ import pytest
 
 from afspm.clock import ExperimentClock
 from afspm.dashboard.access import Access, Visitor
-from afspm.dashboard.acts import Outcome
+from afspm.dashboard.actions import ActionResult
 from afspm.dashboard.sessions import Sessions
 from afspm.dashboard.steering import Steering
 from afspm.dashboard.watch import Watch
@@ -32,9 +32,9 @@ def done(steering: Steering, visitor: Visitor) -> list[Any]:
     """In whose names an act was carried out."""
     asked: list[Any] = []
 
-    def act(person: Any) -> Outcome:
+    def act(person: Any) -> ActionResult:
         asked.append(person)
-        return Outcome("done")
+        return ActionResult("done")
 
     steering.do(visitor, act).result(5.0)
     return asked

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 from nicegui import Client, ui
 
-from afspm.dashboard.health_panel import HealthPanel
+from afspm.dashboard.panels import HealthPanel
 from afspm.model import ProcessCondition, ProcessState
 
 HOSTILE = """x" onmouseover="alert(1)" innerHTML="<img src=x onerror=alert(2)>"""

@@ -13,7 +13,7 @@ from .conftest import FRAME, Write, errors, line_of, only_error
 CLASSIFIER = '[watch]\ncomponent = true\nclass = "parts.Classifier"\n'
 CORRECTOR = '[repair]\ncomponent = true\nclass = "parts.Corrector"\n'
 PEAKS = '[peaks]\ncomponent = true\nclass = "parts.Peaks"\n'
-LOG = '[log]\ncomponent = true\nclass = "LogCollector"\n'
+LOG = '[log]\ncomponent = true\nclass = "parts.Listener"\n'
 PAGE = '[page]\ncomponent = true\nclass = "Dashboard"\n'
 CHOOSER = '[choose]\ncomponent = true\nclass = "parts.Chooser"\n'
 ANYTHING = '[any]\ncomponent = true\nclass = "parts.Anything"\n'
@@ -109,12 +109,12 @@ BROKEN = {
         PEAKS + 'publisher = "tcp://localhost.example.org:9000"\n', FRAME, "without keys"
     ),
     "a publisher where the log is collected": (
-        LOG + 'address = "tcp://127.0.0.1:9000"\n' + PEAKS + 'publisher = "tcp://localhost:9000"\n',
+        LOG + 'at = "tcp://127.0.0.1:9000"\n' + PEAKS + 'publisher = "tcp://localhost:9000"\n',
         FRAME,
-        "[log] and [peaks] both bind tcp://127.0.0.1:9000 (address, publish)",
+        "[log] and [peaks] both bind tcp://127.0.0.1:9000 (at, publish)",
     ),
     "a page where the log is collected": (
-        PAGE + "port = 9000\n" + LOG + 'address = "tcp://127.0.0.1:9000"\n', FRAME, "(address, port)"
+        PAGE + "port = 9000\n" + LOG + 'at = "tcp://127.0.0.1:9000"\n', FRAME, "(at, port)"
     ),
     "a page at all addresses where somebody publishes": (
         PAGE + 'host = "0.0.0.0"\nport = 9000\n' + PEAKS + 'publisher = "tcp://127.0.0.1:9000"\n', FRAME, "both bind"
@@ -136,10 +136,10 @@ BROKEN = {
         "[mine] and [peaks] both bind tcp://127.0.0.1:9010 (at, publish)",
     ),
     "a log that others on the network can send to": (
-        LOG + 'address = "tcp://192.168.1.5:9010"\n', FRAME, "[log] binds tcp://192.168.1.5:9010, which other"
+        LOG + 'at = "tcp://192.168.1.5:9010"\n', FRAME, "[log] binds tcp://192.168.1.5:9010, which other"
     ),
-    "a log at no address": (LOG + 'address = "localhost"\n', FRAME, "this is not an address"),
-    "a log at no port": (LOG + 'address = "tcp://127.0.0.1:99999"\n', FRAME, "this is not an address"),
+    "a log at no address": (LOG + 'at = "localhost"\n', FRAME, "this is not an address"),
+    "a log at no port": (LOG + 'at = "tcp://127.0.0.1:99999"\n', FRAME, "this is not an address"),
     "a page at no port": (PAGE + "port = 99999\n", FRAME, "this is not a port"),
     "no port": (PEAKS + 'publisher = "tcp://127.0.0.1:99999"\n', FRAME, "neither an address"),
     "no port in an intermediary": (
@@ -222,18 +222,18 @@ def test_an_address_beside_an_emulator_is_said_to_be_of_no_use(write: Write) -> 
 def test_what_listens_at_addresses_of_its_own_is_no_error(write: Write) -> None:
     """A page keeps strangers out by itself, and any port that is free is nobody else's."""
     listening = PAGE + 'host = "0.0.0.0"\nport = 9000\n' + PAGE.replace("page", "second") + "port = 0\n"
-    listening += LOG + 'address = "tcp://127.0.0.1:9001"\n' + PEAKS + 'publisher = "tcp://127.0.0.1:9002"\n'
+    listening += LOG + 'at = "tcp://127.0.0.1:9001"\n' + PEAKS + 'publisher = "tcp://127.0.0.1:9002"\n'
     assert errors(write(listening)) == []
 
 
 @pytest.mark.parametrize("secure", ['[security]\nkeys = "."\n', "[security]\ninsecure = true\n"])
 def test_a_log_may_be_collected_from_other_computers_with_keys_or_by_word(write: Write, secure: str) -> None:
-    assert errors(write(LOG + 'address = "tcp://192.168.1.5:9010"\n' + secure)) == []
+    assert errors(write(LOG + 'at = "tcp://192.168.1.5:9010"\n' + secure)) == []
 
 
 def test_of_a_port_that_is_too_high_it_is_said(write: Write) -> None:
     assert "65535" in only_error(write(PEAKS + 'publisher = "tcp://127.0.0.1:99999"\n')).hint
-    assert "65535" in only_error(write(LOG + 'address = "tcp://127.0.0.1:99999"\n')).hint
+    assert "65535" in only_error(write(LOG + 'at = "tcp://127.0.0.1:99999"\n')).hint
     assert errors(write(PEAKS + 'publisher = "tcp://127.0.0.1:65535"\n')) == []
 
 
@@ -348,7 +348,8 @@ def test_what_is_expanded_checks_like_the_file_itself(write: Write) -> None:
         + PEAKS + 'listens_to = []\n[limits]\nmost_pixels = 1000\n')  # fmt: skip
     again = _reload(experiment)
     assert not errors(again)
-    assert again.resolved.settings == experiment.resolved.settings
+    for name, process in experiment.resolved.processes.items():
+        assert again.resolved.processes[name].settings == process.settings
     assert again.resolved.limits.most_pixels == 1000
 
 

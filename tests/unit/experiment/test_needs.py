@@ -52,5 +52,5 @@ def test_a_ready_made_component_needs_what_its_settings_say(write: Write) -> Non
 def test_all_that_ready_made_components_need_the_simulator_has(write: Write, component: str) -> None:
     experiment = write(component, frame=SIMULATED)
     assert errors(experiment) == []
-    declared = [said for said in experiment.resolved.declared.values() if said.needs_actions]
+    declared = [one.declared for one in experiment.resolved.processes.values() if one.declared.needs_actions]
     assert len(declared) == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -193,7 +194,11 @@ def published(write: Write, *texts: str) -> Experiment:
 def test_a_file_of_the_published_form_can_be_run(write: Write) -> None:
     experiment = published(write, DRIFT, PICTURE, SERIES, SHOWN, METADATA)
     assert errors(experiment) == []
-    classes = {name: path.rpartition(".")[2] for name, path in experiment.resolved.class_paths.items()}
+    classes = {
+        name: process.class_path.rpartition(".")[2]
+        for name, process in experiment.resolved.processes.items()
+        if process.class_path
+    }
     assert classes["mediator"] == "DriftCompensatedScheduler"
     assert classes["translator"] == "Simulator"
     assert (classes["rescanner"], classes["metadata"], classes["ui"]) == ("Rescanner", "Metadata", "Dashboard")
@@ -202,7 +207,7 @@ def test_a_file_of_the_published_form_can_be_run(write: Write) -> None:
 
 def test_settings_of_the_drift_scheduler_are_those_of_the_paper_s_tracker(write: Write) -> None:
     experiment = published(write, DRIFT, PICTURE, SERIES)
-    drift = experiment.resolved.settings["mediator"]["drift"]
+    drift = experiment.resolved.processes["mediator"].settings["drift"]
     assert drift["channel"] == "Height", "the simulated channel that stands for the picture's"
     assert drift["tracker"] == {"class": "paper", "w_update": 0.8, "f_min": 0.4, "sr_norm_min": 0.3, "queue": 7}
     assert (drift["rescan"]["rule"], drift["rescan"]["f_rescan"]) == ("paper", 0.9)
@@ -220,7 +225,7 @@ def test_the_published_drift_model_is_an_estimator(write: Write) -> None:
     text = MODEL + DRIFT.replace("display_fit = false", 'drift_model = "model"')
     experiment = published(write, text, PICTURE, SERIES)
     assert errors(experiment) == []
-    drift = experiment.resolved.settings["mediator"]["drift"]
+    drift = experiment.resolved.processes["mediator"].settings["drift"]
     assert drift["estimator"] == {"class": "orb", "transform": "euclidean"}
     assert drift["tracker"]["transform"] == "euclidean"
 
@@ -259,13 +264,13 @@ def test_settings_of_ours_join_the_published_ones(write: Write) -> None:
     text = DRIFT.replace("display_fit = false", 'drift = { correct_after = "2 h", tracker = { lost_after = 9 } }')
     experiment = published(write, text, PICTURE, SERIES)
     assert errors(experiment) == []
-    drift = experiment.resolved.settings["mediator"]["drift"]
+    drift = experiment.resolved.processes["mediator"].settings["drift"]
     assert (drift["correct_after"], drift["tracker"]["lost_after"], drift["tracker"]["w_update"]) == (7200.0, 9, 0.8)
 
 
 def test_what_the_drift_scheduler_is_not_told_stays_as_it_is_here(write: Write) -> None:
     plain = DRIFT.split("channel_id")[0] + DRIFT[DRIFT.index("\n[rescanner]") :]
-    assert "drift" not in published(write, plain, PICTURE, SERIES).resolved.settings["mediator"]
+    assert "drift" not in published(write, plain, PICTURE, SERIES).resolved.processes["mediator"].settings
 
 
 @pytest.mark.parametrize(
@@ -298,16 +303,18 @@ float_tolerance = 1e-5
 """
     experiment = published(write, text, MEDIATOR, SERIES)
     assert errors(experiment) == []
-    assert experiment.resolved.class_paths["translator"].rpartition(".")[2] == ours
-    assert experiment.resolved.settings["translator"].get("address") == expected
-    assert experiment.resolved.settings["translator"].get("reply_timeout_s") == (20.0 if ours == "Asylum" else None)
+    assert experiment.resolved.processes["translator"].class_path.rpartition(".")[2] == ours
+    assert experiment.resolved.processes["translator"].settings.get("address") == expected
+    assert experiment.resolved.processes["translator"].settings.get("reply_timeout_s") == (
+        20.0 if ours == "Asylum" else None
+    )
 
 
 def test_published_functions_are_evaluated_where_a_topic_names_them(write: Write) -> None:
     experiment = published(write, MEDIATOR, PICTURE, SERIES.replace('"sub"', '"full_sub"'))
     assert errors(experiment) == []
     (part,) = [part for part in experiment.parts.components if part.name == "experiment"]
-    assert experiment.resolved.envelopes(part) == ("Scan2d_200.0_Height", "ControlState")
+    assert experiment.resolved.processes[part.name].envelopes == ("Scan2d_200.0_Height", "ControlState")
 
 
 def test_histories_by_size_and_channel_are_rules_of_the_cache(write: Write) -> None:
@@ -357,15 +364,14 @@ def test_the_short_form_is_the_same_experiment(write: Write, tmp_path: Path) -> 
     (tmp_path / "short.toml").write_text(text, encoding="utf-8")
     brief = load(tmp_path / "short.toml")
     assert errors(brief) == []
-    assert brief.resolved.settings == long.resolved.settings
-    assert brief.resolved.class_paths == long.resolved.class_paths
+    assert _known(brief) == _known(long)
     assert brief.resolved.caching.history == long.resolved.caching.history
     for mine, theirs in zip(brief.resolved.caching.rules, long.resolved.caching.rules, strict=True):
         assert vars(mine) == pytest.approx(vars(theirs))
     for part in brief.parts.components:
         (same,) = [other for other in long.parts.components if other.name == part.name]
-        assert brief.resolved.envelopes(part) == long.resolved.envelopes(same)
-    assert brief.resolved.control.request_timeout == 5.0
+        assert brief.resolved.processes[part.name].envelopes == long.resolved.processes[same.name].envelopes
+    assert brief.resolved.sections.control.request_timeout == 5.0
 
 
 def test_addresses_of_other_computers_stay_in_the_short_form(write: Write, tmp_path: Path) -> None:
@@ -384,7 +390,7 @@ def test_a_series_that_a_published_function_took_is_proposed(write: Write, tmp_p
     (tmp_path / "short.toml").write_text(text, encoding="utf-8")
     proposed = load(tmp_path / "short.toml")
     assert errors(proposed) == []
-    series = proposed.resolved.settings["experiment"]
+    series = proposed.resolved.processes["experiment"].settings
     assert series["size"] == pytest.approx([200e-9, 200e-9])
     assert series["center"] == pytest.approx([100e-9, 100e-9])
     assert (series["pixels"], series["every"]) == ([256, 128], 5.0)
@@ -415,3 +421,7 @@ def test_the_command_prints_the_short_form_alone_to_stdout(write: Write, monkeyp
     assert done.stdout == short(load("night.toml"))
     line = line_of(experiment, "update_weight")
     assert f"night.toml:{line}: [mediator] update_weight: drift.tracker.class" in done.stderr
+
+
+def _known(experiment: Experiment) -> dict[str, tuple[str, dict[str, Any]]]:
+    return {name: (process.class_path, process.settings) for name, process in experiment.resolved.processes.items()}

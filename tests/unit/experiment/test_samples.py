@@ -45,8 +45,8 @@ def test_a_sample_can_be_drawn_and_started(files: tuple[str, ...]) -> None:
 def test_a_small_file_ports_an_experiment_to_another_microscope() -> None:
     ported = sample("keep_scanning", "small_scanner.toml")
     assert ported.check() == []
-    assert ported.resolved.settings["series"]["size"] == pytest.approx([500e-9, 500e-9])
-    assert ported.resolved.settings["series"]["every"] == 900.0
+    assert ported.resolved.processes["series"].settings["size"] == pytest.approx([500e-9, 500e-9])
+    assert ported.resolved.processes["series"].settings["every"] == 900.0
     assert ported.resolved.limits.region is not None
 
 
@@ -65,16 +65,16 @@ def test_the_laboratory_s_file_of_two_computers_needs_its_keys(tmp_path: Path) -
 def test_the_paper_s_form_says_the_same_as_the_short_one() -> None:
     short, long = sample("tip_repair").resolved, sample("paper_form").resolved
     for name in ("scheduler", "series", "tip_classifier", "tip_corrector"):
-        assert long.settings[name] == short.settings[name]
-        assert long.class_paths[name] == short.class_paths[name]
-    assert long.settings["translator"] == short.settings["microscope"]
+        assert long.processes[name].settings == short.processes[name].settings
+        assert long.processes[name].class_path == short.processes[name].class_path
+    assert long.processes["translator"].settings == short.processes["microscope"].settings
     assert long.limits.region == short.limits.region
 
 
 def test_the_paper_s_drift_method_has_the_values_of_its_table() -> None:
     experiment = sample("drift_night", "paper.toml")
     assert experiment.check() == []
-    drift, series = (experiment.resolved.settings[name] for name in ("scheduler", "series"))
+    drift, series = (experiment.resolved.processes[name].settings for name in ("scheduler", "series"))
     ransac = {"transform": "translation", "residual_threshold": 0.05, "iterations": 100, "tighten": False}
     assert drift["drift"]["estimator"] == {"class": "brief", **ransac}
     tracker, rescan = drift["drift"]["tracker"], drift["drift"]["rescan"]

@@ -33,7 +33,7 @@ def scanner(settings: str = "", size: str = 'size = ["1 um", "1 um"]') -> str:
 def test_a_setting_reaches_the_process_in_si_and_as_json(write: Write, setting: str, value: object) -> None:
     experiment = write(scanner(setting))
     assert not errors(experiment)
-    settings = experiment.resolved.settings["scan"]
+    settings = experiment.resolved.processes["scan"].settings
     assert settings[setting.split(" ")[0]] == value
     json.dumps(settings)
 
@@ -48,7 +48,7 @@ def test_a_quantity_that_stays_a_text_is_warned_of(write: Write) -> None:
 
 def test_a_relative_file_is_one_beside_the_experiment_file(write: Write) -> None:
     experiment = write(scanner('image = "surface.png"'))
-    assert Path(experiment.resolved.settings["scan"]["image"]) == experiment.folder / "surface.png"
+    assert Path(experiment.resolved.processes["scan"].settings["image"]) == experiment.folder / "surface.png"
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_a_misspelt_required_setting_is_told_once(write: Write) -> None:
 def test_a_class_that_takes_anything_gets_anything(write: Write) -> None:
     experiment = write('[a]\ncomponent = true\nclass = "parts.Anything"\nwhatever = { x = [1, "two"] }\n')
     assert not errors(experiment)
-    assert experiment.resolved.settings["a"] == {"whatever": {"x": [1, "two"]}}
+    assert experiment.resolved.processes["a"].settings == {"whatever": {"x": [1, "two"]}}
 
 
 def test_settings_that_are_handed_on_to_the_base_class_are_checked_by_it(write: Write) -> None:
@@ -189,7 +189,7 @@ more = ["my_plan"]
 def test_an_intermediary_class_of_one_s_own_is_made_by_the_process(write: Write, tmp_path: Path) -> None:
     experiment = write(OBJECT)
     assert experiment.check() == []
-    settings = experiment.resolved.settings["planner"]
+    settings = experiment.resolved.processes["planner"].settings
     assert settings == {"plan": {"class": "parts.Plan", "size": 2e-6}, "more": [settings["plan"]]}
     with class_loader.importing_from([tmp_path]):
         made: Any = loading.load(Launch("planner", "parts.Planner", json.loads(json.dumps(settings))))

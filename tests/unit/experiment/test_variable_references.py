@@ -10,17 +10,17 @@ SCANNER = '[scan]\ncomponent = true\nclass = "parts.Scanner"\n'
 def test_a_string_that_is_a_key_is_replaced(write: Write) -> None:
     experiment = write('scan_size = ["1 um", "2 um"]\n' + SCANNER + 'size = "scan_size"\n')
     assert not errors(experiment)
-    assert experiment.resolved.settings["scan"]["size"] == [1e-6, 2e-6]
+    assert experiment.resolved.processes["scan"].settings["size"] == [1e-6, 2e-6]
 
 
 def test_references_lead_on_to_references_within_lists(write: Write) -> None:
     experiment = write('wide = "3 um"\nscan_size = ["wide", "wide"]\n' + SCANNER + 'size = "scan_size"\n')
-    assert experiment.resolved.settings["scan"]["size"] == [3e-6, 3e-6]
+    assert experiment.resolved.processes["scan"].settings["size"] == [3e-6, 3e-6]
 
 
 def test_a_part_of_a_string_is_not_replaced(write: Write) -> None:
     experiment = write('wide = "3 um"\n' + SCANNER + 'size = ["1 um", "1 um"]\nnames = ["wide.x", "a wide"]\n')
-    assert experiment.resolved.settings["scan"]["names"] == ["wide.x", "a wide"]
+    assert experiment.resolved.processes["scan"].settings["names"] == ["wide.x", "a wide"]
 
 
 def test_a_component_s_name_stays_a_name(write: Write) -> None:
@@ -28,13 +28,13 @@ def test_a_component_s_name_stays_a_name(write: Write) -> None:
         SCANNER + 'size = ["1 um", "1 um"]\nnames = ["scan", "scheduler", "clock"]\n[clock]\nspeed = 1.0\n'
     )
     assert not errors(experiment)
-    assert experiment.resolved.settings["scan"]["names"] == ["scan", "scheduler", "clock"]
+    assert experiment.resolved.processes["scan"].settings["names"] == ["scan", "scheduler", "clock"]
 
 
 def test_a_dotted_string_stays_a_string(write: Write) -> None:
     experiment = write(SCANNER + 'size = ["1 um", "1 um"]\nnames = ["os.system"]\n')
     assert not errors(experiment)
-    assert experiment.resolved.settings["scan"]["names"] == ["os.system"]
+    assert experiment.resolved.processes["scan"].settings["names"] == ["os.system"]
 
 
 def test_a_circle_is_an_error_told_once_with_its_line(write: Write) -> None:
@@ -54,13 +54,13 @@ def test_an_overlay_changes_only_what_it_holds(write: Write) -> None:
         'scan_size = ["7 um", "7 um"]\n[scan]\nevery = "2 min"\n',
     )
     assert not errors(experiment)
-    settings = experiment.resolved.settings["scan"]
+    settings = experiment.resolved.processes["scan"].settings
     assert settings == {"size": [7e-6, 7e-6], "count": 5, "every": 120.0}
 
 
 def test_the_last_of_several_overlays_wins(write: Write) -> None:
     experiment = write(SCANNER + 'size = ["1 um", "1 um"]\n', "[scan]\ncount = 1\n", "[scan]\ncount = 2\n")
-    assert experiment.resolved.settings["scan"]["count"] == 2
+    assert experiment.resolved.processes["scan"].settings["count"] == 2
 
 
 def test_an_overlay_may_switch_a_component_off(write: Write) -> None:
@@ -71,7 +71,7 @@ def test_an_overlay_may_switch_a_component_off(write: Write) -> None:
 
 def test_an_overlay_replaces_a_list_as_a_whole(write: Write) -> None:
     experiment = write(SCANNER + 'size = ["1 um", "1 um"]\nnames = ["a", "b"]\n', '[scan]\nnames = ["c"]\n')
-    assert experiment.resolved.settings["scan"]["names"] == ["c"]
+    assert experiment.resolved.processes["scan"].settings["names"] == ["c"]
 
 
 def test_an_error_in_an_overlay_is_told_with_its_file_and_line(write: Write) -> None:

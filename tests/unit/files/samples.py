@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from afspm.microscopes.simulator.files import Measured, encode_scan, encode_spectrum
 from afspm.model import Region, Spectrum
+from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 
@@ -94,12 +94,12 @@ def gsf() -> bytes:
 def simulated() -> bytes:
     attributes = {"scan-speed [m/s]": 1e-8, "x-scan-direction": "down"}
     channels = {"Height Retrace": ("m", HEIGHT_M), "Phase": ("deg", OTHER)}
-    return encode_scan(REGION, channels, Measured(END_NS, attributes))
+    return encode_scan(REGION, channels, FileFacts(END_NS, attributes))
 
 
 def simulated_spectrum() -> bytes:
     curve = Spectrum((1e-9, -2e-9), "IV", ("Bias", "Current"), ("V", "A"), np.arange(6.0).reshape(3, 2))
-    return encode_spectrum(curve, Measured(END_NS, {}))
+    return encode_spectrum(curve, FileFacts(END_NS, {}))
 
 
 def vpdata() -> bytes:

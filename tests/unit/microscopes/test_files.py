@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from afspm.errors import FileError
-from afspm.microscopes.simulator import files
-from afspm.microscopes.simulator.files import Measured, encode_scan, encode_spectrum
+from afspm.files import read
 from afspm.model import Region, Scan, Spectrum
+from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 
 REGION = Region((1.1e-7, -3.3e-7), (1e-6, 0.7e-6), 0.3)
-MEASURED = Measured(1_767_225_600_123_456_789, {"scan-speed [m/s]": 1e-6, "x-spec-kind": "IV"})
+MEASURED = FileFacts(1_767_225_600_123_456_789, {"scan-speed [m/s]": 1e-6, "x-spec-kind": "IV"})
 CHANNELS = {
     "Height Retrace": ("m", np.random.default_rng(1).normal(size=(3, 5))),
     "Phase": ("deg", np.full((3, 5), np.nan)),
@@ -23,7 +23,7 @@ CHANNELS = {
 
 def test_a_scan_comes_back_exactly(tmp_path: Path) -> None:
     (tmp_path / "a.nc").write_bytes(encode_scan(REGION, CHANNELS, MEASURED))
-    scans = files.load(tmp_path / "a.nc")
+    scans = read(tmp_path / "a.nc")
     for scan, (channel, (unit, values)) in zip(scans, CHANNELS.items(), strict=True):
         assert isinstance(scan, Scan)
         assert (scan.region, scan.channel, scan.unit, scan.time_ns) == (REGION, channel, unit, MEASURED.time_ns)
@@ -34,7 +34,7 @@ def test_a_spectrum_comes_back_exactly(tmp_path: Path) -> None:
     values = np.random.default_rng(2).normal(size=(4, 2))
     spectrum = Spectrum((1e-9, -2e-9), "IV", ("Bias", "Current"), ("V", "A"), values)
     (tmp_path / "a.nc").write_bytes(encode_spectrum(spectrum, MEASURED))
-    (back,) = files.load(tmp_path / "a.nc")
+    (back,) = read(tmp_path / "a.nc")
     assert isinstance(back, Spectrum)
     assert (back.position_m, back.kind, back.names, back.units) == (
         (1e-9, -2e-9),
@@ -63,9 +63,9 @@ def test_every_truncated_file_is_refused(tmp_path: Path) -> None:
     for length in [*range(0, 700, 7), len(content) // 2, len(content) - 1]:
         path.write_bytes(content[:length])
         with pytest.raises(FileError):
-            files.load(path)
+            read(path)
 
 
 def test_a_missing_file_is_said_with_its_name(tmp_path: Path) -> None:
     with pytest.raises(FileError, match=r"none\.nc"):
-        files.load(tmp_path / "none.nc")
+        read(tmp_path / "none.nc")

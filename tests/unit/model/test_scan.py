@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import zlib
-
 import numpy as np
 import pytest
 
 from afspm.errors import InvalidValue
 from afspm.model import ProblemNames, Region, Scan, ScanParameters, ScanSet, Spectrum
-from afspm.model.notebook import png
 
 REGION = Region.from_top_left((0.0, 1e-6), (3e-6, 2e-6))
 SCAN = Scan(REGION, "Height", "m", np.arange(12.0).reshape(3, 4), 1_767_225_600_000_000_000, "a.nc")
@@ -64,15 +61,6 @@ def test_a_scan_shows_itself_in_a_notebook() -> None:
     assert "&lt;b&gt;" in shown
     assert "data:image/png;base64," in shown
     assert "no values" in Scan(REGION, "Height", "m", np.empty((0, 0)))._repr_html_()
-
-
-def test_the_picture_is_a_png_with_the_highest_values_brightest() -> None:
-    data = png(np.array([[0.0, 1.0], [np.nan, 0.5]]))
-    assert data.startswith(b"\x89PNG")
-    at = data.index(b"IDAT") + 4
-    pixels = np.frombuffer(zlib.decompressobj().decompress(data[at:]), np.uint8).reshape(2, 7)[:, 1:].reshape(2, 2, 3)
-    assert pixels[0, 0].sum() < pixels[1, 1].sum() < pixels[0, 1].sum()
-    assert (pixels[1, 0] == 128).all()
 
 
 def test_a_spectrum_gives_its_variables_by_name() -> None:

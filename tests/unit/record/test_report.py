@@ -264,7 +264,7 @@ def test_what_can_not_be_told_apart_is_one_bar(run: Path) -> None:
     for k in range(20_000):  # in an hour: several for each pixel
         begin = night.start_ns + k * 180_000_000
         night.overview.states.spans.append(Span("scanning", begin, begin + 100_000_000))
-    assert time_line.draw(night).count("<rect") < 1000
+    assert time_line.draw(night).count("<span") < 1000
 
 
 def test_a_run_of_which_nothing_is_recorded_has_a_report(tmp_path: Path) -> None:

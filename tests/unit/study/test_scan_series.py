@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from afspm.microscopes.simulator.files import Measured, encode_scan
 from typer.testing import CliRunner
 
 from afspm.cli.app import app
 from afspm.drift.record import DriftRecord
 from afspm.errors import InvalidValue
 from afspm.files import FileContent
-from afspm.microscopes.simulator.files import Measured, encode_scan
 from afspm.model import Region, Scan
 from afspm.simulation import World
 from afspm.study.scan_series import series

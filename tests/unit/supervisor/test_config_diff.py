@@ -10,7 +10,7 @@ import pytest
 from afspm.errors import ConfigError
 from afspm.experiment import load
 from afspm.supervisor import resume
-from afspm.supervisor.config_diff import differing
+from afspm.supervisor.resume import differing
 from afspm.supervisor.run import FILES, HOMES
 
 NIGHT = """

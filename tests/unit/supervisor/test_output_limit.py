@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from afspm.supervisor.output_limit import AT_ONCE, BYTES_PER_S, LAST_BYTES, PAUSE_S, STAMP_BYTES, OutputLimit
+from afspm.supervisor.child_output import AT_ONCE, BYTES_PER_S, LAST_BYTES, PAUSE_S, STAMP_BYTES, OutputLimit
 
 LINE = b"still waiting for the stage\n"
 COST = len(LINE) + STAMP_BYTES

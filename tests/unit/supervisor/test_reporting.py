@@ -8,8 +8,7 @@ import pytest
 
 from afspm.clock import ExperimentClock
 from afspm.experiment import Experiment, ProcessStart, load
-from afspm.supervisor import reporting
-from afspm.supervisor.reporter import Reporter
+from afspm.supervisor.reporter import Reporter, reporter_of
 from afspm.transport.keys import generate
 
 CLOCK = ExperimentClock.real()
@@ -46,7 +45,7 @@ def starts(made: Experiment, *only: str) -> list[ProcessStart]:
 
 def test_a_scheduler_that_is_started_here_is_told(tmp_path: Path) -> None:
     made = experiment(tmp_path)
-    reporter = reporting.reporter(made, starts(made), CLOCK)
+    reporter = reporter_of(made, starts(made), CLOCK)
     assert isinstance(reporter, Reporter)
     assert reporter._launch.sockets.control == "tcp://127.0.0.1:29103"
     assert reporter._launch.name == f"supervisor:{reporter._supervisor}"
@@ -54,7 +53,7 @@ def test_a_scheduler_that_is_started_here_is_told(tmp_path: Path) -> None:
 
 def test_a_part_tells_the_scheduler_of_the_whole_under_a_name_of_its_own(tmp_path: Path) -> None:
     made = experiment(tmp_path)
-    whole, part = (reporting.reporter(made, starts(made, *only), CLOCK) for only in ((), ("series",)))
+    whole, part = (reporter_of(made, starts(made, *only), CLOCK) for only in ((), ("series",)))
     assert isinstance(whole, Reporter)
     assert isinstance(part, Reporter)
     assert part._launch.sockets.control == whole._launch.sockets.control
@@ -66,13 +65,13 @@ def test_a_scheduler_of_another_language_is_not_asked_what_it_does_not_know(
     tmp_path: Path, only: tuple[str, ...]
 ) -> None:
     made = experiment(tmp_path, 'command = ["python", "scheduler.py"]\nrole = "scheduler"')
-    assert reporting.reporter(made, starts(made, *only), CLOCK) is None
+    assert reporter_of(made, starts(made, *only), CLOCK) is None
 
 
 def test_with_keys_it_expects_the_scheduler_s(tmp_path: Path) -> None:
     generate(tmp_path / "keys", ["microscope", "scheduler", "series", "recorder", "supervisor"])
     made = experiment(tmp_path, more='[security]\nkeys = "keys"\n')
-    reporter = reporting.reporter(made, starts(made), CLOCK)
+    reporter = reporter_of(made, starts(made), CLOCK)
     assert isinstance(reporter, Reporter)
     assert reporter._launch.keys == {
         "folder": str(tmp_path / "keys"),

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 
+from afspm.logic.supervision.supervisor_events import EndSignal
 from afspm.supervisor import signals
-from afspm.supervisor.signals import EndSignal
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def test_each_is_told_and_ends_nothing_by_itself(name: str, writer: int) -> None
     told: list[EndSignal] = []
     before = signal.signal(number, signal.default_int_handler)  # whatever the tests themselves were begun with: nohup
     try:
-        with signals.told(told.append, writer):
+        with signals.caught(told.append, writer):
             signal.raise_signal(number)
         assert signal.getsignal(number) is signal.default_int_handler
     finally:
@@ -43,7 +43,7 @@ def test_under_nohup_the_closing_of_the_terminal_stays_ignored(writer: int) -> N
     told: list[EndSignal] = []
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with signals.told(told.append, writer):
+        with signals.caught(told.append, writer):
             signal.raise_signal(signal.SIGHUP)
     finally:
         signal.signal(signal.SIGHUP, before)

@@ -10,7 +10,7 @@ from afspm.logic.supervision.run_end import EndReason
 from afspm.model import Packet, Region, Scan, ScopeState, ScopeStatus, Spectrum
 from afspm.record.journal import SCHEDULER
 from afspm.record.store import RecordSettings, RecordStore
-from afspm.supervisor.summary import lines
+from afspm.supervisor.post_run import summary
 from afspm.supervisor.supervisor import ProcessReport, RunOutcome
 
 REPORTS = (
@@ -21,7 +21,7 @@ REPORTS = (
 
 
 def test_it_says_what_ran_what_was_restarted_and_what_was_given_up(tmp_path: Path) -> None:
-    told = lines(RunOutcome(EndReason.EXPERIMENT_ENDED, "the experiment has ended", REPORTS, 3725.0), tmp_path)
+    told = summary(RunOutcome(EndReason.EXPERIMENT_ENDED, "the experiment has ended", REPORTS, 3725.0), tmp_path)
     assert told == [
         "the experiment has ended, after 1 h 02 min",
         "ran: scheduler, series, hopeless",
@@ -35,7 +35,7 @@ def test_it_says_what_ran_what_was_restarted_and_what_was_given_up(tmp_path: Pat
 def test_a_scan_of_two_channels_is_one_scan(tmp_path: Path) -> None:
     rows = ["time,measurement,channel", "t1,scan,Height", "t1,scan,Phase", "t2,scan,Height", "t3,spectrum,IV"]
     (tmp_path / "metadata.csv").write_text("\n".join(rows), encoding="utf-8")
-    told = lines(RunOutcome(EndReason.EXPERIMENT_ENDED, "", (), 1.0), tmp_path)
+    told = summary(RunOutcome(EndReason.EXPERIMENT_ENDED, "", (), 1.0), tmp_path)
     assert "measured: 2 scans, 1 spectrum" in told
 
 
@@ -49,15 +49,15 @@ def test_without_a_table_the_record_is_counted(tmp_path: Path) -> None:
     store.take([(Packet(*wire.encode(thing), time_ns), SCHEDULER) for time_ns, thing in enumerate(published)])
     store.settle()
     store.close()
-    told = lines(RunOutcome(EndReason.EXPERIMENT_ENDED, "", (), 1.0), tmp_path)
+    told = summary(RunOutcome(EndReason.EXPERIMENT_ENDED, "", (), 1.0), tmp_path)
     assert "measured: 1 scan, 1 spectrum; 1 interrupted" in told
 
 
 def test_a_table_that_can_not_be_read_is_no_reason_to_fail(tmp_path: Path) -> None:
     (tmp_path / "metadata.csv").write_bytes(b"\xff\xfe\x00,\x00")
-    assert lines(RunOutcome(EndReason.EXPERIMENT_ENDED, "", (), 1.0), tmp_path)[-1] == f"everything is in {tmp_path}"
+    assert summary(RunOutcome(EndReason.EXPERIMENT_ENDED, "", (), 1.0), tmp_path)[-1] == f"everything is in {tmp_path}"
 
 
 def test_who_stops_a_run_is_told_how_it_goes_on(tmp_path: Path) -> None:
-    told = lines(RunOutcome(EndReason.STOPPED, "stopped by Ctrl-C", (), 1.0), tmp_path)
+    told = summary(RunOutcome(EndReason.STOPPED, "stopped by Ctrl-C", (), 1.0), tmp_path)
     assert told[-2:] == [f"everything is in {tmp_path}", f"`afspm run --resume {tmp_path}` goes on with it"]

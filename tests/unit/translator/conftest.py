@@ -88,6 +88,9 @@ class FakePort:
     def reply(self, frames: Sequence[bytes] | None) -> None:
         self.replies.append(list(frames or []))
 
+    def is_connected(self, connection: bytes) -> bool:
+        return True
+
     def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:
         assert time_ns is not None
         self.kept += [envelope] if keep else []

@@ -70,8 +70,8 @@ def test_a_scan_that_is_over_before_it_was_seen_is_told_as_a_whole(bench: Any, s
     def at_once() -> None:
         bench.microscope.files["a"] = [scan()]
 
-    bench.translator._service.actions[names.START_SCAN] = _with(
-        bench.translator._service.actions[names.START_SCAN], at_once
+    bench.translator.requests.commands.actions[names.START_SCAN] = _with(
+        bench.translator.requests.commands.actions[names.START_SCAN], at_once
     )
     assert bench.ask(ACTION, names.START_SCAN).code == OK
     assert bench.heard() == ["SCANNING", "Scan2d", "FREE"]
@@ -154,7 +154,7 @@ def test_one_that_is_killed_while_it_switches_the_feedback_off_does_not_leave_th
             set_(*what)
         raise Killed
 
-    whom, what = (bench.translator, "_observe_values") if answered else (bench.microscope, "set")
+    whom, what = (bench.translator.observer, "_observe_values") if answered else (bench.microscope, "set")
     with monkeypatch.context() as patched:
         patched.setattr(whom, what, kill)
         with pytest.raises(Killed):
@@ -768,7 +768,7 @@ def test_a_restarted_translator_does_not_repeat_what_was_done(bench: Any) -> Non
 
 def test_what_a_kill_left_half_done_is_not_done_again(bench: Any) -> None:
     request = wire.decode_request(wire.encode_request(_request("me/1/1")))
-    bench.translator._about_to_act(request)  # killed right here
+    bench.translator.requests._about_to_act(request)  # killed right here
     bench.start()
     response = bench.ask(ACTION, names.START_SCAN, "me/1/1")
     assert response.code == ControlResponse.NO_RESPONSE

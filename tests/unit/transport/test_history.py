@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from afspm.clock import ExperimentClock
-from afspm.transport.history import Published
+from afspm.transport.replay import Published
 
 
 def test_what_is_of_this_moment_only_is_not_sent_to_who_comes_later() -> None:

@@ -15,11 +15,10 @@ from afspm import wire
 from afspm.clock import ExperimentClock
 from afspm.model import CLOCK_REQUEST, Request, Response
 from afspm.transport import router
-from afspm.transport.complaints import Complaints
 from afspm.transport.keys import GUEST, Keys, pair
-from afspm.transport.monitor import ACCEPTED, DISCONNECTED, ConnectionEvent
-from afspm.transport.network import MAX_REQUEST_BYTES, Network
+from afspm.transport.network import ACCEPTED, DISCONNECTED, MAX_REQUEST_BYTES, ConnectionEvent, Network
 from afspm.transport.port import ControlConnected, ReplyReceived
+from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.router import PeerAsked, PeerConnected, PeerDisconnected, Router
 from afspm.transport.zmq_port import ZmqPort
 
@@ -31,7 +30,7 @@ class Listening:
 
     def __init__(self, open_: Any, own: Keys | None = None) -> None:
         self.network = open_(Network(own))
-        self.router = Router(self.network, "tcp://127.0.0.1:0", Complaints(logging.getLogger("test"), CLOCK))
+        self.router = Router(self.network, "tcp://127.0.0.1:0", RateLimitedLog(logging.getLogger("test"), CLOCK))
         self.told: list[Any] = []
 
     def until(self, count: int, kind: type = PeerAsked, *ports: ZmqPort) -> list[Any]:
@@ -39,7 +38,7 @@ class Listening:
         deadline_s = time.monotonic() + 5.0
         while len(found := [event for event in self.told if isinstance(event, kind)]) < count:
             assert time.monotonic() < deadline_s, self.told
-            self.told += self.router.receive() + self.router.follow()
+            self.told += self.router.receive()
             for port in ports:
                 port.poll(0.001)
         return found
@@ -200,7 +199,7 @@ def follows(listening: Listening, monkeypatch: pytest.MonkeyPatch, *rounds: list
     """What the router tells of these events, seen all at once."""
     left = list(rounds)
     monkeypatch.setattr(listening.router.monitor, "drain", lambda: left.pop(0) if left else [])
-    told = listening.router.follow()
+    told = listening.router.receive()
     monkeypatch.undo()
     return told
 
@@ -218,7 +217,7 @@ def test_last_words_are_not_taken_for_those_of_who_has_the_descriptor_next(
     gone, told = happened(listening, DISCONNECTED), []
     if not in_time:  # the socket told of the end before it gave out the last words
         with monkeypatch.context() as patched:
-            patched.setattr(router, "readable", lambda socket: False)
+            patched.setattr(router, "receive_frames", lambda socket: [])
             told += follows(listening, patched, gone)
         assert told == [PeerDisconnected(first.connection)]
         gone = []
@@ -233,7 +232,7 @@ def test_last_words_are_not_taken_for_those_of_who_has_the_descriptor_next(
 
 
 def first_descriptor(listening: Listening) -> int:
-    (descriptor,) = listening.router._by_descriptor
+    (descriptor,) = listening.router._open
     return descriptor
 
 
@@ -296,7 +295,7 @@ class Run:
         while ControlConnected() not in found:
             assert time.monotonic() < deadline_s
             found += port.poll(0.01)
-            self.listening.told += self.listening.router.follow()
+            self.listening.told += self.listening.router.receive()
         return port
 
 
@@ -365,5 +364,5 @@ def test_one_without_a_key_is_not_heard_and_that_is_told_once(
     deadline_s = time.monotonic() + 5.0
     while "has shown no key" not in caplog.text:
         assert time.monotonic() < deadline_s
-        run.listening.router.follow()
+        run.listening.router.receive()
     assert caplog.text.count("plain = true") == 1

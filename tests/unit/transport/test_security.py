@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import stat
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +14,9 @@ from zmq.utils import z85
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError, TransportError
 from afspm.transport import keys
-from afspm.transport.log_link import LogReceiver, LogSender
+from afspm.transport.authenticator import Authenticator
 from afspm.transport.network import Network, is_local
 from afspm.transport.port import CaughtUp, ControlConnected, PacketReceived, RequestReceived
-from afspm.transport.zap import Authenticator
 from afspm.transport.zmq_port import ZmqPort
 from afspm.transport.zmq_server import ZmqServerPort
 
@@ -219,25 +216,6 @@ def test_an_address_whose_owner_is_not_known_is_refused(tmp_path: Path, open_: A
         network.connect(network.socket(zmq.SUB), "tcp://127.0.0.1:4")
     with pytest.raises(ConfigError, match="no public key of 'C'"):
         network.connect(network.socket(zmq.SUB), "tcp://127.0.0.1:5")
-
-
-def test_with_keys_a_line_of_the_log_is_under_the_name_of_its_sender(tmp_path: Path) -> None:
-    keys.generate(tmp_path, ["collector", "series", "thief"])
-    receiver = LogReceiver(Network(keys.load(tmp_path, "collector")), ANY)
-    servers = {receiver.address: "collector"}
-    networks = {name: Network(keys.load(tmp_path, name, servers)) for name in ("series", "thief")}
-    senders = [LogSender(networks["thief"], receiver.address, "series"),
-               LogSender(networks["thief"], receiver.address, "thief"),
-               LogSender(networks["series"], receiver.address, "series")]  # fmt: skip
-    heard: set[tuple[str, str]] = set()
-    deadline_s = time.monotonic() + 10.0
-    while len(heard) < 2 and time.monotonic() < deadline_s:  # what is said before a connection stands is lost
-        for n, sender in enumerate(senders):
-            sender.send(logging.INFO, 5, f"sender {n}")
-        heard |= {(line.name, line.text) for line in receiver.take()}
-    for closed in (*networks.values(), receiver):
-        closed.close()
-    assert heard == {("thief", "sender 1"), ("series", "sender 2")}
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="files have no modes there")

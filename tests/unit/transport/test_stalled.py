@@ -10,11 +10,10 @@ import zmq
 
 from afspm.clock import ExperimentClock
 from afspm.transport import network
-from afspm.transport.history import Published
-from afspm.transport.monitor import DISCONNECTED, Monitor
-from afspm.transport.network import Network
+from afspm.transport.network import DISCONNECTED, Network
 from afspm.transport.port import PacketReceived
 from afspm.transport.publisher import Publisher
+from afspm.transport.replay import Published
 from afspm.transport.zmq_port import ZmqPort
 
 pytestmark = pytest.mark.skipif(sys.platform == "darwin", reason="the system can't tell that a peer takes nothing")
@@ -26,7 +25,7 @@ SOON_S = 6.0  # earlier than anything else disconnects it
 
 
 @pytest.fixture
-def publisher(monkeypatch: pytest.MonkeyPatch, open_: Any) -> Any:
+def publisher(monkeypatch: pytest.MonkeyPatch, open_: Any, gone: Any) -> Any:
     """One that waits for a peer for half a second and remembers its last packet alone."""
     monkeypatch.setattr(network, "_STALLED_MS", 500)
     published = Published(CLOCK, most_packets=2 * SCANS, most_bytes=2 * SCANS * len(SCAN))
@@ -35,13 +34,13 @@ def publisher(monkeypatch: pytest.MonkeyPatch, open_: Any) -> Any:
         def __init__(self) -> None:
             self.network = Network()
             self.publisher = Publisher(self.network, ANY, published)
-            self.monitor = Monitor(self.network, self.publisher.socket, DISCONNECTED)
+            self._gone = gone(self.publisher)
             self.address = self.publisher.address
 
         def poll(self, timeout_s: float) -> list[int]:
-            if self.publisher.socket.poll(int(timeout_s * 1000)):
-                self.publisher.serve()
-            return [event.kind for event in self.monitor.drain()]
+            self.publisher.socket.poll(int(timeout_s * 1000))
+            self.publisher.serve()
+            return self._gone.take()
 
         def publish(self, payload: bytes) -> None:
             self.publisher.publish(published.stamp("Scan2d", payload))

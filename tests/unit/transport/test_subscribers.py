@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import sys
 from typing import Any
 
@@ -10,12 +9,11 @@ import pytest
 import zmq
 
 from afspm.clock import ExperimentClock
-from afspm.transport.history import Published
-from afspm.transport.monitor import DISCONNECTED, Monitor
-from afspm.transport.network import Network
+from afspm.transport.network import DISCONNECTED, Network
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.publisher import Publisher
-from afspm.transport.subscribers import MOST_REPLAYS, Subscribers
+from afspm.transport.replay import Published
+from afspm.transport.tcp_guard import MOST_SUBSCRIBED_BYTES
 from afspm.transport.zmq_port import ZmqPort
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only there the system tells what waits")
@@ -29,19 +27,19 @@ SOON_S = 10.0
 class Lab:
     """A publisher that keeps one packet, and counts how many it has sent that wait for somebody."""
 
-    def __init__(self) -> None:
+    def __init__(self, gone: Any) -> None:
         self.payload = bytes(SCAN)
         self.events: list[int] = []
         self.network = Network()
         self.published = Published(CLOCK, most_packets=1)
-        self.publisher = Publisher(self.network, ANY, self.published, most_waiting_bytes=MOST_WAITING)
-        self._monitor = Monitor(self.network, self.publisher.socket, DISCONNECTED)
+        self.publisher = Publisher(self.network, ANY, self.published, most_unsent=MOST_WAITING)
+        self._gone = gone(self.publisher)
         self._references = sys.getrefcount(self.payload)
 
     def poll(self, timeout_s: float) -> list[int]:
-        if self.publisher.socket.poll(int(timeout_s * 1000)):
-            self.publisher.serve()
-        return [event.kind for event in self._monitor.drain()]
+        self.publisher.socket.poll(int(timeout_s * 1000))
+        self.publisher.serve()
+        return self._gone.take()
 
     def publish(self) -> None:
         self.publisher.publish(self.published.stamp("Scan2d", self.payload))
@@ -54,8 +52,8 @@ class Lab:
 
 
 @pytest.fixture
-def lab(open_: Any) -> Any:
-    return open_(Lab())
+def lab(open_: Any, gone: Any) -> Any:
+    return open_(Lab(gone))
 
 
 @pytest.fixture
@@ -140,16 +138,9 @@ def test_a_plain_subscriber_that_takes_nothing_is_disconnected_when_too_much_wai
     until(lambda: DISCONNECTED in lab.events, (lab, lab.events), timeout_s=SOON_S)
 
 
-def test_a_connection_may_ask_for_a_replay_a_second_and_some_at_once(open_: Any, plain: Any) -> None:
-    now_s = [100.0]
-    network = open_(Network())
-    address = network.bind(network.socket(zmq.XPUB), ANY)
-    host, port = address.removeprefix("tcp://").split(":")
-    with socket.create_connection((host, int(port))) as peer:
-        subscribers = Subscribers(monotonic_s=lambda: now_s[0])
-        assert all(subscribers.may_replay(peer.fileno()) for _ in range(MOST_REPLAYS))
-        now_s[0] += 1.0
-        assert subscribers.may_replay(peer.fileno())
-        assert not subscribers.may_replay(peer.fileno())
-        with pytest.raises(OSError, match=r"Broken pipe|reset"):
-            peer.send(b"anything")
+def test_one_that_asks_for_replays_again_and_again_is_disconnected(lab: Any, plain: Any, until: Any) -> None:
+    asking = plain(zmq.XSUB)
+    asking.connect(lab.publisher.address)
+    for n in range(MOST_SUBSCRIBED_BYTES // 10):
+        asking.send(b"\1\0replay/a/%d\0-1\0" % n)
+    until(lambda: DISCONNECTED in lab.events, (lab, lab.events), timeout_s=SOON_S)

@@ -127,6 +127,14 @@ def test_responses(entry: Any) -> None:
         assert wire.decode_parameter(response.payload) == model.Parameter("scan-speed", "1500.0", "nm/s")
 
 
+@each("our_responses")
+def test_responses_with_what_version_1_does_not_know(entry: Any) -> None:
+    frames = [bytes.fromhex(frame) for frame in entry["frames"]]
+    response = wire.decode_response(frames)
+    assert response == model.Response(3, b"", "why?", "exp/1/7", model.ResponseDetail.NOT_SENT)
+    assert wire.encode_response(response) == frames
+
+
 @each("published")
 def test_packets(entry: Any) -> None:
     frames = [bytes.fromhex(frame) for frame in entry["frames"]]

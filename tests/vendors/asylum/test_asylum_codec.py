@@ -17,9 +17,9 @@ from afspm.emulators.asylum import wire
 from afspm.errors import AfspmError, ConfigError, InvalidValue
 from afspm.files.asylum import center_and_angle
 from afspm.microscopes.asylum import Asylum, xop
-from afspm.microscopes.asylum.folders import local
-from afspm.microscopes.asylum.frame import NAMES, asylums, from_image, generic, on_image
+from afspm.microscopes.asylum.result_files import local
 from afspm.microscopes.asylum.session import Doing
+from afspm.microscopes.asylum.settings import NAMES, asylums, from_image, generic, on_image
 from afspm.model import Region, ScopeState, names
 
 finite = st.floats(-1e300, 1e300)

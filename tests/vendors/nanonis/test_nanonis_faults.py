@@ -101,7 +101,7 @@ def test_fields_of_another_release_than_it_says_are_named(bench: Make) -> None:
 
 def test_a_release_can_be_set_where_it_is_told_wrong(bench: Make) -> None:
     made = bench(release="2025")
-    made.at_panel(lambda emulator: setattr(emulator.panel, "release", 99999))
+    made.at_panel(lambda emulator: setattr(emulator.software.core, "release", 99999))
     peer = small(made, release=14573)
     assert peer.act(names.START_SCAN).ok
     assert scans(peer.until(FREE))
@@ -135,7 +135,7 @@ def test_a_scan_whose_file_does_not_come_is_fetched(bench: Make, kind: str) -> N
     made.strike(kind, duration_s=1e6)
     assert peer.act(names.START_SCAN).ok
     found = scans(peer.until(FREE))
-    assert found[0].filename.endswith("nanonis-0001.npz")
+    assert found[0].filename.endswith("nanonis-0001.nc")
     # by the name that Nanonis had said, or by the folder if it had not said any in time
     made.until_said("unnamed001.sxm): it was fetched from Nanonis", "session): it was fetched from Nanonis")
 
@@ -228,7 +228,7 @@ def test_a_spectrum_that_is_not_saved_is_fetched(bench: Make) -> None:
     made.strike("autosave-off", duration_s=1e6)
     assert peer.act(names.START_SPEC).ok
     (spectrum,) = (one for one in peer.until(FREE) if isinstance(one, Spectrum))
-    assert spectrum.filename.endswith(".npz")
+    assert spectrum.filename.endswith(".nc")
 
 
 def test_a_spectrum_that_somebody_takes_unsaved_is_not_that_of_before(bench: Make) -> None:
@@ -236,8 +236,8 @@ def test_a_spectrum_that_somebody_takes_unsaved_is_not_that_of_before(bench: Mak
     peer = small(made)
     assert peer.act(names.START_SPEC).ok
     assert [one for one in peer.until(FREE) if isinstance(one, Spectrum)]
-    made.at_panel(lambda emulator: setattr(emulator.panel.sweeps["BiasSpectr"], "saves", False))
-    made.at_panel(lambda emulator: emulator.panel.start_curve("BiasSpectr", ""))
+    made.at_panel(lambda emulator: setattr(emulator.software.spectra.sweeps["BiasSpectr"], "saves", False))
+    made.at_panel(lambda emulator: emulator.software.spectra.start("BiasSpectr", ""))
     peer.until(ScopeState.SPEC)
     heard = peer.until(FREE)
     assert not [one for one in heard if isinstance(one, Spectrum)], "nobody has its data"
@@ -252,7 +252,7 @@ def test_a_scan_that_is_not_saved_is_fetched_at_once(bench: Make) -> None:
     assert peer.act(names.START_SCAN).ok
     made.emulator.ends_as_awaited = True
     found = scans(peer.until(FREE))
-    assert found[0].filename.endswith(".npz")
+    assert found[0].filename.endswith(".nc")
 
 
 # --- the tip, and people ---
@@ -391,7 +391,7 @@ def test_a_translator_outlives_a_controller_that_talks_nonsense(bench: Make, see
             assert ask() is not None
             asked += 1
     assert asked >= 5
-    made.emulator.panel.set_frame(0.0, 0.0, 1e-7, 1e-7, 0.0)
+    made.emulator.software.scans.set_frame(0.0, 0.0, 1e-7, 1e-7, 0.0)
     while peer.act(names.STOP_SCAN).code == ControlResponse.NO_RESPONSE:
         pass
     peer.act_once_free(names.STOP_SCAN)

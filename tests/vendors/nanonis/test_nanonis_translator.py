@@ -71,7 +71,7 @@ def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, direction: 
         for mirrored in (values[::-1], values[:, ::-1], values[::-1, ::-1]):
             assert likeness(mirrored) < likeness(values) - 0.1
     file = scans["Z Forward"].filename
-    assert file.endswith(".npz" if fetch else ".sxm")
+    assert file.endswith(".nc" if fetch else ".sxm")
     if not fetch:
         assert read(file).upwards is (direction == "up")
 
@@ -140,11 +140,11 @@ def test_a_size_beyond_the_scanner_is_refused_and_the_frame_stays_where_it_is(be
     made = bench(range_m=2e-6)
     peer = made.start()
     ready(peer)
-    before = made.emulator.panel.frame
+    before = made.emulator.software.scans.frame
     response = peer.set(names.SCAN_SIZE_X, 3e-6)
     assert response.code == ControlResponse.PARAM_ERROR
     assert "nothing was changed" in response.reason
-    assert made.emulator.panel.frame == pytest.approx(before, rel=1e-6)
+    assert made.emulator.software.scans.frame == pytest.approx(before, rel=1e-6)
 
 
 def test_what_is_set_is_told_to_the_last_digit_though_nanonis_keeps_a_float32(bench: Make) -> None:
@@ -176,8 +176,8 @@ def test_the_resolution_alone_leaves_the_frame_as_it_is(bench: Make) -> None:
     ready(peer)
     assert peer.set(names.SCAN_RESOLUTION_X, 64).ok
     assert float(peer.get(names.SCAN_SIZE_X)) == pytest.approx(TURNED.size_m[0], rel=1e-13)
-    assert made.emulator.panel.frame[2] == pytest.approx(TURNED.size_m[0] * 64 / 63, rel=1e-6)
-    assert made.emulator.panel.frame[4] == pytest.approx(-30.0), "clockwise"
+    assert made.emulator.software.scans.frame[2] == pytest.approx(TURNED.size_m[0] * 64 / 63, rel=1e-6)
+    assert made.emulator.software.scans.frame[4] == pytest.approx(-30.0), "clockwise"
 
 
 # --- feedback, probe, spectra ---
@@ -203,15 +203,15 @@ def test_feedback_is_switched_on_only_once_the_rest_of_it_is_set(bench: Make, mo
     made = bench()
     peer = made.start()
     ready(peer)
-    panel, switched_with = made.emulator.panel, []
-    plain = panel.set_z_controller
+    software, switched_with = made.emulator.software, []
+    plain = software.z_controller.switch
 
     def switch(now_s: float, *, on: bool, **settings: float) -> None:
-        switched_with.append((on, panel.rig.feedback.setpoint))
+        switched_with.append((on, software.core.rig.feedback.setpoint))
         plain(now_s, on=on, **settings)
 
     assert peer.set(names.ZCTRL_SETPOINT, 0.25).ok
-    monkeypatch.setattr(panel, "set_z_controller", switch)
+    monkeypatch.setattr(software.z_controller, "switch", switch)
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False, setpoint=0.5)).ok
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True, setpoint=0.75)).ok
     assert switched_with == [(False, 0.25), (True, 0.75)]
@@ -245,7 +245,7 @@ def test_a_spectrum_comes_with_where_it_was_taken(bench: Make, kind: str, first:
     assert spectrum.kind == kind
     assert spectrum.names[0] == first
     assert len(spectrum.values) > 100
-    assert spectrum.filename.endswith(".npz" if fetch else ".dat")
+    assert spectrum.filename.endswith(".nc" if fetch else ".dat")
     true = made.emulator.rig.spectrum
     assert true is not None
     np.testing.assert_allclose(spectrum.values, true.values, rtol=1e-4, atol=1e-18)
@@ -339,10 +339,10 @@ def test_drift_compensation_is_switched_on_by_a_rate_and_off_by_none(bench: Make
     peer = made.start()
     peer.until(FREE)
     assert peer.set("x-drift-rate-x", "2", "pm/s").ok
-    on, x, y, *_ = made.emulator.panel.registers.get("Piezo.DriftComp")
+    on, x, y, *_ = made.emulator.software.core.registers.get("Piezo.DriftComp")
     assert (on, x, y) == (1, pytest.approx(2e-12), 0.0)
     assert peer.set("x-drift-rate-x", 0).ok
-    assert made.emulator.panel.registers.get("Piezo.DriftComp")[0] == 0
+    assert made.emulator.software.core.registers.get("Piezo.DriftComp")[0] == 0
 
 
 def test_parameters_and_actions_of_the_experiment_file(bench: Make) -> None:
@@ -353,7 +353,7 @@ def test_parameters_and_actions_of_the_experiment_file(bench: Make) -> None:
     )
     peer.until(FREE)
     assert peer.set("x-tip-lift", "2", "nm").ok
-    assert made.emulator.panel.registers.get("ZCtrl.TipLift") == (pytest.approx(2e-9),)
+    assert made.emulator.software.core.registers.get("ZCtrl.TipLift") == (pytest.approx(2e-9),)
     assert peer.act("x-home").ok
     response = peer.act("x-wrong")
     assert response.code == ControlResponse.ACTION_ERROR
@@ -367,7 +367,7 @@ def test_a_scan_started_at_the_panel_is_published(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = made.start()
     ready(peer, shape=(40, 32))
-    made.at_panel(lambda emulator: emulator.panel.start_scan(upwards=True))
+    made.at_panel(lambda emulator: emulator.software.scans.start(upwards=True))
     heard = peer.until(FREE)
     assert states(heard) == ["SCANNING", "FREE"]
     assert any(isinstance(one, Scan) for one in heard)
@@ -375,33 +375,37 @@ def test_a_scan_started_at_the_panel_is_published(bench: Make) -> None:
 
 def test_the_panel_may_have_been_left_scanning_on_and_on_and_not_saving(bench: Make) -> None:
     made = bench()
-    made.at_panel(lambda emulator: emulator.panel.__dict__.update(continuous=True, bouncy=True, autosave="off"))
+    made.at_panel(
+        lambda emulator: emulator.software.scans.properties.__dict__.update(
+            continuous=True, bouncy=True, autosave="off"
+        )
+    )
     peer = made.start()
     ready(peer)
     assert scanned(peer)["Z Forward"].filename.endswith(".sxm")
-    panel = made.emulator.panel
-    assert (panel.continuous, panel.bouncy, panel.autosave) == (False, False, "all")
+    left_behind = made.emulator.software.scans.properties
+    assert (left_behind.continuous, left_behind.bouncy, left_behind.autosave) == (False, False, "all")
 
 
 def test_it_can_be_told_to_leave_saving_alone(bench: Make) -> None:
     made = bench(speed=5.0)  # what is not saved must be seen running
-    made.at_panel(lambda emulator: emulator.panel.__dict__.update(autosave="off"))
+    made.at_panel(lambda emulator: emulator.software.scans.properties.__dict__.update(autosave="off"))
     peer = made.start(autosave=False)
     ready(peer)
-    assert scanned(peer)["Z Forward"].filename.endswith(".npz")
-    assert made.emulator.panel.autosave == "off"
+    assert scanned(peer)["Z Forward"].filename.endswith(".nc")
+    assert made.emulator.software.scans.properties.autosave == "off"
 
 
 @pytest.mark.parametrize("release", ["2021", "2022", "2023", "2024", "2025"])
 def test_every_release(bench: Make, release: str) -> None:
     made = bench(release=release)
-    made.at_panel(lambda emulator: emulator.panel.__dict__.update(continuous=True))
+    made.at_panel(lambda emulator: emulator.software.scans.properties.__dict__.update(continuous=True))
     peer = made.start()
     ready(peer)
     assert scanned(peer)
     assert "release " in peer.get("x-controller")
     assert peer.set("x-drift-rate-y", "1", "pm/s").ok
-    assert made.emulator.panel.registers.get("Piezo.DriftComp")[2] == pytest.approx(1e-12)
+    assert made.emulator.software.core.registers.get("Piezo.DriftComp")[2] == pytest.approx(1e-12)
 
 
 def test_a_session_folder_that_has_another_name_over_there(bench: Make) -> None:

@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from afspm.emulators.activities import SimulatedScan, SimulatedSpectrum
+from afspm.emulators.activities import ScanActivity, SpectrumActivity
 from afspm.emulators.asylum import ibw
 from afspm.emulators.asylum.values import IgorValues
 
@@ -55,7 +55,7 @@ class PendingWrites:
         return self._writes[0].at_s if self._writes else None
 
 
-def image(name: str, scan: SimulatedScan, values: IgorValues, now_s: float) -> bytes:
+def image(name: str, scan: ScanActivity, values: IgorValues, now_s: float) -> bytes:
     """The file of a scan; lines that were not scanned are NaN."""
     channels = scan.channels(scan.end_s if scan.stopped_s is not None else None)
     layers, labels = [], []
@@ -70,7 +70,7 @@ def image(name: str, scan: SimulatedScan, values: IgorValues, now_s: float) -> b
     return ibw.wave(name, np.stack(layers, axis=2), "m", steps, labels, _note(values, now_s), now_s)
 
 
-def curve(name: str, spectrum: SimulatedSpectrum, values: IgorValues, now_s: float) -> bytes:
+def curve(name: str, spectrum: SpectrumActivity, values: IgorValues, now_s: float) -> bytes:
     """The file of a force curve: towards the sample and back, over time."""
     table = dict(zip(spectrum.names, spectrum.values.T, strict=True))
     extension = table["Z"].max() - table["Z"]
@@ -84,7 +84,7 @@ def curve(name: str, spectrum: SimulatedSpectrum, values: IgorValues, now_s: flo
     return ibw.wave(name, columns, "m", [(step_s, "s")], ["Raw", "Defl", "ZSnsr"], _note(values, now_s, noted), now_s)
 
 
-def _of_curve(spectrum: SimulatedSpectrum, distance_m: float, points: int, values: IgorValues) -> Entries:
+def _of_curve(spectrum: SpectrumActivity, distance_m: float, points: int, values: IgorValues) -> Entries:
     """Return the entries of a force curve's note that describe its acquisition."""
     duration_s = spectrum.end_s - spectrum.start_s
     velocity_m_s = distance_m / (duration_s / 2)

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from afspm.clock import Clock
-from afspm.emulators.activities import SimulatedScan, SimulatedSpectrum
+from afspm.emulators.activities import ScanActivity, SpectrumActivity
 from afspm.emulators.faults import Faults
 from afspm.emulators.gxsm import files
 from afspm.emulators.gxsm.channels import CHANNELS, SIMULATED_3, GxsmChannel
@@ -89,9 +89,9 @@ class GxsmProgram:
         known = SIMULATED_3 if (version, card) == (3, "simulator") else CHANNELS[version]
         self.channels: list[GxsmChannel] = [one for one in known if one.source in rig.channels]
         self.saving = GxsmFileWriter(folder, faults)
-        self.last: SimulatedScan | None = None
+        self.last: ScanActivity | None = None
         self.last_frame = (0.0, 0.0, 0.0, 0.0, 0.0)
-        self.curve: SimulatedSpectrum | None = None
+        self.curve: SpectrumActivity | None = None
         self._scanning = self._saved = False
         self._before: list[Path] | None = None
         self._y_before = 0
@@ -320,7 +320,7 @@ class GxsmProgram:
         except InvalidValue as error:
             self.dialogs.append(str(error))
 
-    def columns(self, curve: SimulatedSpectrum) -> dict[str, np.ndarray]:
+    def columns(self, curve: SpectrumActivity) -> dict[str, np.ndarray]:
         """Return the columns with GXSM's labels."""
         blanks = "    " if self.card == "RPSPMC" else ""
         found = {}
@@ -329,7 +329,7 @@ class GxsmProgram:
             found[f"{blanks}{_COLUMNS.get(name, name)} ({shown})"] = values * scale
         return found
 
-    def _save_curve(self, curve: SimulatedSpectrum, now_s: float) -> None:
+    def _save_curve(self, curve: SpectrumActivity, now_s: float) -> None:
         self._curves += 1
         path = self._curve_path()
         while self.card == "RPSPMC" and path.exists():  # others overwrite

@@ -10,20 +10,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 from afspm.emulators.emulator import LOOPBACK, Crashed, Emulator
-from afspm.emulators.nanonis import (
-    handle_patterns,
-    handle_scans,
-    handle_signals,
-    handle_spectra,
-    handle_tip,
-    logger,
-    panel,
-    wire,
-)
-from afspm.emulators.nanonis.corruption import senseless_value
-from afspm.emulators.nanonis.dispatch import DeferredResult, FunctionRefused, Results, answer
-from afspm.emulators.nanonis.panel import NanonisState
+from afspm.emulators.nanonis import logger, wire
+from afspm.emulators.nanonis.dispatch import DeferredResult, FunctionRefused, Results
+from afspm.emulators.nanonis.faults import FAULT_KINDS, senseless_value
 from afspm.emulators.nanonis.server import ClientConnection, NanonisServer
+from afspm.emulators.nanonis.software import NanonisSoftware
 from afspm.emulators.rig import RigBusy
 from afspm.errors import ConfigError, InvalidValue
 from afspm.units import Length
@@ -31,8 +22,6 @@ from afspm.units import Length
 RELEASES: Final = {"2021": 10862, "2022": 11798, "2023": 13742, "2024": 14429, "2025": 14573}
 """By the year of the software: the first that has what the protocol has from then on."""
 _ACTS: Final = ("Start", "Action", "Set", "Pulse", "Withdraw", "StartMove", "Home")
-_ANSWERING: Final = (handle_spectra, handle_patterns, handle_scans, handle_signals, handle_tip)
-"""What answers to the functions, by having been imported."""
 _LOGS_EVERY_S: Final = 0.005
 """Real time between two looks at what the TCP Logger has to send."""
 _OTHER_NAME: Final = "Util.RTFreqGet"
@@ -89,24 +78,7 @@ class NanonisEmulator(Emulator):
 
     vendor = "Nanonis"
     usual: ClassVar[Mapping[str, Any]] = {"port": 6501, "ports": 4, "logger_port": logger.USUAL_PORT}
-    fault_kinds: ClassVar[Mapping[str, str]] = {
-        "no-reply": "a request is not answered",
-        "slow": "a reply comes later, by the duration",
-        "dialog": "a dialog waits on the screen: nothing is answered for the duration",
-        "cut": "the connection is cut instead of a reply",
-        "truncated": "half a reply, then the connection is cut",
-        "error": "a reply with an error",
-        "refused": "an error in reply to what sets or starts something",
-        "wrong-name": "the reply to another function",
-        "wrong-release": "for the duration, fields as of another release than it says",
-        "garbage": "bytes that are no reply",
-        "huge": "a reply that announces two gigabytes",
-        "not-utf8": "texts that are not UTF-8",
-        "nan": "NaN for every number",
-        "nonsense": "for the duration, replies of the right form with values that make no sense",
-        "crash": "the software vanishes",
-        **panel.FAULT_KINDS,
-    }
+    fault_kinds: ClassVar[Mapping[str, str]] = FAULT_KINDS
 
     def __init__(
         self,
@@ -146,7 +118,7 @@ class NanonisEmulator(Emulator):
             on_bytes=self._answer_all,
         )
         self.logger_port = self._server.stream_port
-        self.panel = NanonisState(
+        self.software = NanonisSoftware(
             self.rig,
             self.faults,
             self.clock,
@@ -155,6 +127,7 @@ class NanonisEmulator(Emulator):
             range_m=self._range_m,
             release=self.release,
             rows_as_recorded=self._grabbed_rows == "recorded",
+            log=self.log,
         )
         return f"{LOOPBACK}:{','.join(map(str, self._server.ports))}"
 
@@ -164,7 +137,7 @@ class NanonisEmulator(Emulator):
 
     def tick(self, now_s: float) -> float | None:
         """Scans end, files are written, and who has waited for that is answered."""
-        times = [self.panel.advance(now_s), self._log_signals(now_s)]
+        times = [self.software.advance(now_s), self._log_signals(now_s)]
         for connection in self._server.connections:
             times.append(self._go_on(connection, now_s))
             self._answer_all(connection)
@@ -172,16 +145,17 @@ class NanonisEmulator(Emulator):
 
     def _log_signals(self, now_s: float) -> float | None:
         """Send what the TCP Logger has to; returns when there is more."""
-        readers, panel = self._server.readers, self.panel
-        panel.logger.unread = [len(reader.sending) for reader in readers]
-        if not panel.logger.running:
+        readers, signals = self._server.readers, self.software.signals
+        stream = signals.logger
+        stream.unread = [len(reader.sending) for reader in readers]
+        if not stream.running:
             return None
-        for counter in panel.logger.due(now_s):
-            values = panel.signal_values([panel.slots[slot] for slot in panel.logger.slots], now_s)
+        for counter in stream.due(now_s):
+            values = signals.values([signals.slots[slot] for slot in stream.slots], now_s)
             for reader in readers:
                 if len(reader.sending) < logger.MOST_WAITING:
-                    self._server.send(reader, panel.logger.frame(counter, values))
-        return max(panel.logger.next_s(), now_s + panel.experiment_s(_LOGS_EVERY_S))
+                    self._server.send(reader, stream.frame(counter, values))
+        return max(stream.next_s(), now_s + self.software.core.experiment_s(_LOGS_EVERY_S))
 
     def _go_on(self, connection: ClientConnection, now_s: float) -> float | None:
         """Send what was waited for, if it is there; returns when to look again."""
@@ -267,8 +241,8 @@ class NanonisEmulator(Emulator):
             raise FunctionRefused("an emulated error")
         if name.endswith(_ACTS) and self.faults.strikes("refused", now_s):
             raise FunctionRefused("it is not possible now")
-        self.panel.client = connection.memory
-        found = answer(self.panel, name, wire.arguments(name, body, self._wire_release(now_s)))
+        self.software.core.client = connection.memory
+        found = self.software.functions.call(name, wire.arguments(name, body, self._wire_release(now_s)))
         if isinstance(found, DeferredResult):
             connection.waits_for = PendingReply(asked, found)
         else:

@@ -1,4 +1,4 @@
-"""Dispatch of the protocol's functions to their handlers in the modules `on_…`."""
+"""Dispatch of the protocol's functions to their handlers: methods of the software's modules, marked by `answers`."""
 
 from __future__ import annotations
 
@@ -10,18 +10,26 @@ from typing import Any, Final
 
 import numpy as np
 
-from afspm.emulators.nanonis.panel import NanonisState
+from afspm.emulators.nanonis.registers import Registers
 
 Results = tuple[Any, ...]
+_STORED: Final = (
+    "Bias", "BiasSpectr", "Current", "ZCtrl", "SafeTip", "AutoApproach", "ZSpectr", "Piezo", "Scan", "FolMe", "Pattern",
+    "TipShaper", "Motor", "AtomTrack", "LockIn", "PLL", "Signals", "UserIn", "UserOut", "TCPLog", "Util",
+)  # fmt: skip
+"""Modules of the real software: of functions without a handler, what is set in them is at least got again."""
+_KEEPS_NAN: Final = ("BiasSpectr.PropsSet",)
+_MAY_BE_INFINITE: Final = ("BiasSpectr.TimingSet", "ZSpectr.TimingSet")
+"""A slew rate that is not limited is infinite."""
 
 
 class FunctionRefused(Exception):
-    """The controller can't, and says why."""
+    """The controller refuses a function, with a reason."""
 
 
 @dataclass(frozen=True)
 class DeferredResult:
-    """The reply comes when something has happened.
+    """A result that comes when something has happened.
 
     Attributes:
         ready: gives the results once it has.
@@ -39,65 +47,51 @@ class DeferredResult:
 
 Answer = Results | DeferredResult
 Handler = Callable[..., Answer]
-HANDLERS: Final[dict[str, Handler]] = {}
-_NAMED: Final[set[Handler]] = set()
-_STORED: Final = (
-    "Bias", "BiasSpectr", "Current", "ZCtrl", "SafeTip", "AutoApproach", "ZSpectr", "Piezo", "Scan", "FolMe", "Pattern",
-    "TipShaper", "Motor", "AtomTrack", "LockIn", "PLL", "Signals", "UserIn", "UserOut", "TCPLog", "Util",
-)  # fmt: skip
-"""The modules that are there: what is set in them is got again at least."""
-_KEEPS_NAN: Final = ("BiasSpectr.PropsSet",)
-_MAY_BE_INFINITE: Final = ("BiasSpectr.TimingSet", "ZSpectr.TimingSet")
-"""A slew rate that is not limited is infinite."""
 
 
 def answers(*names: str) -> Callable[[Handler], Handler]:
-    """Marks what answers to these functions; a second argument `name` is told which it was."""
+    """Mark a method as the handler of these functions; a parameter `name` receives the function's name."""
 
     def marked(handler: Handler) -> Handler:
-        HANDLERS.update(dict.fromkeys(names, handler))
-        if "name" in inspect.signature(handler).parameters:
-            _NAMED.add(handler)
+        handler.answered_functions = names  # type: ignore[attr-defined]
         return handler
 
     return marked
 
 
-def answer(panel: NanonisState, name: str, arguments: list[Any]) -> Answer:
-    """Execute a function and return its results.
+class Dispatcher:
+    """The handlers of all modules, and the registers behind the other functions."""
 
-    Raises:
-        FunctionRefused, RigBusy, InvalidValue.
-    """
-    handler = HANDLERS.get(name)
-    _refuse_no_numbers(name, arguments, keeps_nan=handler is None or name in _KEEPS_NAN)
-    if handler is not None:
-        return handler(panel, *([name] if handler in _NAMED else []), *arguments)
-    if name.partition(".")[0] not in _STORED:
-        raise FunctionRefused("Module not available")
-    if name.endswith("Set"):
+    def __init__(self, registers: Registers, modules: Iterable[object]) -> None:
+        self._registers = registers
+        self._handlers: dict[str, Handler] = {}
+        for module in modules:
+            for attribute, marked in vars(type(module)).items():
+                for name in getattr(marked, "answered_functions", ()):
+                    self._handlers[name] = getattr(module, attribute)
+
+    def call(self, name: str, arguments: list[Any]) -> Answer:
+        """Execute a function and return its results.
+
+        Raises:
+            FunctionRefused, RigBusy, InvalidValue.
+        """
+        handler = self._handlers.get(name)
+        _refuse_nan(name, arguments, keeps_nan=handler is None or name in _KEEPS_NAN)
+        if handler is not None:
+            named = "name" in inspect.signature(handler).parameters
+            return handler(*([name] if named else []), *arguments)
+        if name.partition(".")[0] not in _STORED:
+            raise FunctionRefused("Module not available")
+        if name.endswith("Get"):
+            return self._registers.got(name, arguments)
+        if not name.endswith("Set"):
+            raise FunctionRefused("it is not part of this emulator")
         try:
-            panel.registers.set(name, arguments)
+            self._registers.set(name, arguments)
         except ValueError as error:
             raise FunctionRefused(str(error)) from error
         return ()
-    if name.endswith("Get"):
-        return panel.registers.got(name, arguments)
-    raise FunctionRefused("it is not part of this emulator")
-
-
-def _refuse_no_numbers(name: str, arguments: Iterable[Any], *, keeps_nan: bool) -> None:
-    """The maker's own examples say of some functions that NaN is no change; (!) how others take it is not known."""
-    for argument in arguments:
-        if not isinstance(argument, str) and np.asarray(argument).dtype.kind == "f":
-            values = np.asarray(argument)
-            if (np.isnan(values).any() and not keeps_nan) or (np.isinf(values).any() and name not in _MAY_BE_INFINITE):
-                raise FunctionRefused("a value is not a number")
-
-
-def deadline_s(panel: NanonisState, timeout_ms: int) -> float:
-    """Experiment time at which a client's patience ends, which is counted in real time."""
-    return math.inf if timeout_ms < 0 else panel.clock.now_s() + panel.experiment_s(timeout_ms / 1000)
 
 
 def chosen(number: int, *choices: Any) -> Any:
@@ -107,8 +101,10 @@ def chosen(number: int, *choices: Any) -> Any:
     return choices[number]
 
 
-def until_free(panel: NanonisState, wait: int, timeout_ms: int = -1) -> Answer:
-    """Return at once, or when the instrument is free if `wait` is set."""
-    if not wait:
-        return ()
-    return DeferredResult(lambda now_s: None if panel.rig.busy(now_s) else (), deadline_s(panel, timeout_ms))
+def _refuse_nan(name: str, arguments: Iterable[Any], *, keeps_nan: bool) -> None:
+    """The maker's own examples say of some functions that NaN is no change; (!) how others take it is not known."""
+    for argument in arguments:
+        if not isinstance(argument, str) and np.asarray(argument).dtype.kind == "f":
+            values = np.asarray(argument)
+            if (np.isnan(values).any() and not keeps_nan) or (np.isinf(values).any() and name not in _MAY_BE_INFINITE):
+                raise FunctionRefused("a value is not a number")

@@ -56,7 +56,7 @@ class ChildPhase(Enum):
 
 @dataclass(frozen=True, slots=True)
 class StartChild:
-    """StartChild the process."""
+    """Start the process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ class ChildWatch:
         return code not in (*self._policy.final_codes, ExitCode.ORPHAN)
 
     def begin(self, now_s: float) -> list[ChildEffect]:
-        """StartChild it, the first time or after it was over."""
+        """Start it, the first time or after it was over."""
         if self.phase not in (ChildPhase.IDLE, ChildPhase.DONE, ChildPhase.GIVEN_UP):
             return []
         return self._start(now_s)

@@ -9,8 +9,7 @@ from typing import Any, Final
 
 from afspm.clock import Clock
 from afspm.errors import Refused
-from afspm.microscopes.asylum.folders import local
-from afspm.microscopes.asylum.result_files import AsylumFiles, Target, free_suffix
+from afspm.microscopes.asylum.result_files import AsylumFiles, Target, free_suffix, local
 from afspm.microscopes.asylum.session import Session
 from afspm.microscopes.asylum.xop import MISSING, XopError
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
@@ -29,17 +28,17 @@ class Activity:
     """What is running at the controller, whoever began it.
 
     Args:
-        harvest: takes what comes of it.
+        files: takes what comes of it.
         kept: JSON-able, and lasts: the frame of the image that spots are counted on, until when the tip moves, and
             whether a scan has led it away since.
-        folders: see `folders.local`.
+        folders: see `local`.
         frame_in_force: as it was set.
     """
 
     def __init__(
         self,
         session: Session,
-        harvest: AsylumFiles,
+        files: AsylumFiles,
         kept: dict[str, Any],
         folders: Mapping[str, str],
         frame_in_force: Callable[[], Region],
@@ -47,7 +46,7 @@ class Activity:
         log: logging.Logger,
     ) -> None:
         self._session = session
-        self._harvest = harvest
+        self._files = files
         self._kept = kept
         self._folders = folders
         self._frame_in_force = frame_in_force
@@ -64,15 +63,15 @@ class Activity:
         what = {ScopeState.SCANNING: SCAN, ScopeState.SPEC: FORCE}.get(state, "")
         if not what:
             self._stopping = False
-        if self._harvest.what not in ("", what):
-            self._harvest.end(self._clock.now_ns())
-        if what and not self._stopping and self._harvest.what != what:
+        if self._files.what not in ("", what):
+            self._files.end(self._clock.now_ns())
+        if what and not self._stopping and self._files.what != what:
             self.begin(what)
         if what == SCAN:
             self._image_begins()
         if state is ScopeState.FREE and self._clock.now_s() < self._moving_until_s:
             return ScopeStatus(ScopeState.MOVING)
-        if state is ScopeState.FREE and self._harvest.broken_off:
+        if state is ScopeState.FREE and self._files.broken_off:
             return ScopeStatus(ScopeState.INTERRUPTED)
         return ScopeStatus(state)
 
@@ -111,7 +110,7 @@ class Activity:
 
     def _image_begins(self) -> None:
         """A scan is seen running: not before, as one that does not begin leaves the image of before."""
-        if (frame := self._harvest.frame) is not None:
+        if (frame := self._files.frame) is not None:
             self._kept["image"] = frame
 
     def begin(self, what: str, position_m: tuple[float, float] | None = None) -> None:
@@ -125,7 +124,7 @@ class Activity:
             if "led_away" in self._kept:  # it was sent somewhere
                 self._kept["led_away"] = True
             taken = {"frame": as_list(self._frame_in_force())}
-        self._harvest.begin(what, self._target(what), taken)
+        self._files.begin(what, self._target(what), taken)
 
     def saves(self, what: str) -> None:
         """Have it saved where it can be found.
@@ -161,7 +160,7 @@ class Activity:
                 raise
 
     def settle(self, what: str) -> None:
-        """Until what was begun is seen running, or has ended already.
+        """Wait until what was begun is seen running, or has ended already.
 
         Raises:
             Refused: ACTION_ERROR: Asylum does not do it, and did not say so.
@@ -169,7 +168,7 @@ class Activity:
         state = ScopeState.SCANNING if what == SCAN else ScopeState.SPEC
         until_s = self._clock.monotonic_s() + _SETTLES_S
         while self._clock.monotonic_s() < until_s:
-            if self._session.doing().state is state or self._harvest.has_file():
+            if self._session.doing().state is state or self._files.has_file():
                 self._image_begins()
                 return
         self.forget()
@@ -189,7 +188,7 @@ class Activity:
 
     def forget(self) -> None:
         """Nothing comes of what was begun."""
-        self._harvest.forget()
+        self._files.forget()
 
     def moves(self, lasts_s: float) -> None:
         """The tip was sent away; it arrives, which Asylum does not tell, after so long at the latest."""

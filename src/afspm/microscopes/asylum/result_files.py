@@ -5,18 +5,29 @@ from __future__ import annotations
 import logging
 import math
 import re
+import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
+from pathlib import Path, PureWindowsPath
 from typing import Any, Final
 
-from afspm.errors import AfspmError, FileError
+from afspm.errors import AfspmError, ConfigError, FileError
 from afspm.files import read
 from afspm.model import Scan, Spectrum
-from afspm.translator.result_files import SCAN, Content, ResultFiles, as_set, lines_missing, modified_ns, region_of
+from afspm.translator.result_files import (
+    SCAN,
+    Content,
+    Entry,
+    Printed,
+    ResultFiles,
+    as_region,
+    lines_missing,
+    modified_ns,
+    newest,
+)
 
-_PRINTED: Final = 1e-4
-"""Relative: what a note has of a number, of which it prints five digits."""
+_PRINTED: Final = Printed(part=1e-4, angle_rad=1e-4 * math.tau)
+"""A note prints five digits of a number."""
 _NUMBERED: Final = re.compile(r".*\d{4}\.ibw", re.IGNORECASE)
 
 
@@ -41,16 +52,9 @@ class Target:
 class AsylumFiles(ResultFiles):
     """The measurement that is running or has just ended, and the results."""
 
-    def __init__(self, kept: dict[str, Any], log: logging.Logger) -> None:
+    def __init__(self, kept: Entry, log: logging.Logger) -> None:
         super().__init__(kept, log)
-        self._read: dict[str, Content] = {}
         kept.setdefault("taken", 0)
-
-    @property
-    def frame(self) -> list[float] | None:
-        """Of the scan that is running (`as_list`); None: none is."""
-        running = self._kept["running"]
-        return None if running is None else running.get("frame")
 
     def begin(self, what: str, target: Target, taken: Mapping[str, Any]) -> None:
         """A measurement begins.
@@ -58,7 +62,7 @@ class AsylumFiles(ResultFiles):
         Args:
             taken: "frame" of a scan, "position" of a spectrum, None if it is not known.
         """
-        there = {"there_ns": modified_ns(target.path), "newest_ns": _newest_ns(target.folder)}
+        there = {"there_ns": modified_ns(target.path), "newest_ns": newest(_files(target.folder))[0]}
         place = {"folder": str(target.folder), "base": target.base, "suffix": target.suffix}
         self._begins(what, {**place, **there, **taken})
 
@@ -68,12 +72,12 @@ class AsylumFiles(ResultFiles):
             self._ends({"end_ns": now_ns})
 
     def has_file(self) -> bool:
-        """Whether the file of what is running has appeared."""
+        """Return True if the file of what is running has appeared."""
         running = self._kept["running"]
         return running is not None and _file(running) is not None
 
     def results(self, now_ns: int) -> list[str]:
-        """The last results, oldest first."""
+        """Return the last results, oldest first."""
         self.broken_off = False
         ended, running = self._kept["ended"], self._kept["running"]
         if ended is not None and self._take(ended):
@@ -82,25 +86,17 @@ class AsylumFiles(ResultFiles):
             # it goes on with the next image
             running["suffix"] += 1
             running["there_ns"] = modified_ns(_target(running).path)
-            running["newest_ns"] = _newest_ns(Path(running["folder"]))
+            running["newest_ns"] = newest(_files(Path(running["folder"])))[0]
         return self._listed()
 
-    def load(self, result: str) -> Content:
-        """Read one of the results, with the parameters that it was taken with.
+    def read(self, entry: Entry) -> Content:
+        path = Path(entry["file"])
+        if modified_ns(path) != entry["modified_ns"]:
+            raise FileError("was overwritten or has gone", where=str(path))
+        return _content(path, entry)
 
-        Raises:
-            FileError: it is no result any more, or its file is another one by now.
-        """
-        entry = self._found(result)
-        if result not in self._read:
-            path = Path(entry["file"])
-            if modified_ns(path) != entry["modified_ns"]:
-                raise FileError("was overwritten or has gone", where=str(path))
-            self._read = {result: _content(path, entry)}
-        return self._read[result]
-
-    def _take(self, measured: Mapping[str, Any]) -> bool:
-        """Whether all is known of what has ended: its file is a result, or no image."""
+    def _take(self, measured: Entry) -> bool:
+        """Return True if all is known of what has ended: its file is a result, or no image."""
         path = _file(measured)
         if path is None:
             return False
@@ -111,65 +107,81 @@ class AsylumFiles(ResultFiles):
             return False  # not yet whole
         if modified_ns(path) != written_ns:
             return False
-        if any(map(lines_missing, content)):  # it was saved when the scan was broken off
+        if lines_missing(content):  # it was saved when the scan was broken off
             self.broken_off = True
             return True
         self._warn_of_frame(path, content[0], measured)
         self._kept["taken"] += 1
         # numbered, since Asylum may overwrite a file by one of the same name
-        result = f"{self._kept['taken']}: {path.name}"
-        self._comes(result, measured, {"file": str(path), "modified_ns": written_ns})
-        self._read = {result: content}
+        facts = {"file": str(path), "modified_ns": written_ns}
+        self._add(f"{self._kept['taken']}: {path.name}", measured, facts, content)
         return True
 
-    def _warn_of_frame(self, path: Path, one: Scan | Spectrum, measured: Mapping[str, Any]) -> None:
-        """If Asylum scanned another frame than was set: the file is right then."""
-        if isinstance(one, Scan) and one.region != region_of(measured):
-            told = f"{path.name} says a frame of {one.region}, and not of {region_of(measured)} as was in force"
+    def _warn_of_frame(self, path: Path, one: Scan | Spectrum, measured: Entry) -> None:
+        """Warn if Asylum scanned another frame than was set: the file is right then."""
+        if isinstance(one, Scan) and one.region != (wanted := as_region(measured["frame"])):
+            told = f"{path.name} says a frame of {one.region}, and not of {wanted} as was in force"
             self._log.warning("%s: it is delivered as the file says", told)
 
 
 def free_suffix(folder: Path, base: str) -> int:
-    """The first number that no file of this base name has, nor any that follows."""
+    """Return the first number that no file of this base name has, nor any that follows."""
     named = re.compile(rf"{re.escape(base)}(\d{{4,}})\.ibw", re.IGNORECASE)
     taken = [int(match[1]) for path in _files(folder) if (match := named.fullmatch(path.name))]
     return max(taken, default=-1) + 1
 
 
-def _target(measured: Mapping[str, Any]) -> Target:
+def local(igor_path: str, folders: Mapping[str, str]) -> Path:
+    """A path of Igor's, "C:Users:Me:Data:", here.
+
+    Args:
+        folders: beginnings of such paths, and where those are from here; the longest that fits counts.
+
+    Raises:
+        ConfigError: it is on another computer, and nothing says where to see it from here.
+    """
+    parts = _parts(igor_path)
+    fitting = [(start, here) for start, here in folders.items() if _begins(parts, _parts(start))]
+    if fitting:
+        start, here = max(fitting, key=lambda one: len(_parts(one[0])))
+        return Path(here, *parts[len(_parts(start)) :])
+    if igor_path.startswith(":"):  # a computer without drives
+        return Path("/", *parts)
+    if sys.platform != "win32" or len(parts[0]) != 1:
+        hint = f'folders = {{ "{igor_path}" = "/where/it/is/mounted" }}'
+        raise ConfigError(f"Asylum saves to {igor_path!r}, which is not on this computer", where="folders", hint=hint)
+    return Path(str(PureWindowsPath(f"{parts[0]}:/", *parts[1:])))
+
+
+def _begins(parts: list[str], start: list[str]) -> bool:
+    """Windows does not tell upper from lower case."""
+    return [part.casefold() for part in parts[: len(start)]] == [part.casefold() for part in start]
+
+
+def _parts(igor_path: str) -> list[str]:
+    """Also of a path as Windows writes it."""
+    return [part for part in igor_path.replace("\\", ":").split(":") if part]
+
+
+def _target(measured: Entry) -> Target:
     return Target(Path(measured["folder"]), measured["base"], measured["suffix"])
 
 
-def _file(measured: Mapping[str, Any]) -> Path | None:
-    """The file of a measurement, if it is there: the one that was to come, or a new one of another name."""
+def _file(measured: Entry) -> Path | None:
+    """Return the file of a measurement, if it is there: the one that was to come, or a new one of another name."""
     expected = _target(measured).path
     if modified_ns(expected) not in (0, measured["there_ns"]):
         return expected
-    new = [(modified_ns(path), path) for path in _files(expected.parent)]
-    new = [(time_ns, path) for time_ns, path in new if time_ns > measured["newest_ns"]]
-    return max(new)[1] if new else None
+    return newest(_files(expected.parent), measured["newest_ns"])[1]
 
 
 def _files(folder: Path) -> list[Path]:
     return [path for path in folder.glob("*.ibw") if _NUMBERED.fullmatch(path.name)] if folder.is_dir() else []
 
 
-def _newest_ns(folder: Path) -> int:
-    return max(map(modified_ns, _files(folder)), default=0)
-
-
-def _content(path: Path, measured: Mapping[str, Any]) -> Content:
+def _content(path: Path, measured: Entry) -> Content:
     found = read(path)
     content: Sequence[Scan | Spectrum] = found.scans if measured["what"] == SCAN else found.spectra
     if not content:
         raise FileError(f"holds no {measured['what']}", where=str(path))
-    return [_as_taken(one, measured) for one in content]
-
-
-def _as_taken(one: Scan | Spectrum, measured: Mapping[str, Any]) -> Scan | Spectrum:
-    """With the frame or position that was set, of which the note has five digits, and our time."""
-    if isinstance(one, Scan):
-        return as_set(one, measured, part=_PRINTED, angle_rad=_PRINTED * math.tau)
-    place = measured["position"]
-    position_m = one.position_m if place is None else (place[0], place[1])
-    return replace(one, kind=measured["what"], position_m=position_m, time_ns=measured["end_ns"])
+    return [_PRINTED.as_set(one, measured) for one in content]

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
 from afspm.errors import ConfigError, Refused
 from afspm.microscopes.gxsm.activity import SHOWS_S, Activity
-from afspm.microscopes.gxsm.frame import PIXELS, REFNAMES, Frame, number, send, user_unit_m
 from afspm.microscopes.gxsm.hardware import (
     ABORT,
     APPROACH,
@@ -24,12 +22,23 @@ from afspm.microscopes.gxsm.hardware import (
 from afspm.microscopes.gxsm.link import Address, Asking, open_link
 from afspm.microscopes.gxsm.live import new_lines
 from afspm.microscopes.gxsm.result_files import SOON_S, GxsmFiles
+from afspm.microscopes.gxsm.settings import (
+    REFNAMES,
+    FeedbackSwitch,
+    FrameSettings,
+    ScanFrame,
+    TipPlace,
+    number,
+    send,
+    user_unit_m,
+)
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.translator.driver import ControllerLost, Driver, action
 from afspm.translator.parameters import FEEDBACK_ON, Value
-from afspm.translator.settings import FRAME, POSITION, frame
+from afspm.translator.settings import FRAME, POSITION, KeptSettings, frame
 from afspm.units import Duration
 
+_AT_FIRST: Final[dict[str, Value]] = {names.SPEC_KIND: "IV", names.PULSE_VOLTAGE: 4.0, names.PULSE_DURATION: 0.1}
 _SAVERS: Final = ("afspm", "gxsm")
 
 
@@ -46,12 +55,11 @@ class Gxsm(Driver):
         feedback_actions: GXSM's actions that switch the feedback on and off, where its hardware has such.
         secret_file: a copy of the bridge's `~/.afspm/gxsm-bridge-secret`, if GXSM runs on another computer.
         reply_timeout_s: how long an answer may take, in real time.
-        parameters, actions, poll_period_s, result_timeout_s, live_lines_s: as for every microscope.
+        common: as for every microscope.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
-    translated = (*Frame.names, *POSITION, FEEDBACK_ON, names.SPEC_KIND, names.CONTROLLER)
-    kept = MappingProxyType({names.PULSE_VOLTAGE: 4.0, names.PULSE_DURATION: 0.1})
+    translated = (*FRAME, *POSITION, FEEDBACK_ON, names.CONTROLLER, *_AT_FIRST)
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
 
@@ -66,19 +74,9 @@ class Gxsm(Driver):
         feedback_actions: tuple[str, str] | None = None,
         secret_file: str | None = None,
         reply_timeout_s: Duration = 5.0,
-        parameters: Mapping[str, Mapping[str, Any]] | None = None,
-        actions: Mapping[str, Mapping[str, Any]] | None = None,
-        poll_period_s: Duration = 0.1,
-        result_timeout_s: Duration = 10.0,
-        live_lines_s: Duration | None = None,
+        **common: Any,
     ) -> None:
-        super().__init__(
-            parameters=parameters,
-            actions=actions,
-            poll_period_s=poll_period_s,
-            result_timeout_s=result_timeout_s,
-            live_lines_s=live_lines_s,
-        )
+        super().__init__(**common)
         kinds = [kind.value for kind in Hardware]
         if hardware is not None and hardware not in kinds:
             raise ConfigError(f"there is no {hardware!r}", where="hardware", hint=f"there are {', '.join(kinds)}")
@@ -95,6 +93,7 @@ class Gxsm(Driver):
         self._whole_table = self.table
         self._refs: dict[str, str] = {}
         self._asking: Asking | None = None
+        self._kept = KeptSettings(_AT_FIRST)
 
     @classmethod
     def excused(cls, controller: str) -> Mapping[str, str]:
@@ -119,25 +118,19 @@ class Gxsm(Driver):
         self._hardware = Hardware(self._given_hardware) if self._given_hardware else found
         self._find_parameters()
         self.lacking = self._missing_actions()
-        self._frame = Frame(ask, user_unit_m(ask))
+        self._frame = ScanFrame(ask, user_unit_m(ask))
         if self._saves and AUTOSAVE_OFF in self._actions:
             ask.call("action", AUTOSAVE_OFF)
             self.log.info("GXSM's Auto Save of scans is off from now on, and stays off: see the setting saving")
-        self._kept: dict[str, Any] = self.memory.setdefault("kept", {})
-        self._kept.update({names.SPEC_KIND: "IV", "probe": None, **self.kept} | self._kept)
-        self._harvest = GxsmFiles(
-            self.memory,
-            self.patience_s(self.result_timeout_s / 2),
-            self.patience_s(SOON_S),
-            self.log,
-            rewritten=not self._saves,
-        )
+        self._kept.kept_in(self.memory)
+        waits_s = (self.patience_s(self.result_timeout_s / 2), self.patience_s(SOON_S))
+        self._files = GxsmFiles(self.memory, *waits_s, self.log, rewritten=not self._saves)
         self._activity = Activity(
             ask,
             self._hardware,
             self._frame,
-            self._harvest,
-            self._kept,
+            self._files,
+            self.memory,
             self.clock,
             self.log,
             set_frame=lambda: frame(self.in_force(FRAME)),
@@ -146,14 +139,16 @@ class Gxsm(Driver):
             scan_dir=self._scan_dir,
             probe_dir=self._probe_dir,
         )
+        self._tip = TipPlace(self._frame, self.memory, self._sets_out)
+        own = FrameSettings(self._frame, self._tip, is_led=self._hardware is Hardware.RPSPMC)
+        feedback = FeedbackSwitch(ask, self._activity.doing, self._feedback_actions)
+        self.groups = (own, self._tip, self._kept, feedback)
 
     def _find_parameters(self) -> None:
         table = self._whole_table
-        own = {*self.translated, *(name for name in self.kept if table[name].vendor == name)}
-        vendors = {name: spec.vendor for name, spec in table.items() if name not in own}
+        vendors = {name: spec.vendor for name, spec in table.items() if name not in self.translated}
         self._refs = available(vendors, self._refnames)
         lacking = sorted(vendors.keys() - self._refs.keys())
-        self._own = [name for name in self.kept if name in own]
         if self._feedback_actions and self._actions.issuperset(self._feedback_actions):
             table = table.extended({FEEDBACK_ON: {"read_only": False}}, where="feedback_actions")
         self.table = table.without(lacking)
@@ -196,89 +191,42 @@ class Gxsm(Driver):
 
     # --- parameters ---
 
-    def read(self, wanted: Collection[str]) -> dict[str, Value]:
-        """What GXSM has, and what is kept for it."""
-        found: dict[str, Value] = {}
-        if not set(Frame.names).isdisjoint(wanted):
-            found.update(self._frame.read())
-        if not set(POSITION).isdisjoint(wanted):
-            found.update(zip(POSITION, self._probe_m(), strict=True))
-        if FEEDBACK_ON in wanted:
-            found[FEEDBACK_ON] = self._activity.doing().feedback_on
-        found.update({name: self._kept[name] for name in (names.SPEC_KIND, *self._own)})
-        found[names.CONTROLLER] = f"{self._harvest.program or 'GXSM'} ({self._hardware.value})"
-        return found | super().read([name for name in wanted if name not in found])
-
-    def write(self, values: Mapping[str, Value]) -> None:
-        """The frame first, which the tip's place depends on."""
-        framed = {name: value for name, value in values.items() if name in Frame.names}
-        if framed:
-            self._write_frame(framed)
-        position = {name: float(value) for name, value in values.items() if name in POSITION}
-        if position:
-            x, y = (position.get(name, before) for name, before in zip(POSITION, self._probe_m(), strict=True))
-            self._send_probe((x, y))
-        kept = {name: values[name] for name in (names.SPEC_KIND, *self._own) if name in values}
-        self._kept.update(kept)
-        if FEEDBACK_ON in values:
-            on, off = self._feedback_actions
-            self._ask.call("action", on if values[FEEDBACK_ON] else off)
-        own = {*framed, *position, *kept, FEEDBACK_ON}
-        super().write({name: value for name, value in values.items() if name not in own})
-
     def get(self, vendor: str) -> Value:
-        """By GXSM's name."""
+        if vendor == names.CONTROLLER:
+            return f"{self._files.program or 'GXSM'} ({self._hardware.value})"
         return number(self._ask, self._there(vendor))
 
     def set(self, values: Mapping[str, Value]) -> None:
-        """By GXSM's names, one after the other."""
         for vendor, value in values.items():
             send(self._ask, self._there(vendor), float(value))
 
     def _there(self, vendor: str) -> str:
-        """Of the names that a parameter may have, the one that this GXSM has: it does not say of others that it has
+        """Return the name that this GXSM has, of those that a parameter may have: of others it does not say that it has
         them not."""
         there = available({"": vendor}, self._refnames)
         if not there:
             raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, f"this GXSM has no parameter {vendor!r}")
         return there[""]
 
-    def _probe_m(self) -> tuple[float, float]:
-        """Where the tip was sent; GXSM's files of spectra do not tell."""
-        kept = self._kept["probe"]
-        return self._frame.tip() if kept is None else (float(kept[0]), float(kept[1]))
-
-    def _write_frame(self, framed: Mapping[str, Value]) -> None:
-        if self._hardware is not Hardware.RPSPMC or framed.keys() <= PIXELS:
-            self._frame.write(framed)
-            return
-        # the tip goes along with its frame, which a RedPitaya does not tell
-        before_m = self._frame.tip()
-        self._frame.write(framed)
-        self._activity.sets_out(self._way_s(math.dist(before_m, self._frame.tip())))
-
-    def _send_probe(self, xy_m: tuple[float, float]) -> None:
-        way_s = self._way_s(math.dist(self._frame.tip(), xy_m))
-        self._frame.move_tip(xy_m)
-        self._kept["probe"] = list(xy_m)
-        self._activity.sets_out(way_s)
-
     def _way_s(self, way_m: float) -> float:
-        """How long the tip takes for so long a way; none if GXSM does not tell its speed."""
+        """Return the time that the tip takes for so long a way; none if GXSM does not tell its speed."""
         if names.MOVE_SPEED not in self._refs:
             return 0.0
-        speed_m_s = float(super().read([names.MOVE_SPEED])[names.MOVE_SPEED])
+        speed_m_s = float(self.read_rows([names.MOVE_SPEED])[names.MOVE_SPEED])
         return way_m / speed_m_s if speed_m_s > 0.0 else 0.0
+
+    def _sets_out(self, way_m: float) -> None:
+        self._activity.sets_out(self._way_s(way_m))
 
     # --- results ---
 
     def results(self) -> Sequence[str]:
         """The last scans and spectra that GXSM saved."""
-        return self._harvest.results(self.clock.now_s())
+        return self._files.results(self.clock.now_s())
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         """Read the files of one."""
-        return self._harvest.load(result)
+        return self._files.load(result)
 
     def lines(self, start: int) -> Sequence[ScanLines]:
         """Return what is new in GXSM's memory; of channels that a scan was saved of."""
@@ -286,7 +234,7 @@ class Gxsm(Driver):
         if not endings:
             return ()
         done = self._activity.lines_done()
-        found = new_lines(self._ask, endings, self._harvest.channels, self._harvest.scanning, start, done)
+        found = new_lines(self._ask, endings, self._files.channels, self._files.scanning, start, done)
         # of a scan that is stopped meanwhile GXSM says that it is at its last line
         return found if self._activity.doing().measuring else ()
 
@@ -313,7 +261,7 @@ class Gxsm(Driver):
             reason = f"this GXSM has no {execute(kind)} with its hardware ({self._hardware.value}): see x-spec-kind"
             raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, reason)
         reach_m = math.hypot(*self._frame.region().size_m)
-        self._activity.start_curve(kind, self._probe_m(), self._way_s(reach_m))
+        self._activity.start_curve(kind, self._tip.xy_m(), self._way_s(reach_m))
 
     @action(names.STOP_SPEC)
     def stop_spec(self) -> None:
@@ -322,9 +270,7 @@ class Gxsm(Driver):
 
     @action(names.PULSE, state=ScopeState.BUSY_PARAM)
     def pulse(self) -> None:
-        """A bias pulse of `x-pulse-voltage` for `x-pulse-duration`, where the tip is: the bias is set, and put back."""
-        wanted = self.in_force([names.PULSE_VOLTAGE, names.PULSE_DURATION])
-        self.for_a_while({names.TIP_BIAS_VOLTAGE: wanted[names.PULSE_VOLTAGE]}, float(wanted[names.PULSE_DURATION]))
+        self.pulse_bias()
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
@@ -334,6 +280,3 @@ class Gxsm(Driver):
     def command(self, text: str) -> None:
         """One of GXSM's actions, e.g. "DSP_CMD_STOPALL"."""
         self._ask.call("action", text)
-
-
-__all__ = ["AfspmError", "Gxsm", "GxsmError"]

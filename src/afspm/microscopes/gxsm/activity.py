@@ -9,10 +9,10 @@ from typing import Any, Final
 
 from afspm.clock import Clock
 from afspm.microscopes.gxsm.errors import GxsmError
-from afspm.microscopes.gxsm.frame import Frame
 from afspm.microscopes.gxsm.hardware import ABORT, STATUS, Doing, Hardware, decoded, execute
 from afspm.microscopes.gxsm.link import Asking
 from afspm.microscopes.gxsm.result_files import GxsmFiles, endings
+from afspm.microscopes.gxsm.settings import ScanFrame
 from afspm.microscopes.gxsm.staleness import Rows, is_unfinished, looked_at
 from afspm.model import Region, ScopeState, ScopeStatus
 from afspm.translator.result_files import SCAN, as_list
@@ -41,8 +41,8 @@ class Activity:
         self,
         ask: Asking,
         hardware: Hardware,
-        frame: Frame,
-        harvest: GxsmFiles,
+        frame: ScanFrame,
+        files: GxsmFiles,
         kept: dict[str, Any],
         clock: Clock,
         log: logging.Logger,
@@ -57,7 +57,7 @@ class Activity:
         self._hardware = hardware
         self._frame = frame
         self._set_frame = set_frame
-        self._harvest = harvest
+        self._files = files
         self._clock = clock
         self._log = log
         self._shows_s = shows_s
@@ -82,7 +82,7 @@ class Activity:
         self._begin_scan(self._clock.now_ns())
         self._y_before = int(self._ask.number("y_current"))
         rows, columns = self._set_frame()[1]
-        self._harvest.before = looked_at(self._ask, len(self._channels()), (0, rows - 1), columns)
+        self._files.before = looked_at(self._ask, len(self._channels()), (0, rows - 1), columns)
         self._shows_until_s = self._clock.now_s() + self._shows_s
         self._ask.call("startscan")
 
@@ -124,7 +124,7 @@ class Activity:
     def next_change_s(self) -> float | None:
         """When the tip has arrived, what was begun must show, or files must be there."""
         now_s = self._clock.now_s()
-        times = (self._arrives_s, self._shows_until_s, self._settles_until_s, self._harvest.next_s() or 0.0)
+        times = (self._arrives_s, self._shows_until_s, self._settles_until_s, self._files.next_s() or 0.0)
         return min((at_s for at_s in times if at_s > now_s), default=None)
 
     # --- what goes on ---
@@ -132,7 +132,7 @@ class Activity:
     def endings(self) -> list[str]:
         """Of the files of each channel of the running scan; none before it was seen running: GXSM would still tell of
         the scan before."""
-        if self._harvest.what != SCAN or self._shows_until_s > 0.0:
+        if self._files.what != SCAN or self._shows_until_s > 0.0:
             return []
         if not self._endings:
             self._endings = [next(iter(endings([Path(path)])), "") for path in self._channels()]
@@ -161,14 +161,14 @@ class Activity:
             if not doing.moving and now_s >= self._arrives_s:
                 self._take_curve(now_s)
             return ScopeStatus(ScopeState.SPEC)
-        if doing.measuring and not (led and not self._harvest.what):
+        if doing.measuring and not (led and not self._files.what):
             return self._measuring(doing)
         self._idle_ns = self._clock.now_ns()
         moving = doing.moving or now_s < self._arrives_s
         if self._stopping and moving:  # a spectrum that was to be taken at the end of the way
             return ScopeStatus(ScopeState.INTERRUPTED)
         self._stopping = False
-        what = self._harvest.what
+        what = self._files.what
         if what and now_s < self._shows_until_s:
             return ScopeStatus(ScopeState.SCANNING if what == SCAN else ScopeState.SPEC)
         if what == SCAN and not self._is_settled(now_s):
@@ -179,24 +179,24 @@ class Activity:
             return ScopeStatus(ScopeState.COARSE_MOTOR)
         if moving:
             return ScopeStatus(ScopeState.MOVING)
-        return ScopeStatus(ScopeState.INTERRUPTED if self._harvest.broken_off else ScopeState.FREE)
+        return ScopeStatus(ScopeState.INTERRUPTED if self._files.broken_off else ScopeState.FREE)
 
     def _measuring(self, doing: Doing) -> ScopeStatus:
         self._shows_until_s = self._settles_until_s = 0.0
-        if not self._harvest.what and not self._stopping:  # somebody began it at the panel
+        if not self._files.what and not self._stopping:  # somebody began it at the panel
             if doing.scanning:
                 self._begin_scan(self._idle_ns)
             else:
                 self._begin_curve("VP", self._frame.tip())
-        if self._harvest.what == SCAN and self._harvest.before is None:
-            self._harvest.before = self._last_row()
-        curve = doing.probing and (self._harvest.what not in ("", SCAN) or not doing.scanning)
+        if self._files.what == SCAN and self._files.before is None:
+            self._files.before = self._last_row()
+        curve = doing.probing and (self._files.what not in ("", SCAN) or not doing.scanning)
         return ScopeStatus(ScopeState.SPEC if curve else ScopeState.SCANNING, doing.paused or None)
 
     def _last_row(self) -> Rows | None:
         """Return what is in the last row of a scan that was found running; None once it may have been scanned."""
-        rows, columns = self._harvest.scanning[1]
-        last = 0 if self._harvest.upwards else rows - 1
+        rows, columns = self._files.scanning[1]
+        last = 0 if self._files.upwards else rows - 1
         found = looked_at(self._ask, len(self._channels()), [last], columns)
         return found if abs(int(self._ask.number("y_current")) - last) > 1 else None
 
@@ -210,7 +210,7 @@ class Activity:
         """The tip was on its way to a spectrum: that must not be taken into what somebody measures."""
         self._log.error("no spectrum is taken: somebody began to measure while the tip was on its way to it")
         self._execute, self._kept["arrives_s"] = "", 0.0
-        self._harvest.forget()
+        self._files.forget()
         return ScopeStatus(ScopeState.INTERRUPTED)
 
     def _take_curve(self, now_s: float) -> None:
@@ -223,22 +223,22 @@ class Activity:
         self._settles_until_s, self._y_before, self._y_moved = 0.0, None, False
         region, shape = self._set_frame()
         taken = {"frame": as_list(region), "shape": list(shape)}
-        self._harvest.begin(SCAN, self._folder(), begun_ns, taken)
+        self._files.begin(SCAN, self._folder(), begun_ns, taken)
 
     def _begin_curve(self, kind: str, position_m: tuple[float, float]) -> None:
         self._stopping = False
         folder = self._probe_dir or self._folder()
-        self._harvest.begin(kind, folder, 0, {"position": list(position_m)})
+        self._files.begin(kind, folder, 0, {"position": list(position_m)})
 
     def _stop(self) -> None:
         self._stopping = True
         self._execute, self._shows_until_s = "", 0.0
-        self._harvest.forget()
+        self._files.forget()
 
     def _end(self, what: str) -> None:
         if what != SCAN:
             now_ns = self._clock.now_ns()
-            self._harvest.end(now_ns, now_ns)
+            self._files.end(now_ns, now_ns)
             return
         is_whole = self._is_whole()
         if is_whole and self._saves:
@@ -248,11 +248,11 @@ class Activity:
                 self._log.error("the scan can't be saved: %s", error)
         # only now: before, GXSM may still tell of the folder of the scan before
         channels, folder = self._channels(), self._folder()
-        self._harvest.end(self._ended_ns, self._clock.now_ns(), channels, folder, is_whole=is_whole)
+        self._files.end(self._ended_ns, self._clock.now_ns(), channels, folder, is_whole=is_whole)
 
     def _is_whole(self) -> bool:
         """Return whether the scan that has ended came to its end, as far as GXSM's memory tells."""
-        before, (_, shape) = self._harvest.before, self._harvest.scanning
+        before, (_, shape) = self._files.before, self._files.scanning
         if before is None and self._seen_last[0] == shape:  # somebody began it, and it was soon over
             before = self._seen_last[1]
         columns = shape[1] if before is None else before["columns"]

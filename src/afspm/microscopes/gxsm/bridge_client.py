@@ -6,9 +6,7 @@ import base64
 import json
 import math
 import os
-import socket
 from collections.abc import Callable
-from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
@@ -17,9 +15,9 @@ import numpy as np
 
 from afspm.microscopes.gxsm.errors import BadReply, GxsmError
 from afspm.translator.driver import ControllerLost
+from afspm.translator.tcp import Receiver, TcpConnection
 
 _LONGEST: Final = 1 << 29
-_AT_ONCE: Final = 1 << 18
 _TYPES: Final = {f"<{kind}" for kind in ("f8", "f4", "i8", "i4", "u8", "u4", "i2", "u2")} | {"|u1", "|i1"}
 _SECRET: Final = "~/.afspm/gxsm-bridge-secret"
 _WELCOME: Final = {"value": "afspm bridge"}
@@ -27,16 +25,10 @@ _HINT: Final = "is bridge.py running in GXSM's console? Nothing is answered whil
 
 
 class BridgeLink:
-    """A connection to the bridge. Whatever goes wrong on it but an error that it tells of, it is closed: a late answer
-    must never be taken for that to the next call.
+    """A connection to the bridge; the other arguments are those of `TcpConnection`.
 
     Args:
-        timeout_s: how long an answer may take, in real time.
-        monotonic_s: real time.
         secret_file: left out: where the bridge of this user puts it.
-
-    Raises:
-        ControllerLost: nobody listens there.
     """
 
     def __init__(
@@ -46,41 +38,16 @@ class BridgeLink:
         monotonic_s: Callable[[], float],
         secret_file: Path | None = None,
     ) -> None:
-        self._timeout_s = timeout_s
-        self._monotonic_s = monotonic_s
-        self._where = f"{address[0]}:{address[1]}"
-        try:
-            self._socket = socket.create_connection(address, timeout_s)
-        except OSError as error:
-            raise ControllerLost(f"no connection: {error}", where=self._where, hint=_HINT) from error
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._tcp = TcpConnection(address, timeout_s, monotonic_s, (_HINT, _HINT))
         self._secret_file = secret_file or Path(_SECRET).expanduser()
         self._is_welcome = False
-
-    def _introduce(self) -> None:
-        """Send the secret, before the first call. Raises ControllerLost: there is none, or not what the bridge has."""
-        secret_file = self._secret_file
-        hint = f"run the bridge.py of this version, and use its ~/.afspm/{secret_file.name} (secret_file)"
-        try:
-            if os.name == "posix" and secret_file.stat().st_mode & 0o077:
-                raise ControllerLost("others can read the bridge's secret", where=str(secret_file), hint="chmod 600")
-            reply = self._replied("the secret", secret_file.read_bytes().strip() + b"\n")
-        except OSError as error:
-            self.close()
-            raise ControllerLost(f"the bridge's secret can't be read: {error}", hint=hint) from error
-        except ControllerLost as error:
-            self.close()
-            raise ControllerLost(f"the bridge did not welcome us: {error}", where=self._where, hint=hint) from error
-        if reply != _WELCOME:
-            self.close()
-            raise ControllerLost("is not the bridge of this version of afspm", where=self._where, hint=hint)
-        self._is_welcome = True
+        self.close = self._tcp.close
 
     def call(self, method: str, *arguments: str | int | float) -> Any:
         """Call a function of GXSM (see `Link`)."""
         if not self._is_welcome:
             self._introduce()
-        reply = self._replied(method, _message(method, *arguments))
+        reply = self._tcp.ask(method, _message(method, *arguments), _read)
         if "error" in reply:
             raise GxsmError(str(reply["error"]), where=method)
         return reply["value"]
@@ -89,49 +56,38 @@ class BridgeLink:
         """Return where GXSM was started; it saves there until its user chooses another folder."""
         return Path(str(self.call("getcwd")))
 
-    def _replied(self, method: str, message: bytes) -> dict[str, Any]:
-        """Return the reply to a message. Raises ControllerLost: none, or what is none; the link is closed."""
+    def _introduce(self) -> None:
+        """Send the secret, before the first call. Raises ControllerLost: there is none, or not what the bridge has."""
+        secret_file, where = self._secret_file, self._tcp.where
+        hint = f"run the bridge.py of this version, and use its ~/.afspm/{secret_file.name} (secret_file)"
         try:
-            return _reply(self._exchange(method, message))
-        except TimeoutError as error:
-            self.close()
-            what = f"no answer to {method} within {self._timeout_s:g} s"
-            raise ControllerLost(what, where=self._where, hint=_HINT) from error
+            if os.name == "posix" and secret_file.stat().st_mode & 0o077:
+                raise ControllerLost("others can read the bridge's secret", where=str(secret_file), hint="chmod 600")
+            reply = self._tcp.ask("the secret", secret_file.read_bytes().strip() + b"\n", _read)
         except OSError as error:
             self.close()
-            what = f"the connection was lost at {method}: {error}"
-            raise ControllerLost(what, where=self._where, hint=_HINT) from error
-        except ControllerLost:
+            raise ControllerLost(f"the bridge's secret can't be read: {error}", hint=hint) from error
+        except ControllerLost as error:
             self.close()
-            raise
+            raise ControllerLost(f"the bridge did not welcome us: {error}", where=where, hint=hint) from error
+        if reply != _WELCOME:
+            self.close()
+            raise ControllerLost("is not the bridge of this version of afspm", where=where, hint=hint)
+        self._is_welcome = True
 
-    def close(self) -> None:
-        """End the connection."""
-        with suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
-        self._socket.close()
 
-    def _exchange(self, method: str, message: bytes) -> bytes:
-        """The line that is replied."""
-        until_s = self._monotonic_s() + self._timeout_s
-        self._socket.settimeout(self._timeout_s)
-        self._socket.sendall(message)
-        parts: list[bytes] = []
-        size = 0
-        while not (parts and parts[-1].endswith(b"\n")):
-            left_s = until_s - self._monotonic_s()
-            if left_s <= 0.0:
-                raise TimeoutError
-            self._socket.settimeout(left_s)
-            part = self._socket.recv(_AT_ONCE)
-            if not part:
-                what = f"the connection was closed after {size} bytes of the reply to {method}"
-                raise ControllerLost(what, where=self._where, hint=_HINT)
-            parts.append(part)
-            size += len(part)
-            if size > _LONGEST or b"\n" in part[:-1]:
-                raise BadReply(f"more than one answer to {method}", where=self._where)
-        return b"".join(parts)
+def _read(receiver: Receiver) -> dict[str, Any]:
+    """Return the reply in the one line that is replied."""
+    parts = [receiver.some()]
+    size = len(parts[0])
+    while not parts[-1].endswith(b"\n"):
+        if size > _LONGEST or b"\n" in parts[-1]:
+            break
+        parts.append(receiver.some())
+        size += len(parts[-1])
+    if size > _LONGEST or b"\n" in parts[-1][:-1]:
+        raise BadReply("more than one answer to a call")
+    return _reply(b"".join(parts))
 
 
 @lru_cache(256, typed=True)  # the same few are asked again and again, a frame by seven questions

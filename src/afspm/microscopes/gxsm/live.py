@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from afspm.microscopes.gxsm.frame import ANGSTROM_M
 from afspm.microscopes.gxsm.link import Asking
+from afspm.microscopes.gxsm.settings import ANGSTROM_M
 from afspm.model import Region, ScanLines
 
 

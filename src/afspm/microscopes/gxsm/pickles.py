@@ -1,60 +1,49 @@
-"""What Gxsm4 pickles, read without unpickling: nothing is imported, nothing called, whatever the bytes say.
+"""Reads what Gxsm4 pickles with an allow-list: numbers, texts, bytes, containers and numpy arrays of numbers.
 
-A pickle is a program for a small stack machine (documented in the standard library's `pickletools`). Here it may make
-numbers, texts, bytes, tuples, lists, dicts and numpy arrays of numbers; anything else is refused.
+Nothing is imported, and nothing called but the stand-ins for numpy's types here, whatever the bytes say. Python's own
+unpickler in Python is used, since that in C sets aside as much memory as a damaged pickle asks for.
 """
 
 from __future__ import annotations
 
-import pickletools
-from collections.abc import Callable
+import io
+import pickle
 from typing import Any, Final
 
 import numpy as np
 
 from afspm.microscopes.gxsm.errors import BadReply
 
-_PLAIN: Final = {
-    "BININT": int, "BININT1": int, "BININT2": int, "LONG1": int, "LONG4": int, "BINFLOAT": float,
-    "SHORT_BINUNICODE": str, "BINUNICODE": str, "BINUNICODE8": str,
-    "SHORT_BINBYTES": bytes, "BINBYTES": bytes, "BINBYTES8": bytes, "BYTEARRAY8": bytes,
-}  # fmt: skip
-_CONSTANTS: Final = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
-_SMALL_TUPLES: Final = {"EMPTY_TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
-_GETS, _PUTS = {"BINGET", "LONG_BINGET"}, {"BINPUT", "LONG_BINPUT"}
 _NUMBERS: Final = {f"{kind}{size}" for kind in "fiu" for size in (1, 2, 4, 8)} - {"f1", "f2"}
-_MARK: Final = object()
-_PARTS: Final = 1_000_000
+_MOST_PARTS: Final = 1_000_000
 
 
-class _Type:
-    """numpy's dtype of plain numbers."""
+class _DType:
+    """Stands for numpy's dtype of plain numbers."""
 
-    def __init__(self, code: object) -> None:
+    def __init__(self, code: object, *_: object) -> None:
         if code not in _NUMBERS:
             raise BadReply(f"an array of {code!r}")
         self.numpy = np.dtype(str(code))
 
-    def fill(self, state: Any) -> None:
-        """Its byte order."""
+    def __setstate__(self, state: Any) -> None:
         self.numpy = self.numpy.newbyteorder(">" if state[1] == ">" else "<")
 
 
 class _Array:
-    """numpy's array, to be filled."""
+    """Stands for numpy's array, filled from (version, shape, type, True if by columns, bytes)."""
 
     values: np.ndarray | None = None
 
-    def fill(self, state: Any) -> None:
-        """With (version, shape, type, whether by columns, bytes)."""
+    def __setstate__(self, state: Any) -> None:
         _, shape, kind, by_columns, content = state
         self.values = _array(content, kind, shape, "F" if by_columns else "C")
 
 
 def _array(content: Any, kind: Any, shape: Any, order: Any) -> np.ndarray:
-    if not (isinstance(kind, _Type) and isinstance(content, bytes) and order in ("C", "F")):
+    if not (isinstance(kind, _DType) and isinstance(content, bytes | bytearray) and order in ("C", "F")):
         raise BadReply("an array that is none")
-    return np.frombuffer(content, kind.numpy).reshape(tuple(shape), order=order)
+    return np.frombuffer(bytes(content), kind.numpy).reshape(tuple(shape), order=order)
 
 
 def _from_buffer(content: Any, kind: Any, shape: Any, order: Any) -> _Array:
@@ -63,137 +52,56 @@ def _from_buffer(content: Any, kind: Any, shape: Any, order: Any) -> _Array:
     return made
 
 
-_CORES: Final = ("numpy.core", "numpy._core")  # before numpy 2, and since
-_CALLS: Final[dict[str, Callable[..., Any]]] = {
-    "numpy dtype": lambda code, *_: _Type(code),
-    **{f"{core}.multiarray _reconstruct": lambda *_: _Array() for core in _CORES},
-    **{f"{core}.multiarray scalar": lambda kind, content: _array(content, kind, (), "C").item() for core in _CORES},
-    **{f"{core}.numeric _frombuffer": _from_buffer for core in _CORES},
-}
-_CLASSES: Final[dict[str, object]] = {**_CALLS, "numpy ndarray": object()}
+def _scalar(kind: Any, content: Any) -> object:
+    return _array(content, kind, (), "C").item()
+
+
+_ALLOWED: Final[dict[tuple[str, str], Any]] = {("numpy", "dtype"): _DType, ("numpy", "ndarray"): _Array}
+for _core in ("numpy.core", "numpy._core"):  # before numpy 2, and since
+    _ALLOWED[f"{_core}.multiarray", "_reconstruct"] = lambda *_: _Array()
+    _ALLOWED[f"{_core}.multiarray", "scalar"] = _scalar
+    _ALLOWED[f"{_core}.numeric", "_frombuffer"] = _from_buffer
+
+
+class _Unpickler(pickle._Unpickler):  # type: ignore[name-defined, misc, unused-ignore]
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in _ALLOWED:
+            raise BadReply(f"GXSM's reply asks for {f'{module} {name}'[:100]!r}, which is not run")
+        return _ALLOWED[module, name]
 
 
 def loads(content: bytes) -> Any:
-    """The value of a pickle.
+    """Return the value of a pickle.
 
     Raises:
         BadReply: it is none, or of something that GXSM does not reply.
     """
     try:
-        return _Finishing().value(_Machine().run(content))
+        return _Values().of(_Unpickler(io.BytesIO(content), encoding="latin-1").load())
     except BadReply:
         raise
     except RecursionError:
         raise BadReply("GXSM's reply is nested too deeply") from None
-    except Exception as error:  # whatever the bytes make of the machine
+    except Exception as error:  # whatever the bytes make of the unpickler
         raise BadReply(f"GXSM's reply is no pickle of a value: {type(error).__name__}: {error}") from error
 
 
-class _Machine:
-    """The stack, and what was put aside."""
+class _Values:
+    """Puts arrays in place of their stand-ins; it ends also where a list holds itself, or many times the same."""
 
     def __init__(self) -> None:
-        self._stack: list[Any] = []
-        self._memo: dict[int, Any] = {}
+        self._left = _MOST_PARTS
 
-    def run(self, content: bytes) -> Any:
-        for opcode, argument, _ in pickletools.genops(content):
-            if opcode.name == "STOP":
-                if len(self._stack) != 1:
-                    raise BadReply(f"a pickle that leaves {len(self._stack)} values")
-                return self._stack.pop()
-            self._step(opcode.name, argument)
-        raise BadReply("a pickle without an end")
-
-    def _step(self, name: str, argument: Any) -> None:
-        stack = self._stack
-        if name in _PLAIN:
-            stack.append(_PLAIN[name](argument))
-        elif name in _CONSTANTS:
-            stack.append(_CONSTANTS[name])
-        elif name in _SMALL_TUPLES:
-            stack.append(tuple(self._popped(_SMALL_TUPLES[name])))
-        elif name in ("MEMOIZE", *_PUTS):
-            self._memo[len(self._memo) if argument is None else argument] = stack[-1]
-        elif name in _GETS:
-            stack.append(self._memo[argument])
-        elif name in ("GLOBAL", "STACK_GLOBAL"):
-            stack.append(self._named(argument if name == "GLOBAL" else " ".join(map(str, self._popped(2)))))
-        elif name not in ("PROTO", "FRAME"):
-            self._build(name)
-
-    def _build(self, name: str) -> None:
-        stack = self._stack
-        if name == "MARK":
-            stack.append(_MARK)
-        elif name == "TUPLE":
-            stack.append(tuple(self._popped_to_mark()))
-        elif name in ("EMPTY_LIST", "EMPTY_DICT"):
-            stack.append([] if name == "EMPTY_LIST" else {})
-        elif name in ("APPEND", "APPENDS"):
-            values = self._popped(1) if name == "APPEND" else self._popped_to_mark()
-            self._top(list).extend(values)
-        elif name in ("SETITEM", "SETITEMS"):
-            values = self._popped(2) if name == "SETITEM" else self._popped_to_mark()
-            self._top(dict).update(zip(values[::2], values[1::2], strict=True))
-        elif name == "REDUCE":
-            call, arguments = self._popped(2)
-            stack.append(call(*arguments) if call in _CALLS.values() else self._named(call))
-        elif name == "BUILD":
-            (state,) = self._popped(1)
-            self._top(_Type if isinstance(stack[-1], _Type) else _Array).fill(state)
-        else:
-            raise BadReply(f"GXSM's reply does what no value needs: {name}")
-
-    def _named(self, name: object) -> Any:
-        if name not in _CLASSES:
-            raise BadReply(f"GXSM's reply asks for {str(name)[:100]!r}, which is not run")
-        return _CLASSES[str(name)]
-
-    def _top(self, kind: type) -> Any:
-        if not isinstance(self._stack[-1], kind):
-            raise BadReply(f"a pickle that fills a {type(self._stack[-1]).__name__}")
-        return self._stack[-1]
-
-    def _popped(self, count: int) -> list[Any]:
-        if len(self._stack) < count:
-            raise BadReply("a pickle that takes what is not there")
-        values = self._stack[len(self._stack) - count :]
-        del self._stack[len(self._stack) - count :]
-        return values
-
-    def _popped_to_mark(self) -> list[Any]:
-        at = max(i for i, value in enumerate(self._stack) if value is _MARK)
-        values = self._stack[at + 1 :]
-        del self._stack[at:]
-        return values
-
-
-class _Finishing:
-    """Puts arrays in place of what they were made from; it ends also where a list holds itself, or many times the
-    same."""
-
-    def __init__(self) -> None:
-        self._left = _PARTS
-
-    def value(self, value: Any) -> Any:
+    def of(self, value: Any) -> Any:
         self._left -= 1
         if self._left < 0:
             raise BadReply("GXSM's reply has too many parts")
-        if isinstance(value, _Array):
-            if value.values is None:
-                raise BadReply("an array without values")
+        if isinstance(value, _Array) and value.values is not None:
             return value.values
         if isinstance(value, tuple | list):
-            return type(value)(self.value(part) for part in value)
-        if isinstance(value, dict):
-            return {_hashable(key): self.value(part) for key, part in value.items()}
-        if value is not None and not isinstance(value, bool | int | float | str | bytes):
-            raise BadReply("GXSM's reply holds no value")
-        return value
-
-
-def _hashable(key: Any) -> Any:
-    if not isinstance(key, str | int | float):
-        raise BadReply(f"a dict with the key {key!r}")
-    return key
+            return type(value)(self.of(part) for part in value)
+        if isinstance(value, dict) and all(isinstance(key, str | int | float) for key in value):
+            return {key: self.of(part) for key, part in value.items()}
+        if value is None or isinstance(value, bool | int | float | str | bytes):
+            return value
+        raise BadReply(f"GXSM's reply holds no value: {type(value).__name__}")

@@ -5,22 +5,19 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from afspm.clock import NS_PER_S
 from afspm.errors import AfspmError
 from afspm.files import read
 from afspm.files.content import FileContent
 from afspm.microscopes.gxsm.staleness import Rows
-from afspm.model import Region, Scan, Spectrum
-from afspm.translator.result_files import SCAN, ResultFiles, as_set, lines_missing, region_of
+from afspm.model import Region
+from afspm.translator.result_files import SCAN, Content, Entry, Printed, ResultFiles, as_region, lines_missing
 
 _NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+\.nc)$")
-_STORED: Final = 1e-5
-"""Relative: what is lost of a length in a file."""
-_TURNED_RAD: Final = 1e-6
+_PRINTED: Final = Printed(part=1e-5, angle_rad=1e-6)
 _CLOCK_NS: Final = 2 * NS_PER_S
 """Files tell the second in which a scan began."""
 _LATE_NS: Final = 20 * NS_PER_S
@@ -38,9 +35,7 @@ class GxsmFiles(ResultFiles):
         rewritten: files may be there before the scan is over, and be written again.
     """
 
-    def __init__(
-        self, kept: dict[str, Any], patience_s: float, soon_s: float, log: logging.Logger, *, rewritten: bool
-    ) -> None:
+    def __init__(self, kept: Entry, patience_s: float, soon_s: float, log: logging.Logger, *, rewritten: bool) -> None:
         super().__init__(kept, log)
         self._patience_s = patience_s
         self._soon_s = soon_s
@@ -59,7 +54,7 @@ class GxsmFiles(ResultFiles):
     def scanning(self) -> tuple[Region, tuple[int, int]]:
         """The frame of the running scan, and (rows, columns). Only while one runs."""
         rows, columns = self._kept["running"]["shape"]
-        return region_of(self._kept["running"]), (rows, columns)
+        return as_region(self._kept["running"]["frame"]), (rows, columns)
 
     @property
     def before(self) -> Rows | None:
@@ -83,7 +78,7 @@ class GxsmFiles(ResultFiles):
         found: str = self._kept["program"]
         return found
 
-    def begin(self, what: str, folder: Path | None, begun_ns: int, taken: Mapping[str, Any]) -> None:
+    def begin(self, what: str, folder: Path | None, begun_ns: int, taken: Entry) -> None:
         """A measurement begins.
 
         Args:
@@ -136,28 +131,22 @@ class GxsmFiles(ResultFiles):
         if ended is not None:
             files = self._new(ended)
             over = now_s >= ended["until_s"]
-            gaps = [file for file, content in files.items() if _gaps(content)]
+            gaps = [file for file, content in files.items() if lines_missing(content)]
             if not any(scan.values.any() for content in files.values() for scan in content.scans):
                 gaps = [file for file in files if ended["what"] == SCAN]  # stopped in its first line
             if gaps and (over or not self._rewritten):
                 self._give_up(f"was stopped: {gaps[0]} lacks lines")
             elif files and not gaps and (over or self._all(ended, files, now_s)):
-                self._add(ended, files)
+                self._take(ended, files)
             elif over:
                 self._give_up(self._missing(ended))
         return self._listed()
 
-    def load(self, result: str) -> list[Scan | Spectrum]:
-        """Read one of the results, with the parameters that it was taken with.
-
-        Raises:
-            FileError: it is no result any more, or a file has gone.
-        """
-        entry = self._found(result)
+    def read(self, entry: Entry) -> Content:
         contents = [self._whole.get(Path(file)) or read(file) for file in entry["files"]]
-        return [_as_taken(one, entry) for content in contents for one in content]
+        return [_PRINTED.as_set(one, entry) for content in contents for one in content]
 
-    def _new(self, ended: Mapping[str, Any]) -> dict[Path, FileContent]:
+    def _new(self, ended: Entry) -> dict[Path, FileContent]:
         """The files of what has ended that are whole: they have stopped growing, and can be read."""
         found = {}
         for file in sorted(_files(_folder(ended), ended["what"])):
@@ -197,17 +186,17 @@ class GxsmFiles(ResultFiles):
             self._before.add(start_ns)
         return is_of_before
 
-    def _saw(self, ended: Mapping[str, Any], starts: set[int]) -> None:
+    def _saw(self, ended: Entry, starts: set[int]) -> None:
         """Files that began then, after what was begun."""
         self._kept["starts"] = sorted(starts)
         self._kept["behind_ns"] = ended["begun_ns"] - max(starts) if starts and ended["begun_ns"] else 0
 
-    def _all(self, ended: Mapping[str, Any], files: Iterable[Path], now_s: float) -> bool:
+    def _all(self, ended: Entry, files: Iterable[Path], now_s: float) -> bool:
         """Whether no file is missing; those that did not come with the scan before are not waited for as long."""
         missing = set(ended["channels"]) - endings(files).keys()
         return not missing or (missing <= set(self._kept["absent"]) and now_s >= ended["soon_s"])
 
-    def _missing(self, ended: Mapping[str, Any]) -> str:
+    def _missing(self, ended: Entry) -> str:
         folder = _folder(ended)
         if folder is None:
             return "GXSM does not say where it saves: did it begin at all, is a channel set?"
@@ -228,7 +217,7 @@ class GxsmFiles(ResultFiles):
             self._saw(ended, self._before)
         self.broken_off = True
 
-    def _add(self, ended: Mapping[str, Any], files: Mapping[Path, FileContent]) -> None:
+    def _take(self, ended: Entry, files: Mapping[Path, FileContent]) -> None:
         if ended["what"] == SCAN:
             absent = sorted(set(ended["channels"]) - endings(files).keys())
             if set(absent) - set(self._kept["absent"]):
@@ -242,7 +231,8 @@ class GxsmFiles(ResultFiles):
                 self._kept["channels"][ending] = [scan.channel, scan.unit]
         names = [str(file) for file in files]
         # numbered by its end: files of spectra may be overwritten
-        self._comes(f"{names[0]} ({ended['end_ns']})", ended, {"files": names})
+        content = [_PRINTED.as_set(one, ended) for file in files.values() for one in file]
+        self._add(f"{names[0]} ({ended['end_ns']})", ended, {"files": names}, content)
         self._kept["ended"] = None
 
 
@@ -252,7 +242,7 @@ def endings(files: Iterable[Path]) -> dict[str, Path]:
     return {match[1]: file for match, file in named if match}
 
 
-def _folder(ended: Mapping[str, Any]) -> Path | None:
+def _folder(ended: Entry) -> Path | None:
     return None if ended["folder"] is None else Path(ended["folder"])
 
 
@@ -260,16 +250,3 @@ def _files(folder: Path | None, what: str) -> list[Path]:
     if folder is None or not folder.is_dir():
         return []
     return list(folder.glob("*.nc" if what == SCAN else "*.vpdata"))
-
-
-def _gaps(content: FileContent) -> bool:
-    """Whether lines were not scanned."""
-    return any(map(lines_missing, content.scans))
-
-
-def _as_taken(one: Scan | Spectrum, entry: Mapping[str, Any]) -> Scan | Spectrum:
-    """With the frame that was set, where the file has the same, or the position that the tip was sent to; our time."""
-    if isinstance(one, Scan):
-        return as_set(one, entry, part=_STORED, angle_rad=_TURNED_RAD)
-    x, y = entry["position"]
-    return replace(one, kind=entry["what"], position_m=(x, y), time_ns=entry["end_ns"])

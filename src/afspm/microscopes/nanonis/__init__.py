@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import math
 import shlex
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.errors import ConfigError, FileError, Refused
-from afspm.microscopes.nanonis import fetched, groups, protocol
+from afspm.microscopes.nanonis import fetched, protocol
+from afspm.microscopes.nanonis import settings as own
 from afspm.microscopes.nanonis.activity import Activity
-from afspm.microscopes.nanonis.float32 import same_float32
 from afspm.microscopes.nanonis.result_files import NanonisFiles
 from afspm.microscopes.nanonis.session import MODULES, Session
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.translator.driver import ControllerLost, Driver, action
 from afspm.translator.parameters import Value
-from afspm.translator.result_files import SCAN, region_of
-from afspm.translator.settings import FRAME, frame
+from afspm.translator.result_files import SCAN, Entry, as_region
+from afspm.translator.settings import FRAME, KeptSettings, frame
 from afspm.units import Duration
 
 _AT_FIRST: Final[dict[str, Value]] = {
@@ -31,6 +30,7 @@ _AT_FIRST: Final[dict[str, Value]] = {
 }
 _AT_ONCE: Final = 0
 """To what could also wait until it is done."""
+_NO_TIMEOUT: Final = -1
 
 
 class Nanonis(Driver):
@@ -45,11 +45,11 @@ class Nanonis(Driver):
         reply_timeout_s: how long it may take to answer, in real time.
         autosave: whether Nanonis is to save every scan; if not, what its panel says is left alone.
         grabbed_rows, grabbed_backward: see `fetched.Grabbing`.
-        parameters, actions, poll_period_s, result_timeout_s, live_lines_s: as for every microscope.
+        common: as for every microscope.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
-    translated = (*groups.NAMES, *_AT_FIRST, names.CONTROLLER)
+    translated = (*own.TRANSLATED, *_AT_FIRST, names.CONTROLLER)
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
 
@@ -63,19 +63,9 @@ class Nanonis(Driver):
         autosave: bool = True,
         grabbed_rows: str = "top-first",
         grabbed_backward: str = "mirrored",
-        parameters: Mapping[str, Mapping[str, Any]] | None = None,
-        actions: Mapping[str, Mapping[str, Any]] | None = None,
-        poll_period_s: Duration = 0.1,
-        result_timeout_s: Duration = 10.0,
-        live_lines_s: Duration | None = None,
+        **common: Any,
     ) -> None:
-        super().__init__(
-            parameters=parameters,
-            actions=actions,
-            poll_period_s=poll_period_s,
-            result_timeout_s=result_timeout_s,
-            live_lines_s=live_lines_s,
-        )
+        super().__init__(**common)
         self.controller_at = address
         _addresses(address)
         self._session_dir = None if session_dir is None else Path(session_dir)
@@ -84,113 +74,74 @@ class Nanonis(Driver):
         self._autosave = autosave
         self._grabbing = fetched.Grabbing(grabbed_rows, grabbed_backward)
         self._session: Session | None = None
-        self._probe = groups.Probe()
-        self._groups: list[groups.Group] = []
+        self._kept = KeptSettings(_AT_FIRST)
+        ask = self._ask
+        self._probe = own.Probe(ask, lambda: self.clock.now_s())
+        feedback = own.FeedbackOn(ask, lambda holds: self.wait_for(holds, reply_timeout_s))
+        by_value = (own.ScanFrame, own.ScanSpeed, own.Gains, own.MoveSpeed, own.Slope, own.DriftRate)
+        self.groups = (*(group(ask) for group in by_value), self._probe, feedback, self._kept)
+        self._files: NanonisFiles
 
     def connect(self) -> None:
-        """Both connections, the release, and the modules that only answer once they are open."""
         self.close()
-        session = self._session = Session(
-            _addresses(self.controller_at),
-            self._reply_timeout_s,
-            self._release,
-            prove=self.prove,
-            monotonic_s=self.clock.monotonic_s,
-            wake=self.wake,
-            log=self.log,
-        )
-        if not self._groups:
-            self._kept: dict[str, Any] = self.memory.setdefault("kept", {})
-            kept = groups.Kept(self._kept, _AT_FIRST)
-            on = groups.FeedbackOn(self.clock.monotonic_s, self._reply_timeout_s)
-            self._groups = [*groups.OTHERS, self._probe, on, kept]
+        addresses = _addresses(self.controller_at)
+        session = self._session = Session(self, addresses, self._reply_timeout_s, self._release)
+        if not hasattr(self, "_files"):
+            self._kept.kept_in(self.memory)
             own_folder = (self.run_dir / "scans").resolve()
             patience_s = self.patience_s(self.result_timeout_s / 2)
-            self._harvest = NanonisFiles(self.memory, self._session_dir, own_folder, patience_s, self.log)
-        self._activity = Activity(session, self._harvest, self._probe, self.memory, self.clock, self.log)
+            self._files = NanonisFiles(self.memory, self._session_dir, own_folder, patience_s, self.log)
+        self._activity = Activity(session, self._files, self._probe, self.memory, self.clock, self.log)
         folder = self._session_dir or Path(session.ask("Util.SessionPathGet")[0])
         if not folder.is_dir():
             self.log.warning("%s can't be seen from here: all data is fetched over TCP (set session_dir)", folder)
 
     def close(self) -> None:
-        """End both connections. What was begun goes on."""
         if self._session is not None:
             self._session.close()
             self._session = None
 
-    def _ask(self, name: str, *arguments: Any) -> tuple[Any, ...]:
+    @property
+    def _there(self) -> Session:
         if self._session is None:
             raise ControllerLost("Nanonis is not connected")
-        return self._session.ask(name, *arguments)
+        return self._session
+
+    def _ask(self, name: str, *arguments: Any) -> tuple[Any, ...]:
+        return self._there.ask(name, *arguments)
 
     def status(self) -> ScopeStatus:
-        """What Nanonis is doing now."""
         return self._activity.status()
 
     def next_change_s(self) -> float | None:
-        """When a move, a pulse or the wait for a file is over."""
         return self._activity.next_change_s()
 
-    # --- parameters ---
-
-    def read(self, wanted: Collection[str]) -> dict[str, Value]:
-        """What Nanonis has, by groups, and what is kept for it."""
-        found: dict[str, Value] = {}
-        for group in self._groups:
-            if not set(group.names).isdisjoint(wanted):
-                found.update(group.read(self._ask))
-        return found | super().read([name for name in wanted if name not in found])
-
     def same(self, name: str, a: Value, b: Value, among: Mapping[str, Value]) -> bool:
-        """Nanonis has most as float32."""
-        return same_float32(name, a, b, among)
-
-    def write(self, values: Mapping[str, Value]) -> None:
-        """Each group by one command, those of a single value last."""
-        left = dict(values)
-        for group in self._groups:
-            asked = {name: left.pop(name) for name in group.names if name in left}
-            if asked and group is self._probe:
-                self._send_probe(asked)
-            elif asked:
-                group.write(self._ask, asked)
-        super().write(left)
+        return own.same_float32(name, a, b, among)
 
     def get(self, vendor: str) -> Value:
         """By the name of a pair of functions: "Bias." is Bias.Get."""
-        if vendor == names.CONTROLLER and self._session is not None:
-            return self._session.controller
-        value: Value = groups.numbers(self._ask, f"{vendor}Get")[0]
+        if vendor == names.CONTROLLER:
+            return self._there.controller
+        value: Value = own.numbers(self._ask, f"{vendor}Get")[0]
         return value
 
     def set(self, values: Mapping[str, Value]) -> None:
-        """By the names of pairs of functions, one after the other."""
         for vendor, value in values.items():
             self._ask(f"{vendor}Set", value)
-
-    def _send_probe(self, asked: Mapping[str, Value]) -> None:
-        before = self._probe.read(self._ask)
-        self._probe.write(self._ask, asked)
-        after = self._probe.read(self._ask)
-        way_m = math.hypot(*(float(after[name]) - float(before[name]) for name in self._probe.names))
-        speed_m_s = float(self.read([names.MOVE_SPEED])[names.MOVE_SPEED])
-        self._activity.sets_out(way_m / speed_m_s if speed_m_s > 0.0 else 0.0)
 
     # --- results ---
 
     def results(self) -> Sequence[str]:
-        """The last files that Nanonis saved, and of ours with what it did not."""
-        return self._harvest.results(self.clock.now_s(), self._fetch)
+        return self._files.results(self.clock.now_s(), self._fetch)
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
-        """Read a file."""
-        return self._harvest.load(result)
+        return self._files.load(result)
 
-    def _fetch(self, ended: Mapping[str, Any]) -> Sequence[Scan | Spectrum]:
+    def _fetch(self, ended: Entry) -> Sequence[Scan | Spectrum]:
         if ended["what"] == SCAN:
-            region = region_of(ended)
             found = fetched.images(self._ask, self._grabbing)
-            return [Scan(region, image.name, image.unit, image.values) for image in found]
+            return [Scan(as_region(ended["frame"]), image.name, image.unit, image.values) for image in found]
         curve, self._activity.curve = self._activity.curve, None
         if curve is None:
             raise FileError("Nanonis was not asked for its data")
@@ -216,11 +167,10 @@ class Nanonis(Driver):
             self._activity.forget()
             raise
         if self._ask("Scan.StatusGet")[0]:  # it may be over before it is looked at again
-            self._harvest.seen()
+            self._files.seen()
 
     @action(names.STOP_SCAN)
     def stop_scan(self) -> None:
-        """Break the scan off."""
         self._activity.stop_scan()
 
     @action(names.START_SPEC)
@@ -228,65 +178,53 @@ class Nanonis(Driver):
         """Take a spectrum of the kind `x-spec-kind` where the tip is."""
         self._activity.refuse_safe_tip()
         kind = str(self._kept[names.SPEC_KIND])
-        if self._session is not None and MODULES[kind] not in self._session.opened:
+        if MODULES[kind] not in self._there.opened:
             raise Refused(ControlResponse.ACTION_ERROR, f"Nanonis has no module {MODULES[kind]}, or can't open it")
         self._activity.start_curve(kind)
 
     @action(names.STOP_SPEC)
     def stop_spec(self) -> None:
-        """Break the spectrum off."""
-        for module in MODULES.values():
-            if self._session is not None and module in self._session.opened and self._ask(f"{module}.StatusGet")[0]:
-                self._ask(f"{module}.Stop")
-        self._activity.stopping = True
-        self._harvest.forget()
+        self._activity.stop_curve()
 
     @action(names.PULSE, state=ScopeState.BUSY_PARAM)
     def pulse(self) -> None:
-        """A bias pulse of `x-pulse-voltage` for `x-pulse-duration`, the z controller on hold meanwhile."""
-        duration_s = float(self._kept[names.PULSE_DURATION])
+        """Do a bias pulse of `x-pulse-voltage` for `x-pulse-duration`, the z controller on hold meanwhile."""
+        duration_s = self._kept.number(names.PULSE_DURATION)
         hold, absolute = 1, 2
         with self._activity.occupied(ScopeState.BUSY_PARAM, duration_s):
-            self._ask("Bias.Pulse", _AT_ONCE, duration_s, float(self._kept[names.PULSE_VOLTAGE]), hold, absolute)
+            self._ask("Bias.Pulse", _AT_ONCE, duration_s, self._kept.number(names.PULSE_VOLTAGE), hold, absolute)
 
     @action(names.CRASH, state=ScopeState.MOVING)
     def crash(self) -> None:
-        """The tip shaper: `x-crash-depth` down at `x-crash-speed`, up again, and the z controller as it was."""
+        """Shape the tip: `x-crash-depth` down at `x-crash-speed`, up again, and the z controller as it was."""
         self._activity.refuse_safe_tip()
-        depth_m, ramp_s = float(self._kept[names.CRASH_DEPTH]), 0.0
-        ramp_s = depth_m / float(self._kept[names.CRASH_SPEED])
-        bias_v = groups.numbers(self._ask, "Bias.Get")[0]
-        same_bias, settle_s, restore, no_timeout = 2, 0.1, 1, -1
+        depth_m = self._kept.number(names.CRASH_DEPTH)
+        ramp_s = depth_m / self._kept.number(names.CRASH_SPEED)
+        bias_v = own.numbers(self._ask, "Bias.Get")[0]
+        same_bias, settle_s, restore = 2, 0.1, 1
         before = (settle_s, same_bias, bias_v)
         self._ask("TipShaper.PropsSet", *before, -depth_m, ramp_s, bias_v, settle_s, depth_m, ramp_s, settle_s, restore)
         with self._activity.occupied(ScopeState.MOVING, 2 * ramp_s + 4 * settle_s):
-            self._ask("TipShaper.Start", _AT_ONCE, no_timeout)
+            self._ask("TipShaper.Start", _AT_ONCE, _NO_TIMEOUT)
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
         """Withdraw the tip by its piezo, whatever is going on, and whether that can be stopped or not."""
-        for stop in (self._activity.stop_approach, self._stop_measuring):
+        for stop in (self._activity.stop_approach, self._activity.stop_measuring):
             try:
                 stop()
             except protocol.NanonisError as error:
                 self.log.error("what is going on can't be stopped, the tip is withdrawn all the same: %s", error)
-        no_timeout = -1
-        self._ask("ZCtrl.Withdraw", _AT_ONCE, no_timeout)
-
-    def _stop_measuring(self) -> None:
-        if self._harvest.what == SCAN or self._ask("Scan.StatusGet")[0]:
-            self.stop_scan()
-        elif self._harvest.what:
-            self.stop_spec()
+        self._ask("ZCtrl.Withdraw", _AT_ONCE, _NO_TIMEOUT)
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
-        """The z controller on: it brings the tip back that `x-retract` or the safe tip has withdrawn."""
+        """Switch the z controller on: it brings the tip back that `x-retract` or the safe tip has withdrawn."""
         on = 1
         self._ask("ZCtrl.OnOffSet", on)
 
     def command(self, text: str) -> None:
-        """A function with its arguments, e.g. "AutoApproach.OnOffSet 1"."""
+        """Call a function with its arguments, e.g. "AutoApproach.OnOffSet 1"."""
         name, *words = shlex.split(text)
         codes = [code for code, _ in protocol.function(name).arguments]
         try:
@@ -297,7 +235,7 @@ class Nanonis(Driver):
         self._ask(name, *arguments)
 
     def _prepare_panel(self) -> None:
-        """One scan, in the direction that was asked for, and saved: told to Nanonis only if its panel says otherwise.
+        """Have one scan made and saved; told to Nanonis only if its panel says otherwise.
 
         What is got is not set as it is: continuous, bouncy and autosave count differently there.
         """

@@ -9,40 +9,38 @@ from typing import Any, Final
 
 from afspm.clock import Clock
 from afspm.errors import Refused
-from afspm.microscopes.nanonis.groups import Probe, ScanFrame
-from afspm.microscopes.nanonis.listener import CurveEnded, Failed, Heard, ScanEnded
 from afspm.microscopes.nanonis.protocol import NanonisError
 from afspm.microscopes.nanonis.result_files import NanonisFiles
-from afspm.microscopes.nanonis.session import APPROACH, MODULES, Session
+from afspm.microscopes.nanonis.session import APPROACH, MODULES, CurveEnded, Heard, ScanEnded, Session
+from afspm.microscopes.nanonis.settings import Probe, ScanFrame
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.translator.driver import ControllerLost
 from afspm.translator.result_files import SCAN, as_list
 from afspm.translator.settings import frame
 
 _SETTLES_S: Final = 1.0
-"""So long, in real time, a spectrum may take to be seen running."""
+"""Real time that a spectrum may take to be seen running."""
 _SHOWS_S: Final = 10.0
 """The same of a scan, which may have to go to its first line."""
 _LATEST_S: Final = 10.0
-"""So much later than it should the tip may arrive, in experiment time."""
+"""Experiment time that the tip may arrive later than it should."""
 _SAFE_TIP, _WITHDRAWING = 5, 6
 
 
 class Activity:
-    """See the module.
+    """The measurements, moves and pauses of one controller.
 
     Args:
         kept: JSON-able, and lasts: what it is occupied with.
 
     Attributes:
         curve: the data of the last spectrum, once it has ended.
-        stopping: what is running was told to stop: nothing comes of it.
     """
 
     def __init__(
         self,
         session: Session,
-        harvest: NanonisFiles,
+        files: NanonisFiles,
         probe: Probe,
         kept: dict[str, Any],
         clock: Clock,
@@ -51,13 +49,13 @@ class Activity:
         self._ask = session.ask
         self._listener = session.listener
         self._opened = session.opened
-        self._harvest = harvest
+        self._files = files
         self._probe = probe
         self._kept = kept
         self._clock = clock
         self._log = log
         self.curve: CurveEnded | None = None
-        self.stopping = False
+        self._stopping = False
         self._kind_asked = ""
         self._told: str | None = None
         self._was_safe = self._cut_off = False
@@ -67,18 +65,10 @@ class Activity:
 
     def begin_scan(self, region: Region) -> None:
         """A scan of a frame begins, or was found running."""
-        self.stopping = False
+        self._stopping = False
         self._listener.scan()
-        taken = {"frame": as_list(region)}
-        self._harvest.begin(SCAN, self._session_folder(), taken)
+        self._files.begin(SCAN, self._session_folder(), {"frame": as_list(region)})
         self._shows_until_s = self._clock.monotonic_s() + _SHOWS_S
-
-    def begin_curve(self, kind: str) -> None:
-        """A spectrum begins, or was found running."""
-        self.stopping, self.curve = False, None
-        position = self._probe.read(self._ask)
-        taken = {"position": [float(position[name]) for name in self._probe.names]}
-        self._harvest.begin(kind, self._session_folder(), taken)
 
     def start_curve(self, kind: str) -> None:
         """Take a spectrum; its data come over the second connection.
@@ -86,43 +76,58 @@ class Activity:
         Raises:
             Refused: ACTION_ERROR: Nanonis would not.
         """
-        self.begin_curve(kind)
+        self._begin_curve(kind)
         self._kind_asked = kind
         same_name = ""
         self._listener.curve(MODULES[kind], same_name)
         self._settle(f"{MODULES[kind]}.StatusGet")
 
-    def _settle(self, status: str) -> None:
-        """Until what was begun is seen running, or has ended already.
+    def _begin_curve(self, kind: str) -> None:
+        self._stopping, self.curve = False, None
+        self._files.begin(kind, self._session_folder(), {"position": list(self._probe.xy_m())})
 
-        Raises:
-            Refused: ACTION_ERROR: Nanonis would not.
-        """
+    def _settle(self, status: str) -> None:
+        """Return once what was begun is seen running, or has ended already. Raises Refused: Nanonis would not."""
         until_s = self._clock.monotonic_s() + _SETTLES_S
         while not self._ask(status)[0] and self._clock.monotonic_s() < until_s:
             for heard in self._listener.heard():
-                if isinstance(heard, Failed) and not isinstance(heard.error, ControllerLost):
+                if isinstance(heard, Exception) and not isinstance(heard, ControllerLost):
                     self.forget()
-                    raise Refused(ControlResponse.ACTION_ERROR, str(heard.error))
+                    raise Refused(ControlResponse.ACTION_ERROR, str(heard))
                 self._take(heard)
                 return
 
+    def stop_measuring(self) -> None:
+        """Break off whatever is being measured."""
+        if self._files.what == SCAN or self._ask("Scan.StatusGet")[0]:
+            self.stop_scan()
+        elif self._files.what:
+            self.stop_curve()
+
     def stop_scan(self) -> None:
-        """Break it off."""
+        """Break the scan off."""
         stop, no_direction = 1, 0
         self._ask("Scan.Action", stop, no_direction)
-        self.stopping = True
-        self._harvest.forget()
+        self._stopping = True
+        self._files.forget()
+
+    def stop_curve(self) -> None:
+        """Break the spectrum off."""
+        for module in self._opened.intersection(MODULES.values()):
+            if self._ask(f"{module}.StatusGet")[0]:
+                self._ask(f"{module}.Stop")
+        self._stopping = True
+        self._files.forget()
 
     def forget(self) -> None:
         """Nothing comes of what was begun."""
         self._kind_asked = ""
-        self._harvest.forget()
+        self._files.forget()
 
     @contextmanager
     def occupied(self, state: ScopeState, lasts_s: float) -> Iterator[None]:
         """What is begun in the block takes so long, experiment time, which Nanonis itself does not tell: also where its
-        answer is lost, or the connection, or we are."""
+        answer is lost, or the connection, or this process."""
         self._kept["occupied"] = [state.name, self._clock.now_s() + lasts_s]
         try:
             yield
@@ -136,20 +141,16 @@ class Activity:
         name, until_s = self._kept.get("occupied") or (ScopeState.FREE.name, 0.0)
         return ScopeState[name], float(until_s)
 
-    def sets_out(self, lasts_s: float) -> None:
-        """The tip was sent away, and should arrive after so long, experiment time."""
-        self._probe.arrives_s = self._clock.now_s() + lasts_s
-
     def next_change_s(self) -> float | None:
-        """When a move, a pulse or the wait for a file is over."""
+        """Return when a move, a pulse or the wait for a file is over."""
         now_s = self._clock.now_s()
-        times = (self._occupied[1], self._probe.arrives_s, self._harvest.next_s() or 0.0)
+        times = (self._occupied[1], self._probe.arrives_s, self._files.next_s() or 0.0)
         return min((at_s for at_s in times if at_s > now_s), default=None)
 
     # --- what goes on ---
 
     def status(self) -> ScopeStatus:
-        """What Nanonis is doing now; what has ended is awaited from here on.
+        """Return what Nanonis is doing now; what has ended is awaited from here on.
 
         Raises:
             ControllerLost: one of both connections.
@@ -160,18 +161,18 @@ class Activity:
         told, self._told = self._told, None
         if scanning:
             return self._scanning(told)
-        if self._harvest.what == SCAN and not self._harvest.was_seen and not self._harvest.has_file():
+        if self._files.what == SCAN and not self._files.was_seen and not self._files.has_file():
             if self._clock.monotonic_s() < self._shows_until_s:
                 self._listener.scan()  # what it has heard was not of this one
                 return ScopeStatus(ScopeState.SCANNING)
             told = None
-        if self._harvest.what == SCAN or told is not None:
+        if self._files.what == SCAN or told is not None:
             self._end(told)
         state, cut_off, self._cut_off = self._besides_scans(), self._cut_off, False
-        return ScopeStatus(ScopeState.INTERRUPTED if cut_off or self._harvest.broken_off else state)
+        return ScopeStatus(ScopeState.INTERRUPTED if cut_off or self._files.broken_off else state)
 
     def refuse_safe_tip(self) -> None:
-        """Raises Refused: nothing is to be measured with a tip that has been withdrawn in an emergency."""
+        """Raise Refused where the tip was withdrawn in an emergency: nothing is to be measured then."""
         if self._ask("ZCtrl.StatusGet")[0] == _SAFE_TIP:
             reason = "Nanonis' safe tip has withdrawn the tip: find out why; x-engage brings it back"
             raise Refused(ControlResponse.ACTION_ERROR, reason)
@@ -179,10 +180,10 @@ class Activity:
     def _scanning(self, told: str | None) -> ScopeStatus:
         if told:  # it scans again and again
             self._end(told)
-        if not self.stopping:
-            if self._harvest.what != SCAN:
-                self.begin_scan(frame(ScanFrame().read(self._ask))[0])
-            self._harvest.seen()
+        if not self._stopping:
+            if self._files.what != SCAN:
+                self.begin_scan(frame(ScanFrame(self._ask).read())[0])
+            self._files.seen()
             self._listener.scan()
             if self._watch_safe_tip(self._ask("ZCtrl.StatusGet")[0]):
                 self.stop_scan()  # it may go on in the air, and look well
@@ -192,11 +193,11 @@ class Activity:
     def _besides_scans(self) -> ScopeState:
         kind = self._kind_running()
         if kind:
-            if not self.stopping and self._harvest.what != kind:
-                self.begin_curve(kind)
+            if not self._stopping and self._files.what != kind:
+                self._begin_curve(kind)
             return ScopeState.SPEC
-        self.stopping = False
-        if self._harvest.what:
+        self._stopping = False
+        if self._files.what:
             self._end(None)
         state, until_s = self._occupied
         if self._clock.now_s() < until_s:
@@ -208,7 +209,7 @@ class Activity:
         return ScopeState.FREE if self._is_there() else ScopeState.MOVING
 
     def stop_approach(self) -> None:
-        """It would bring a tip back that is withdrawn meanwhile."""
+        """Stop an approach, which would bring a tip back that is withdrawn meanwhile."""
         if self._approaches():
             off = 0
             self._ask("AutoApproach.OnOffSet", off)
@@ -225,7 +226,7 @@ class Activity:
         return ""
 
     def _is_there(self) -> bool:
-        if self._probe.arrived(self._ask):
+        if self._probe.arrived():
             return True
         if self._clock.now_s() < self._probe.arrives_s + _LATEST_S:
             return False
@@ -234,7 +235,7 @@ class Activity:
         return True
 
     def _watch_safe_tip(self, z_controller: int) -> bool:
-        """Whether it has withdrawn the tip, which is said once."""
+        """Return True if it has withdrawn the tip, which is logged once."""
         safe = z_controller == _SAFE_TIP
         if safe and not self._was_safe:
             self._log.error("Nanonis' safe tip has withdrawn the tip: nothing is measured until that is put right")
@@ -242,23 +243,22 @@ class Activity:
         return safe
 
     def _take(self, heard: Heard) -> None:
-        """What the second connection has to say."""
+        """Take in what the second connection has to say."""
         if isinstance(heard, ScanEnded):
             self._told = heard.path
         elif isinstance(heard, CurveEnded):
             self._kind_asked, self.curve = "", heard
-        elif isinstance(heard.error, ControllerLost):
-            raise heard.error
+        elif isinstance(heard, ControllerLost):
+            raise heard
         else:
-            self._log.error("%s", heard.error)
+            self._log.error("%s", heard)
             if self._kind_asked:
                 self._kind_asked = ""
                 not_saved = ""
                 self._end(not_saved)
 
     def _end(self, told: str | None) -> None:
-        self._harvest.end(self._clock.now_ns(), self._clock.now_s(), told)
+        self._files.end(self._clock.now_ns(), self._clock.now_s(), told)
 
     def _session_folder(self) -> str:
-        folder: Any = self._ask("Util.SessionPathGet")[0]
-        return str(folder)
+        return str(self._ask("Util.SessionPathGet")[0])

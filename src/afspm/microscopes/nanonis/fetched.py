@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import io
-import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from afspm.errors import ConfigError, FileError
-from afspm.microscopes.nanonis.groups import Ask
-from afspm.microscopes.nanonis.listener import CurveEnded
+from afspm.microscopes.nanonis.session import CurveEnded
+from afspm.microscopes.nanonis.settings import Ask
 from afspm.model import Region, Scan, ScanLines, Spectrum
 from afspm.storage.atomic import write_atomic
+from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 
-SUFFIX: Final = ".npz"
 ROWS: Final = ("top-first", "recorded")
 BACKWARD: Final = ("mirrored", "as-seen")
 _FORWARD, _BACKWARD = 1, 0
@@ -110,50 +108,17 @@ def name_and_unit(text: str) -> tuple[str, str]:
     return (text, "") if unit is None else ((text[: unit.start()] + text[unit.end() :]).strip(), unit[1])
 
 
-def write(path: Path, content: Sequence[Scan | Spectrum]) -> None:
-    """All channels of one scan, or one spectrum."""
-    about: list[dict[str, Any]] = []
-    arrays: dict[str, Any] = {}
-    for number, one in enumerate(content):
-        arrays[f"values{number}"] = one.values
-        if isinstance(one, Scan):
-            frame = [*one.region.center_m, *one.region.size_m, one.region.angle_rad]
-            about.append({"channel": one.channel, "unit": one.unit, "frame": frame})
-        else:
-            about.append(
-                {"kind": one.kind, "names": one.names, "units": one.units, "position": one.position_m},
-            )
-    file = io.BytesIO()
-    np.savez(file, about=np.array(json.dumps(about)), **arrays)
+def write(path: Path, content: Sequence[Scan | Spectrum], end_ns: int) -> None:
+    """Keep all channels of one scan, or one spectrum, in a file that `afspm.files.read` reads."""
+    facts = FileFacts(end_ns, {})
+    one = content[0]
+    if isinstance(one, Spectrum):
+        encoded = encode_spectrum(one, facts)
+    else:
+        scans = [scan for scan in content if isinstance(scan, Scan)]
+        names = [scan.channel for scan in scans]
+        told_apart = (name if name not in names[:k] else f"{name} #{k + 1}" for k, name in enumerate(names))
+        channels = {name: (scan.unit, scan.values) for name, scan in zip(told_apart, scans, strict=True)}
+        encoded = encode_scan(one.region, channels, facts)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, [file.getvalue()])
-
-
-def read(path: Path) -> list[Scan | Spectrum]:
-    """What was written.
-
-    Raises:
-        FileError: it is gone, or broken.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            about = json.loads(str(file["about"]))
-            return [_made(one, file[f"values{number}"], str(path)) for number, one in enumerate(about)]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FileError(f"can't be read: {error}", where=str(path)) from error
-
-
-def _made(about: Mapping[str, Any], values: np.ndarray, filename: str) -> Scan | Spectrum:
-    if "channel" in about:
-        x, y, width, height, angle = about["frame"]
-        region = Region((x, y), (width, height), angle)
-        return Scan(region, about["channel"], about["unit"], values, filename=filename)
-    position = about["position"]
-    return Spectrum(
-        None if position is None else (position[0], position[1]),
-        about["kind"],
-        tuple(about["names"]),
-        tuple(about["units"]),
-        values,
-        filename=filename,
-    )
+    write_atomic(path, [encoded])

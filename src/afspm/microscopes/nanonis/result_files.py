@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from pathlib import Path, PureWindowsPath
 from typing import Any, Final
 
 from afspm.errors import AfspmError, FileError
 from afspm.files import read
 from afspm.microscopes.nanonis import fetched
-from afspm.model import Scan, Spectrum
 from afspm.translator.driver import LOST
-from afspm.translator.result_files import SCAN, Content, ResultFiles, as_set, lines_missing
+from afspm.translator.result_files import SCAN, Content, Entry, Printed, ResultFiles, lines_missing, newest
 
-_PRINTED: Final = 2e-6
-"""Relative: what a file has of a position, of which it prints seven digits."""
+_PRINTED: Final = Printed(part=2e-6, angle_rad=1e-3, positions=True)
+"""A file prints seven digits of a position, and degrees with three."""
 
-_TURNED_RAD: Final = 1e-3
-"""The same of the angle, in degrees with three digits."""
-
-Fetch = Callable[[Mapping[str, Any]], Sequence[Scan | Spectrum]]
+Fetch = Callable[[Entry], Content]
 
 
 class NanonisFiles(ResultFiles):
@@ -36,7 +30,7 @@ class NanonisFiles(ResultFiles):
 
     def __init__(
         self,
-        kept: dict[str, Any],
+        kept: Entry,
         session_dir: Path | None,
         own_folder: Path,
         patience_s: float,
@@ -46,7 +40,6 @@ class NanonisFiles(ResultFiles):
         self._session_dir = session_dir
         self._own_folder = own_folder
         self._patience_s = patience_s
-        self._read: dict[str, Content] = {}
         kept.setdefault("fetched", 0)
 
     def begin(self, what: str, session: str, taken: Mapping[str, Any]) -> None:
@@ -56,14 +49,13 @@ class NanonisFiles(ResultFiles):
             session: Nanonis' session folder.
             taken: "frame" of a scan, "position" of a spectrum.
         """
-        taken = {"seen": what != SCAN, **taken}
         folder = self._session_dir or Path(session)
-        newest = max((file.stat().st_mtime_ns for file in self._files(folder, what)), default=0)
-        self._begins(what, {"folder": str(folder), "newest_ns": newest, **taken})
+        newest_ns, _ = newest(_files(folder, what))
+        self._begins(what, {"seen": what != SCAN, "folder": str(folder), "newest_ns": newest_ns, **taken})
 
     @property
     def was_seen(self) -> bool:
-        """Whether what is running was ever seen running: if not, what Nanonis has in memory is of the scan before."""
+        """True if what is running was seen running: if not, what Nanonis has in memory is of the scan before."""
         return self._kept["running"] is not None and bool(self._kept["running"].get("seen", True))
 
     def seen(self) -> None:
@@ -79,9 +71,8 @@ class NanonisFiles(ResultFiles):
         """
         running = self._kept["running"]
         if running is not None:
-            seen = Path(running["folder"]).is_dir()
-            fetch_at_s = now_s + (self._patience_s if seen else 0.0)
-            self._ends({"told": told, "end_ns": now_ns, "fetch_at_s": fetch_at_s})
+            patience_s = self._patience_s if Path(running["folder"]).is_dir() else 0.0
+            self._ends({"told": told, "end_ns": now_ns, "fetch_at_s": now_s + patience_s})
         ended = self._kept["ended"]
         if ended is not None and told is not None:
             ended["told"] = told
@@ -89,17 +80,17 @@ class NanonisFiles(ResultFiles):
                 ended["fetch_at_s"] = now_s
 
     def has_file(self) -> bool:
-        """Whether a file of what is running has appeared."""
+        """Return True if a file of what is running has appeared."""
         running = self._kept["running"]
         return running is not None and self._file({**running, "told": None}) is not None
 
     def next_s(self) -> float | None:
-        """When to look again at the latest."""
+        """Return when to look again at the latest."""
         ended = self._kept["ended"]
         return None if ended is None else float(ended["fetch_at_s"])
 
     def results(self, now_s: float, fetch: Fetch) -> list[str]:
-        """The last results, oldest first.
+        """Return the last results, oldest first.
 
         Args:
             fetch: gets from Nanonis what is in no file.
@@ -109,30 +100,23 @@ class NanonisFiles(ResultFiles):
         if ended is not None:
             file = self._file(ended)
             if file is not None and (content := self._whole(file, ended)) is not None:
-                self._add(file, ended, content)
+                self._take(file, ended, content)
             elif now_s >= ended["fetch_at_s"]:
                 self._kept["ended"] = None
                 self._fetch(fetch, ended, file)
         return self._listed()
 
-    def load(self, result: str) -> Content:
-        """Read one of the results, with the parameters that it was taken with.
+    def read(self, entry: Entry) -> Content:
+        return _content(Path(entry["result"]), entry)
 
-        Raises:
-            FileError: it is no result any more, or its file has gone.
-        """
-        entry = self._found(result)
-        if result not in self._read:
-            self._read = {result: _content(Path(result), entry)}
-        return self._read[result]
-
-    def _fetch(self, fetch: Fetch, ended: Mapping[str, Any], file: Path | None) -> None:
+    def _fetch(self, fetch: Fetch, ended: Entry, file: Path | None) -> None:
         missed = str(file or ended["told"] or f"in {ended['folder']}")
         try:
             if not ended.get("seen", True):
                 raise FileError("it was never seen running")
-            content = list(fetch(ended))
-            _refuse_gaps(content)
+            content = fetch(ended)
+            if missing := lines_missing(content):
+                raise FileError(f"{missing} of its {content[0].values.shape[0]} lines were not scanned")
         except LOST:
             self._kept["ended"] = dict(ended)  # once it is found again
             raise
@@ -143,58 +127,36 @@ class NanonisFiles(ResultFiles):
         if ended["told"] != "":
             self._log.warning("no whole file of the %s (%s): it was fetched from Nanonis", ended["what"], missed)
         self._kept["fetched"] += 1
-        path = self._own_folder / f"nanonis-{self._kept['fetched']:04d}{fetched.SUFFIX}"
-        fetched.write(path, content)
-        self._add(path, ended, _content(path, ended))
+        path = self._own_folder / f"nanonis-{self._kept['fetched']:04d}.nc"
+        fetched.write(path, content, ended["end_ns"])
+        self._take(path, ended, _content(path, ended))
 
-    def _add(self, file: Path, ended: Mapping[str, Any], content: Content) -> None:
-        name = str(file)
-        self._comes(name, ended, {})
+    def _take(self, file: Path, ended: Entry, content: Content) -> None:
+        self._add(str(file), ended, {}, content)
         self._kept["ended"] = None
-        self._read = {name: content}
 
-    def _whole(self, file: Path, ended: Mapping[str, Any]) -> Content | None:
+    def _whole(self, file: Path, ended: Entry) -> Content | None:
         try:
             content = _content(file, ended)
-            _refuse_gaps(content)
-            return content
         except (AfspmError, OSError):
             return None  # not yet
+        return None if lines_missing(content) else content
 
-    def _file(self, ended: Mapping[str, Any]) -> Path | None:
-        """The file of what has ended, if it is there."""
+    def _file(self, ended: Entry) -> Path | None:
+        """Return the file of what has ended, if it is there."""
         if ended["told"]:
             # whatever the other computer calls its folder, the name is the same
             folder = self._session_dir
             path = Path(ended["told"]) if folder is None else folder / PureWindowsPath(ended["told"]).name
-            return path if path.is_file() and path.stat().st_mtime_ns > ended["newest_ns"] else None
+            return newest([path] if path.is_file() else [], ended["newest_ns"])[1]
         if ended["told"] == "":
             return None
-        times = [(file.stat().st_mtime_ns, file) for file in self._files(Path(ended["folder"]), ended["what"])]
-        new = [(time_ns, file) for time_ns, file in times if time_ns > ended["newest_ns"]]
-        return max(new)[1] if new else None
-
-    def _files(self, folder: Path, what: str) -> list[Path]:
-        return list(folder.glob("*.sxm" if what == SCAN else "*.dat")) if folder.is_dir() else []
+        return newest(_files(Path(ended["folder"]), ended["what"]), ended["newest_ns"])[1]
 
 
-def _content(path: Path, entry: Mapping[str, Any]) -> Content:
-    found = fetched.read(path) if path.suffix == fetched.SUFFIX else list(read(path))
-    return [_as_taken(one, entry) for one in found]
+def _files(folder: Path, what: str) -> list[Path]:
+    return list(folder.glob("*.sxm" if what == SCAN else "*.dat")) if folder.is_dir() else []
 
 
-def _as_taken(one: Scan | Spectrum, entry: Mapping[str, Any]) -> Scan | Spectrum:
-    """With the frame or position that was set, of which the file has as many digits as it prints, and our time."""
-    if isinstance(one, Scan):
-        return as_set(one, entry, part=_PRINTED, angle_rad=_TURNED_RAD)
-    x, y = entry["position"]
-    there = one.position_m is None or math.dist(one.position_m, (x, y)) <= 10 * _PRINTED * max(abs(x), abs(y)) + 1e-12
-    position = (x, y) if there else one.position_m
-    return replace(one, kind=entry["what"], position_m=position, time_ns=entry["end_ns"])
-
-
-def _refuse_gaps(content: Sequence[Scan | Spectrum]) -> None:
-    """Raises FileError: lines that were never scanned, of a scan that was broken off."""
-    for one in content:
-        if missing := lines_missing(one):
-            raise FileError(f"{missing} of its {one.values.shape[0]} lines were not scanned")
+def _content(path: Path, entry: Entry) -> Content:
+    return [_PRINTED.as_set(one, entry) for one in read(path)]

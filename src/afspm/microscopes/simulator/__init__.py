@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
 from afspm.errors import AfspmError, ConfigError, ErrorCollector, Refused
-from afspm.microscopes.simulator import files
+from afspm.files import read
 from afspm.microscopes.simulator.faults import Fault, Faults
 from afspm.microscopes.simulator.instrument import Instrument, PanelEvent
 from afspm.microscopes.simulator.truth import Truth
@@ -226,7 +226,7 @@ class Simulator(Driver):
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         """Read a saved file."""
-        return files.load(Path(result))
+        return list(read(result))
 
     def lines(self, start: int) -> Sequence[ScanLines]:
         """The lines that are complete by now."""

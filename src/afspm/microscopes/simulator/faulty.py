@@ -13,26 +13,24 @@ from afspm.translator.process import Translator
 
 
 class FaultyTranslator(Translator):
-    """`Translator`, but for the faults that its simulated microscope is told to have."""
+    """`Translator` with the faults that its simulated microscope is told to have."""
 
     _late: tuple[float, Response] | None = None
 
     @property
     def _faults(self) -> Faults | None:
-        return getattr(self.microscope, "faults", None)
+        return getattr(self.driver, "faults", None)
 
     def look(self) -> None:
-        """As a faultless one, after what is due has gone wrong."""
         if self._late is not None and self._clock.monotonic_s() >= self._late[0]:
             response, self._late = self._late[1], None
-            super()._reply(response)
+            super().reply(response)
         faults = self._faults
         while faults is not None and (fault := faults.due(self._clock.now_s())) is not None:
             self._go_wrong(fault)
         super().look()
 
     def wait_s(self) -> float:
-        """Not beyond the next fault or the answer that is being kept back."""
         wait_s = super().wait_s()
         if self._late is not None:
             wait_s = min(wait_s, self._late[0] - self._clock.monotonic_s())
@@ -43,13 +41,13 @@ class FaultyTranslator(Translator):
 
     def _go_wrong(self, fault: Fault) -> None:
         self._log.warning("a simulated fault: %s", fault)
-        self._save()
+        self.state.save()
         if fault.kind == "crash":
             os._exit(ExitCode.CRASHED)
         if fault.kind == "hang":
             threading.Event().wait(fault.duration_s)
 
-    def _reply(self, response: Response, level: int = logging.INFO) -> None:
+    def reply(self, response: Response, level: int = logging.INFO) -> None:
         faults = self._faults
         if faults is not None and faults.strikes("lose") is not None:
             self._log.warning("a simulated fault: the answer %s is lost", response)
@@ -57,4 +55,4 @@ class FaultyTranslator(Translator):
         elif faults is not None and (delay_s := faults.strikes("slow")) is not None:
             self._late = (self._clock.monotonic_s() + delay_s, response)
         else:
-            super()._reply(response, level)
+            super().reply(response, level)

@@ -20,11 +20,11 @@ import numpy as np
 
 from afspm.errors import AfspmError, FileError, Refused
 from afspm.microscopes.simulator.faults import Faults
-from afspm.microscopes.simulator.files import Measured, encode_scan, encode_spectrum
 from afspm.microscopes.simulator.truth import Truth
 from afspm.model import ControlResponse, ScanLines, ScopeState, Spectrum, names
 from afspm.simulation import SimulatedScan, World
 from afspm.storage.atomic import write_atomic
+from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 from afspm.translator.parameters import ParameterTable, Value
 from afspm.translator.settings import feedback, frame
 
@@ -318,7 +318,7 @@ class Instrument:
         self._save(name, encode_spectrum(spectrum, self._measured(doing)), doing["end_s"])
         self._note(doing["end_s"], "spectrum", {"file": name, "position_m": position_m, "kind": kind})
 
-    def _measured(self, doing: dict[str, Any]) -> Measured:
+    def _measured(self, doing: dict[str, Any]) -> FileFacts:
         values = self._si(doing["values"])
         attributes = {
             f"{name} [{self._table[name].si_unit}]" if self._table[name].si_unit else name: (
@@ -326,7 +326,7 @@ class Instrument:
             )
             for name, value in values.items()
         }
-        return Measured(int(doing["end_s"] * NS_PER_S), attributes)
+        return FileFacts(int(doing["end_s"] * NS_PER_S), attributes)
 
     def _save(self, name: str, content: bytes, end_s: float) -> None:
         path = self._folder / name

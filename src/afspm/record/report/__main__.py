@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import sys
 
-from afspm import garbage
 from afspm.errors import AfspmError
 from afspm.record.report.writing import write
 
-garbage.seldom()
 try:
     write(sys.argv[1])
 except AfspmError as error:

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm import wire
+from afspm.drawing.raster import picture
 from afspm.errors import AfspmError
 from afspm.model import ControlMode, ControlState, ScanSet, names
-from afspm.model.notebook import png
 from afspm.record.night_record import NightMark, NightRecord, Shot, thumbnail
 from afspm.record.report.story import RunStory
 from afspm.record.run import Run
@@ -41,7 +41,7 @@ class Small:
     def png(self) -> bytes:
         """In colour, with y upwards. Raises AttributeError without a picture."""
         assert self.picture is not None
-        return png(self.picture[::-1].astype(np.float64))
+        return picture(self.picture.astype(np.float64))
 
 
 def smalls(run: Run, rows: Sequence[ScanRow]) -> list[Small]:

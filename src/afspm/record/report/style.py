@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from afspm.drawing import timeline
+
 # P. Tol's bright scheme: told apart by everybody, red kept for problems
-CSS = """
+CSS = (
+    timeline.CSS
+    + """
+:root{--lane:var(--panel);--quiet:var(--soft)}
 :root{--paper:#fff;--ink:#1b1b1b;--soft:#666;--rule:#ddd;--panel:#f5f5f5;--state:#888;--problem:#c9304a;
 --manual:#d9a400;--c0:#4477aa;--c1:#228833;--c2:#aa3377;--c3:#3a9fc0;--c4:#9a8a1c;color-scheme:light dark}
 @media(prefers-color-scheme:dark){:root{--paper:#16181b;--ink:#e8e8e8;--soft:#a0a0a0;--rule:#34383d;--panel:#1f2327;
@@ -19,8 +24,9 @@ font-size:.9rem;vertical-align:middle;letter-spacing:.08em}
 .cards{display:grid;grid-template-columns:repeat(auto-fit,minmax(9rem,1fr));gap:.6rem}
 .card{background:var(--panel);border-radius:.5rem;padding:.7rem .9rem;display:flex;flex-direction:column}
 .card b{font-size:1.6rem;line-height:1.2}
-.timeline{width:100%;min-width:640px;height:auto;font-size:12px}.timeline text{fill:var(--ink)}
-.rule,.tick{stroke:var(--rule);stroke-width:1}
+.lanes{min-width:640px}.lane span.state{background:var(--state)}.lane span.problem{background:var(--problem)}
+.lane span.manual{background:var(--manual)}.lane span.c0{background:var(--c0)}.lane span.c1{background:var(--c1)}
+.lane span.c2{background:var(--c2)}.lane span.c3{background:var(--c3)}.lane span.c4{background:var(--c4)}
 rect.state{fill:var(--state)}rect.problem{fill:var(--problem)}rect.manual{fill:var(--manual)}
 rect.c0{fill:var(--c0)}rect.c1{fill:var(--c1)}rect.c2{fill:var(--c2)}rect.c3{fill:var(--c3)}rect.c4{fill:var(--c4)}
 i{display:block;height:4px;margin-top:2px}i.state{background:var(--state)}i.c0{background:var(--c0)}
@@ -41,4 +47,5 @@ font-variant-numeric:tabular-nums}
 footer{margin-top:2rem;font-size:.85rem}
 @media print{main{max-width:none;padding:0}section{break-inside:auto}h2{break-after:avoid}
 *{-webkit-print-color-adjust:exact;print-color-adjust:exact}}
-""".strip()
+"""
+)

@@ -13,7 +13,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
 
-from afspm import garbage
 from afspm.errors import AfspmError, FileError
 from afspm.scheduler.drift import pipe
 from afspm.scheduler.drift.settings import DriftCompensationSettings
@@ -32,7 +31,6 @@ def main() -> int:
     except AfspmError as error:
         pipe.write(answers, {"is": "broken", "reason": str(error)})
         return 1
-    garbage.loaded()
     try:
         while (message := pipe.read(asked)) is not None:
             worker.take(*message)

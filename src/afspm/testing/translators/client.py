@@ -23,7 +23,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
-from afspm.process.stopping import StopRequested
+from afspm.process.parent import StopRequested
 from afspm.testing.translators.registry import Failed, Lost, expect
 
 T = TypeVar("T")

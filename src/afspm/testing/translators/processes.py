@@ -10,9 +10,10 @@ from queue import Empty, SimpleQueue
 
 from afspm.clock import Clock
 from afspm.experiment import ProcessStart
+from afspm.logic.supervision.supervisor_events import Exited, describe_exit
+from afspm.supervisor.child_output import Printed
 from afspm.supervisor.log import LineReader, RunLog
-from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, Printed, describe_exit
-from afspm.supervisor.task import from_start
+from afspm.supervisor.process import ChildEvent, ChildProcess, from_start
 
 ASKED_S, KILLED_S = 5.0, 3.0
 
@@ -43,9 +44,7 @@ class Processes:
         self._readers |= {start.launch.name: LineReader() for start in starts}
         for start in starts:
             task = from_start(start)
-            self._running[task.name] = ChildProcess(
-                task.name, task.command, task.launch.to_json(), self._tell, task.environment, task.folder, task.hidden
-            )
+            self._running[task.name] = ChildProcess(task, self._tell)
 
     @property
     def ended(self) -> str:

@@ -33,8 +33,8 @@ from afspm.testing.translators.processes import Processes
 from afspm.testing.translators.registry import Lost
 from afspm.testing.translators.support import Support, find_out
 from afspm.translator import Driver
-from afspm.transport.launching import open_port
 from afspm.transport.port import ParentGone, Port
+from afspm.transport.zmq_port import open_port
 
 NAME = "translator_test"
 SPEED = 20.0
@@ -113,7 +113,7 @@ def prepare(options: CheckOptions) -> Experiment:
         experiment = load(*options.files, file)
         experiment.require_valid()
     schedulers = experiment.resolved.with_role(Role.SCHEDULER)
-    if any(getattr(experiment.resolved.classes.get(part.name), "frame", None) is Frame.SAMPLE for part in schedulers):
+    if any(getattr(scheduler.component, "frame", None) is Frame.SAMPLE for scheduler in schedulers):
         raise ConfigError(
             "a translator is checked in tip coordinates, and this scheduler has the sample's",
             where=str(options.files[0]),
@@ -138,14 +138,13 @@ def opened(options: CheckOptions) -> Iterator[CheckSession]:
         client, folder, simulated = _client(experiment, options, stack, complaints)
         stack.callback(client.end)
         stack.enter_context(_interrupting(client))
-        abilities = resolved.abilities(translator)
+        abilities = translator.capabilities()
         actions, parameters = (abilities.actions, abilities.parameters) if abilities else ((), ())
         support = find_out(client, sorted(actions), sorted(parameters))
-        named = resolved.class_paths.get(translator.name) or " ".join(translator.command)
-        class_ = resolved.classes.get(translator.name)
+        named = translator.class_path or " ".join(translator.part.command)
         excused: Mapping[str, str] = {}
-        if isinstance(class_, type) and issubclass(class_, Driver):
-            excused = class_.excused(support.controller)
+        if translator.component is not None and issubclass(translator.component, Driver):
+            excused = translator.component.excused(support.controller)
         yield CheckSession(client, support, named, simulated, folder, options, excused, complaints)
 
 

@@ -1,0 +1,52 @@
+"""Setting what a measurement needs: region, shape, probe position and kind of spectrum, unless they are set."""
+
+from __future__ import annotations
+
+from afspm.client.command_retry import CommandRetry
+from afspm.client.published_state import PublishedState
+from afspm.client.targets import FITS, SAME, XY, ScanTarget, Target, is_set, xy_of
+from afspm.model import ControlRequest, Frame, Parameter, ProbePosition, Region, ScanParameters, names
+
+
+class MeasurementSetup:
+    """Sets the microscope up for measurements. Control must be held around every call.
+
+    Args:
+        view: what is in force.
+    """
+
+    def __init__(self, view: PublishedState, commands: CommandRetry) -> None:
+        self._view = view
+        self._commands = commands
+        self._rounded: tuple[ScanParameters, ScanParameters | None] | None = None
+
+    def prepare(self, target: Target, until_s: float | None) -> None:
+        """Set what a target needs."""
+        if isinstance(target, ScanTarget):
+            self.set_scan(target.parameters, until_s)
+            return
+        if target.kind is not None:
+            self._commands.ask(ControlRequest.PARAM, Parameter(names.SPEC_KIND, target.kind), until_s=until_s)
+        if target.at_m is not None:
+            self.move_probe(target.at_m, until_s)
+
+    def move_probe(self, xy_m: XY, until_s: float | None) -> None:
+        """Move the probe to (x, y) in m, unless it stands there."""
+        xy_m = xy_of(xy_m)
+        now = self._view.probe_position
+        if now is None or now.xy_m != xy_m:
+            self._commands.set(ControlRequest.SET_PROBE_POS, ProbePosition(xy_m), "ProbePosition", until_s)
+
+    def set_scan(self, wanted: ScanParameters, until_s: float | None) -> None:
+        """Set region and shape as a whole, unless they are set."""
+        if wanted.region is None and wanted.shape is None:
+            return
+        # in sample coordinates the same region is another place of the tip a while later
+        is_fixed = not (isinstance(wanted.region, Region) and wanted.region.frame is Frame.SAMPLE)
+        now = self._view.scan_parameters
+        if is_fixed and (is_set(wanted, now, SAME) or (now is not None and (wanted, now) == self._rounded)):
+            return
+        self._commands.set(ControlRequest.SET_SCAN_PARAMS, wanted, "ScanParameters2d", until_s)
+        # a controller may round: then this is what our wish looks like when it is set; what lies elsewhere is another's
+        now = self._view.scan_parameters
+        self._rounded = (wanted, now) if is_set(wanted, now, FITS) else None

@@ -1,0 +1,159 @@
+"""A scan or a spectrum as it should be taken, and whether a published result is one. Pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+from afspm.errors import InvalidValue
+from afspm.formatting import area_text, position_text
+from afspm.model import Frame, Region, Scan, ScanParameters, ScopeState, Spectrum, names
+
+XY = tuple[float, float]
+
+SAME = 1e-6  # of the size: closer than any controller positions
+FITS = 1e-2  # of the size: a controller's rounding, not another region
+SPOT_M = 20e-9  # a scanner with sensors reports where the tip was, some nanometres from where it was sent
+MOVED = 0.5  # of the size: where drift is corrected, a scan lies where it turned out to have been taken
+SHEARED = 0.1  # of the size: and is as large, and as turned, as it turned out to be
+
+
+@dataclass(frozen=True)
+class ScanTarget:
+    """A scan to take. None leaves what is set.
+
+    Attributes:
+        shape: (rows, columns).
+    """
+
+    region: Region | None
+    shape: tuple[int, int] | None
+
+    what: ClassVar = "scan"
+    action: ClassVar = names.START_SCAN
+    busy: ClassVar = ScopeState.SCANNING
+    message: ClassVar = "Scan2d"
+
+    @classmethod
+    def of(cls, region: Region | None, shape: tuple[int, int] | None, frame: Frame) -> ScanTarget:
+        if isinstance(region, Region) and frame is Frame.SAMPLE:
+            region = replace(region, frame=Frame.SAMPLE)
+        return cls(region, None if shape is None else (int(shape[0]), int(shape[1])))
+
+    @property
+    def parameters(self) -> ScanParameters:
+        return ScanParameters(self.region, self.shape)
+
+    def facts(self) -> dict[str, Any]:
+        """Return the target in JSON's types, by which a later life of the component recognises it."""
+        region = self.region
+        numbers = region and [*region.center_m, *region.size_m, region.angle_rad, region.frame.value]
+        return {"what": self.what, "region": numbers, "shape": self.shape and list(self.shape)}
+
+    def fits(self, scan: Scan) -> bool:
+        """Return whether a scan can be this one."""
+        wanted = self.region
+        if self.shape is not None and scan.shape != self.shape:
+            return False
+        if wanted is None:
+            return True
+        if wanted.frame is Frame.SAMPLE:
+            near = math.dist(wanted.center_m, scan.region.center_m) <= MOVED * min(wanted.size_m)
+            return near and is_near(wanted.moved_to(scan.region.center_m), scan.region, SHEARED)
+        return is_near(wanted, scan.region, FITS)
+
+    def name_of(self, scan: Scan) -> str:
+        """Return what is there once in a result: the channel."""
+        return scan.channel
+
+    def describe(self, scan: Scan) -> str:
+        region, (rows, columns) = scan.region, scan.shape
+        turned = f", turned by {math.degrees(region.angle_rad):.4g} degrees" if region.angle_rad else ""
+        return f"{area_text(region.size_m)} at {position_text(region.center_m)}{turned}, {rows} x {columns} pixels"
+
+
+@dataclass(frozen=True)
+class SpectrumTarget:
+    """A spectrum to take. None leaves what is set, or the probe where it stands."""
+
+    at_m: XY | None
+    kind: str | None
+    frame: Frame = Frame.TIP
+
+    what: ClassVar = "spectrum"
+    action: ClassVar = names.START_SPEC
+    busy: ClassVar = ScopeState.SPEC
+    message: ClassVar = "Spec1d"
+
+    @classmethod
+    def of(cls, at_m: Any, kind: str | None, frame: Frame) -> SpectrumTarget:
+        return cls(None if at_m is None else xy_of(at_m), kind, frame)
+
+    def facts(self) -> dict[str, Any]:
+        """Return the target in JSON's types, by which a later life of the component recognises it."""
+        return {
+            "what": self.what,
+            "at_m": self.at_m and list(self.at_m),
+            "kind": self.kind,
+            "frame": self.frame.value,
+        }
+
+    def fits(self, spectrum: Spectrum) -> bool:
+        """Return whether a spectrum can be this one."""
+        if self.kind is not None and spectrum.kind != self.kind:
+            return False
+        if self.at_m is None or spectrum.position_m is None or self.frame is Frame.SAMPLE:
+            return True
+        return math.dist(self.at_m, spectrum.position_m) <= SPOT_M
+
+    def name_of(self, spectrum: Spectrum) -> str:
+        """Return the same for all: there is one in a result, and the next may be of another kind."""
+        return ""
+
+    def describe(self, spectrum: Spectrum) -> str:
+        where = "somewhere" if spectrum.position_m is None else f"at {position_text(spectrum.position_m)}"
+        return f"{spectrum.kind or 'of no kind'} {where}"
+
+
+Target = ScanTarget | SpectrumTarget
+
+
+def target_from(facts: dict[str, Any]) -> Target:
+    """Return the target that gave these facts."""
+    if facts["what"] == SpectrumTarget.what:
+        return SpectrumTarget.of(facts["at_m"], facts["kind"], Frame(facts["frame"]))
+    region = None
+    if facts["region"] is not None:
+        x, y, width, height, angle, frame = facts["region"]
+        region = Region((x, y), (width, height), angle, Frame(frame))
+    return ScanTarget.of(region, facts["shape"], Frame.TIP)
+
+
+def xy_of(xy_m: Any) -> XY:
+    """Return two numbers as a tuple: an array of numpy is not compared as a tuple is. Raises InvalidValue."""
+    try:
+        x, y = xy_m
+        return float(x), float(y)
+    except (TypeError, ValueError) as error:
+        raise InvalidValue(f"a place is (x, y) in metres, not {xy_m!r}", hint="e.g. (1e-7, 0)") from error
+
+
+def is_set(wanted: ScanParameters, now: ScanParameters | None, tolerance: float) -> bool:
+    """Return whether what is in force is what is wanted, within `tolerance` of the size."""
+    if now is None or (wanted.shape is not None and wanted.shape != now.shape):
+        return False
+    if not isinstance(wanted.region, Region):
+        return wanted.region is None
+    return isinstance(now.region, Region) and is_near(wanted.region, now.region, tolerance)
+
+
+def is_near(a: Region, b: Region, tolerance: float) -> bool:
+    """Return whether two regions differ by less than `tolerance` of their size everywhere."""
+    size_m = math.hypot(*a.size_m)
+    turned = math.remainder(a.angle_rad - b.angle_rad, math.tau)
+    return (
+        math.dist(a.center_m, b.center_m) <= tolerance * size_m
+        and math.dist(a.size_m, b.size_m) <= tolerance * size_m
+        and abs(turned) <= tolerance
+    )

@@ -1,0 +1,193 @@
+"""What a person can do to a running experiment. Everything is asked of the scheduler, which may say no."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from afspm import wire
+from afspm.client.link import ExperimentLink
+from afspm.client.parameter_values import from_parameter, to_parameter
+from afspm.dashboard.watch import Watch
+from afspm.dashboard.words import position
+from afspm.formatting import quantity
+from afspm.model import (
+    RESTART_REQUEST,
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Parameter,
+    ProbePosition,
+    Region,
+    Response,
+    ScanParameters,
+    ScopeState,
+    names,
+)
+from afspm.model.geometry import XY
+from afspm.record.overview import Overview
+
+ANSWER_S = 20.0  # real time that an answer may take
+FREE_S = 60.0  # that the microscope may take to get to a place
+SETTLED_S = 2.0  # what was set is published by then, if it changed anything
+
+
+@dataclass(frozen=True)
+class ActionResult:
+    """What came of an action; `text` says it to the person, with the reason where it was refused."""
+
+    text: str
+    ok: bool = True
+
+
+class Actions:
+    """Actions in the name of one person, for one thread. None raises for a refusal; it is in the result."""
+
+    def __init__(self, link: ExperimentLink, watch: Watch) -> None:
+        self._link = link
+        self._watch = watch
+
+    # --- the experiment ---
+
+    def set_mode(self, mode: ControlMode) -> ActionResult:
+        """Set MANUAL or AUTOMATED."""
+        return _result(self._ask(ControlRequest.SET_CONTROL_MODE, int(mode)), f"The mode is {mode.name}")
+
+    def end(self) -> ActionResult:
+        """End the experiment for everybody."""
+        return _result(self._ask(ControlRequest.END_EXPERIMENT), "The experiment ends")
+
+    def flag(self, problem: int) -> ActionResult:
+        """Raise a problem."""
+        response = self._ask(ControlRequest.ADD_EXP_PRBLM, problem)
+        return _result(response, f"{self._watch.problems.name(problem)} is flagged")
+
+    def clear(self, problem: int) -> ActionResult:
+        """Remove the flag of a problem."""
+        response = self._ask(ControlRequest.RMV_EXP_PRBLM, problem)
+        return _result(response, f"{self._watch.problems.name(problem)} is cleared")
+
+    def clear_all(self, problems: Sequence[int]) -> ActionResult:
+        """Remove the flags of these problems; the first refusal ends it."""
+        for problem in problems:
+            if not (result := self.clear(problem)).ok:
+                return result
+        return ActionResult(f"{len(problems)} problems are cleared")
+
+    def restart(self, process: str) -> ActionResult:
+        """Have a process ended and started anew."""
+        return _result(self._ask(RESTART_REQUEST, process), f"{process} will be started anew")
+
+    # --- the microscope, in MANUAL ---
+
+    def stop_scan(self, *, by_manual: bool = False) -> ActionResult:
+        """Stop the scan or spectrum that runs.
+
+        Args:
+            by_manual: switch to MANUAL before, which alone lets a person command the microscope.
+        """
+        if by_manual:
+            result = self.set_mode(ControlMode.MANUAL)
+            if not result.ok:
+                return result
+        with self._watch.reading() as overview:
+            is_spectrum = overview.status is not None and overview.status.state is ScopeState.SPEC
+        response = self._ask(ControlRequest.ACTION, names.STOP_SPEC if is_spectrum else names.STOP_SCAN)
+        return _result(response, "The spectrum is stopped" if is_spectrum else "The scan is stopped")
+
+    def read(self, parameter: str) -> ActionResult:
+        """Return the value of a parameter that is in force, with its unit, as the text of the result."""
+        response = self._ask(ControlRequest.PARAM, Parameter(parameter))
+        return _result(response, "") if not response.ok else ActionResult(_in_force(parameter, response))
+
+    def set(self, parameter: str, text: str) -> ActionResult:
+        """Set a parameter to a quantity as a person writes it: "0.5 V", "2 um/s", "12"; without a unit it is SI."""
+        response = self._ask(ControlRequest.PARAM, to_parameter(parameter, _number_or(text.strip()), None))
+        if not response.ok or not response.payload:
+            return _result(response, f"{parameter} is set to {text}")
+        return ActionResult(f"{parameter} is now {_in_force(parameter, response)}")
+
+    def scan(self, region: Region | None = None, shape: tuple[int, int] | None = None) -> ActionResult:
+        """Begin a scan; `region` and `shape` None: as they are set. It is done when the scan has begun."""
+        if region is not None or shape is not None:
+            wanted = ScanParameters(region, shape)
+            response = self._ask(ControlRequest.SET_SCAN_PARAMS, wanted)
+            if not response.ok:
+                return _result(response, "")
+            self._settle(lambda o: o.scan_parameters is not None and _fits(o.scan_parameters, wanted))
+        where = "" if region is None else f" at {position(region.center_m)}"
+        return _result(self._when_free(names.START_SCAN), f"The scan{where} begins")
+
+    def spectrum(self, at_m: XY | None = None) -> ActionResult:
+        """Begin a spectrum at (x, y); None: where the probe stands. It is done when it has begun."""
+        if at_m is not None:
+            response = self._ask(ControlRequest.SET_PROBE_POS, ProbePosition(at_m))
+            if not response.ok:
+                return _result(response, "")
+            self._settle(lambda o: o.probe_position is not None and _near(o.probe_position.xy_m, at_m))
+        where = "" if at_m is None else f" at {position(at_m)}"
+        return _result(self._when_free(names.START_SPEC), f"The spectrum{where} begins")
+
+    # --- within ---
+
+    def _ask(self, kind: int, subject: Any = None) -> Response:
+        self._link.pump(0.0)  # what has come of the connection since we asked last
+        return self._link.request(kind, subject, until_s=self._link.until(ANSWER_S))
+
+    def _when_free(self, action: str) -> Response:
+        """Ask for an action, again and again while the microscope is not free."""
+        until_s = self._link.clock.monotonic_s() + FREE_S
+        while True:
+            self._watch.wait_free(until_s - self._link.clock.monotonic_s())
+            with self._watch.reading():
+                seen = self._watch.changes
+            response = self._ask(ControlRequest.ACTION, action)
+            if response.code != ControlResponse.NOT_FREE or self._link.clock.monotonic_s() >= until_s:
+                return response
+            self._watch.wait_for(lambda _, n=seen: self._watch.changes != n, 1.0)  # type: ignore[misc]
+
+    def _settle(self, done: Callable[[Overview], bool]) -> None:
+        """Wait until what was set is published; it is not where nothing changed."""
+        self._watch.wait_for(done, SETTLED_S)
+
+
+def _result(response: Response, done: str) -> ActionResult:
+    return ActionResult(f"{done}.") if response.ok else ActionResult(refusal(response), ok=False)
+
+
+def refusal(response: Response) -> str:
+    """Return why something was not done, for a person."""
+    code = ControlResponse(response.code).name if response.code in ControlResponse._value2member_map_ else response.code
+    return f"Refused: {response.reason or 'no reason was given'} ({code})"
+
+
+def _in_force(parameter: str, response: Response) -> str:
+    """Return a value in SI where it has a unit, with the prefix that reads well."""
+    if not response.payload:
+        return "not told"
+    said = wire.decode_parameter(response.payload)
+    value = from_parameter(said, None)
+    unit = names.BASE_PARAMETERS.get(parameter) or said.unit or ""
+    if isinstance(value, bool) or not isinstance(value, float | int):
+        return str(value)
+    return f"{math.degrees(value):.6g} deg" if unit == "rad" else quantity(value, unit, 6)
+
+
+def _number_or(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _fits(now: ScanParameters, wanted: ScanParameters) -> bool:
+    if wanted.shape is not None and now.shape != wanted.shape:
+        return False
+    a, b = now.region, wanted.region
+    return b is None or (isinstance(a, Region) and isinstance(b, Region) and _near(a.center_m, b.center_m))
+
+
+def _near(a: XY, b: XY) -> bool:
+    return math.dist(a, b) < 1e-3 * max(math.hypot(*b), 1e-9)

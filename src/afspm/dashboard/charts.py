@@ -1,0 +1,123 @@
+"""Drift against time, and spectra, as options of ECharts and a line of text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from afspm.dashboard.words import position
+from afspm.drawing.curves import Array, thinned
+from afspm.formatting import quantity, scale, time_of_day
+from afspm.model import Spectrum
+from afspm.record.overview import DriftPoint
+
+BEFORE = 6  # spectra that are shown faintly behind the newest
+MOST_DRIFT = 5_000
+_MARGINS = {"left": 8, "right": 16, "top": 30, "bottom": 28, "containLabel": True}
+_QUIET, _LINE = "var(--quiet)", "var(--line)"
+_LEGEND = {"top": 0, "right": 0, "icon": "rect", "itemWidth": 14, "itemHeight": 3, "textStyle": {"color": _QUIET}}
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart and the HTML above it; `options` of None: nothing to draw."""
+
+    words: str
+    options: dict[str, Any] | None = None
+
+
+def drift_chart(points: Sequence[DriftPoint]) -> Chart:
+    """Return where the sample has drifted to, and how fast, against time: figure 7 of the paper."""
+    if not points:
+        return Chart('<p class="nothing">Nobody tracks drift in this experiment.</p>')
+    points = points[-MOST_DRIFT:]
+    time_ms = np.array([point.time_ns / 1e6 for point in points])
+    xy = np.array([point.translation_m for point in points])
+    lost = np.array([point.lost for point in points])
+    guessed = np.array([not point.matched for point in points]) & ~lost
+    shown: Array = np.where(lost[:, None], np.nan, xy)
+    factor, unit = scale(float(np.nanmax(np.abs(shown), initial=0.0)), "m")
+    series = [_line(time_ms, shown[:, i] * factor, f"var(--t{i})", name) for i, name in enumerate("xy")]
+    if guessed.any():
+        either = np.concatenate([xy[guessed, 0], xy[guessed, 1]]) * factor
+        dots = {"type": "scatter", "name": "predicted only", "symbolSize": 5, "itemStyle": {"color": "var(--bad)"}}
+        series.append({**dots, "data": _pairs(np.tile(time_ms[guessed], 2), either)})
+    options = _options(series, {"type": "time"}, f"drift of the sample [{unit}]")
+    return Chart(_drift_words(points[-1]), {**options, "legend": _LEGEND})
+
+
+def _drift_words(point: DriftPoint) -> str:
+    speed = math.hypot(*point.rate_m_s) * 60
+    if point.lost:
+        return f'<p class="alarm">The sample is lost: {escape(point.reason) or "no scan fits"}</p>'
+    how = "corrected" if point.correcting else "not corrected yet"
+    word = "" if point.matched else f"; the last scan did not fit ({escape(point.reason)})"
+    return f"<p>{position(point.translation_m)}, moving at {quantity(speed, 'm')}/min, {how}{word}</p>"
+
+
+def spectrum_chart(spectra: Sequence[tuple[int, Spectrum]], variable: str) -> Chart:
+    """Return the last of `spectra`, and behind it those before that have the same variables.
+
+    Args:
+        variable: shown against the first; another is taken if the spectrum has none of this name.
+    """
+    if not spectra:
+        return Chart('<p class="nothing">No spectrum has been taken.</p>')
+    time_ns, last = spectra[-1]
+    if len(last.names) < 2 or not len(last.values):
+        return Chart(f'<p class="nothing">A spectrum at {time_of_day(time_ns)} that has no curve.</p>')
+    variable = variable if variable in last.names[1:] else last.names[1]
+    before = [s for _, s in spectra[:-1] if s.names == last.names and s.units == last.units][-BEFORE:]
+    across, unit_across = scale(_largest([last], last.names[0]), last.units[0])
+    up, unit_up = scale(_largest([*before, last], variable), last.units[last.names.index(variable)])
+    drawn = [(s, "var(--t0)" if s is last else _QUIET) for s in [*before, last]]
+    series = [_line(s.values[:, 0] * across, s[variable] * up, colour) for s, colour in drawn]
+    for one in series[:-1]:
+        one["lineStyle"]["opacity"] = 0.4
+    where = "" if last.position_m is None else f" at {position(last.position_m)}"
+    words = f"<p>{escape(last.kind or 'Spectrum')}{where}, {time_of_day(time_ns)}</p>"
+    axis = {"type": "value", "scale": True, "name": _named(last.names[0], unit_across)}
+    return Chart(words, _options(series, axis, _named(variable, unit_up)))
+
+
+def _largest(spectra: Sequence[Spectrum], name: str) -> float:
+    return max(float(np.nanmax(np.abs(one[name]), initial=0.0)) for one in spectra)
+
+
+def _named(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit else name
+
+
+def _line(x: Array, y: Array, colour: str, name: str = "") -> dict[str, Any]:
+    style = {"color": colour}
+    return {
+        "type": "line", "name": name, "data": _pairs(*thinned(x, y)), "showSymbol": False, "itemStyle": style,
+        "lineStyle": {**style, "width": 1.6}, "emphasis": {"disabled": True},
+    }  # fmt: skip
+
+
+def _pairs(x: Array, y: Array) -> list[list[float | None]]:
+    """Points as JSON has them, which knows no NaN: None is a gap."""
+    points = zip(x.tolist(), y.tolist(), strict=True)
+    return [[a if math.isfinite(a) else None, float(f"{b:.6g}") if math.isfinite(a + b) else None] for a, b in points]
+
+
+def _options(series: list[dict[str, Any]], x: dict[str, Any], y_name: str) -> dict[str, Any]:
+    axis = {
+        "axisLabel": {"color": _QUIET},
+        "axisLine": {"onZero": False, "lineStyle": {"color": _LINE}},
+        "splitLine": {"show": False},
+    }
+    names = {"nameTextStyle": {"color": _QUIET, "align": "left"}, "nameGap": 12}
+    return {
+        "animation": False, "grid": _MARGINS, "series": series,
+        "tooltip": {"trigger": "axis", "className": "tip", "borderWidth": 0},
+        "xAxis": {**axis, "nameLocation": "middle", "nameTextStyle": {"color": _QUIET}, "nameGap": 26, **x},
+        "yAxis": {**axis, **names, "type": "value", "scale": True, "name": y_name,
+                  "splitLine": {"lineStyle": {"color": _LINE}}},
+    }  # fmt: skip

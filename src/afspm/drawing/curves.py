@@ -1,0 +1,56 @@
+"""Curves: fewer points without losing a peak, round ticks, and a small picture of one."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+MOST_POINTS = 600
+
+
+def thinned(x: Array, y: Array, most: int = MOST_POINTS) -> tuple[Array, Array]:
+    """Return at most about `most` points: the lowest and highest of each stretch, so that no peak gets lost."""
+    if len(x) <= most:
+        return x, y
+    edges = np.linspace(0, len(x), most // 2 + 1).astype(int)
+    chosen: list[int] = []
+    for begin, end in itertools.pairwise(edges.tolist()):
+        part = y[begin:end]
+        if not np.isfinite(part).any():
+            chosen.append(begin)
+            continue
+        chosen += sorted({int(begin + np.nanargmin(part)), int(begin + np.nanargmax(part))})
+    return x[chosen], y[chosen]
+
+
+def round_ticks(low: float, high: float, about: int = 5) -> list[float]:
+    """Return round numbers between two, about so many."""
+    if not high > low:
+        return [low]
+    step = 10.0 ** math.floor(math.log10((high - low) / about))
+    step *= next((factor for factor in (1, 2, 5, 10) if (high - low) / (step * factor) <= about), 10)
+    first = math.ceil(low / step - 1e-9)
+    last = math.floor(high / step + 1e-9)
+    return [round(i * step, 15 - math.floor(math.log10(abs(i * step) or 1.0))) for i in range(first, last + 1)]
+
+
+def sparkline(x: Array, y: Array, width: int = 200, height: int = 120) -> str:
+    """Return a curve as a small SVG without axes; what is not finite goes to the middle."""
+    across, up = 5 + (width - 10) * _to_unit(x), height - 5 - (height - 10) * _to_unit(y)
+    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across, up, strict=True))
+    return (
+        f'<svg width="{width}" height="{height}" style="background:#fff">'
+        f'<polyline fill="none" stroke="#a0522d" points="{points}"/></svg>'
+    )
+
+
+def _to_unit(values: Array) -> Array:
+    finite = np.isfinite(values)
+    if not finite.any():
+        return np.full(values.shape, 0.5)
+    low, high = values[finite].min(), values[finite].max()
+    return np.where(finite, (values - low) / (high - low if high > low else 1.0), 0.5)

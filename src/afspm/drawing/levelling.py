@@ -1,0 +1,61 @@
+"""Level scans for looking at them; what is published stays as it is."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Levelling(Enum):
+    """The background that is subtracted before a scan is shown."""
+
+    NONE = "none"
+    PLANE = "plane"
+    """The plane that fits best (least squares)."""
+    LINES = "lines"
+    """Of each line, the straight line along the fast axis that fits best."""
+
+
+def levelled(values: Array, how: Levelling) -> Array:
+    """Return values [y, x] without their background; what is not finite stays, and counts for nothing."""
+    if how is Levelling.NONE or not values.size:
+        return values
+    finite = np.isfinite(values)
+    if not finite.any():
+        return values
+    return values - (_plane(values, finite) if how is Levelling.PLANE else _lines(values, finite))
+
+
+def _plane(values: Array, finite: NDArray[np.bool_]) -> Array:
+    """The plane through the finite values, by the normal equations in coordinates about their middle."""
+    weights = finite.astype(np.float64)
+    known = np.where(finite, values, 0.0)
+    x, y = (np.arange(n, dtype=np.float64) for n in reversed(values.shape))
+    count = weights.sum()
+    columns, rows = weights.sum(axis=0), weights.sum(axis=1)
+    x = x - columns @ x / count
+    y = y - rows @ y / count
+    mean = known.sum() / count
+    xx, yy, xy = columns @ x**2, rows @ y**2, y @ weights @ x
+    by_column, by_row = known.sum(axis=0), known.sum(axis=1)
+    matrix = np.array([[xx, xy], [xy, yy]])
+    # one row or column alone has no slope across it: the least of all that fit
+    slope_x, slope_y = np.linalg.lstsq(matrix, np.array([by_column @ x, by_row @ y]), rcond=1e-12)[0]
+    return np.asarray(mean + slope_x * x[None, :] + slope_y * y[:, None])
+
+
+def _lines(values: Array, finite: NDArray[np.bool_]) -> Array:
+    weights = finite.astype(np.float64)
+    known = np.where(finite, values, 0.0)
+    count = np.maximum(weights.sum(axis=1), 1.0)
+    x = np.arange(values.shape[1], dtype=np.float64)
+    middle = weights @ x / count
+    offset = x[None, :] - middle[:, None]
+    spread = (weights * offset**2).sum(axis=1)
+    mean = known.sum(axis=1) / count
+    slope = (known * offset).sum(axis=1) / np.where(spread > 0.0, spread, 1.0)
+    return np.asarray(mean[:, None] + slope[:, None] * offset)

@@ -1,0 +1,87 @@
+"""Components that are part of an experiment without being in its file: the recorder, and the notifier of [notify]."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from afspm.components.notifications import END, OCCASIONS, Targets, address
+from afspm.errors import ConfigError
+from afspm.experiment.parts import ExperimentPart
+from afspm.model import Role
+
+if TYPE_CHECKING:
+    from afspm.experiment.resolution import ResolvedExperiment
+    from afspm.experiment.sections import NotifySection
+
+RECORDER, NOTIFIER = "recorder", "notifier"
+RECORDS, NOTIFIES = "records", "notifies"
+"""Attributes by which a class says that it does what the recorder or the notifier does."""
+
+
+def recorder(resolved: ResolvedExperiment) -> ExperimentPart | None:
+    """Return the recorder as [record] wants it; None: it wants none, the file has one, or there is no scheduler."""
+    section = resolved.sections.record
+    if not section.on or resolved.saying(RECORDS) or not resolved.with_role(Role.SCHEDULER):
+        return None
+    scans = section.scans
+    if scans and importlib.util.find_spec("h5py") is None:
+        scans = False
+        resolved.warning(
+            "scans and spectra are not recorded: h5py is not installed",
+            "record",
+            hint='pip install "afspm[record]"; or say [record] scans = false',
+        )
+    return _implied(resolved, RECORDER, {} if scans else {"scans": False}, "record")
+
+
+def notifier(resolved: ResolvedExperiment) -> ExperimentPart | None:
+    """Return the notifier as [notify] wants it; None if nobody is told of what happens during the experiment."""
+    section = resolved.sections.notify
+    occasions = (set(OCCASIONS) - {END}) & set(section.on)
+    is_wanted = (section.command or section.webhook) and occasions
+    if not is_wanted or resolved.saying(NOTIFIES) or not resolved.with_role(Role.SCHEDULER):
+        return None
+    wanted = targets(section, resolved.document.folders[0])
+    settings: dict[str, Any] = {"program": list(wanted.command)} if wanted.command else {}
+    settings |= {"webhook": wanted.webhook} if wanted.webhook else {}
+    settings |= {"on": list(section.on), "unsolved_after": section.unsolved_after, "folder": wanted.folder}
+    return _implied(resolved, NOTIFIER, settings, "notify")
+
+
+def _implied(resolved: ResolvedExperiment, name: str, settings: dict[str, Any], section: str) -> ExperimentPart:
+    free_name, place = resolved.parts.free_name(name), resolved.document.place(section)
+    return ExperimentPart(free_name, name.capitalize(), (), settings, {}, place, implied=True)
+
+
+def targets(section: NotifySection, folder: Path) -> Targets:
+    """Return who is told. "python" as the program means the one that runs us."""
+    command = section.command
+    if command[:1] == ("python",):
+        command = (sys.executable, *command[1:])
+    return Targets(command, section.webhook, str(folder))
+
+
+def check_notify(resolved: ResolvedExperiment) -> None:
+    """[notify] names a way to tell people, and it works."""
+    section = resolved.sections.notify
+    if "notify" in resolved.parts.sections and not (section.command or section.webhook):
+        resolved.error("[notify] nobody is told of anything", "notify", hint="give a `command` or a `webhook`")
+    if section.command and not is_program(section.command[0], resolved.document.folders[0]):
+        what = f"[notify] there is no program {section.command[0]!r}"
+        resolved.error(what, "notify", "command", hint="give its path, or install it")
+    if section.webhook:
+        try:
+            address(section.webhook)
+        except ConfigError as error:
+            # the environment may be that of another computer, where the scheduler is started
+            report = resolved.warning if section.webhook.startswith("$") else resolved.error
+            report(f"[notify] webhook: {error.what}", "notify", "webhook", hint=error.hint)
+
+
+def is_program(name: str, folder: Path) -> bool:
+    """Whether a command may begin with this: "python", which is ours, a program that is found, a file in a folder."""
+    return name == "python" or shutil.which(name) is not None or (folder / name).is_file()

@@ -1,0 +1,123 @@
+"""The state of one supervised process: its lives, its heartbeats, and how it ended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from afspm.logic.supervision.child import ChildWatch, HeartbeatReport
+from afspm.logic.supervision.liveness import LivenessPolicy
+from afspm.model import Role
+
+LATE_START_S = 15.0
+"""Time that a process started at the end has to come up, and to hear what it missed."""
+
+
+@dataclass(frozen=True)
+class ChildSpec:
+    """A process to supervise.
+
+    Attributes:
+        beats: whether it sends heartbeats; one that does not is only known by its exit.
+    """
+
+    name: str
+    role: Role = Role.COMPONENT
+    beats: bool = True
+
+    @property
+    def essential(self) -> bool:
+        """Whether the experiment can't go on without it."""
+        return self.role is not Role.COMPONENT
+
+
+@dataclass(slots=True)
+class ChildLife:
+    """A process that runs: one life of a child.
+
+    Attributes:
+        beat: its last heartbeat, at `beat_s`; None before the first.
+        works: whether it is seen to work though it does not beat; None: that is not known.
+    """
+
+    pid: int
+    started_s: float
+    beat: HeartbeatReport | None = None
+    beat_s: float = 0.0
+    works: bool | None = None
+
+    @property
+    def is_closing(self) -> bool:
+        return self.beat is not None and self.beat.closing
+
+    def overdue_s(self, liveness: LivenessPolicy) -> float | None:
+        """When its next beat is so late that the operating system is asked what it does; None: never."""
+        return None if self.beat is None or self.beat.closing else self.beat_s + liveness.silence_s / 2.0
+
+    def is_overdue(self, now_s: float, liveness: LivenessPolicy) -> bool:
+        """Whether that time has come."""
+        due_s = self.overdue_s(liveness)
+        return due_s is not None and now_s >= due_s
+
+    def is_busy(self, now_s: float, liveness: LivenessPolicy) -> bool:
+        """Whether it works on a step, as its last beat says or is seen, and for no longer than it declared."""
+        if self.beat is None or self.beat.closing:
+            return False
+        longest_s, age_s = self.beat.longest_step_s or liveness.longest_step_s, self.beat.step_age_s or 0.0
+        silent_s = now_s - self.beat_s
+        if silent_s >= liveness.silence_s:
+            return bool(self.works) and age_s + silent_s <= longest_s
+        return 0.0 < age_s <= longest_s
+
+    def is_silent(self, now_s: float, liveness: LivenessPolicy) -> bool:
+        """Whether it should have beaten long ago, and does not work either."""
+        beating = self.beat is not None and not self.beat.closing
+        return beating and now_s - self.beat_s >= liveness.silence_s and not self.is_busy(now_s, liveness)
+
+
+@dataclass(slots=True)
+class SupervisedChild:
+    """A process over all its lives.
+
+    Attributes:
+        starts, ordered: how often it was started, and how often of that by a person's order.
+        rescued: it was started once more though the experiment had ended.
+        last_exit: how it ended last, in words.
+    """
+
+    spec: ChildSpec
+    watch: ChildWatch
+    life: ChildLife | None = None
+    starts: int = 0
+    ordered: int = 0
+    rescued: bool = False
+    given_up: bool = False
+    last_exit: str = ""
+
+    @property
+    def is_over(self) -> bool:
+        return self.given_up or self.watch.over
+
+    def may_still_finish(self, now_s: float, liveness: LivenessPolicy, *, can_hear: bool) -> bool:
+        """Whether it is too early to say that it has nothing left to do: it starts, has not beaten for a moment, is
+        frozen and can be started again, or was, and has yet to hear what it missed, if it still can."""
+        life = self.life
+        if life is None or not self.spec.beats or self.spec.role is not Role.COMPONENT:
+            return False
+        if life.beat is None:
+            return now_s - life.started_s < LATE_START_S
+        given_up = self.rescued and life.is_silent(now_s, liveness)
+        # between two steps of its start it looks as if it had nothing to do
+        begins_anew = can_hear and self.starts > 1 and now_s - life.started_s < LATE_START_S
+        is_late = now_s - life.beat_s > 1.5 * liveness.beat_period_s
+        return not life.is_closing and not given_up and (begins_anew or is_late)
+
+
+@dataclass(frozen=True)
+class ProcessReport:
+    """What became of one process; `ordered` counts the starts that a person ordered."""
+
+    name: str
+    starts: int
+    given_up: bool
+    last_exit: str
+    ordered: int = 0

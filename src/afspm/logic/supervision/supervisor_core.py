@@ -1,0 +1,334 @@
+"""The supervisor's decisions about all processes of a run. Pure: events and real monotonic times in, effects out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+from afspm.exit_codes import ExitCode
+from afspm.logic.supervision.child import (
+    ChildEffect,
+    ChildLog,
+    ChildPhase,
+    ChildPolicy,
+    ChildWatch,
+    GiveUpChild,
+    HeartbeatReport,
+    KillChild,
+    StartChild,
+)
+from afspm.logic.supervision.run_end import EndReason, EndStep, RunEnd
+from afspm.logic.supervision.supervised_child import ChildLife, ChildSpec, ProcessReport, SupervisedChild
+from afspm.logic.supervision.supervisor_events import (
+    ActivitySeen,
+    Beaten,
+    EndSignal,
+    Exited,
+    ProcessAction,
+    ProcessCommand,
+    ProcessStarted,
+    ReleaseComponents,
+    RestartOrdered,
+    RunBegan,
+    SchedulerAnswered,
+    StartFailed,
+    SupervisorEffect,
+    SupervisorEvent,
+    TimePassed,
+    WriteLog,
+    describe_exit,
+)
+from afspm.logic.supervisor_registry import LOGGED_AS
+from afspm.model import Role
+
+SCHEDULER_ANSWERS_WITHIN_S = 15.0
+"""Time after which components no longer wait for the scheduler to answer."""
+
+
+class SupervisorCore:
+    """Decides what to start, kill, ask to end and log.
+
+    Args:
+        awaits_scheduler: components begin only when the scheduler has answered.
+
+    Attributes:
+        ending: how the run ends; None while it goes on.
+    """
+
+    def __init__(self, specs: Iterable[ChildSpec], policy: ChildPolicy, *, awaits_scheduler: bool = False) -> None:
+        self.children = {
+            spec.name: SupervisedChild(spec, ChildWatch(replace(policy, beats=spec.beats))) for spec in specs
+        }
+        self.ending: RunEnd | None = None
+        self._liveness = policy.liveness
+        self._awaits_scheduler = awaits_scheduler
+        self._has_told_waiting = False
+        self._effects: list[SupervisorEffect] = []
+        self._now_s = 0.0
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the run has ended and nothing of it runs any more."""
+        return self.ending is not None and not any(child.life for child in self.children.values())
+
+    def step(self, event: SupervisorEvent, now_s: float) -> list[SupervisorEffect]:
+        """Take in an event at a real monotonic time; returns what to do, in order."""
+        self._now_s = now_s
+        match event:
+            case RunBegan():
+                for child in self.children.values():
+                    self._apply(child, child.watch.begin(now_s))
+            case ProcessStarted(name, pid):
+                self.children[name].starts += 1
+                self.children[name].life = ChildLife(pid, now_s)
+                self._log(name, "DEBUG", f"started, process {pid}")
+            case StartFailed(name, why):
+                child = self.children[name]
+                child.starts += 1
+                child.last_exit = f"could not be started: {why}"
+                self._apply(child, child.watch.start_failed(why, now_s))
+            case Beaten(name, report):
+                self._on_beat(self.children[name], report)
+            case ActivitySeen(name, works):
+                if (life := self.children[name].life) is not None:
+                    life.works = works
+            case Exited():
+                self._on_exit(self.children[event.name], event)
+            case EndSignal() if self.ending is None:
+                self._end(EndReason.STOPPED, f"stopped by {event.name}")
+            case EndSignal():
+                assert self.ending is not None
+                self.ending = self.ending.hurried(now_s)
+            case RestartOrdered(name):
+                self._on_order(name)
+            case SchedulerAnswered():
+                self._release()
+            case TimePassed():
+                self._on_time()
+        effects, self._effects = self._effects, []
+        return effects
+
+    def may_start(self, name: str) -> bool:
+        """Whether a process that is to be started still is: the run may have ended meanwhile."""
+        return self.ending is None or self.children[name].rescued
+
+    def deadline_s(self) -> float | None:
+        """When `TimePassed` is due at the latest; None: it is not."""
+        if self.ending is not None:
+            found = [self.ending.deadline_s()]
+        else:
+            found = [child.watch.deadline_s() for child in self.children.values()]
+        for child in self.children.values():
+            if child.life is not None and not child.life.is_overdue(self._now_s, self._liveness):
+                found.append(child.life.overdue_s(self._liveness))
+        return min((s for s in found if s is not None), default=None)
+
+    def overdue(self, now_s: float) -> tuple[dict[str, int], float]:
+        """Return the processes whose beat is late, with their ids, and over which time to judge whether they work."""
+        overdue: dict[str, int] = {}
+        for name, child in self.children.items():
+            if child.life is None:
+                continue
+            if child.life.is_overdue(now_s, self._liveness):
+                overdue[name] = child.life.pid
+            else:
+                child.life.works = None
+        return overdue, self._liveness.silence_s / 2.0
+
+    def reports(self) -> tuple[ProcessReport, ...]:
+        """Return what became of each process."""
+        return tuple(
+            ProcessReport(name, child.starts, child.given_up, child.last_exit, child.ordered)
+            for name, child in self.children.items()
+        )
+
+    # --- events ---
+
+    def _on_beat(self, child: SupervisedChild, report: HeartbeatReport) -> None:
+        if child.life is not None:
+            if child.life.beat is None:
+                self._log(child.spec.name, "DEBUG", "is up")
+            child.life.beat, child.life.beat_s = report, self._now_s
+        self._apply(child, child.watch.beat(report, self._now_s))
+
+    def _on_exit(self, child: SupervisedChild, exited: Exited) -> None:
+        life, code = child.life, exited.code
+        if life is None or life.pid != exited.pid:
+            return
+        child.life = None
+        how = describe_exit(code)
+        child.last_exit = f"{how}: {exited.last_error}" if code == ExitCode.CRASHED and exited.last_error else how
+        if self.ending is not None:
+            if child.watch.died(code) and self._may_be_rescued(child):
+                self._log(child.spec.name, "WARNING", f"{how}; it is started again, to finish")
+                self._rescue(child)
+            else:
+                self._log(child.spec.name, "DEBUG", child.last_exit)
+        elif code == ExitCode.DONE and child.spec.role is Role.TRANSLATOR and not life.is_closing:
+            # one of version 1 that has caught an error of its own ends like that; one that closes on purpose says so
+            told = f"{how}, before the experiment has ended and without saying that it closes"
+            self._apply(child, child.watch.exited(ExitCode.CRASHED, self._now_s, told))
+        else:
+            self._apply(child, child.watch.exited(code, self._now_s, how))
+            if code == ExitCode.ENDED:
+                self._end(EndReason.EXPERIMENT_ENDED, "the experiment has ended")
+            elif code == ExitCode.CONFIG:
+                self._give_up(child, exited.last_error or "its settings can't work")
+            elif code == ExitCode.DONE and child.spec.essential:
+                self._end(EndReason.EXPERIMENT_ENDED, f"{child.spec.name} is done")
+
+    def _on_order(self, name: str) -> None:
+        child = self.children.get(name)
+        if child is None or self.ending is not None:
+            return
+        child.given_up, child.ordered = False, child.ordered + 1
+        self._apply(child, child.watch.restart(self._now_s))
+
+    def _on_time(self) -> None:
+        self._await_scheduler()
+        if self.ending is not None:
+            self._continue_ending(self.ending)
+            return
+        for child in self.children.values():
+            works = None if child.life is None else child.life.works
+            self._apply(child, child.watch.tick(self._now_s, works=works))
+        if self.ending is None and all(child.is_over for child in self.children.values()):
+            if all(child.given_up for child in self.children.values()):
+                self._end(EndReason.LOST, "everything is given up")
+            else:
+                self._end(EndReason.ALL_DONE, "all is done")
+
+    def _await_scheduler(self) -> None:
+        """A scheduler that beats and does not answer us, for want of a key perhaps, may answer components."""
+        if not self._awaits_scheduler:
+            return
+        for child in self._with_role(Role.COMPONENT):
+            child.watch.waits(self._now_s)
+        lives = [child.life for child in self._with_role(Role.SCHEDULER)]
+        if any(life and life.beat and self._now_s - life.started_s >= SCHEDULER_ANSWERS_WITHIN_S for life in lives):
+            self._release()
+            self._log(LOGGED_AS, "WARNING", "the scheduler does not answer; the components begin all the same")
+
+    # --- one child ---
+
+    def _apply(self, child: SupervisedChild, effects: Sequence[ChildEffect]) -> None:
+        for effect in effects:
+            match effect:
+                case StartChild():
+                    self._start(child)
+                case KillChild() if child.life is not None:
+                    self._command(ProcessAction.KILL, child)
+                case ChildLog(level, text):
+                    self._log(child.spec.name, level, text)
+                case GiveUpChild(why):
+                    self._give_up(child, why)
+
+    def _start(self, child: SupervisedChild) -> None:
+        if self.may_start(child.spec.name):
+            self._command(ProcessAction.START, child)
+
+    def _give_up(self, child: SupervisedChild, why: str) -> None:
+        child.given_up = True
+        name = child.spec.name
+        if child.spec.essential:
+            what = f"{name} is given up, and the experiment can't go on without it: {why}"
+            self._end(EndReason.LOST, what)
+        else:
+            self._log(LOGGED_AS, "CRITICAL", f"{name} is given up, the rest goes on (Ctrl-C ends it): {why}")
+
+    def _end(self, why: EndReason, text: str) -> None:
+        self._release()
+        if self.ending is not None:
+            return
+        self.ending = RunEnd.begin(why, text, self._now_s)
+        for child in self.children.values():
+            is_missing = child.life is None and child.watch.phase is ChildPhase.WAITING
+            child.watch.stop(self._now_s)
+            if is_missing and self._may_be_rescued(child):
+                self._rescue(child)
+            # the scheduler tells all others that the experiment has ended; a translator does not listen to it
+            if child.spec.role is Role.TRANSLATOR and child.life:
+                self._command(ProcessAction.CLOSE_INPUT, child)
+        # a run that ended as it should is told of by its summary, in a moment
+        level = {EndReason.STOPPED: "INFO", EndReason.LOST: "CRITICAL"}.get(why, "DEBUG")
+        self._log(LOGGED_AS, level, text)
+
+    # --- the end ---
+
+    def _may_be_rescued(self, child: SupervisedChild) -> bool:
+        """Whether it is started once more though the experiment has ended: it had not finished when it died."""
+        return self._has_just_ended and child.spec.beats and child.spec.role is Role.COMPONENT and not child.rescued
+
+    @property
+    def _has_just_ended(self) -> bool:
+        """Whether the experiment itself has ended, and nobody has been asked to leave."""
+        ending = self.ending
+        return ending is not None and ending.why is EndReason.EXPERIMENT_ENDED and ending.last is None
+
+    def _rescue(self, child: SupervisedChild) -> None:
+        child.rescued = True
+        self._start(child)
+
+    def _continue_ending(self, ending: RunEnd) -> None:
+        if self._has_just_ended:
+            self._release_scheduler()
+        busy = self._unfinished(ending)
+        self.ending, step = ending.step(self._now_s, busy=bool(busy))
+        postponed = step is None and self.ending.deadline_s() != ending.deadline_s()
+        if busy and postponed and not self._has_told_waiting:
+            self._has_told_waiting = True
+            self._log(LOGGED_AS, "INFO", f"waiting for {', '.join(busy)} to finish; Ctrl-C ends it now")
+        for child in self.children.values():
+            if child.life is not None and step is not None:
+                self._carry_out(step, child, child.life.pid)
+
+    def _carry_out(self, step: EndStep, child: SupervisedChild, pid: int) -> None:
+        match step:
+            case EndStep.ASK:
+                self._command(ProcessAction.CLOSE_INPUT, child)
+            case EndStep.KILL:
+                self._log(child.spec.name, "WARNING", "does not end: killed")
+                self._command(ProcessAction.KILL, child)
+            case EndStep.LEAVE:
+                self._log(child.spec.name, "CRITICAL", f"can't be killed (process {pid})")
+                self._command(ProcessAction.ABANDON, child)
+                child.life = None
+
+    def _release_scheduler(self) -> None:
+        """Kill components that are frozen, and let the scheduler go once nobody needs it any more."""
+        left = [child for child in self.children.values() if child.life is not None]
+        for child in left:
+            if all(other.spec.role is Role.SCHEDULER for other in left):
+                self._command(ProcessAction.CLOSE_INPUT, child)
+            elif self._may_be_rescued(child) and child.life and child.life.is_silent(self._now_s, self._liveness):
+                self._command(ProcessAction.KILL, child)
+
+    def _unfinished(self, ending: RunEnd) -> list[str]:
+        """The names of those with something to finish; a translator may have after it was asked to end: the tip."""
+        now_s, is_asked = self._now_s, ending.last is not None
+        has_ended = ending.why is EndReason.EXPERIMENT_ENDED
+        # a scheduler on another computer may be there
+        can_hear = all(child.life for child in self._with_role(Role.SCHEDULER))
+        found = []
+        for name, child in self.children.items():
+            is_busy = child.life is not None and child.life.is_busy(now_s, self._liveness)
+            may_finish = has_ended and child.may_still_finish(now_s, self._liveness, can_hear=can_hear)
+            if (is_busy or may_finish) if not is_asked else (is_busy and child.spec.role is Role.TRANSLATOR):
+                found.append(name)
+        return found
+
+    # --- effects ---
+
+    def _with_role(self, role: Role) -> list[SupervisedChild]:
+        return [child for child in self.children.values() if child.spec.role is role]
+
+    def _release(self) -> None:
+        if self._awaits_scheduler:
+            self._awaits_scheduler = False
+            self._effects.append(ReleaseComponents())
+
+    def _command(self, action: ProcessAction, child: SupervisedChild) -> None:
+        self._effects.append(ProcessCommand(action, child.spec.name))
+
+    def _log(self, name: str, level: str, text: str) -> None:
+        self._effects.append(WriteLog(name, level, text))

@@ -1,0 +1,156 @@
+"""Events that the supervisor's decisions take in, and the effects that come out."""
+
+from __future__ import annotations
+
+import signal
+from dataclasses import dataclass
+from enum import Enum, auto
+
+from afspm.exit_codes import ExitCode
+from afspm.logic.supervision.child import HeartbeatReport
+
+
+@dataclass(frozen=True, slots=True)
+class RunBegan:
+    """Everything is to be started."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessStarted:
+    """The operating system has made the process."""
+
+    name: str
+    pid: int
+
+
+@dataclass(frozen=True, slots=True)
+class StartFailed:
+    """There is no process."""
+
+    name: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Beaten:
+    """A heartbeat came."""
+
+    name: str
+    report: HeartbeatReport
+
+
+@dataclass(frozen=True, slots=True)
+class ActivitySeen:
+    """The operating system was asked whether a process that does not beat works; None: it can't tell."""
+
+    name: str
+    works: bool | None
+
+
+@dataclass(frozen=True, slots=True)
+class Exited:
+    """A child is gone; a negative code is the number of the signal that ended it, as in `subprocess`."""
+
+    name: str
+    pid: int
+    code: int
+    last_error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class EndSignal:
+    """A person, or the system, wants the run to end."""
+
+    number: int
+
+    @property
+    def name(self) -> str:
+        return "Ctrl-C" if self.number == signal.SIGINT else signal.Signals(self.number).name
+
+
+@dataclass(frozen=True, slots=True)
+class RestartOrdered:
+    """A process is to be started anew."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class SchedulerAnswered:
+    """The scheduler of this run has answered: components may ask it."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimePassed:
+    """The deadline came, or anything else happened."""
+
+
+SupervisorEvent = (
+    RunBegan
+    | ProcessStarted
+    | StartFailed
+    | Beaten
+    | ActivitySeen
+    | Exited
+    | EndSignal
+    | RestartOrdered
+    | SchedulerAnswered
+    | TimePassed
+)
+
+
+class ProcessAction(Enum):
+    """What the supervisor does to a process."""
+
+    START = auto()
+    """`ProcessStarted` or `StartFailed` follows."""
+    KILL = auto()
+    """End it, and all that it has started, now."""
+    CLOSE_INPUT = auto()
+    """Ask it to end by closing its standard input."""
+    ABANDON = auto()
+    """Wait for it no longer: it can't be killed."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessCommand:
+    """Carry out an action on a process."""
+
+    action: ProcessAction
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class ReleaseComponents:
+    """Components that wait for the scheduler may begin."""
+
+
+@dataclass(frozen=True, slots=True)
+class WriteLog:
+    """Write a line to the log in the name of a process; `level` is a name of the logging module."""
+
+    name: str
+    level: str
+    text: str
+
+
+SupervisorEffect = ProcessCommand | ReleaseComponents | WriteLog
+
+
+_EXIT_REASONS = {
+    ExitCode.DONE: "done",
+    ExitCode.CRASHED: "crashed",
+    ExitCode.CONFIG: "its settings can't work",
+    ExitCode.ENDED: "ended with the experiment",
+    ExitCode.ORPHAN: "ended as it was asked to",
+}
+
+
+def describe_exit(code: int) -> str:
+    """Return why a process ended, as its exit code says."""
+    if code < 0:
+        try:
+            return f"killed by {signal.Signals(-code).name}"
+        except ValueError:
+            return f"killed by signal {-code}"
+    return next((words for known, words in _EXIT_REASONS.items() if known == code), f"exit code {code}")

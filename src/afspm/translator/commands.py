@@ -1,0 +1,183 @@
+"""Does what a request asks for: checks everything first, then has the driver do it."""
+
+from __future__ import annotations
+
+import difflib
+import logging
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+from afspm import units
+from afspm.errors import AfspmError, ConfigError, Refused
+from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, request_name
+from afspm.translator.driver import LOST, Action, Driver
+from afspm.translator.parameters import Value
+from afspm.translator.sequence import SequenceStep, StatusSequence
+from afspm.translator.setters import apply, wanted_values
+from afspm.translator.settings import MOVES, of_message
+from afspm.translator.temporary_settings import TemporarySettings, state_for
+from afspm.wire import encode
+
+_ANNOUNCED = {
+    ControlRequest.SET_SCAN_PARAMS: "ScanParameters2d",
+    ControlRequest.SET_ZCTRL_PARAMS: "ZCtrlParameters",
+    ControlRequest.SET_PROBE_POS: "ProbePosition",
+}
+_SETTERS = (*_ANNOUNCED, ControlRequest.PARAM)
+
+
+@dataclass
+class CommandOutcome:
+    """The response to a request, with what follows from it.
+
+    Attributes:
+        steps: to publish after the response.
+        announce: messages to publish even if nothing in them changed: the peer waits for them.
+    """
+
+    response: Response
+    steps: list[SequenceStep] = field(default_factory=list)
+    announce: tuple[str, ...] = ()
+
+
+class Commands:
+    """Carries out requests at one microscope.
+
+    Args:
+        sequence: says whether the microscope is free, and in which order peers hear of it.
+        about_to_act: called right before anything is done that can't be taken back.
+    """
+
+    def __init__(
+        self,
+        driver: Driver,
+        sequence: StatusSequence,
+        temporary: TemporarySettings,
+        about_to_act: Callable[[Request], None],
+        log: logging.Logger,
+    ) -> None:
+        self._driver = driver
+        self._sequence = sequence
+        self._temporary = temporary
+        self._about_to_act = about_to_act
+        self._log = log
+        driver.for_a_while = temporary.begin
+        self.actions = driver.own_actions() | self._added_actions(driver.added_actions)
+
+    def do(self, request: Request) -> CommandOutcome:
+        """Carry out a request, whatever is wrong with it or with the controller. Raises only what says it is lost."""
+        try:
+            return self._dispatch(request)
+        except Refused as refused:
+            return CommandOutcome(Response(refused.response, reason=refused.reason, id=request.id))
+        except LOST:
+            raise
+        except Exception as error:
+            # an error of the controller, or of its driver, must not end the process: it is the reason
+            self._log.exception("%s failed", request_name(request.kind))
+            is_action = request.kind == ControlRequest.ACTION
+            code = ControlResponse.ACTION_ERROR if is_action else ControlResponse.PARAM_ERROR
+            return CommandOutcome(Response(code, reason=f"{type(error).__name__}: {error}", id=request.id))
+
+    def _dispatch(self, request: Request) -> CommandOutcome:
+        if request.kind == ControlRequest.ACTION_SUPPORT:
+            self._find_action(request.subject)
+            return self._success(request)
+        if request.kind == ControlRequest.ACTION:
+            return self._act(request)
+        if request.kind not in _SETTERS:
+            reason = f"{request_name(request.kind)} is not for a translator"
+            raise Refused(ControlResponse.CMD_NOT_SUPPORTED, reason)
+        values = wanted_values(request, self._driver)
+        return self._success(request) if values is None else self._set(request, values)
+
+    def _success(self, request: Request) -> CommandOutcome:
+        """Return the success of a request; of one for a parameter with its value, in the unit that the peer used."""
+        asked, payload = request.subject, b""
+        if isinstance(asked, Parameter):
+            spec = self._driver.table.find(asked.name)
+            text, unit = spec.told(self._driver.in_force([spec.name])[spec.name], asked.unit)
+            payload = encode(Parameter(spec.name, text, unit or None))[1]
+        return CommandOutcome(Response(ControlResponse.SUCCESS, payload, id=request.id))
+
+    def _set(self, request: Request, values: Mapping[str, Value]) -> CommandOutcome:
+        self._refuse_if_busy(all(self._driver.table[name].while_busy for name in values))
+        if values:
+            apply(self._driver, values, lambda: self._about_to_act(request))
+        steps = self._sequence.begin(ScopeState.MOVING) if MOVES & values.keys() else []
+        done = self._success(request)
+        done.steps = steps
+        if request.kind == ControlRequest.PARAM:
+            told = (message for message in _ANNOUNCED.values() if set(of_message(message)) & values.keys())
+            done.announce = tuple(told)
+        else:
+            done.announce = (_ANNOUNCED[ControlRequest(request.kind)],)
+        return done
+
+    def _act(self, request: Request) -> CommandOutcome:
+        action = self._find_action(request.subject)
+        state = self._sequence.said.state
+        done = self._success(request)
+        if action.only_stops and state not in action.interrupts:
+            return done
+        self._refuse_if_busy(action.while_busy)
+        self._about_to_act(request)
+        action.do()
+        if state in action.interrupts:
+            done.steps = self._sequence.interrupt()
+        elif action.state is not None:
+            done.steps = self._sequence.begin(action.state)
+        return done
+
+    def _find_action(self, name: str) -> Action:
+        if name not in self.actions:
+            near = difflib.get_close_matches(name[:100], self.actions, n=1)
+            hint = f", perhaps {near[0]!r}" if near else ""
+            raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, f"this microscope has no action {name[:100]!r}{hint}")
+        if name in self._driver.lacking:
+            raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, f"{name}: {self._driver.lacking[name]}")
+        return self.actions[name]
+
+    def _refuse_if_busy(self, allowed: bool) -> None:
+        state = self._sequence.said.state
+        if state is not ScopeState.FREE and not allowed:
+            raise Refused(ControlResponse.NOT_FREE, f"the microscope is not free: SS_{state.name}")
+
+    def _added_actions(self, given: Mapping[str, Any]) -> dict[str, Action]:
+        added = {}
+        for name, what in given.items():
+            where = f"actions.{name}"
+            is_table = isinstance(what, Mapping) and set(what) <= {"set", "command", "for"} and len(what) > 0
+            if not is_table or set(what) == {"for"} or not isinstance(what.get("set", {}), Mapping):
+                hint = '{ set = { "<parameter>" = <value> }, command = "<text>", for = "<time>" }: at least one of both'
+                raise ConfigError(f"{what!r} is not an action", where=where, hint=hint)
+            values = self._driver.table.written(what.get("set", {}), where=where)
+            command = str(what["command"]) if "command" in what else None
+            for_s = _duration_s(what["for"], f"{where}.for") if "for" in what else None
+            moves = ScopeState.MOVING if MOVES & values.keys() else None
+            state = moves if for_s is None else state_for(values)
+            added[name] = Action(name, partial(self._do, values, command, for_s), state)
+        return added
+
+    def _do(self, values: Mapping[str, Value], command: str | None, for_s: float | None) -> None:
+        """Do an action of the experiment file; the request behind it was written down before it began."""
+        if for_s is not None:
+            self._temporary.begin(values, for_s)
+        elif values:
+            apply(self._driver, values)
+        if command is not None:
+            self._driver.command(command)
+
+
+def _duration_s(given: Any, where: str) -> float:
+    try:
+        number, unit = units.parse_quantity(given) if isinstance(given, str) else (float(given), "")
+        found = units.convert(number, unit or "s", "s")
+    except (AfspmError, ValueError, TypeError) as error:
+        raise ConfigError(f"{given!r} is no duration: {error}", where=where) from error
+    if not 0.0 < found < math.inf:
+        raise ConfigError(f"{given!r} is no duration", where=where, hint="more than 0 s")
+    return found

@@ -1,0 +1,113 @@
+"""The connection to the controller: made, lost, and tried again."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+from afspm.clock import Clock
+from afspm.errors import AfspmError, ConfigError
+from afspm.translator.driver import LOST, ControllerLost, Driver
+from afspm.translator.emulated_controller import EmulatedController
+
+RETRY_S = 1.0
+_STARTUP_S = 2.0
+"""Real time in which a controller that is started together with its translator (an emulated one) may be missing: until
+then it is looked for every `_STARTUP_RETRY_S`, and nothing is logged."""
+_STARTUP_RETRY_S = 0.1
+
+
+class Connection:
+    """Connects a driver to its controller, and decides what says that the controller is lost.
+
+    Args:
+        controller: the emulator of this run, in whose place no other controller is ever reached; None: the driver
+            knows where its controller is.
+        on_lost: called when the loss is to be published.
+
+    Attributes:
+        stands: True while the controller is connected.
+        why_lost: the reason of the last loss.
+    """
+
+    def __init__(
+        self,
+        driver: Driver,
+        controller: EmulatedController | None,
+        clock: Clock,
+        log: logging.Logger,
+        on_lost: Callable[[], None],
+    ) -> None:
+        self._driver = driver
+        self._controller = controller
+        self._clock = clock
+        self._log = log
+        self._on_lost = on_lost
+        self.stands = False
+        self.why_lost = self._logged = ""
+        self._ever_stood = self._loss_published = False
+        self._retry_at_s = 0.0
+        self._began_s = clock.monotonic_s()
+
+    def establish(self) -> bool:
+        """Connect if it is time to try. Return True if the connection stands anew."""
+        if self._clock.monotonic_s() < self._retry_at_s:
+            return False
+        self.reach()
+        self.stands = self._ever_stood = True
+        if self._logged:
+            self._logged = ""
+            self._log.info("the controller answers")
+        return True
+
+    def reach(self) -> None:
+        """Connect at once, unless connected. Raises what says that the controller is lost."""
+        if self.stands:
+            return
+        if self._controller is None:
+            self._driver.connect()
+        else:
+            self._controller.reach(self._driver)
+
+    def require(self) -> None:
+        """Raise ControllerLost unless connected."""
+        if not self.stands:
+            raise ControllerLost(f"it is being looked for: {self.why_lost}")
+
+    def wait_s(self) -> float:
+        """Return the real seconds until the next attempt to connect."""
+        return max(0.0, self._retry_at_s - self._clock.monotonic_s())
+
+    def guarded(self, do: Callable[[], None]) -> bool:
+        """Return True if that could be done; if not, the controller is lost, or says what can't be.
+
+        Raises:
+            ConfigError: the controller can never be connected to with these settings.
+        """
+        try:
+            do()
+            return True
+        except ConfigError as error:
+            if not self._ever_stood:
+                raise
+            self.lose(error)
+        except (*LOST, AfspmError) as error:
+            self.lose(error)
+        except Exception as error:  # whatever a controller says, its translator lives on
+            self._log.debug("while looking at the controller", exc_info=True)
+            self.lose(error)
+        return False
+
+    def lose(self, error: Exception) -> None:
+        """Note the loss, and publish and log it once."""
+        now_s = self._clock.monotonic_s()
+        starts = isinstance(error, LOST) and not self._ever_stood and now_s - self._began_s < _STARTUP_S
+        self._retry_at_s = now_s + (_STARTUP_RETRY_S if starts else RETRY_S)
+        stood, self.stands = self.stands, False
+        self.why_lost = str(error) if isinstance(error, AfspmError | OSError) else f"{type(error).__name__}: {error}"
+        if not starts and (stood or self.why_lost != self._logged):
+            self._logged = self.why_lost
+            self._log.error("lost contact with the controller: %s; retrying", self._logged)
+        if stood or not self._loss_published:
+            self._loss_published = True
+            self._on_lost()

@@ -1,0 +1,199 @@
+"""Watches the controller and publishes what changes at it, whoever changed it."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Sequence
+from contextlib import nullcontext
+
+from afspm import wire
+from afspm.errors import AfspmError
+from afspm.model import ScopeState, ScopeStatus, names
+from afspm.translator import settings
+from afspm.translator.driver import LOST, MEASURING, Driver
+from afspm.translator.live_lines import LiveLines
+from afspm.translator.outbox import Outbox
+from afspm.translator.parameters import Value
+from afspm.translator.polling import AdaptivePolling
+from afspm.translator.safe_exit import FeedbackWatch
+from afspm.translator.sequence import DiscardResults, LogError, PublishResults, PublishStatus, SequenceStep
+from afspm.translator.state import TranslatorState
+from afspm.translator.temporary_settings import TemporarySettings
+from afspm.transport.port import ServerPort
+
+
+class Observer:
+    """Reads values, status and results of the controller, and publishes them in order.
+
+    Attributes:
+        values: in force at the last look.
+    """
+
+    def __init__(
+        self,
+        driver: Driver,
+        port: ServerPort,
+        state: TranslatorState,
+        temporary: TemporarySettings,
+        feedback: FeedbackWatch,
+        log: logging.Logger,
+    ) -> None:
+        self._driver = driver
+        self._port = port
+        self._clock = port.clock
+        self._state = state
+        self._temporary = temporary
+        self._feedback = feedback
+        self._log = log
+        self._outbox = Outbox(driver, state.kept["outbox"], state.stamp, log)
+        self._polling = AdaptivePolling(driver.poll_period_s, driver.eager_poll_s)
+        self._live = LiveLines(driver)
+        self.values: dict[str, Value] = {}
+        self._polled_for = ScopeState.UNDEFINED
+        self._all_at_s = 0.0
+        self._replayed = False
+
+    def begin(self) -> None:
+        """Publish everything in force, once connected; after a restart the last results before."""
+        if not self._replayed:
+            self._replayed = True
+            for packet in self._outbox.start():
+                self._port.publish(*packet)
+            self._state.save()
+        self._temporary.end()  # before a kill, or while the controller was lost, nobody could
+        self._take_in(self._read())
+        self.publish_all()
+
+    def look(self) -> None:
+        """See what has changed at the controller and publish it."""
+        said = self._state.sequence.said
+        self._temporary.end_if_due()
+        if self._clock.monotonic_s() >= self._all_at_s:
+            self.observe()
+        elif (status := self._status()) != said:
+            # what ends a measurement changes nothing of what is in force; what else happens, may
+            self.observe(values=said.state not in MEASURING, status=status)
+        for name, payload in self._live.look(self._clock.now_s()):
+            self._port.publish(name, payload, self._state.stamp()[0], keep=False)
+
+    def wait_s(self) -> float:
+        """Return the real seconds until the controller should be looked at again."""
+        real_now_s, now_s = self._clock.monotonic_s(), self._clock.now_s()
+        wait_s = min(self._polling.wait_s(real_now_s), self._all_at_s - real_now_s)
+        sequence_s = self._state.sequence.deadline_s()
+        for at_s in (self._driver.next_change_s(), sequence_s, self._live.due_s, self._temporary.until_s):
+            if at_s is not None:
+                # a change that should have been and was not seen yet is looked for eagerly, and not without a break
+                until_s = self._clock.real_s(at_s - now_s)
+                wait_s = min(wait_s, until_s if until_s > 0.0 else self._driver.eager_poll_s)
+        return max(0.0, wait_s)
+
+    def observe(self, announce: Sequence[str] = (), *, values: bool = True, status: ScopeStatus | None = None) -> None:
+        """Publish what is new.
+
+        Args:
+            announce: messages to publish even if nothing in them changed.
+            values: False leaves out what is in force, which takes a question for each parameter.
+            status: as it was just seen, since a driver reports only once that something was interrupted; None: ask.
+        """
+        if values:
+            self._observe_values(announce)
+        # the state first: a result that comes in between then waits for the next look, and is not lost
+        status = self._status() if status is None else status
+        is_over = self._state.sequence.said.state in MEASURING and status.state not in MEASURING
+        if is_over:
+            self._polling.over(self._clock.monotonic_s())
+        with self._clock.late() if is_over else nullcontext():
+            steps = self._state.sequence.observe(status, self._outbox.look(), self._clock.now_s())
+            if steps:
+                self._state.save()  # before anything is out: a restarted process must not tell an older story
+                self.play(steps)
+
+    def play(self, steps: Sequence[SequenceStep]) -> None:
+        """Do the steps of a status sequence."""
+        for step in steps:
+            if isinstance(step, PublishStatus):
+                self.publish(step.status)
+                self._poll_for(step.status.state)
+            elif isinstance(step, PublishResults):
+                packets = self._outbox.take()
+                self._state.save()  # a restart then publishes the same again, at the same times, and not anew
+                for packet in packets:
+                    self._port.publish(*packet)
+            elif isinstance(step, DiscardResults):
+                self._outbox.discard()
+                self._state.save()
+            elif isinstance(step, LogError):
+                self._log.error("%s", step.text)
+
+    def publish_all(self) -> None:
+        """Publish everything in force, for a scheduler that has just connected."""
+        for thing in settings.messages(self.values).values():
+            self.publish(thing)
+        said = self._state.sequence.said
+        if said.state is not ScopeState.UNDEFINED:
+            self.publish(said)
+        if said.state in MEASURING and self._polled_for not in MEASURING:  # since when is not known: it may end soon
+            self._polled_for = said.state
+            self._polling.began(object(), self._clock.monotonic_s())
+
+    def publish(self, thing: settings.Published | ScopeStatus) -> None:
+        """Publish a message."""
+        name, payload = wire.encode(thing)
+        self._port.publish(name, payload, self._state.stamp()[0])
+
+    def _status(self) -> ScopeStatus:
+        """Return the state of the microscope, which is not asked while something is in force for a while."""
+        return self._temporary.status or self._driver.status()
+
+    def _observe_values(self, announce: Sequence[str]) -> None:
+        values = self._read()
+        before = settings.messages(self.values)
+        self._take_in(values)
+        for name, thing in settings.messages(values).items():
+            if name in announce or before.get(name) != thing:
+                self.publish(thing)
+        wait_s, next_s = self._driver.poll_period_s, self._driver.next_change_s()
+        if next_s is not None:
+            wait_s = min(wait_s, max(0.0, self._clock.real_s(next_s - self._clock.now_s())))
+        self._all_at_s = self._clock.monotonic_s() + wait_s
+
+    def _read(self) -> dict[str, Value]:
+        """Return what is in force; differences below the controller's precision are none."""
+        table, old = self._driver.table, self.values
+        values = self._driver.in_force(settings.watched(table))
+        return {
+            name: old[name] if name in old and table[name].same(old[name], value) else value
+            for name, value in values.items()
+        }
+
+    def _take_in(self, values: dict[str, Value]) -> None:
+        self.values = values
+        if self._feedback.saw(settings.feedback(values).on):
+            self._state.save()
+
+    def _poll_for(self, state: ScopeState) -> None:
+        """Poll as often as the state asks for."""
+        before, self._polled_for, now_s = self._polled_for, state, self._clock.monotonic_s()
+        if state is ScopeState.SCANNING:
+            self._live.begin(self._clock.now_ns())
+        else:
+            self._live.end()
+        if state in MEASURING:
+            lasts_s, extent = self._scan_s() if state is ScopeState.SCANNING else (None, ())
+            self._polling.began((state, *extent), now_s, lasts_s)
+        elif state in (ScopeState.FREE, ScopeState.UNDEFINED):
+            self._polling.ended(now_s, as_expected=state is ScopeState.FREE and before in MEASURING)
+        else:
+            self._polling.moved(now_s)
+
+    def _scan_s(self) -> tuple[float | None, tuple[Value, ...]]:
+        """Return the real seconds of the scan, if no time is lost at its edges, and the values they depend on."""
+        extent = tuple(self.values.get(name, 0.0) for name in settings.EXTENT)
+        with contextlib.suppress(*LOST, AfspmError, ArithmeticError):
+            if all(extent) and names.SCAN_SPEED in self._driver.table:
+                speed_m_s = float(self._driver.in_force([names.SCAN_SPEED])[names.SCAN_SPEED])
+                width_m, rows = float(extent[0]), float(extent[1])
+                return self._clock.real_s(2.0 * width_m * rows / speed_m_s), (*extent, speed_m_s)
+        return None, extent

@@ -1,0 +1,73 @@
+"""Files that afspm writes where a controller saves none: one per scan with all its channels, one per spectrum.
+
+The simulated microscope saves them, and drivers save what they fetched. `afspm.files.simulator` reads them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import numpy as np
+
+from afspm.files import netcdf, simulator
+from afspm.files.netcdf import Attributes, Variable
+from afspm.model import Region, Spectrum
+
+
+@dataclass(frozen=True)
+class FileFacts:
+    """The facts of a file besides its values.
+
+    Attributes:
+        time_ns: when it was finished.
+        attributes: everything that was in force, for a reader of the file.
+    """
+
+    time_ns: int
+    attributes: Attributes
+
+
+def encode_scan(region: Region, channels: Mapping[str, tuple[str, np.ndarray]], facts: FileFacts) -> bytes:
+    """Return a scan file: a variable over (y, x) per channel; x and y are those of the frame before it was turned."""
+    rows, columns = next(iter(channels.values()))[1].shape
+    (left, low), (width, height) = region.top_left_m, region.size_m
+    variables = {
+        "y": Variable(("y",), np.linspace(low, low + height, rows), {"units": "m"}),
+        "x": Variable(("x",), np.linspace(left, left + width, columns), {"units": "m"}),
+    }
+    for channel, (unit, values) in channels.items():
+        attributes: Attributes = {"long_name": channel, "units": unit}
+        variables[_identifier(channel)] = Variable(("y", "x"), values, attributes)
+    where = {
+        "region_center_x_m": region.center_m[0],
+        "region_center_y_m": region.center_m[1],
+        "region_size_x_m": region.size_m[0],
+        "region_size_y_m": region.size_m[1],
+        "region_angle_rad": region.angle_rad,
+    }
+    return netcdf.encoded(variables, _header("scan", facts) | where | dict(facts.attributes))
+
+
+def encode_spectrum(spectrum: Spectrum, facts: FileFacts) -> bytes:
+    """Return a spectrum file: a variable over (point) per measured one, in their order."""
+    variables = {}
+    for number, (name, unit) in enumerate(zip(spectrum.names, spectrum.units, strict=True)):
+        attributes: Attributes = {"long_name": name, "units": unit}
+        variables[_identifier(name)] = Variable(("point",), spectrum.values[:, number], attributes)
+    where: dict[str, str | float] = {"kind": spectrum.kind}
+    if spectrum.position_m is not None:
+        where |= {"position_x_m": spectrum.position_m[0], "position_y_m": spectrum.position_m[1]}
+    return netcdf.encoded(variables, _header("spectrum", facts) | where | dict(facts.attributes))
+
+
+def _header(content: str, facts: FileFacts) -> dict[str, str | float]:
+    # as text: a float64 has no room for nanoseconds since 1970
+    when = datetime.fromtimestamp(facts.time_ns / 1e9, UTC).isoformat()
+    return {"Conventions": simulator.CONVENTIONS, "content": content, "time": when, "time_ns": str(facts.time_ns)}
+
+
+def _identifier(name: str) -> str:
+    """Return a name that every reader of the format takes; the real one is the attribute `long_name`."""
+    return "".join(c if c.isascii() and c.isalnum() else "_" for c in name).lower()

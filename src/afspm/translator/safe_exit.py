@@ -1,0 +1,149 @@
+"""Sees to the tip when a run ends: nothing goes on measuring, and a tip without feedback is retracted."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Callable
+
+from afspm.clock import Clock
+from afspm.logic.watchdog import feedback_of
+from afspm.model import ControlRequest, Request, Response, ScopeState, names
+from afspm.translator.connection import RETRY_S, Connection
+from afspm.translator.driver import LOST
+from afspm.translator.state import Kept, TranslatorState
+from afspm.translator.temporary_settings import TemporarySettings
+
+_TIP_S = 8.0
+"""Real time in which the tip is tried to be retracted when the run is stopped: a controller may be lost just then, or
+refuse. A little less than `runtime.parent` leaves."""
+
+
+class FeedbackWatch:
+    """Remembers whether a request, rather than a person at the panel, has switched the feedback off.
+
+    Args:
+        kept: JSON values that outlive a kill.
+    """
+
+    def __init__(self, kept: Kept) -> None:
+        self._kept = kept
+
+    @property
+    def is_off(self) -> bool:
+        """True while the feedback is known to be switched off by a request."""
+        return bool(self._kept.get("feedback_off"))
+
+    @property
+    def in_danger(self) -> bool:
+        """True while the feedback is, or may be, switched off by a request."""
+        return self.is_off or bool(self._kept.get("may_have_switched"))
+
+    def saw(self, on: bool | None) -> bool:
+        """Note the feedback as it is now. Return True if a request was just seen to have switched it off."""
+        kept = self._kept
+        switched_off = on is False and bool(kept.get("feedback_was_on") and kept.get("may_have_switched"))
+        kept["feedback_off"] = on is False and (switched_off or self.is_off)
+        kept["feedback_was_on"], kept["may_have_switched"] = on, False
+        return switched_off
+
+    def may_switch(self, request: Request) -> bool:
+        """Note that a request is about to act. Return True if a kill must not make this be forgotten."""
+        affects = request.kind == ControlRequest.ACTION or feedback_of(request) is not None
+        in_doubt = affects and not self._kept.get("may_have_switched")
+        self._kept["may_have_switched"] = True
+        return in_doubt
+
+    def retracted(self) -> None:
+        """Note that the tip is away, and needs no feedback."""
+        self._kept["may_have_switched"] = self._kept["feedback_off"] = False
+
+
+class SafeExit:
+    """Stops what is measuring, and retracts the tip where that is owed.
+
+    Args:
+        retracts: True if the tip is to be retracted when nobody is left to switch the feedback on again that a request
+            has switched off.
+        act: does an action that nobody has asked for.
+        observe: publishes what is new.
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        state: TranslatorState,
+        feedback: FeedbackWatch,
+        temporary: TemporarySettings,
+        clock: Clock,
+        log: logging.Logger,
+        *,
+        retracts: bool,
+        act: Callable[[str], Response],
+        observe: Callable[[], None],
+    ) -> None:
+        self._connection = connection
+        self._state = state
+        self._feedback = feedback
+        self._temporary = temporary
+        self._clock = clock
+        self._log = log
+        self._retracts = retracts
+        self._act = act
+        self._observe = observe
+
+    def is_owed(self) -> bool:
+        """Return True if the tip has to be retracted before the process ends. May be called from another thread."""
+        return self._retracts and self._feedback.in_danger
+
+    def end(self) -> None:
+        """End as the scheduler says, which has seen to the tip."""
+        with contextlib.suppress(*LOST):
+            self._stop_measuring()
+            self._temporary.end()
+
+    def leave(self, wait: Callable[[float], None]) -> None:
+        """End with nobody left. A feedback that is off at the panel is for the person at the panel.
+
+        Args:
+            wait: lets so many real seconds pass, and looks at the controller then.
+        """
+        self._connection.guarded(self._stop_measuring)
+        if self._connection.stands:
+            self._connection.guarded(self._temporary.end)
+        until_s = self._clock.monotonic_s() + _TIP_S
+        while self.is_owed():
+            off = "off" if self._feedback.is_off else "perhaps off"
+            why_not = self._retracted() if off == "off" else f"it is not known: {self._connection.why_lost}"
+            if not why_not:
+                self._log.warning("the run is stopped with the feedback off: the tip is retracted")
+                return
+            if self._clock.monotonic_s() >= until_s:
+                told = "the run is stopped with the feedback %s, and the tip can't be retracted: %s"
+                self._log.critical(told, off, why_not)
+                return
+            wait(RETRY_S)
+
+    def _retracted(self) -> str:
+        """Return why the tip can't be retracted; empty: it is."""
+        answered: list[Response] = []
+        self._connection.guarded(lambda: answered.append(self._retract()))
+        if not answered:
+            return self._connection.why_lost
+        response = answered[0]
+        return "" if response.ok else response.reason or str(response.code)
+
+    def _retract(self) -> Response:
+        self._connection.reach()
+        response = self._act(names.RETRACT)
+        self._state.save()
+        return response
+
+    def _stop_measuring(self) -> None:
+        """Stop a measurement: the tip does not go on scanning with nobody there."""
+        said = self._state.sequence.said.state
+        stop = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}.get(said)
+        if stop is not None and self._connection.stands:
+            self._act(stop)
+            self._observe()
+            self._state.save()

@@ -1,0 +1,111 @@
+"""A TCP connection to a controller that answers one question after the other, and never speaks unasked."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Final, TypeVar
+
+from afspm.translator.driver import ControllerLost
+
+_AT_ONCE: Final = 1 << 20
+_SLOWEST_BYTES_PER_S: Final = 1e6
+
+T = TypeVar("T")
+
+
+class Receiver:
+    """The bytes that come in reply to one question, until its deadline."""
+
+    def __init__(self, connected: socket.socket, monotonic_s: Callable[[], float], until_s: float, what: str) -> None:
+        self._socket = connected
+        self._monotonic_s = monotonic_s
+        self._until_s = until_s
+        self._what = what
+
+    def some(self, most: int = _AT_ONCE, after: str = "some") -> bytes:
+        """Return at least one byte.
+
+        Raises:
+            TimeoutError: none came in time. ControllerLost: the connection was closed. OSError.
+        """
+        left_s = self._until_s - self._monotonic_s()
+        if left_s <= 0.0:
+            raise TimeoutError
+        self._socket.settimeout(left_s)
+        part = self._socket.recv(min(most, _AT_ONCE))
+        if not part:
+            raise ControllerLost(f"the connection was closed after {after} bytes of the reply to {self._what}")
+        return part
+
+    def exactly(self, size: int) -> bytearray:
+        """Return so many bytes; memory is taken for what has come, not for what was announced."""
+        self._until_s += size / _SLOWEST_BYTES_PER_S
+        received = bytearray()
+        while len(received) < size:
+            received += self.some(size - len(received), f"{len(received)} of {size}")
+        return received
+
+
+class TcpConnection:
+    """A connection, for one thread at a time but for `close`.
+
+    Whatever goes wrong on it, it is closed: a late answer must never be taken for that to the next question.
+
+    Args:
+        timeout_s: how long an answer may take, in real time.
+        monotonic_s: real time.
+        hints: what to look at where nobody listens, and where no answer comes.
+
+    Raises:
+        ControllerLost: nobody listens there.
+    """
+
+    def __init__(
+        self, address: tuple[str, int], timeout_s: float, monotonic_s: Callable[[], float], hints: tuple[str, str]
+    ) -> None:
+        self._timeout_s = timeout_s
+        self._monotonic_s = monotonic_s
+        self._silent_hint = hints[1]
+        self.where = f"{address[0]}:{address[1]}"
+        try:
+            self._socket = socket.create_connection(address, timeout_s)
+        except OSError as error:
+            raise ControllerLost(f"no connection: {error}", where=self.where, hint=hints[0]) from error
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def ask(self, what: str, message: bytes, read: Callable[[Receiver], T], *, longer_s: float = 0.0) -> T:
+        """Send a question, and return what `read` makes of the bytes of its answer.
+
+        Args:
+            what: is asked for, for messages.
+            longer_s: so much longer than usual may the answer take.
+
+        Raises:
+            ControllerLost: no answer, or none to be trusted; the connection is closed.
+        """
+        timeout_s = self._timeout_s + longer_s
+        receiver = Receiver(self._socket, self._monotonic_s, self._monotonic_s() + timeout_s, what)
+        try:
+            self._socket.settimeout(timeout_s)
+            self._socket.sendall(message)
+            return read(receiver)
+        except TimeoutError as error:
+            self.close()
+            told = f"no answer to {what} within {timeout_s:g} s"
+            raise ControllerLost(told, where=self.where, hint=self._silent_hint) from error
+        except OSError as error:
+            self.close()
+            told = f"the connection was lost at {what}: {error}"
+            raise ControllerLost(told, where=self.where, hint=self._silent_hint) from error
+        except ControllerLost as error:
+            self.close()
+            error.where = error.where or self.where
+            raise
+
+    def close(self) -> None:
+        """Let go of it, from any thread: a thread that waits for an answer hears that the connection is lost."""
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()

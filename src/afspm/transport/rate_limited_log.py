@@ -1,0 +1,34 @@
+"""A log that lets a handful of warnings through and counts the rest: a flood must not fill the log."""
+
+from __future__ import annotations
+
+import logging
+
+from afspm.clock import Clock
+
+_BURST = 5
+_PERIOD_S = 10.0
+
+
+class RateLimitedLog:
+    """Passes on a few warnings every ten seconds, and says later how many it dropped."""
+
+    def __init__(self, log: logging.Logger, clock: Clock) -> None:
+        self._log = log
+        self._clock = clock
+        self._since_s = clock.monotonic_s()
+        self._passed = 0
+        self._dropped = 0
+
+    def warning(self, text: str) -> None:
+        """Log `text`, or count it as one of many."""
+        now_s = self._clock.monotonic_s()
+        if now_s - self._since_s > _PERIOD_S:
+            if self._dropped:
+                self._log.warning("dropped %d more warnings of this kind", self._dropped)
+            self._since_s, self._passed, self._dropped = now_s, 0, 0
+        if self._passed < _BURST:
+            self._passed += 1
+            self._log.warning("%s", text)
+        else:
+            self._dropped += 1
