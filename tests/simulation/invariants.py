@@ -21,6 +21,7 @@ from afspm.logic.events import (
     SaveState,
 )
 from afspm.logic.settings import SchedulerSettings
+from afspm.logic.state import SavedState
 from afspm.model import (
     ControlMode,
     ControlRequest,
@@ -85,7 +86,7 @@ class Invariants:
         self._life = 0
         self._checked: ArbitrationState | None = None
         self._saved_control: ArbitrationState | None = None
-        self._saved_state: dict[str, bytes] | None = None
+        self._saved_state: SavedState | None = None
         self.written = Written(timeline, codec, self._must, NAME_TAKEN)
         microscope.on_executed = self.executed
 
@@ -199,10 +200,8 @@ class Invariants:
         if host.disk.stale or (host.core.control is self._saved_control and host.disk.state is self._saved_state):
             return
         self._saved_control, self._saved_state = host.core.control, host.disk.state
-        control = host.core.control.to_dict()
-        saved = host.disk.saved_part("control")
-        if saved is None:
-            saved = {"mode": 2, "holder": None, "solving": 0, "problems": {}, "ended": False}
+        control, state = host.core.control, host.disk.state
+        saved = ArbitrationState() if state is None else state.control
         self._must(saved == control, f"told before it was saved: {control}, saved {saved}")
 
     # --- requests ---

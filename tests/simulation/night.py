@@ -10,7 +10,7 @@ from afspm.logic.arbitration import Cause, RoleTable, Rules
 from afspm.logic.envelopes import Envelopes
 from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.logic.microscope_status import FEEDBACK_OFF
-from afspm.logic.scheduler_core import SchedulerSettings
+from afspm.logic.settings import SchedulerSettings
 from afspm.logic.supervision.child import ChildPolicy
 from afspm.logic.supervision.liveness import LivenessPolicy
 from afspm.logic.supervision.restart import RestartPolicy

@@ -7,26 +7,18 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import typer
 
 if TYPE_CHECKING:
-    from afspm.cli.telling import About
+    from afspm.cli.status_text import RunDescription
     from afspm.client.follower import Follower
     from afspm.client.scope import Scope
 
 NOT_RUNNING = 3
 """The exit code where nothing runs."""
 TERMINAL = "terminal"
-
-Where = Annotated[
-    Path,
-    typer.Argument(
-        metavar="RUN|FILE",
-        help="The folder of a run, a folder of runs (its newest is meant), or the experiment file.",
-    ),
-]
 
 
 def person() -> str:
@@ -68,13 +60,13 @@ def acting(where: Path) -> Iterator[Scope]:
         yield scope
 
 
-def about(follower: Follower, *, fancy: bool = True) -> About:
-    """What is known of the run besides what it publishes."""
-    from afspm.cli.telling import About
+def describe(follower: Follower, *, fancy: bool = True) -> RunDescription:
+    """Return what is known of the run besides what it publishes."""
+    from afspm.cli.status_text import RunDescription
     from afspm.record.run_json import read_run_json
 
     clock = follower.launch.clock
-    return About(
+    return RunDescription(
         name=str(read_run_json(follower.folder).get("name", follower.folder.name)),
         folder=str(follower.folder),
         simulated=follower.launch.simulated,
@@ -85,7 +77,7 @@ def about(follower: Follower, *, fancy: bool = True) -> About:
 
 
 def can_show_blocks() -> bool:
-    """Whether what the bars are made of arrives at the terminal."""
+    """Return whether what the bars are made of arrives at the terminal."""
     try:
         "█░".encode(sys.stdout.encoding or "ascii")
     except (UnicodeEncodeError, LookupError):
@@ -100,7 +92,7 @@ def say_nothing_runs(why: str) -> NoReturn:
 
 
 def _running(where: Path) -> Path:
-    """The folder of the run that is meant, as far as it is not known to have ended."""
+    """Return the folder of the run that is meant, as far as it is not known to have ended."""
     from afspm.client.connect import find_run
     from afspm.errors import FileError
     from afspm.record.run_json import ENDED, read_run_json

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from afspm.dashboard.words import position
 from afspm.drawing.curves import Array, thinned
-from afspm.formatting import quantity, scale, time_of_day
+from afspm.formatting import quantity, scale, time_of_day, typeset_position
 from afspm.model import Spectrum
 from afspm.record.overview import DriftPoint
 
@@ -57,7 +56,7 @@ def _drift_words(point: DriftPoint) -> str:
         return f'<p class="alarm">The sample is lost: {escape(point.reason) or "no scan fits"}</p>'
     how = "corrected" if point.correcting else "not corrected yet"
     word = "" if point.matched else f"; the last scan did not fit ({escape(point.reason)})"
-    return f"<p>{position(point.translation_m)}, moving at {quantity(speed, 'm')}/min, {how}{word}</p>"
+    return f"<p>{typeset_position(point.translation_m)}, moving at {quantity(speed, 'm')}/min, {how}{word}</p>"
 
 
 def spectrum_chart(spectra: Sequence[tuple[int, Spectrum]], variable: str) -> Chart:
@@ -79,7 +78,7 @@ def spectrum_chart(spectra: Sequence[tuple[int, Spectrum]], variable: str) -> Ch
     series = [_line(s.values[:, 0] * across, s[variable] * up, colour) for s, colour in drawn]
     for one in series[:-1]:
         one["lineStyle"]["opacity"] = 0.4
-    where = "" if last.position_m is None else f" at {position(last.position_m)}"
+    where = "" if last.position_m is None else f" at {typeset_position(last.position_m)}"
     words = f"<p>{escape(last.kind or 'Spectrum')}{where}, {time_of_day(time_ns)}</p>"
     axis = {"type": "value", "scale": True, "name": _named(last.names[0], unit_across)}
     return Chart(words, _options(series, axis, _named(variable, unit_up)))

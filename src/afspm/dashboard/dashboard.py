@@ -68,8 +68,8 @@ class Dashboard(Component):
         return super().run_process(context)
 
     def on_start(self) -> None:
+        from afspm.dashboard.actions import Steering
         from afspm.dashboard.application import application
-        from afspm.dashboard.steering import Steering
 
         launch = self._context.launch
         state_dir = Path(launch.state_dir) if launch.state_dir else None

@@ -15,10 +15,10 @@ from fastapi import Depends, FastAPI, Response
 from fastapi.responses import PlainTextResponse
 
 from afspm.dashboard.archive import Archive
-from afspm.dashboard.pictures import Look, Picture, PictureCache, number_or_none, profile
-from afspm.dashboard.signals import Bell
-from afspm.dashboard.watch import Watch
+from afspm.dashboard.pictures import Look, Picture, PictureCache, number_or_none
+from afspm.dashboard.watch import Bell, Watch
 from afspm.drawing.palette import LEVELS, PALETTES
+from afspm.drawing.profile import profile
 from afspm.drawing.raster import png
 
 POLL_S = 20.0  # then the browser asks anew: what is in between may close connections that say nothing for longer
@@ -94,7 +94,7 @@ class Live:
         drawn = await asyncio.to_thread(self._drawn, asked)
         if drawn is None:
             return {"distances_m": [], "values": [], "unit": ""}
-        distances_m, values = profile(drawn.values, drawn.frame.region, (x0, y0), (x1, y1))
+        distances_m, values = profile(drawn.values, drawn.frame.region.size_m, (x0, y0), (x1, y1))
         return {
             "distances_m": distances_m.tolist(),
             "values": [number_or_none(value) for value in values.tolist()],

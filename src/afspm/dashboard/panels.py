@@ -12,7 +12,7 @@ from afspm.clock import NS_PER_S
 from afspm.dashboard.charts import Chart, spectrum_chart
 from afspm.dashboard.content import NOT_HEARD_OF
 from afspm.dashboard.watch import Watch
-from afspm.dashboard.words import colour_class
+from afspm.drawing.timeline import tint_class
 from afspm.formatting import duration_text, time_of_day
 from afspm.model import LogLine, ProcessCondition, ProcessState
 
@@ -127,7 +127,7 @@ def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: 
         return '<p class="nothing">No such line.</p>'
     rows = "".join(
         f'<li class="level-{escape(line.level.lower())}"><time>{time_of_day(line.time_ns)}</time>'
-        f'<b class="{colour_class(line.name)}">{escape(line.name)}</b><i>{escape(line.level)}</i>'
+        f'<b class="{tint_class(line.name)}">{escape(line.name)}</b><i>{escape(line.level)}</i>'
         f"<span>{escape(line.text)}</span></li>"
         for line in wanted[: -MOST_LINES - 1 : -1]
     )

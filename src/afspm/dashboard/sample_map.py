@@ -8,9 +8,8 @@ from html import escape
 
 import numpy as np
 
-from afspm.dashboard.words import area
 from afspm.drawing.curves import Array, round_ticks
-from afspm.formatting import scale, time_of_day
+from afspm.formatting import scale, time_of_day, typeset_area
 from afspm.model import Region
 from afspm.record.overview import ScanSummary, SpectrumSummary
 
@@ -154,7 +153,7 @@ def _scan(frame: _MapFrame, one: ScanSummary, count: int, shown_ns: int | None) 
     often = f", {count} scans" if count > 1 else ""
     cut = ", interrupted" if one.interrupted else ""
     who = f" by {one.holder}" if one.holder else ""
-    title = f"{area(one.region.size_m)} at {time_of_day(one.time_ns)}{who}{often}{cut}"
+    title = f"{typeset_area(one.region.size_m)} at {time_of_day(one.time_ns)}{who}{often}{cut}"
     style = "scan" + (" cut" if one.interrupted else "") + (" shown" if shown_ns == one.time_ns else "")
     data = f' data-time="{one.time_ns}" data-channel="{escape(one.channel)}"'
     return _polygon(frame, one.region.corners_m(), style, f"<title>{escape(title)}</title>", data)

@@ -1,4 +1,4 @@
-"""What is spoken about: scans, spectra, regions, states, requests. Frozen, in SI units, with numpy alone."""
+"""The things that messages are about: scans, spectra, regions, states, requests. Frozen, in SI, numpy alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is published: a packet, and what can be known of it without reading its values."""
+"""A published packet, and its header, which is known without reading its values."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Packet:
 
 @dataclass(frozen=True, slots=True)
 class PacketHeader:
-    """What the envelope of a packet may depend on.
+    """The header of a packet, on which its envelope may depend.
 
     Attributes:
         message: the name of the message, e.g. "Scan2d".

@@ -14,7 +14,8 @@ from afspm.clock import Clock
 from afspm.errors import FileError
 from afspm.exit_codes import ExitCode
 from afspm.logic.fencing import Epoch
-from afspm.logic.scheduler_core import SchedulerCore, SchedulerSettings
+from afspm.logic.scheduler_core import SchedulerCore
+from afspm.logic.settings import SchedulerSettings
 from afspm.model import ProblemNames
 from afspm.scheduler.journal import Journal
 from afspm.scheduler.settings import scheduler_settings
@@ -143,9 +144,8 @@ def _epoch(context: SchedulerContext) -> bytes:
 
 def _restore(core: Core, state: StateFile, journal: Journal) -> None:
     """What was in force before a restart."""
-    saved = state.load()
     try:
-        if saved:
+        if (saved := state.load()) is not None:
             core.restore(saved)
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(

@@ -6,7 +6,7 @@ import contextlib
 import logging
 import math
 from collections.abc import Hashable, Iterable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from afspm import wire
 from afspm.errors import WireError
@@ -28,11 +28,12 @@ from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
 from afspm.transport.translator_link import LinkReply, LinkUp
-from afspm.wire.frames import LONGEST_ID
+from afspm.wire.protocol import LONGEST_ID
 
 if TYPE_CHECKING:
     from afspm.clock import Clock
     from afspm.logic.arbitration import ArbitrationState
+    from afspm.logic.state import SavedState
     from afspm.scheduler.journal import Journal
     from afspm.scheduler.state_file import StateFile
     from afspm.transport.rate_limited_log import RateLimitedLog
@@ -53,7 +54,7 @@ class Core(Protocol):
     def step(self, event: events.Input, now_s: float, now_ns: int) -> list[events.Effect]: ...
     def deadline_s(self) -> float | None: ...
     def deadline_ns(self) -> int | None: ...
-    def restore(self, state: dict[str, Any]) -> None: ...
+    def restore(self, saved: SavedState) -> None: ...
     def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None: ...
     def cached(self) -> Iterable[tuple[Packet, int | None]]: ...
     @property
@@ -84,7 +85,7 @@ class SchedulerShell:
         self._journal = journal
         self._disk = DiskThread()
         self._told = OutageLog("what is told now would be lost in a crash", log)
-        self._problems: frozenset[str] = frozenset()
+        self._problems: frozenset[int] = frozenset()
         self._warnings = warnings
         self._log = log
         self._replay: tuple[Packet, ...] = ()
@@ -335,8 +336,8 @@ class SchedulerShell:
             if saved is not None and self._has_new_problems(saved.state):
                 SYNCER.now(DEADLINE_S)
 
-    def _has_new_problems(self, state: dict[str, Any]) -> bool:
-        before, self._problems = self._problems, frozenset(state["control"]["problems"])
+    def _has_new_problems(self, state: SavedState) -> bool:
+        before, self._problems = self._problems, frozenset(state.control.problems)
         return not self._problems <= before
 
 

@@ -55,7 +55,7 @@ class ResumableRun:
     added: tuple[str, ...] = ()
 
     def with_overlay(self, file: Path) -> ResumableRun:
-        """The same run, which goes on with what the file adds."""
+        """Return the same run, which goes on with what the file adds."""
         experiment = load_expanded(self.folder / EXPERIMENT_FILE, self.homes, file)
         before = self.experiment.component_names
         added = [name for name in experiment.component_names if name not in before]
@@ -145,7 +145,7 @@ def last_seen_ns(folder: Path) -> int:
 
 
 def _wait_until_gone(facts: dict[str, Any], folder: Path) -> None:
-    """Whoever lost his parent ends within a moment; two of one name must not be at work in one folder.
+    """Wait until processes that lost their parent have ended: two of one name must not share a folder.
 
     Raises:
         FileError: somebody stays.
@@ -167,7 +167,7 @@ def _wait_until_gone(facts: dict[str, Any], folder: Path) -> None:
 
 
 def _is_gone(port: int, until_s: float) -> bool:
-    """Whether nobody listens on a port any more; a connection that is closed says that it is so, or soon will be."""
+    """Return whether nobody listens on a port any more; a connection that is closed says so."""
     clock = ExperimentClock.real()
     while (left_s := until_s - clock.monotonic_s()) > 0.0:
         try:
@@ -205,13 +205,13 @@ def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> Non
 
 
 def _whole(experiment: Experiment) -> dict[str, Any]:
-    """What is in force, defaults too, whoever wrote it down."""
+    """Return what is in force, defaults too, whoever wrote it down."""
     experiment.resolved  # noqa: B018  (adds what the file leaves open)
     return tomllib.loads(experiment.expanded(secrets=False))
 
 
 def differing(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Where two experiments differ: each section with its keys."""
+    """Return where two experiments differ: each section with its keys."""
     found = []
     for name in {**before, **now}:
         then, later = before.get(name), now.get(name)

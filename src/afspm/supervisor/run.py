@@ -41,7 +41,7 @@ CLOCK_FILE = "clock"
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How to run an experiment here and now, as far as the experiment file is not about it.
+    """Options of a run that the experiment file is not about.
 
     Attributes:
         runs: the folder of run folders.
@@ -61,7 +61,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What came of a run."""
+    """A run that is over."""
 
     folder: Path
     outcome: RunOutcome
@@ -143,7 +143,7 @@ def addresses_of(starts: Sequence[ProcessStart]) -> dict[str, str]:
 
 
 def facts_to_resume(experiment: Experiment, starts: Sequence[ProcessStart], options: RunOptions) -> dict[str, object]:
-    """What else run.json says, so that the run can be resumed with that file alone.
+    """Return what else run.json says, so that the run can be resumed with that file alone.
 
     There the recorder and others that go where the scheduler is are named like all the rest, and so are chosen by name.
     """
@@ -157,13 +157,13 @@ def facts_to_resume(experiment: Experiment, starts: Sequence[ProcessStart], opti
 
 
 def dry_run(experiment: Experiment, options: RunOptions = RunOptions()) -> list[ProcessStart]:
-    """What `run` would start, and nothing else. Raises as `run` does."""
+    """Return what `run` would start, and nothing else. Raises as `run` does."""
     experiment.require_valid()
     return _starts(experiment, options, _own(experiment, options), FreePorts())
 
 
 def run_facts(name: str, starts: Sequence[ProcessStart], common: RunIdentity) -> dict[str, object]:
-    """What run.json says: who is where, and with what launch line a script can join (`afspm.connect`)."""
+    """Return what run.json says: who is where, and with what launch line a script can join (`afspm.connect`)."""
     facts: dict[str, object] = {
         "name": name,
         RUN: common.run,
@@ -216,7 +216,7 @@ def _starts(
 
 
 def _own(experiment: Experiment, options: RunOptions) -> RunIdentity:
-    """What this part of the experiment would have by itself."""
+    """Return what this part of the experiment would have by itself."""
     simulated = experiment.simulated(options.only, options.without)
     clock, speed = experiment.clock(), options.speed
     if speed is not None and not experiment.resolved.simulated:
@@ -233,7 +233,7 @@ def _common(
     options: RunOptions,
     terminal: TextIO | None,
 ) -> RunIdentity:
-    """What the whole experiment has, of which perhaps only a part is started here: it is the scheduler's.
+    """Return what the whole experiment has, of which perhaps only a part is started here: it is the scheduler's.
 
     Raises:
         ConfigError: the file's time is a simulation's, and here it is not certain that the microscope is simulated.

@@ -1,4 +1,4 @@
-"""How a run ends: who is asked to when, who is killed when. Decisions only."""
+"""The end of a run: when processes are asked to end, killed and left. Decisions only."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LEAVE_AFTER_S = 3.0  # after being killed
 
 
 class EndReason(Enum):
-    """What ended a run."""
+    """The reason for which a run ended."""
 
     EXPERIMENT_ENDED = auto()
     ALL_DONE = auto()
@@ -30,7 +30,7 @@ class EndReason(Enum):
 
 
 class EndStep(Enum):
-    """What is to be done with those that still run."""
+    """The next step with processes that still run."""
 
     ASK = auto()
     """Close their stdin: they end cleanly."""
@@ -89,7 +89,7 @@ class RunEnd:
                 return None
 
     def step(self, now_s: float, *, busy: bool = False) -> tuple[RunEnd, EndStep | None]:
-        """What the time has come for, if anything, and the ending after it.
+        """Return what the time has come for, if anything, and the ending after it.
 
         Args:
             busy: somebody still works on a step, within what it declared: before they are asked, a component (a picture

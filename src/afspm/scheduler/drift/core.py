@@ -22,7 +22,9 @@ from afspm.logic.events import (
     TranslatorCaughtUp,
     TranslatorUp,
 )
-from afspm.logic.scheduler_core import SchedulerCore, SchedulerSettings
+from afspm.logic.scheduler_core import SchedulerCore
+from afspm.logic.settings import SchedulerSettings
+from afspm.logic.state import SavedState
 from afspm.model import (
     ControlRequest,
     ControlState,
@@ -152,11 +154,11 @@ class DriftCore:
     def deadline_ns(self) -> int | None:
         return self.core.deadline_ns()
 
-    def snapshot(self) -> dict[str, Any]:
+    def snapshot(self) -> SavedState:
         return self.core.snapshot()
 
-    def restore(self, state: dict[str, Any]) -> None:
-        self.core.restore(state)
+    def restore(self, saved: SavedState) -> None:
+        self.core.restore(saved)
         kept = self.frame.restored
         if kept:
             self.knowledge.restore(kept["knowledge"])

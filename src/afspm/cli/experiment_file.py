@@ -1,13 +1,14 @@
-"""`afspm check`: every error of an experiment file, before anything starts."""
+"""`afspm check`, `graph` and `keys`: what is done with an experiment file before anything starts."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from afspm.cli.arguments import Files
+from afspm.cli.arguments import Files, opt
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -68,9 +69,69 @@ def show(findings: Sequence[Finding], console: Console) -> None:
         console.print(line, soft_wrap=True)  # a wrapped line could not be clicked or searched
 
 
+def require_no_errors(experiment: Experiment) -> None:
+    """Show what is wrong or doubtful. Raises typer.Exit if something is wrong."""
+    findings = experiment.check()
+    if findings:
+        from rich.console import Console
+
+        show(findings, Console(stderr=True, highlight=False))
+    if any(finding.is_error for finding in findings):
+        raise typer.Exit(1)
+
+
 def _summary(experiment: Experiment, findings: Sequence[Finding]) -> str:
     errors = sum(finding.is_error for finding in findings)
     warnings = len(findings) - errors
     count = len(experiment.component_names)
     told = [f"{n} {word}{'s' if n != 1 else ''}" for n, word in ((errors, "error"), (warnings, "warning")) if n]
     return f"{experiment.name}: {count} process{'es' if count != 1 else ''}, {', '.join(told) or 'nothing wrong'}"
+
+
+def graph(
+    files: Files,
+    output: Annotated[Path | None, opt("The SVG file to write. Default: named as the experiment.", "--output", "-o")]
+    = None,
+) -> None:  # fmt: skip
+    """Draw the components, sockets and envelopes of an experiment as SVG."""
+    from afspm.errors import FileError
+    from afspm.experiment import load
+    from afspm.experiment.graph import draw
+
+    experiment = load(*files)
+    experiment.require_valid()
+    target = output or Path(f"{experiment.name}.svg")
+    try:
+        target.write_text(draw(experiment), encoding="utf-8")
+    except OSError as error:
+        raise FileError(f"the picture can't be written: {error.strerror or error}", where=str(target)) from error
+    typer.echo(target)
+
+
+def keys(
+    files: Files,
+    folder: Annotated[
+        Path | None, opt("Where to put them. Default: [security] keys of the file, else keys/ beside it.", "--folder")
+    ] = None,
+    also: Annotated[
+        list[str] | None, opt("A person who is to have a key. Repeatable.", "--also", metavar="NAME")
+    ] = None,
+) -> None:
+    """Make a key pair for each process of an experiment, for the supervisors, and for the people named.
+
+    Keys that are there already are left as they are. Copy public/ to every computer, and of private/ only the keys of
+    what runs there.
+    """
+    from afspm.experiment import load
+    from afspm.logic.supervisor_registry import SUPERVISOR
+    from afspm.transport.keys import generate
+
+    experiment = load(*files)
+    target = folder or experiment.keys_folder or experiment.folder / "keys"
+    written = generate(target, [*experiment.component_names, SUPERVISOR, *(also or ())])
+    for file in written:
+        typer.echo(file)
+    if not written:
+        typer.echo(f"all keys are there already, in {target}")
+    if experiment.keys_folder is None:
+        typer.echo(f'to use them: [security] keys = "{target.name}"')
