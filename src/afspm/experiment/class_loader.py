@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from afspm import plugins
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.known import SHORT_NAME_PACKAGES
 from afspm.experiment.parts import DECLARED_KEYS
@@ -89,10 +90,10 @@ def _is_from(folder: Path, name: str) -> bool:
 
 
 def full_path(name: str) -> str:
-    """Return a name without a module as the full path of our class of that name; a path with a module as it is.
+    """Return a name without a module as the full path of the class, of ours or of a plug-in; other paths as they are.
 
     Raises:
-        Unloadable: none of ours is called that.
+        Unloadable: there is no such class.
     """
     if "." in name:
         return name
@@ -106,6 +107,10 @@ def full_path(name: str) -> str:
             found = _attribute(module, name)
             return f"{found.__module__}.{found.__qualname__}"
         known += [n for n in offered if n[:1].isupper()]
+    for group in (plugins.COMPONENTS, plugins.DRIVERS):
+        if (path := plugins.class_path(group, name)) is not None:
+            return path
+        known += plugins.names(group)
     raise Unloadable(f"there is no ready-made class {name!r}", nearest(name, known) or 'write it as "module.Name"')
 
 
