@@ -297,7 +297,11 @@ class Driver(ABC):
             if asked:
                 group.write(asked)
         if left:
-            self.set({self.table[name].vendor: self.table[name].to_vendor(value) for name, value in left.items()})
+            self.write_rows(left)
+
+    def write_rows(self, values: Mapping[str, Value]) -> None:
+        """Set parameters that the table alone says how to set."""
+        self.set({self.table[name].vendor: self.table[name].to_vendor(value) for name, value in values.items()})
 
     def wait_for(self, condition: Callable[[], bool], at_most_s: float) -> bool:
         """Ask the controller until something holds, which it does with a delay. Return False after so long, real time.

@@ -123,6 +123,12 @@ def frame(values: Mapping[str, Value]) -> tuple[Region, tuple[int, int]]:
     return region, shape
 
 
+def frame_values(region: Region, shape: tuple[int, int]) -> dict[str, Value]:
+    """Return the values that describe a frame, by generic names, in SI: the reverse of `frame`."""
+    corner, size, (rows, columns) = region.top_left_m, region.size_m, shape
+    return dict(zip(FRAME, (*corner, *size, region.angle_rad, columns, rows), strict=True))
+
+
 def feedback(values: Mapping[str, Value]) -> Feedback:
     """The z feedback that values describe. Of a tip that is known to be withdrawn nobody is told that it is without
     feedback, which would be a danger at the sample."""

@@ -203,7 +203,6 @@ class Asylum(Driver):
 
     @action(names.STOP_SPEC)
     def stop_spec(self) -> None:
-        """Break the force curve off."""
         self._igor().do("DoForceFunc", "Reset")
         self._activity.stopped()
 

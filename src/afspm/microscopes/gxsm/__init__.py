@@ -20,8 +20,8 @@ from afspm.microscopes.gxsm.hardware import (
     recognised,
 )
 from afspm.microscopes.gxsm.link import Address, Asking, open_link
-from afspm.microscopes.gxsm.live import new_lines
 from afspm.microscopes.gxsm.result_files import SOON_S, GxsmFiles
+from afspm.microscopes.gxsm.scan_memory import new_lines
 from afspm.microscopes.gxsm.settings import (
     REFNAMES,
     FeedbackSwitch,
@@ -170,7 +170,6 @@ class Gxsm(Driver):
         }
 
     def close(self) -> None:
-        """Let go of the link. What was begun goes on."""
         if self._asking is not None:
             self._asking.close()
             self._asking = None
@@ -182,11 +181,9 @@ class Gxsm(Driver):
         return self._asking
 
     def status(self) -> ScopeStatus:
-        """What GXSM is doing now."""
         return self._activity.status()
 
     def next_change_s(self) -> float | None:
-        """When a move or the wait for files is over."""
         return self._activity.next_change_s()
 
     # --- parameters ---
@@ -221,11 +218,9 @@ class Gxsm(Driver):
     # --- results ---
 
     def results(self) -> Sequence[str]:
-        """The last scans and spectra that GXSM saved."""
         return self._files.results(self.clock.now_s())
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
-        """Read the files of one."""
         return self._files.load(result)
 
     def lines(self, start: int) -> Sequence[ScanLines]:
@@ -249,7 +244,6 @@ class Gxsm(Driver):
 
     @action(names.STOP_SCAN)
     def stop_scan(self) -> None:
-        """Break the scan off."""
         self._activity.stop_scan()
 
     @action(names.START_SPEC)
@@ -265,7 +259,6 @@ class Gxsm(Driver):
 
     @action(names.STOP_SPEC)
     def stop_spec(self) -> None:
-        """Break the spectrum off."""
         self._activity.stop_curve()
 
     @action(names.PULSE, state=ScopeState.BUSY_PARAM)

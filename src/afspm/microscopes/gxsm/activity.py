@@ -12,8 +12,8 @@ from afspm.microscopes.gxsm.errors import GxsmError
 from afspm.microscopes.gxsm.hardware import ABORT, STATUS, Doing, Hardware, decoded, execute
 from afspm.microscopes.gxsm.link import Asking
 from afspm.microscopes.gxsm.result_files import GxsmFiles, endings
+from afspm.microscopes.gxsm.scan_memory import Rows, is_unfinished, looked_at
 from afspm.microscopes.gxsm.settings import ScanFrame
-from afspm.microscopes.gxsm.staleness import Rows, is_unfinished, looked_at
 from afspm.model import Region, ScopeState, ScopeStatus
 from afspm.translator.result_files import SCAN, as_list
 

@@ -12,7 +12,7 @@ from afspm.clock import NS_PER_S
 from afspm.errors import AfspmError
 from afspm.files import read
 from afspm.files.content import FileContent
-from afspm.microscopes.gxsm.staleness import Rows
+from afspm.microscopes.gxsm.scan_memory import Rows
 from afspm.model import Region
 from afspm.translator.result_files import SCAN, Content, Entry, Printed, ResultFiles, as_region, lines_missing
 
