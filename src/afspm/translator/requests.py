@@ -173,7 +173,7 @@ class RequestOutcomes:
                 del self._kept[request_id]
 
     def outcome(self, request: Request) -> Response | None:
-        """How the request was answered before; None if it is new."""
+        """Return how the request was answered before; None if it is new."""
         entry = self._kept.get(request.id) if request.id else None
         if entry is None:
             return None

@@ -38,7 +38,7 @@ def generic(found: Mapping[str, float]) -> dict[str, Value]:
 
 
 def asylums(wanted: Mapping[str, Value], before: Mapping[str, Value]) -> dict[str, float]:
-    """What to set at Asylum for generic parameters that are wanted, given all of `NAMES` as they were.
+    """Return what to set at Asylum for generic parameters that are wanted, given all of `NAMES` as they were.
 
     All that depends on each other is set, as PV does none of what the panel does. Asylum scans by its ScanRate, so
     that is set to keep the speed when the width changes.

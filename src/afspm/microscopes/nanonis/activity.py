@@ -1,4 +1,4 @@
-"""What Nanonis is doing, from what both connections say of it."""
+"""The state of Nanonis, from what both connections say of it."""
 
 from __future__ import annotations
 
@@ -126,8 +126,10 @@ class Activity:
 
     @contextmanager
     def occupied(self, state: ScopeState, lasts_s: float) -> Iterator[None]:
-        """What is begun in the block takes so long, experiment time, which Nanonis itself does not tell: also where its
-        answer is lost, or the connection, or this process."""
+        """Note that what is begun in the block takes so long, experiment time, which Nanonis itself does not tell.
+
+        It holds also where its answer is lost, or the connection, or this process.
+        """
         self._kept["occupied"] = [state.name, self._clock.now_s() + lasts_s]
         try:
             yield
