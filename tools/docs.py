@@ -35,12 +35,12 @@ def state_diagram() -> str:
 
 def transition_table() -> str:
     lines = ["| a component … | when | it gets | and | because |", "| --- | --- | --- | --- | --- |"]
-    for row in arbitration.TABLE:
+    for event, row in [(event, row) for event, rows in arbitration.TABLE.items() for row in rows]:
         answer = "the translator's answer" if arbitration.ControlChange.FORWARD in row.do else "—"
         if row.response is not None:
             answer = f"`REP_{row.response.name}`"
         done = ", ".join(_done(do) for do in row.do if do is not arbitration.ControlChange.FORWARD) or "nothing changes"
-        lines.append(f"| {row.event.value} | {row.when.text} | {answer} | {done} | {row.why} |")
+        lines.append(f"| {event.value} | {row.when.text} | {answer} | {done} | {row.why} |")
     return "\n".join(lines) + "\n"
 
 

@@ -21,6 +21,7 @@ from afspm.logic.events import (
     SaveState,
 )
 from afspm.logic.settings import SchedulerSettings
+from afspm.logic.state import SavedState
 from afspm.model import (
     ControlMode,
     ControlRequest,
@@ -85,7 +86,7 @@ class Invariants:
         self._life = 0
         self._checked: ArbitrationState | None = None
         self._saved_control: ArbitrationState | None = None
-        self._saved_state: dict[str, bytes] | None = None
+        self._saved_state: SavedState | None = None
         self.written = Written(timeline, codec, self._must, NAME_TAKEN)
         microscope.on_executed = self.executed
 
@@ -199,10 +200,8 @@ class Invariants:
         if host.disk.stale or (host.core.control is self._saved_control and host.disk.state is self._saved_state):
             return
         self._saved_control, self._saved_state = host.core.control, host.disk.state
-        control = host.core.control.to_dict()
-        saved = host.disk.saved_part("control")
-        if saved is None:
-            saved = {"mode": 2, "holder": None, "solving": 0, "problems": {}, "ended": False}
+        control, state = host.core.control, host.disk.state
+        saved = ArbitrationState() if state is None else state.control
         self._must(saved == control, f"told before it was saved: {control}, saved {saved}")
 
     # --- requests ---
@@ -284,7 +283,7 @@ class Invariants:
     def _replayed(self, host: SchedulerHost, event: ReplayRequested, effects: Sequence[Effect]) -> None:
         """Exactly what is cached and it has not had, oldest first over all envelopes."""
         replay = next(effect for effect in effects if isinstance(effect, Replay))
-        cached = [packet for packet, _ in host.core.cached()]
+        cached = [packet for packet, *_ in host.core.cached()]
         wanted = [p for p in cached if (p.time_ns or 0) > event.since_ns and p.envelope.startswith(event.prefixes)]
         self._must(list(replay.packets) == wanted, f"a replay of {len(replay.packets)} instead of {len(wanted)}")
         times = [packet.time_ns or 0 for packet in replay.packets]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import marshal
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -31,24 +30,24 @@ from afspm.logic.events import (
     TranslatorReply,
     TranslatorUp,
 )
-from afspm.logic.scheduler_core import SchedulerCore, SchedulerSettings
+from afspm.logic.scheduler_core import SchedulerCore
+from afspm.logic.settings import SchedulerSettings
+from afspm.logic.state import KIND, VERSION, SavedState
 from afspm.model import (
     HAS_ENDED,
     RELAY_REQUEST,
     ControlResponse,
+    LoggedPacket,
     Packet,
     PacketHeader,
     Request,
     Response,
     ResponseDetail,
 )
+from afspm.model.snapshot import restored, snapshot
 from tests.simulation.network import ControlLine, ControlServer, Feed, Publisher, Weather
 from tests.simulation.process import Alarm, Process
 from tests.simulation.timeline import Timeline
-
-Entry = tuple[Packet, int | None]
-
-_BY_VALUE = 2  # the version of marshal whose bytes follow from the value alone
 
 
 @dataclass
@@ -56,39 +55,33 @@ class Disk:
     """What survives a kill of the scheduler.
 
     Attributes:
-        state: the parts of what was last saved, by value; written ten times as fast as JSON, since there are a thousand
-            saves to a restart.
+        state: what was last saved; it is frozen, and made into plain data only for a restart.
         full: nothing can be written.
         stale: something could not be written, and nothing has been since.
     """
 
-    state: dict[str, bytes] | None = None
-    journal: tuple[Entry, ...] = ()
+    state: SavedState | None = None
+    journal: tuple[LoggedPacket, ...] = ()
     full: bool = False
     stale: bool = False
 
-    def save(self, state: dict[str, Any]) -> None:
+    def save(self, state: SavedState) -> None:
         self.stale = self.full
         if not self.full:
-            self._save(state)
+            self.state = state
 
-    def _save(self, state: dict[str, Any]) -> None:
-        self.state = {name: marshal.dumps(part, _BY_VALUE) for name, part in state.items()}
-
-    def keep(self, packet: Packet, source_ns: int | None) -> None:
+    def keep(self, entry: LoggedPacket) -> None:
         """A packet, before it is published."""
         if self.full:
             self.stale = True
             return
-        self.journal = (*self.journal, (packet, source_ns))
+        self.journal = (*self.journal, entry)
 
-    def saved(self) -> dict[str, Any] | None:
+    def saved(self) -> SavedState | None:
         """As it comes out of a JSON file; None if nothing was saved."""
-        return None if self.state is None else {name: self.saved_part(name) for name in self.state}
-
-    def saved_part(self, name: str) -> Any:
-        """One part of it, as it comes out of a JSON file; None if nothing was saved."""
-        return None if self.state is None else json.loads(json.dumps(marshal.loads(self.state[name])))
+        if self.state is None:
+            return None
+        return restored(SavedState, json.loads(json.dumps(snapshot(self.state, KIND, VERSION))), KIND, VERSION)
 
 
 class Observer(Protocol):
@@ -279,11 +272,11 @@ class SchedulerHost(Process):
         elif isinstance(effect, Forward):
             self._link.ask(effect.request, effect.number)
         elif isinstance(effect, Publish):
-            if effect.cached and (effect.source_ns is None or self.writes_ahead):
-                self.disk.keep(effect.packet, effect.source_ns)
+            if effect.history and (effect.source_ns is None or self.writes_ahead):
+                self.disk.keep(LoggedPacket(effect.packet, effect.source_ns, effect.history))
             for feed in list(self._feeds):
                 feed.publish(effect.packet)
-            if effect.cached and not self._journal_due:
+            if effect.history and not self._journal_due:
                 self._journal_due = True
                 self.later(self.journal_s * self.timeline.random.random(), self._write_journal)
         elif isinstance(effect, Replay):

@@ -9,23 +9,21 @@ from typing import Any
 
 import pytest
 
-from afspm.logic import arbitration, event_log
-from afspm.logic.arbiter import Arbiter
-from afspm.logic.arbitration import ControlChange, ControlEvent, Transition
+from afspm.logic import answers, arbitration, control_change, event_log, scheduler_core
+from afspm.logic.arbitration import ArbitrationEvent, ControlChange, Transition
 from afspm.logic.cache import PacketCache
 from afspm.logic.event_log import EventLog
-from afspm.logic.experiment_end import ExperimentEnd
+from afspm.logic.events import Effect, SaveState
 from afspm.logic.forwarder import Forwarder
-from afspm.logic.holder_timeout import HolderTimeout
+from afspm.logic.holder_timeout import HolderTimeout, Lease
 from afspm.logic.idempotency_cache import IdempotencyCache
-from afspm.logic.lease import Lease
+from afspm.logic.lifecycle import ExperimentEnd
 from afspm.logic.limit_checker import LimitChecker
-from afspm.logic.microscope_status import TipRisk
-from afspm.logic.request_pipeline import RequestPipeline
-from afspm.logic.scheduler_core import SchedulerCore
+from afspm.logic.microscope_status import MicroscopeStatus
 from afspm.logic.sessions import Hearing, SessionTable
+from afspm.logic.state import SchedulerState, StateDraft
 from afspm.logic.watchdog import Watchdog
-from afspm.model import JournalEntries
+from afspm.model import JournalEntries, JournalEntry
 from tests.simulation.invariants import InvariantViolated
 from tests.simulation.night import Fault, Night, Plan, plan
 
@@ -52,9 +50,9 @@ def _bad_night(seed: int) -> Plan:
 
 
 def _rows(
-    patch: Patch, event: ControlEvent, change: Callable[[tuple[Transition, ...]], tuple[Transition, ...]]
+    patch: Patch, event: ArbitrationEvent, change: Callable[[tuple[Transition, ...]], tuple[Transition, ...]]
 ) -> None:
-    patch.setitem(arbitration._ROWS, event, change(arbitration._ROWS[event]))
+    patch.setitem(arbitration.TABLE, event, change(arbitration.TABLE[event]))
 
 
 def _without(condition: arbitration.Condition) -> Callable[[tuple[Transition, ...]], tuple[Transition, ...]]:
@@ -66,55 +64,54 @@ def _not_doing(do: ControlChange) -> Callable[[tuple[Transition, ...]], tuple[Tr
 
 
 def flag_leaves_control(patch: Patch) -> None:
-    _rows(patch, ControlEvent.FLAG, _not_doing(ControlChange.TAKE))
+    _rows(patch, ArbitrationEvent.FLAG, _not_doing(ControlChange.TAKE))
 
 
 def two_in_control(patch: Patch) -> None:
-    _rows(patch, ControlEvent.REQUEST_CONTROL, _without(arbitration.OTHER_HOLDS))
+    _rows(patch, ArbitrationEvent.REQUEST_CONTROL, _without(arbitration.OTHER_HOLDS))
 
 
 def anybody_while_flagged(patch: Patch) -> None:
-    _rows(patch, ControlEvent.REQUEST_CONTROL, _without(arbitration.SOLVES_NONE))
+    _rows(patch, ArbitrationEvent.REQUEST_CONTROL, _without(arbitration.SOLVES_NONE))
 
 
 def manual_lets_in(patch: Patch) -> None:
-    _rows(patch, ControlEvent.REQUEST_CONTROL, _without(arbitration.IS_MANUAL))
+    _rows(patch, ArbitrationEvent.REQUEST_CONTROL, _without(arbitration.IS_MANUAL))
 
 
 def manual_leaves_control(patch: Patch) -> None:
-    _rows(patch, ControlEvent.SET_MODE, _not_doing(ControlChange.TAKE))
+    _rows(patch, ArbitrationEvent.SET_MODE, _not_doing(ControlChange.TAKE))
 
 
 def solver_stays_when_solved(patch: Patch) -> None:
-    _rows(patch, ControlEvent.CLEAR, _not_doing(ControlChange.TAKE))
+    _rows(patch, ArbitrationEvent.CLEAR, _not_doing(ControlChange.TAKE))
 
 
 def anybody_commands(patch: Patch) -> None:
-    rows = arbitration._ROWS[ControlEvent.COMMAND]
-    _rows(patch, ControlEvent.COMMAND, lambda _: (replace(rows[0], when=arbitration.OTHERWISE),))
+    rows = arbitration.TABLE[ArbitrationEvent.COMMAND]
+    _rows(patch, ArbitrationEvent.COMMAND, lambda _: (replace(rows[0], when=arbitration.OTHERWISE),))
 
 
 def the_dead_keep_control(patch: Patch) -> None:
-    _rows(patch, ControlEvent.DEAD, _not_doing(ControlChange.TAKE))
+    _rows(patch, ArbitrationEvent.DEAD, _not_doing(ControlChange.TAKE))
 
 
 def no_lease(patch: Patch) -> None:
-    patch.setattr(Lease, "deadline_ns", lambda self: None)
+    patch.setattr(Lease, "deadline_ns", lambda self, is_free: None)
 
 
 def nobody_is_dead(patch: Patch) -> None:
-    patch.setattr(HolderTimeout, "dead_at_s", lambda self, holder: None)
+    patch.setattr(HolderTimeout, "dead_at_s", lambda self, *args: None)
 
 
 def an_impostor_is_let_in(patch: Patch) -> None:
     real = SessionTable.hear
 
-    def hear(self: SessionTable, *args: Any) -> Hearing:
-        hearing = real(self, *args)
+    def hear(self: SessionTable, *args: Any) -> tuple[SessionTable, Hearing]:
+        table, hearing = real(self, *args)
         if hearing is Hearing.TAKEN:
-            self._bind(args[1], None, args[0])
-            return Hearing.ACCEPTED
-        return hearing
+            return table.bound(args[1], None, args[0]), Hearing.ACCEPTED
+        return table, hearing
 
     patch.setattr(SessionTable, "hear", hear)
 
@@ -124,12 +121,11 @@ def ids_are_forgotten(patch: Patch) -> None:
 
 
 def sent_actions_are_not_saved(patch: Patch) -> None:
-    real = RequestPipeline.snapshot
-    patch.setattr(RequestPipeline, "snapshot", lambda self: {**real(self), "sent": []})
+    patch.setattr(IdempotencyCache, "sent", lambda self, client, request: self)
 
 
 def nothing_expires(patch: Patch) -> None:
-    patch.setattr(Forwarder, "expire", lambda self, now_s: [])
+    patch.setattr(Forwarder, "expired", lambda self, now_s: (self, ()))
 
 
 def any_answer_will_do(patch: Patch) -> None:
@@ -142,17 +138,17 @@ def any_answer_will_do(patch: Patch) -> None:
 
 
 def nothing_is_called_back(patch: Patch) -> None:
-    patch.setattr(RequestPipeline, "call_back", lambda self, former, cause: None)
+    patch.setattr(answers, "call_back", lambda draft, former, cause: None)
 
 
 def told_before_saved(patch: Patch) -> None:
-    real = Arbiter._follow
+    real = StateDraft.finish
 
-    def follow(self: Arbiter, *args: Any) -> None:
-        real(self, *args)
-        self._pipeline.effects.sort(key=lambda effect: type(effect).__name__ == "SaveState")
+    def finish(self: StateDraft) -> tuple[SchedulerState, list[Effect]]:
+        state, effects = real(self)
+        return state, sorted(effects, key=lambda effect: isinstance(effect, SaveState))
 
-    patch.setattr(Arbiter, "_follow", follow)
+    patch.setattr(StateDraft, "finish", finish)
 
 
 def times_go_back(patch: Patch) -> None:
@@ -182,32 +178,32 @@ def replay_envelope_by_envelope(patch: Patch) -> None:
 
 
 def answers_are_written_down_once_more(patch: Patch) -> None:
-    real = EventLog.take
+    real, before = EventLog.take, list[JournalEntry]()
 
-    def take(self: EventLog) -> JournalEntries:
-        taken, before = real(self), self.__dict__.setdefault("before", JournalEntries(()))
-        self.__dict__["before"] = JournalEntries(taken.entries[-1:])
-        return JournalEntries((*before.entries, *taken.entries))
+    def take(self: EventLog, *args: Any) -> tuple[EventLog, JournalEntries]:
+        log, taken = real(self, *args)
+        twice = JournalEntries((*before, *taken.entries))
+        before[:] = taken.entries[-1:]
+        return log, twice
 
     patch.setattr(EventLog, "take", take)
 
 
 def every_fiftieth_answer_is_not_written_down(patch: Patch) -> None:
-    real, count = EventLog.answered, itertools.count(1)
+    real, count = EventLog.add_request, itertools.count(1)
 
-    def answered(self: EventLog, *args: Any) -> None:
-        if next(count) % 50:
-            real(self, *args)
+    def add_request(self: EventLog, *args: Any) -> EventLog:
+        return real(self, *args) if next(count) % 50 else self
 
-    patch.setattr(EventLog, "answered", answered)
+    patch.setattr(EventLog, "add_request", add_request)
 
 
 def changes_of_control_are_not_written_down(patch: Patch) -> None:
-    patch.setattr(EventLog, "_say", lambda self, who, what, reason="": None)
+    patch.setattr(control_change, "control_entries", lambda *args: [])
 
 
 def entries_are_held_back(patch: Patch) -> None:
-    patch.setattr(SchedulerCore, "_entries_due_s", lambda self: None)
+    patch.setattr(scheduler_core, "_entries_due_s", lambda state: None)
 
 
 def entries_are_published_at_once(patch: Patch) -> None:
@@ -216,7 +212,12 @@ def entries_are_published_at_once(patch: Patch) -> None:
 
 def entries_backwards(patch: Patch) -> None:
     real = EventLog.take
-    patch.setattr(EventLog, "take", lambda self: JournalEntries(real(self).entries[::-1]))
+
+    def take(self: EventLog, *args: Any) -> tuple[EventLog, JournalEntries]:
+        log, taken = real(self, *args)
+        return log, JournalEntries(taken.entries[::-1])
+
+    patch.setattr(EventLog, "take", take)
 
 
 def entries_are_not_kept_over_a_kill(patch: Patch) -> None:
@@ -229,11 +230,11 @@ def entries_are_not_kept_over_a_kill(patch: Patch) -> None:
 
 
 def the_tip_is_never_retracted(patch: Patch) -> None:
-    patch.setattr(Watchdog, "_want_retract", lambda self: None)
+    patch.setattr(Watchdog, "_endangered", lambda self, microscope: self)
 
 
 def a_danger_that_can_not_be_helped_is_never_told(patch: Patch) -> None:
-    patch.setattr(TipRisk, "untold", lambda self: None)
+    patch.setattr(MicroscopeStatus, "telling", lambda self: (self, None))
 
 
 def nobody_is_called_to_a_tip_that_was_retracted(patch: Patch) -> None:
@@ -241,15 +242,15 @@ def nobody_is_called_to_a_tip_that_was_retracted(patch: Patch) -> None:
 
 
 def other_problems_are_solved_with_a_tip_that_is_away(patch: Patch) -> None:
-    _rows(patch, ControlEvent.REQUEST_CONTROL, _without(arbitration.SOLVES_OTHER_THAN_MALFUNCTION))
+    _rows(patch, ArbitrationEvent.REQUEST_CONTROL, _without(arbitration.SOLVES_OTHER_THAN_MALFUNCTION))
 
 
 def the_end_does_not_wait_for_the_tip(patch: Patch) -> None:
-    patch.setattr(ExperimentEnd, "is_due", lambda self, now_s: self.by_s is not None)
+    patch.setattr(ExperimentEnd, "is_due", lambda self, now_s, owes_retract: self.by_s is not None)
 
 
 def the_end_never_comes(patch: Patch) -> None:
-    patch.setattr(ExperimentEnd, "is_due", lambda self, now_s: False)
+    patch.setattr(ExperimentEnd, "is_due", lambda self, now_s, owes_retract: False)
 
 
 def limits_are_not_checked(patch: Patch) -> None:

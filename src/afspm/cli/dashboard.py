@@ -7,31 +7,25 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from afspm.cli.arguments import RUNS, Where, opt
+
 if TYPE_CHECKING:
     from afspm.experiment import Experiment
     from afspm.supervisor.resume import ResumableRun
 
-RUNS = Path("runs")
 NAME_OF_CLASS = "Dashboard"
 
 
 def dashboard(
-    where: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RUN|FILE",
-            help="The folder of a run, a folder of runs (its newest is meant), or the experiment file.",
-        ),
-    ] = RUNS,
+    where: Where = RUNS,
     host: Annotated[
         str, typer.Option(help="The address to listen at; others than this computer's own need a password.")
     ] = "127.0.0.1",
-    port: Annotated[int | None, typer.Option(help="By default 8080, or any that is free.", show_default=False)] = None,
-    certificate: Annotated[Path | None, typer.Option(help="PEM file, for https.", show_default=False)] = None,
-    certificate_key: Annotated[Path | None, typer.Option(help="PEM file, its key.", show_default=False)] = None,
+    port: Annotated[int | None, opt("By default 8080, or any that is free.")] = None,
+    certificate: Annotated[Path | None, opt("PEM file, for https.")] = None,
+    certificate_key: Annotated[Path | None, opt("PEM file, its key.")] = None,
     people: Annotated[
-        Path | None,
-        typer.Option(help='TOML file with a line for each person who may steer: Ada = "scrypt:…".', show_default=False),
+        Path | None, opt('TOML file with a line for each person who may steer: Ada = "scrypt:…".')
     ] = None,
     make_password: Annotated[
         bool, typer.Option("--make-password", help="Ask for a name and a password, print their line, and end.")

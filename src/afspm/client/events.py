@@ -1,4 +1,4 @@
-"""What was published, one thing after the other, for scripts that want to look at everything themselves."""
+"""Published messages, one after the other, for scripts that look at everything themselves."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ class ComponentLoop:
             at_most -= 1
 
     def _handle_rest(self, within_s: float) -> None:
-        """What was measured before the end is not to be lost: a table must not lack the last scan."""
+        """Handle what was measured before the end: a table must not lack the last scan."""
         until_s = self._context.clock.monotonic_s() + within_s
         while self._has_begun and len(self._backlog) and self._context.clock.monotonic_s() < until_s:
             with contextlib.suppress(ExperimentEnded, StopRequested):  # nothing can be asked for any more

@@ -55,7 +55,7 @@ class _Watch:
 
 @dataclass
 class _Task:
-    """How far a measurement has come."""
+    """The progress of a measurement."""
 
     target: Target
     key: str | None

@@ -38,7 +38,7 @@ _BUSY = {ScopeState.SCANNING: "scan", ScopeState.SPEC: "spectrum"}
 
 @dataclass(frozen=True)
 class ControlProvenance:
-    """Who was in control when a measurement began, and how things stood; texts, empty where it is not known."""
+    """The holder of control and the state when a measurement began; texts, empty where not known."""
 
     in_control: str = ""
     mode: str = ""
@@ -107,13 +107,13 @@ class Metadata(Component):
         self._write("spectrum", spectrum.time_ns, lambda at: spectrum_row(timed, at))
 
     def _time_ns(self, measured: Scan | Spectrum) -> int | None:
-        """When it was finished; where it does not say so itself, when it was sent: rows are told apart by it."""
+        """Return when it was finished, or else when it was sent: rows are told apart by it."""
         if measured.time_ns is None and self.packet is not None:
             return self.packet.time_ns
         return measured.time_ns
 
     def _circumstances(self, what: str, time_ns: int | None) -> ControlProvenance:
-        """Those noted when it began, if it is the measurement that they were noted for."""
+        """Return those noted when it began, if it is the measurement that they were noted for."""
         if self.memory.get("what") != what:
             return ControlProvenance()
         finished_ns = self.memory["finished_ns"]
@@ -165,5 +165,5 @@ def _number(value: float) -> str:
 
 
 def _identity(row: list[str]) -> tuple[Any, ...]:
-    """What no two rows share: when, what, which file and which channel."""
+    """Return what no two rows share: time, measurement, file and channel."""
     return tuple(row[:4])

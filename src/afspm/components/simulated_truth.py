@@ -1,4 +1,4 @@
-"""What a simulated run knows of its drift, for judging afterwards: from the `truth.jsonl` that the simulator leaves."""
+"""The true drift of a simulated run, from the `truth.jsonl` that the simulator leaves."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from afspm.clock import NS_PER_S
 from afspm.dashboard.charts import Chart, spectrum_chart
 from afspm.dashboard.content import NOT_HEARD_OF
 from afspm.dashboard.watch import Watch
-from afspm.dashboard.words import colour_class
+from afspm.drawing.timeline import tint_class
 from afspm.formatting import duration_text, time_of_day
 from afspm.model import LogLine, ProcessCondition, ProcessState
 
@@ -127,7 +127,7 @@ def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: 
         return '<p class="nothing">No such line.</p>'
     rows = "".join(
         f'<li class="level-{escape(line.level.lower())}"><time>{time_of_day(line.time_ns)}</time>'
-        f'<b class="{colour_class(line.name)}">{escape(line.name)}</b><i>{escape(line.level)}</i>'
+        f'<b class="{tint_class(line.name)}">{escape(line.name)}</b><i>{escape(line.level)}</i>'
         f"<span>{escape(line.text)}</span></li>"
         for line in wanted[: -MOST_LINES - 1 : -1]
     )
@@ -135,7 +135,7 @@ def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: 
 
 
 class Restarter(Protocol):
-    """What the panel of processes needs of steering."""
+    """The part of steering that the panel of processes needs."""
 
     @property
     def may_steer(self) -> bool: ...
@@ -148,7 +148,7 @@ class HealthPanel:
 
     def __init__(self, steering: Restarter) -> None:
         self._steering = steering
-        self._rows: dict[str, ProcessRow] = {}
+        self._rows: dict[str, HealthRow] = {}
         self._nothing = ui.html("Nothing has been heard of processes yet.", sanitize=False).classes("nothing")
         self._list = ui.element("div").classes("processes").props('role="table" aria-label="Processes"')
 
@@ -159,11 +159,11 @@ class HealthPanel:
             row = self._rows.get(state.name)
             if row is None:
                 with self._list:
-                    row = self._rows[state.name] = ProcessRow(state.name, self._steering)
+                    row = self._rows[state.name] = HealthRow(state.name, self._steering)
             row.show(state, unheard.get(state.name))
 
 
-class ProcessRow:
+class HealthRow:
     """The condition of one process, and a button to restart it."""
 
     def __init__(self, name: str, steering: Restarter) -> None:

@@ -22,7 +22,6 @@ from pydantic import Field
 from afspm.errors import AfspmError
 from afspm.experiment import class_loader
 from afspm.experiment.document import Document
-from afspm.experiment.findings import Findings
 from afspm.experiment.known import WiringClass
 from afspm.experiment.published import length_m, wire_of
 from afspm.experiment.sections import Section, parse
@@ -61,7 +60,7 @@ class CacheSection(Section):
 
 @dataclass(frozen=True)
 class CacheSettings:
-    """What the scheduler is told of the cache."""
+    """The settings of the scheduler's cache."""
 
     rules: tuple[CacheRule, ...] = ()
     mapping: str | None = None
@@ -69,7 +68,7 @@ class CacheSettings:
 
     @property
     def envelopes(self) -> tuple[str, ...]:
-        """How the envelopes of the rules begin, as far as that is fixed."""
+        """The beginnings of the rules' envelopes, as far as they are fixed."""
         return tuple(re.split(r"[{}]", rule.envelope)[0] for rule in self.rules if rule.envelope)
 
     def to_settings(self) -> dict[str, Any]:
@@ -78,15 +77,13 @@ class CacheSettings:
         return {"rules": rules, "mapping": self.mapping, "history": dict(self.history)}
 
 
-def read(
-    table: Mapping[str, Any], logic: Mapping[str, Any] | None, document: Document, findings: Findings
-) -> CacheSettings:
-    """The section, with what the paper's form says of the cache where the section says nothing.
+def read(table: Mapping[str, Any], logic: Mapping[str, Any] | None, document: Document) -> CacheSettings:
+    """Return the section, with what the paper's form says of the cache where the section says nothing.
 
     Args:
         logic: the table that the scheduler's cache refers to in the paper's form.
     """
-    section = parse(CacheSection, "cache", dict(table), document, findings)
+    section = parse(CacheSection, "cache", dict(table), document)
     rules = []
     for i, rule in enumerate(section.rules):
         try:
@@ -94,9 +91,9 @@ def read(
                 CacheRule(rule.message, rule.channel, rule.kind, rule.above, rule.up_to, rule.envelope, rule.history)
             )
         except AfspmError as error:
-            findings.error(f"[cache] rules[{i}]: {error.what}", document.place("cache", "rules", i), error.hint)
+            document.error(f"[cache] rules[{i}]: {error.what}", "cache", "rules", i, hint=error.hint)
     if section.mapping is not None:
-        _check_mapping(section.mapping, document, findings)
+        _check_mapping(section.mapping, document)
     history = dict(section.history)
     if logic is not None and wire_of(logic) is WiringClass.CACHE_LOGIC:
         history = _published_history(logic) | history
@@ -104,21 +101,20 @@ def read(
     return CacheSettings(tuple(rules), section.mapping, history)
 
 
-def _check_mapping(name: str, document: Document, findings: Findings) -> None:
-    place = document.place("cache", "mapping")
+def _check_mapping(name: str, document: Document) -> None:
     try:
         function = class_loader.load(name)
     except class_loader.Unloadable as error:
-        findings.error(f"[cache] mapping: {error.what}", place, error.hint)
+        document.error(f"[cache] mapping: {error.what}", "cache", "mapping", hint=error.hint)
         return
     if not callable(function):
-        findings.error(f"[cache] mapping: {name} is no function", place)
+        document.error(f"[cache] mapping: {name} is no function", "cache", "mapping")
         return
     for header in _EXAMPLES:  # else its packets would be missing, in the middle of the night
         try:
             Envelopes(mapping=function).of(header)
         except AfspmError as error:
-            findings.error(f"[cache] mapping: {error.what}", place, error.hint)
+            document.error(f"[cache] mapping: {error.what}", "cache", "mapping", hint=error.hint)
             return
 
 

@@ -1,4 +1,4 @@
-"""What a ready-made component will do, as far as that is fixed before it runs: made once, never started."""
+"""The plan of a ready-made component, as far as it is fixed before it runs: made once, never started."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class PlannedMeasurements:
 
 
 def plan_of(component: type, settings: Mapping[str, Any]) -> PlannedMeasurements | None:
-    """The plan of a component with these settings; None where it has none, or none that can be known.
+    """Return the plan of a component with these settings; None where it has none, or none that can be known.
 
     Raises:
         AfspmError: the component refuses its settings.
@@ -49,7 +49,7 @@ def plan_of(component: type, settings: Mapping[str, Any]) -> PlannedMeasurements
 
 
 def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[str]:
-    """Why the limits would refuse what is planned; each reason once."""
+    """Return why the limits would refuse what is planned; each reason once."""
     # steps and rates depend on what is in force by then
     guard = LimitChecker(_without_changes(limits))
     wanted: list[tuple[ControlRequest, object]] = [

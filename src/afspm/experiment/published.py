@@ -118,7 +118,7 @@ def class_of(table: Mapping[str, Any]) -> PublishedClass | None:
 
 
 def without_counterpart(path: str) -> str:
-    """Return what to write instead of a published class that has no counterpart; empty for every other class."""
+    """Return what to write instead of a published class that has no counterpart; empty for all others."""
     return INSTEAD.get(path.rpartition(".")[2], "") if path.startswith(COMPONENTS) else ""
 
 
@@ -151,7 +151,7 @@ def _gone(why: str, *names: str) -> dict[str, PublishedSetting]:
 
 
 def _paper(ours: str) -> PublishedSetting:
-    """A setting of the paper's tracker, whose queue is what the published scheduler caches."""
+    """Return a setting of the paper's tracker, whose queue is what the published scheduler caches."""
 
     def becomes(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
         settings = {"drift.tracker.class": "paper", f"drift.tracker.{ours}": value}
@@ -168,7 +168,7 @@ def _within(value: Any, *keys: str) -> Any:
 
 
 def _estimator(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
-    """The published drift model: a descriptor and a transform, by the names of enumerations, fitted by RANSAC."""
+    """Return the published drift model: descriptor and transform, by names of enumerations."""
     given = {"descriptor_type": "BRIEF", "transform_type": "TRANSLATION", "fitting": "RANSAC"}
     given |= {key: item for key, item in dict(value).items() if key != "class"}
     known = {key: str(given.pop(key)).rpartition(".")[2].lower() for key in ("descriptor_type", "transform_type")}

@@ -20,7 +20,7 @@ from afspm.addresses import Listens
 from afspm.errors import UnitError
 from afspm.experiment import class_loader
 from afspm.experiment.document import Document
-from afspm.experiment.findings import Findings, closest, nearest
+from afspm.experiment.findings import closest, nearest
 from afspm.experiment.sections import report
 
 _ANNOTATED = ("m", "s", "rad", "V", "A", "m/s", "Hz")
@@ -33,11 +33,10 @@ def check(
     settings: Mapping[str, Any],
     path: tuple[str, ...],
     document: Document,
-    findings: Findings,
     given: Collection[str] = (),
     wrong: set[str] | None = None,
 ) -> dict[str, Any]:
-    """The settings as the process gets them: validated, in SI units, of JSON's types. Reports what is wrong.
+    """Return the settings as the process gets them: validated, in SI units, of JSON's types. Reports what is wrong.
 
     Args:
         given: parameters that are not for the table to set.
@@ -53,28 +52,26 @@ def check(
         if name in parameters:
             annotation = kinds.get(name, Any)
             if name not in kinds and _is_quantity(value):
-                findings.warning(
-                    f"[{'.'.join(path)}] {name} = {value!r} stays a text: the argument does not say what it is",
-                    document.place(*path, name),
-                    f"e.g. `def __init__(self, {name}: Length)`, with Length from afspm.units",
-                )
-            errors = findings.errors
-            checked[name] = _value(annotation, value, (*path, name), document, findings)
-            if wrong is not None and findings.errors > errors:
+                what = f"[{'.'.join(path)}] {name} = {value!r} stays a text: the argument does not say what it is"
+                hint = f"e.g. `def __init__(self, {name}: Length)`, with Length from afspm.units"
+                document.warning(what, *path, name, hint=hint)
+            errors = document.findings.errors
+            checked[name] = _value(annotation, value, (*path, name), document)
+            if wrong is not None and document.findings.errors > errors:
                 wrong.add(name)
         elif takes_any:
             checked[name] = jsonable(value, document.folder_of(*path, name))
         else:
             unknown.append(name)
-            place = document.place(*path, name)
             replaced = "" if closest(name, parameters) else _replaced(path, name, document)
-            findings.error(f"[{'.'.join(path)}] has no setting {name!r}", place, replaced or nearest(name, parameters))
-    _report_missing(parameters, settings, unknown, path, document, findings)
+            what = f"[{'.'.join(path)}] has no setting {name!r}"
+            document.error(what, *path, name, hint=replaced or nearest(name, parameters))
+    _report_missing(parameters, settings, unknown, path, document)
     return checked
 
 
 def _replaced(path: tuple[str, ...], name: str, document: Document) -> str:
-    """What to do about a setting of a class that a later file has replaced; empty: none has."""
+    """Return what to do about a setting of a class that a later file has replaced; empty: none has."""
     of_class, of_setting = document.place(*path, "class").file, document.place(*path, name).file
     if document.files.index(Path(of_class)) <= document.files.index(Path(of_setting)):
         return ""
@@ -82,7 +79,7 @@ def _replaced(path: tuple[str, ...], name: str, document: Document) -> str:
 
 
 def default_of(component: type, name: str) -> Any:
-    """The default of a setting; None where it has none."""
+    """Return the default of a setting; None where it has none."""
     parameter = _parameters(component).get(name)
     return None if parameter is None or parameter.default is inspect.Parameter.empty else parameter.default
 
@@ -117,12 +114,12 @@ def jsonable(value: Any, folder: Path) -> Any:
     return value
 
 
-def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Document, findings: Findings) -> Any:
+def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Document) -> Any:
     folder = document.folder_of(*path)
     if _is_object(value):
-        return _object(value, path, document, findings)
+        return _object(value, path, document)
     if isinstance(value, list) and any(map(_is_object, value)):
-        return [_value(Any, item, path, document, findings) for item in value]
+        return [_value(Any, item, path, document) for item in value]
     try:
         adapter = pydantic.TypeAdapter(annotation, config=None if _has_own_config(annotation) else _TYPES)
     except pydantic.PydanticUndefinedAnnotation:
@@ -131,27 +128,26 @@ def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Documen
         return jsonable(adapter.validate_python(value), folder)
     except pydantic.ValidationError as error:
         for one in error.errors(include_url=False):
-            report(one, path, document, findings)
+            report(one, path, document)
         return jsonable(value, folder)
 
 
-def _object(value: dict[str, Any], path: tuple[str, ...], document: Document, findings: Findings) -> dict[str, Any]:
-    """An intermediary class of the user's own: checked here, made by the process."""
+def _object(value: dict[str, Any], path: tuple[str, ...], document: Document) -> dict[str, Any]:
+    """Return an intermediary class of the user's own: checked here, made by the process."""
     settings = {key: item for key, item in value.items() if key != "class"}
-    place = document.place(*path)
     try:
         wanted = class_loader.load(value["class"])
     except class_loader.Unloadable as error:
-        findings.error(f"[{path[0]}] {'.'.join(path[1:])} class: {error.what}", place, error.hint)
+        document.error(f"[{path[0]}] {'.'.join(path[1:])} class: {error.what}", *path, hint=error.hint)
         return {"class": value["class"]}
     if not isinstance(wanted, type):
-        findings.error(f"[{path[0]}] {'.'.join(path[1:])}: {value['class']} is not a class", place)
+        document.error(f"[{path[0]}] {'.'.join(path[1:])}: {value['class']} is not a class", *path)
         return {"class": value["class"]}
-    return {"class": value["class"], **check(wanted, settings, path, document, findings)}
+    return {"class": value["class"], **check(wanted, settings, path, document)}
 
 
 def _is_quantity(value: Any) -> bool:
-    """Whether a text is a number with a unit for which there is an annotation."""
+    """Return whether a text is a number with a unit for which there is an annotation."""
     if not isinstance(value, str):
         return False
     for unit in _ANNOTATED:
@@ -174,7 +170,7 @@ def _has_own_config(annotation: Any) -> bool:
 
 @cache
 def _parameters(component: type) -> Mapping[str, inspect.Parameter]:
-    """The parameters of the constructor; where it hands **settings on to its base class, those of that as well."""
+    """Return the parameters of the constructor, and those of its base classes that it hands **settings on to."""
     found: dict[str, inspect.Parameter] = {}
     for init in _constructors(component):
         own = list(inspect.signature(init).parameters.values())[1:]  # without self
@@ -215,11 +211,10 @@ def _report_missing(
     unknown: list[str],
     path: tuple[str, ...],
     document: Document,
-    findings: Findings,
 ) -> None:
     for name, parameter in parameters.items():
         if parameter.default is not inspect.Parameter.empty or name in settings:
             continue
         if closest(name, unknown, 0.7):
             continue  # the misspelt key has been reported with this name as the hint
-        findings.error(f"[{'.'.join(path)}] lacks its setting {name!r}", document.place(*path))
+        document.error(f"[{'.'.join(path)}] lacks its setting {name!r}", *path)

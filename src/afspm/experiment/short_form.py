@@ -73,7 +73,7 @@ def _lines(resolved: ResolvedExperiment) -> Iterator[tuple[tuple[str, ...], str]
 
 
 def _addresses(resolved: ResolvedExperiment) -> set[str]:
-    """Every address between processes of the experiment, as the tables of the wiring say it."""
+    """Return every address between processes of the experiment, as the tables of the wiring say it."""
     found = {slot.address for slot in resolved.net.slots.values()}
     for table in resolved.parts.intermediaries.values():
         if wire_of(table) is not None:
@@ -168,7 +168,7 @@ def _length(length_m: float | None) -> str | None:
 
 
 def _instead(name: str, table: Mapping[str, Any]) -> str:
-    """A component without counterpart: as a series of scans where its data say which, else a comment."""
+    """Return a component without counterpart: as a series of scans where its data say which, else a comment."""
     called = table.get("get_next_params") or table.get("message_received_method") or table.get("per_loop_method") or ""
     was = f"# [{name}] was {last(table)}{f', which called {called}' if called else ''}."
     series = _series(table)

@@ -35,7 +35,7 @@ def to_toml(experiment: Experiment, *, secrets: bool = True) -> str:
 
 
 def _secrets_in(value: Any) -> list[str]:
-    """The secrets in a document, each once, wherever they are."""
+    """Return the secrets in a document, each once, wherever they are."""
     if isinstance(value, list | tuple):
         return list(dict.fromkeys(secret for one in value for secret in _secrets_in(one)))
     if not isinstance(value, Mapping):
@@ -46,7 +46,7 @@ def _secrets_in(value: Any) -> list[str]:
 
 
 def _without(secrets: list[str], value: Any) -> Any:
-    """A document with names of environment variables instead of secrets, which a variable may hold, too."""
+    """Return a document with names of environment variables instead of secrets, which a variable may hold, too."""
     if isinstance(value, Mapping):
         return {key: _without(secrets, one) for key, one in value.items()}
     if isinstance(value, list | tuple):
@@ -57,7 +57,7 @@ def _without(secrets: list[str], value: Any) -> Any:
 
 
 def dumps(document: Mapping[str, Any]) -> str:
-    """A document of plain TOML values as text."""
+    """Return a document of plain TOML values as text."""
     lines = [f"{_key(k)} = {value(v)}" for k, v in document.items() if not isinstance(v, Mapping)]
     blocks = ["\n".join(lines)] if lines else []
     blocks += [_table((key,), one) for key, one in document.items() if isinstance(one, Mapping)]

@@ -10,14 +10,13 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from types import MappingProxyType
-from typing import Any
 
 from afspm.model import ControlMode, ControlResponse, ControlState, Problem, ProblemNames, component_of
 
 _NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
 
 
-class ControlEvent(Enum):
+class ArbitrationEvent(Enum):
     """What control depends on: the requests, by kind, and two that time brings."""
 
     REQUEST_CONTROL = "asks for control"
@@ -86,28 +85,6 @@ class ArbitrationState:
         """What all peers are told of it."""
         return ControlState(self.mode, self.holder, tuple(sorted(self.problems)))
 
-    def to_dict(self) -> dict[str, Any]:
-        """As plain JSON."""
-        problems = {str(number): who for number, who in sorted(self.problems.items())}
-        return {
-            "mode": int(self.mode),
-            "holder": self.holder,
-            "solving": self.solving,
-            "problems": problems,
-            "ended": self.ended,
-        }
-
-    @classmethod
-    def from_dict(cls, plain: Mapping[str, Any]) -> ArbitrationState:
-        problems = {int(number): str(who) for number, who in plain["problems"].items()}
-        return cls(
-            ControlMode(plain["mode"]),
-            plain["holder"],
-            int(plain["solving"]),
-            MappingProxyType(problems),
-            bool(plain["ended"]),
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class RoleTable:
@@ -138,11 +115,11 @@ class Rules:
     problems: ProblemNames = field(default_factory=ProblemNames)
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class ControlInput:
     """An event of `who`; `number` is the problem or mode that it is about."""
 
-    event: ControlEvent
+    event: ArbitrationEvent
     who: str
     number: int = 0
 
@@ -166,7 +143,6 @@ class Transition:
         cause: why control is taken, where it is.
     """
 
-    event: ControlEvent
     when: Condition
     response: ControlResponse | None
     do: tuple[ControlChange, ...]
@@ -225,145 +201,112 @@ NO_SUCH_MODE = Condition(
 SAME_MODE = Condition("that is the mode", lambda c, a, r: a.number == c.mode)
 TO_MANUAL = Condition("to manual", lambda c, a, r: a.number == ControlMode.MANUAL)
 
-_E, _R = ControlEvent, ControlResponse
+_R, _D = ControlResponse, ControlChange
 
-TABLE: tuple[Transition, ...] = (
-    Transition(
-        _E.REQUEST_CONTROL,
-        IS_MANUAL,
-        _R.WRONG_CONTROL_MODE,
-        (),
-        "the mode is manual: the person at the microscope is in control",
-    ),
-    Transition(
-        _E.REQUEST_CONTROL,
-        SOLVES_UNFLAGGED,
-        _R.WRONG_EXP_PROBLEM,
-        (),
-        "{problem} is not flagged; flagged: {problems}",
-    ),
-    Transition(
-        _E.REQUEST_CONTROL,
-        SOLVES_OTHER_THAN_MALFUNCTION,
-        _R.WRONG_EXP_PROBLEM,
-        (),
-        "flagged: {problems}; device-malfunction comes first: until that is cleared, control is only for who solves it",
-    ),
-    Transition(
-        _E.REQUEST_CONTROL,
-        SOLVES_NONE,
-        _R.WRONG_EXP_PROBLEM,
-        (),
-        "flagged: {problems}; until that is cleared, control is only for who solves it",
-    ),
-    Transition(
-        _E.REQUEST_CONTROL, OTHER_HOLDS, _R.ALREADY_UNDER_CONTROL, (), "{holder} is in control until it gives that back"
-    ),
-    Transition(
-        _E.REQUEST_CONTROL,
-        ASKER_HOLDS,
-        _R.SUCCESS,
-        (ControlChange.GRANT,),
-        "asked for again: it stays in control, for the problem it now names",
-    ),
-    Transition(
-        _E.REQUEST_CONTROL,
-        OTHERWISE,
-        _R.SUCCESS,
-        (ControlChange.GRANT,),
-        "nobody is in control: the first to ask gets it",
-    ),
-    Transition(_E.RELEASE_CONTROL, ASKER_HOLDS, _R.SUCCESS, (ControlChange.TAKE,), "its own decision", Cause.RELEASED),
-    Transition(
-        _E.RELEASE_CONTROL, OTHERWISE, _R.NOT_IN_CONTROL, (), "{who} is not in control, {holder} is; nothing changed"
-    ),
-    Transition(
-        _E.FLAG, UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, (), "this experiment knows no problem with the number {number}"
-    ),
-    Transition(_E.FLAG, IS_FLAGGED, _R.SUCCESS, (), "what was asked for is so: two may notice the same"),
-    Transition(
-        _E.FLAG,
-        HOLDER_SOLVES_NOTHING,
-        _R.SUCCESS,
-        (ControlChange.FLAG, ControlChange.TAKE),
-        "from now on only who solves a flagged problem may have control",
-        Cause.PROBLEM,
-    ),
-    Transition(
-        _E.FLAG,
-        MALFUNCTION_IS_NEW_TO_HOLDER,
-        _R.SUCCESS,
-        (ControlChange.FLAG, ControlChange.TAKE),
-        "nothing else can be solved with a microscope that can't be used, or a tip that was in danger",
-        Cause.PROBLEM,
-    ),
-    Transition(
-        _E.FLAG,
-        OTHERWISE,
-        _R.SUCCESS,
-        (ControlChange.FLAG,),
-        "a solver stays in control while its own problem is flagged",
-    ),
-    Transition(
-        _E.CLEAR, UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, (), "this experiment knows no problem with the number {number}"
-    ),
-    Transition(
-        _E.CLEAR, NOT_FLAGGED, _R.SUCCESS, (), "what was asked for is so: classifier and corrector may both clear"
-    ),
-    Transition(
-        _E.CLEAR,
-        MAY_NOT_CLEAR,
-        _R.FAILURE,
-        (),
-        "{who} has not flagged {problem} and has not the role 'clear' ([control] roles)",
-    ),
-    Transition(
-        _E.CLEAR,
-        HOLDER_SOLVES_IT,
-        _R.SUCCESS,
-        (ControlChange.UNFLAG, ControlChange.TAKE),
-        "solved: its solver has no more reason to be in control",
-        Cause.SOLVED,
-    ),
-    Transition(_E.CLEAR, OTHERWISE, _R.SUCCESS, (ControlChange.UNFLAG,), "who solves another problem stays in control"),
-    Transition(_E.SET_MODE, MAY_NOT_SET_MODE, _R.FAILURE, (), "{who} has not the role 'mode' ([control] roles)"),
-    Transition(
-        _E.SET_MODE, NO_SUCH_MODE, _R.WRONG_CONTROL_MODE, (), "there is no control mode {number}: 1 manual, 2 automated"
-    ),
-    Transition(_E.SET_MODE, SAME_MODE, _R.SUCCESS, (), "what was asked for is so"),
-    Transition(
-        _E.SET_MODE,
-        TO_MANUAL,
-        _R.SUCCESS,
-        (ControlChange.SET_MODE, ControlChange.TAKE),
-        "a person takes over: whoever is in control is disengaged",
-        Cause.MANUAL,
-    ),
-    Transition(
-        _E.SET_MODE, OTHERWISE, _R.SUCCESS, (ControlChange.SET_MODE,), "components ask for control again, and go on"
-    ),
-    Transition(_E.END, MAY_NOT_END, _R.FAILURE, (), "{who} has not the role 'end' ([control] roles)"),
-    Transition(_E.END, OTHERWISE, _R.SUCCESS, (ControlChange.END,), "all receivers close"),
-    Transition(
-        _E.COMMAND, ASKER_HOLDS, None, (ControlChange.FORWARD,), "only who is in control commands the microscope"
-    ),
-    Transition(_E.COMMAND, IS_OPERATOR, None, (ControlChange.FORWARD,), "in manual mode a person may, by a component"),
-    Transition(_E.COMMAND, OTHERWISE, _R.NOT_IN_CONTROL, (), "{who} is not in control, {holder} is"),
-    Transition(_E.READ, OTHERWISE, None, (ControlChange.FORWARD,), "it disturbs nothing, so anybody may, at any time"),
-    Transition(_E.DEAD, ASKER_HOLDS, None, (ControlChange.TAKE,), "control never stays with the dead", Cause.DEAD),
-    Transition(_E.DEAD, OTHERWISE, None, (), "it was not in control"),
-    Transition(
-        _E.IDLE, ASKER_HOLDS, None, (ControlChange.TAKE,), "a greedy component can't block the night", Cause.IDLE
-    ),
-    Transition(_E.IDLE, OTHERWISE, None, (), "it was not in control"),
-)
 
-_ROWS = {event: tuple(row for row in TABLE if row.event is event) for event in ControlEvent}
+def _refuse(when: Condition, response: ControlResponse, why: str) -> Transition:
+    return Transition(when, response, (), why)
+
+
+def _accept(when: Condition, do: tuple[ControlChange, ...], why: str, cause: Cause | None = None) -> Transition:
+    return Transition(when, ControlResponse.SUCCESS, do, why, cause)
+
+
+def _happen(when: Condition, do: tuple[ControlChange, ...], why: str, cause: Cause | None = None) -> Transition:
+    """A row without an answer of the scheduler's: the translator answers, or nobody asked."""
+    return Transition(when, None, do, why, cause)
+
+
+TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
+    ArbitrationEvent.REQUEST_CONTROL: (
+        _refuse(IS_MANUAL, _R.WRONG_CONTROL_MODE, "the mode is manual: the person at the microscope is in control"),
+        _refuse(SOLVES_UNFLAGGED, _R.WRONG_EXP_PROBLEM, "{problem} is not flagged; flagged: {problems}"),
+        _refuse(
+            SOLVES_OTHER_THAN_MALFUNCTION,
+            _R.WRONG_EXP_PROBLEM,
+            "flagged: {problems}; device-malfunction comes first:"
+            " until that is cleared, control is only for who solves it",
+        ),
+        _refuse(
+            SOLVES_NONE,
+            _R.WRONG_EXP_PROBLEM,
+            "flagged: {problems}; until that is cleared, control is only for who solves it",
+        ),
+        _refuse(OTHER_HOLDS, _R.ALREADY_UNDER_CONTROL, "{holder} is in control until it gives that back"),
+        _accept(ASKER_HOLDS, (_D.GRANT,), "asked for again: it stays in control, for the problem it now names"),
+        _accept(OTHERWISE, (_D.GRANT,), "nobody is in control: the first to ask gets it"),
+    ),
+    ArbitrationEvent.RELEASE_CONTROL: (
+        _accept(ASKER_HOLDS, (_D.TAKE,), "its own decision", Cause.RELEASED),
+        _refuse(OTHERWISE, _R.NOT_IN_CONTROL, "{who} is not in control, {holder} is; nothing changed"),
+    ),
+    ArbitrationEvent.FLAG: (
+        _refuse(UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, "this experiment knows no problem with the number {number}"),
+        _accept(IS_FLAGGED, (), "what was asked for is so: two may notice the same"),
+        _accept(
+            HOLDER_SOLVES_NOTHING,
+            (_D.FLAG, _D.TAKE),
+            "from now on only who solves a flagged problem may have control",
+            Cause.PROBLEM,
+        ),
+        _accept(
+            MALFUNCTION_IS_NEW_TO_HOLDER,
+            (_D.FLAG, _D.TAKE),
+            "nothing else can be solved with a microscope that can't be used, or a tip that was in danger",
+            Cause.PROBLEM,
+        ),
+        _accept(OTHERWISE, (_D.FLAG,), "a solver stays in control while its own problem is flagged"),
+    ),
+    ArbitrationEvent.CLEAR: (
+        _refuse(UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, "this experiment knows no problem with the number {number}"),
+        _accept(NOT_FLAGGED, (), "what was asked for is so: classifier and corrector may both clear"),
+        _refuse(
+            MAY_NOT_CLEAR, _R.FAILURE, "{who} has not flagged {problem} and has not the role 'clear' ([control] roles)"
+        ),
+        _accept(
+            HOLDER_SOLVES_IT,
+            (_D.UNFLAG, _D.TAKE),
+            "solved: its solver has no more reason to be in control",
+            Cause.SOLVED,
+        ),
+        _accept(OTHERWISE, (_D.UNFLAG,), "who solves another problem stays in control"),
+    ),
+    ArbitrationEvent.SET_MODE: (
+        _refuse(MAY_NOT_SET_MODE, _R.FAILURE, "{who} has not the role 'mode' ([control] roles)"),
+        _refuse(NO_SUCH_MODE, _R.WRONG_CONTROL_MODE, "there is no control mode {number}: 1 manual, 2 automated"),
+        _accept(SAME_MODE, (), "what was asked for is so"),
+        _accept(
+            TO_MANUAL,
+            (_D.SET_MODE, _D.TAKE),
+            "a person takes over: whoever is in control is disengaged",
+            Cause.MANUAL,
+        ),
+        _accept(OTHERWISE, (_D.SET_MODE,), "components ask for control again, and go on"),
+    ),
+    ArbitrationEvent.END: (
+        _refuse(MAY_NOT_END, _R.FAILURE, "{who} has not the role 'end' ([control] roles)"),
+        _accept(OTHERWISE, (_D.END,), "all receivers close"),
+    ),
+    ArbitrationEvent.COMMAND: (
+        _happen(ASKER_HOLDS, (_D.FORWARD,), "only who is in control commands the microscope"),
+        _happen(IS_OPERATOR, (_D.FORWARD,), "in manual mode a person may, by a component"),
+        _refuse(OTHERWISE, _R.NOT_IN_CONTROL, "{who} is not in control, {holder} is"),
+    ),
+    ArbitrationEvent.READ: (_happen(OTHERWISE, (_D.FORWARD,), "it disturbs nothing, so anybody may, at any time"),),
+    ArbitrationEvent.DEAD: (
+        _happen(ASKER_HOLDS, (_D.TAKE,), "control never stays with the dead", Cause.DEAD),
+        _happen(OTHERWISE, (), "it was not in control"),
+    ),
+    ArbitrationEvent.IDLE: (
+        _happen(ASKER_HOLDS, (_D.TAKE,), "a greedy component can't block the night", Cause.IDLE),
+        _happen(OTHERWISE, (), "it was not in control"),
+    ),
+}
 
 
 def row_for(control: ArbitrationState, ask: ControlInput, rules: Rules) -> Transition:
     """The row of the table that applies."""
-    for row in _ROWS[ask.event]:
+    for row in TABLE[ask.event]:
         if row.when.holds(control, ask, rules):
             return row
     raise AssertionError(f"the table has no last row for {ask.event}")

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from afspm.formatting import area_text, lengths_text, position_text
-from afspm.logic.arbitration import ArbitrationState, ControlEvent, ControlInput, Rules, Transition
+from afspm.logic.arbitration import ArbitrationEvent, ArbitrationState, ControlInput, Rules, Transition
 from afspm.model import (
     RESTART_REQUEST,
     ControlMode,
@@ -30,7 +30,7 @@ def is_routine(before: ArbitrationState, after: ArbitrationState, ask: ControlIn
     """Whether a change needs no telling: control is given back, or taken once more by who was told to have it last."""
     if (after.problems, after.mode, after.ended) != (before.problems, before.mode, before.ended) or after.problems:
         return False
-    return ask.event is ControlEvent.RELEASE_CONTROL if after.holder is None else after.holder == holder_told
+    return ask.event is ArbitrationEvent.RELEASE_CONTROL if after.holder is None else after.holder == holder_told
 
 
 def said(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, row: Transition, rules: Rules) -> str:

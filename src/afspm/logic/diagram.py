@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from types import MappingProxyType
 
-from afspm.logic.arbitration import ArbitrationState, ControlEvent, ControlInput, Rules, apply, row_for
+from afspm.logic.arbitration import ArbitrationEvent, ArbitrationState, ControlInput, Rules, apply, row_for
 from afspm.model import ControlMode
 
 _MODES = (ControlMode.AUTOMATED, ControlMode.MANUAL)
@@ -24,7 +24,7 @@ def kind(control: ArbitrationState) -> str:
 def edges() -> list[tuple[str, str, str]]:
     """All (from, label, to) between different nodes, in the order of the table."""
     found: dict[tuple[str, str, str], None] = {}
-    for event in ControlEvent:
+    for event in ArbitrationEvent:
         for control in _states():
             for who in ("a", "b"):
                 for number in (0, 1, 2):
@@ -46,18 +46,18 @@ def mermaid() -> str:
         if after != "ended":
             merged.setdefault((before, after), []).append(label)
     lines += [f"    {names[a]} --> {names[b]}: {' / '.join(labels)}" for (a, b), labels in merged.items()]
-    lines += [f"    {name} --> Ended: {ControlEvent.END.value}" for name in names.values() if name != "Ended"]
+    lines += [f"    {name} --> Ended: {ArbitrationEvent.END.value}" for name in names.values() if name != "Ended"]
     return "\n".join([*lines, "    Ended --> [*]"]) + "\n"
 
 
 def _label(ask: ControlInput, before: ArbitrationState, after: ArbitrationState) -> str:
-    if ask.event is ControlEvent.SET_MODE:
+    if ask.event is ArbitrationEvent.SET_MODE:
         return f"sets the mode {after.mode.name.lower()}"
-    if ask.event in (ControlEvent.DEAD, ControlEvent.IDLE, ControlEvent.RELEASE_CONTROL):
+    if ask.event in (ArbitrationEvent.DEAD, ArbitrationEvent.IDLE, ArbitrationEvent.RELEASE_CONTROL):
         return f"the holder {ask.event.value}"
-    if ask.event is ControlEvent.CLEAR and after.problems:
+    if ask.event is ArbitrationEvent.CLEAR and after.problems:
         return "the solver's flag is removed, others are left"
-    if ask.event is ControlEvent.CLEAR:
+    if ask.event is ArbitrationEvent.CLEAR:
         return "the last flag is removed"
     return str(ask.event.value)
 

@@ -1,10 +1,13 @@
-"""What happens, gathered to be published some at a time: what was asked and answered, who is in control, orders.
+"""The event log: what was asked and answered, who is in control, orders; published some at a time.
 
-To note something costs next to nothing, since nobody waits longer for an answer because of it: words are found when it
+To add an entry costs next to nothing, since nobody waits longer for an answer because of it: words are found when it
 is published.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
 
 from afspm.logic.arbitration import ArbitrationState, ControlInput, Transition
 from afspm.logic.descriptions import asked
@@ -12,6 +15,8 @@ from afspm.model import (
     CLOCK_REQUEST,
     RELAY_REQUEST,
     RESTART_REQUEST,
+    ControlEvent,
+    ControlRequest,
     JournalEntries,
     JournalEntry,
     ProblemNames,
@@ -28,97 +33,123 @@ LONGEST = 1000
 """Characters of what was asked, and of the reason."""
 
 REQUEST, CONTROL, ORDER = "request", "control", "order"
+LATE = "late: it had been told that there was no answer"
+"""Of an answer of the translator that came after all."""
 SCHEDULER = "scheduler"
 """Who asks for what nobody else did."""
 _UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})
 
-_Answered = tuple[int, str, Request, Response, float, str]
 
-
-class EventLog:
-    """Gathers entries. Whoever owns it says at each step what time it is, and publishes what it gives when that is due.
+@dataclass(frozen=True, slots=True)
+class AnsweredRequest:
+    """A request with its answer, not in words yet.
 
     Attributes:
-        due_s: when, in real monotonic time, what has been gathered is to be published; None: nothing has been.
+        took_s: real time from the question to the answer.
+        late: the answer came after the client had been told that there was none.
     """
 
-    def __init__(self, problems: ProblemNames, most: int = MOST) -> None:
-        self.due_s: float | None = None
-        self._problems = problems
-        self._most = most
-        self._now_s, self._now_ns = 0.0, 0
-        self._gathered: list[_Answered | JournalEntry] = []
-        self._left_out = 0
+    time_ns: int
+    who: str
+    request: Request
+    response: Response
+    took_s: float
+    late: bool = False
 
-    def at(self, now_s: float, now_ns: int) -> None:
-        """What follows happens now: real monotonic time, and the experiment's."""
-        self._now_s, self._now_ns = now_s, now_ns
+    def entry(self, problems: ProblemNames) -> JournalEntry:
+        kind = ORDER if self.request.kind == RESTART_REQUEST else REQUEST
+        what = asked(self.request, problems)[:LONGEST]
+        reason = "; ".join(filter(None, (LATE if self.late else "", self.response.reason[:LONGEST])))
+        flags = (ControlRequest.ADD_EXP_PRBLM, ControlRequest.RMV_EXP_PRBLM)
+        return JournalEntry(
+            self.time_ns,
+            kind,
+            self.who,
+            what,
+            self.response.code,
+            reason,
+            self.took_s,
+            request=self.request.kind,
+            problem=int(self.request.subject or 0) if self.request.kind in flags else None,
+            late=self.late,
+        )
 
-    def answered(self, who: str, request: Request, response: Response, heard_s: float, note: str = "") -> None:
-        """A request got its answer.
 
-        Args:
-            heard_s: when, in real monotonic time, it was heard.
-            note: what there is to say of the answer beside its reason.
-        """
-        if request.kind not in _UNWRITTEN:
-            self._add_request((self._now_ns, who, request, response, self._now_s - heard_s, note))
+@dataclass(frozen=True, slots=True)
+class EventLog:
+    """The entries that are still to be published.
 
-    def unreadable(self, who: str, response: Response) -> None:
-        """Somebody asked for what could not be read."""
-        reason = response.reason[:LONGEST]
-        self._add_request(JournalEntry(self._now_ns, REQUEST, who, "what can't be read", response.code, reason, 0.0))
+    Attributes:
+        due_s: when, in real monotonic time, they are to be published; None: there are none.
+        left_out: requests beyond `most`.
+    """
 
-    def began(self, control: ArbitrationState, *, again: bool) -> None:
-        """The scheduler was started."""
-        what = "started" if not again else f"started again; {control.holder or 'nobody'} is in control"
-        self._add(JournalEntry(self._now_ns, CONTROL, SCHEDULER, what))
+    most: int = MOST
+    due_s: float | None = None
+    gathered: tuple[AnsweredRequest | JournalEntry, ...] = ()
+    left_out: int = 0
 
-    def changed(self, before: ArbitrationState, after: ArbitrationState, ask: ControlInput, row: Transition) -> None:
-        """ArbitrationState, mode or problems changed: an entry for each, in whose name it was, and why."""
-        name = self._problems.name
+    def add(self, now_s: float, *entries: AnsweredRequest | JournalEntry) -> EventLog:
+        if not entries:
+            return self
+        due_s = now_s + PERIOD_S if self.due_s is None else self.due_s
+        return replace(self, due_s=due_s, gathered=(*self.gathered, *entries))
+
+    def add_request(self, now_s: float, entry: AnsweredRequest | JournalEntry) -> EventLog:
+        """Add one of those of which there may be any number."""
+        if isinstance(entry, AnsweredRequest) and entry.request.kind in _UNWRITTEN:
+            return self
+        if len(self.gathered) >= self.most:
+            return replace(self, left_out=self.left_out + 1)
+        return self.add(now_s, entry)
+
+    def take(self, problems: ProblemNames, now_ns: int) -> tuple[EventLog, JournalEntries]:
+        """Return the entries in words, oldest first: they are the caller's to publish."""
+        entries = [one if isinstance(one, JournalEntry) else one.entry(problems) for one in self.gathered]
+        if self.left_out:
+            entries.append(JournalEntry(now_ns, REQUEST, SCHEDULER, f"{self.left_out} more requests are left out"))
+        return EventLog(self.most), JournalEntries(tuple(entries))
+
+
+def unreadable_entry(now_ns: int, who: str, response: Response) -> JournalEntry:
+    """Return the entry of a request that could not be read."""
+    return JournalEntry(now_ns, REQUEST, who, "what can't be read", response.code, response.reason[:LONGEST], 0.0)
+
+
+def start_entry(now_ns: int, control: ArbitrationState, *, is_restart: bool) -> JournalEntry:
+    """Return the entry of the scheduler's start."""
+    if not is_restart:
+        return JournalEntry(now_ns, CONTROL, SCHEDULER, "started", event=ControlEvent.STARTED)
+    what = f"started again; {control.holder or 'nobody'} is in control"
+    return JournalEntry(now_ns, CONTROL, SCHEDULER, what, event=ControlEvent.RESTARTED)
+
+
+def control_entries(
+    now_ns: int,
+    before: ArbitrationState,
+    after: ArbitrationState,
+    ask: ControlInput,
+    row: Transition,
+    problems: ProblemNames,
+) -> list[JournalEntry]:
+    """Return an entry for each change of control, mode and problems: in whose name it was, and why."""
+    name, entry = problems.name, partial(JournalEntry, now_ns, CONTROL)
+    entries = []
+    if before.holder is not None and after.holder != before.holder:
         cause = row.cause.value if row.cause is not None else ""
-        if before.holder is not None and after.holder != before.holder:
-            self._say(before.holder, "no longer in control", cause)
-        for number in sorted(after.problems.keys() - before.problems.keys()):
-            self._say(ask.who, f"flagged {name(number)}")
-        for number in sorted(before.problems.keys() - after.problems.keys()):
-            self._say(ask.who, f"cleared {name(number)}", f"it was flagged by {before.problems[number]}")
-        if after.mode is not before.mode:
-            self._say(ask.who, f"mode {after.mode.name}")
-        if after.holder is not None and (after.holder, after.solving) != (before.holder, before.solving):
-            solving = f" to solve {name(after.solving)}" if after.solving else ""
-            self._say(after.holder, f"in control{solving}")
-        if after.ended and not before.ended:
-            self._say(ask.who, "ended the experiment")
-
-    def take(self) -> JournalEntries:
-        """What has been gathered, oldest first; from here on it is the owner's to publish."""
-        gathered, left_out = self._gathered, self._left_out
-        self._gathered, self._left_out, self.due_s = [], 0, None
-        entries = [one if isinstance(one, JournalEntry) else self._worded(one) for one in gathered]
-        if left_out:
-            entries.append(JournalEntry(self._now_ns, REQUEST, SCHEDULER, f"{left_out} more requests are left out"))
-        return JournalEntries(tuple(entries))
-
-    def _say(self, who: str, what: str, reason: str = "") -> None:
-        self._add(JournalEntry(self._now_ns, CONTROL, who, what, None, reason))
-
-    def _add_request(self, entry: _Answered | JournalEntry) -> None:
-        """Of requests there may be any number."""
-        if len(self._gathered) >= self._most:
-            self._left_out += 1
-        else:
-            self._add(entry)
-
-    def _add(self, entry: _Answered | JournalEntry) -> None:
-        if self.due_s is None:
-            self.due_s = self._now_s + PERIOD_S
-        self._gathered.append(entry)
-
-    def _worded(self, answered: _Answered) -> JournalEntry:
-        time_ns, who, request, response, took_s, note = answered
-        kind = ORDER if request.kind == RESTART_REQUEST else REQUEST
-        what = asked(request, self._problems)[:LONGEST]
-        reason = "; ".join(filter(None, (note, response.reason[:LONGEST])))
-        return JournalEntry(time_ns, kind, who, what, response.code, reason, took_s)
+        entries.append(entry(before.holder, "no longer in control", reason=cause, event=ControlEvent.CONTROL_LOST))
+    for number in sorted(after.problems.keys() - before.problems.keys()):
+        flagged = ControlEvent.PROBLEM_FLAGGED
+        entries.append(entry(ask.who, f"flagged {name(number)}", event=flagged, problem=number))
+    for number in sorted(before.problems.keys() - after.problems.keys()):
+        why, cleared = f"it was flagged by {before.problems[number]}", ControlEvent.PROBLEM_CLEARED
+        entries.append(entry(ask.who, f"cleared {name(number)}", reason=why, event=cleared, problem=number))
+    if after.mode is not before.mode:
+        entries.append(entry(ask.who, f"mode {after.mode.name}", event=ControlEvent.MODE_CHANGED, mode=after.mode))
+    if after.holder is not None and (after.holder, after.solving) != (before.holder, before.solving):
+        solving, gained = f" to solve {name(after.solving)}" if after.solving else "", ControlEvent.CONTROL_GAINED
+        problem = after.solving or None
+        entries.append(entry(after.holder, f"in control{solving}", event=gained, problem=problem))
+    if after.ended and not before.ended:
+        entries.append(entry(ask.who, "ended the experiment", event=ControlEvent.EXPERIMENT_ENDED))
+    return entries

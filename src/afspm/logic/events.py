@@ -8,9 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from afspm.model import Packet, PacketHeader, Parameter, Request, Response
+
+if TYPE_CHECKING:
+    from afspm.logic.state import SavedState
 
 # --- inputs ---------------------------------------------------------------------------------------------------------
 
@@ -38,7 +41,7 @@ class Greeted:
     user: str | None = None
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class RequestIn:
     """A request came by `connection` from the peer that calls itself `name`.
 
@@ -54,7 +57,7 @@ class RequestIn:
     heard_s: float = -1.0
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Unreadable:
     """What came from the peer `name` was no request, and was refused with `response`."""
 
@@ -62,7 +65,7 @@ class Unreadable:
     response: Response
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class PacketIn:
     """The translator published a packet."""
 
@@ -104,7 +107,7 @@ class TranslatorCaughtUp:
     """All that the translator published while we were not there has been taken in."""
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class TranslatorReply:
     """The translator answered the request that was forwarded under `number`."""
 
@@ -170,7 +173,7 @@ Input = (
 # --- effects, to be carried out in the order given --------------------------------------------------------------------
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Reply:
     """Answer the peer `name`, over `connection` (which is open, and the newest of that name).
 
@@ -186,7 +189,7 @@ class Reply:
     tells_why: bool = False
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Forward:
     """Send a request to the translator, marked with `number`.
 
@@ -197,21 +200,21 @@ class Forward:
     request: Request
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Publish:
     """Publish a packet to whoever subscribes to its envelope.
 
     Attributes:
         source_ns: the translator's own time of it; None for what comes from the scheduler.
-        cached: whether it is in the cache now, so that it should be kept over a restart.
+        history: how many of its envelope the cache keeps over a restart; 0: this one is not in it.
     """
 
     packet: Packet
     source_ns: int | None = None
-    cached: bool = True
+    history: int = 1
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Replay:
     """Send these packets to one subscriber, in this order, and then that it has caught up."""
 
@@ -219,14 +222,14 @@ class Replay:
     packets: tuple[Packet, ...]
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class SaveState:
-    """Keep `state` (plain JSON) so that it survives a kill, before the effects that follow are carried out."""
+    """Keep `state` so that it survives a kill, before the effects that follow are carried out."""
 
-    state: dict[str, Any]
+    state: SavedState
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Log:
     """Tell people. `level` is a name of the logging module: "INFO", "WARNING", "ERROR"."""
 
@@ -234,7 +237,7 @@ class Log:
     text: str
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Kill:
     """The experiment ends: publish the signal KILL, and close.
 

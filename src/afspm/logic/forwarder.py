@@ -1,35 +1,42 @@
 """Requests on their way to the translator: one at a time, each with its deadline, and every one is answered.
 
 A translator of version 1 serves one request after the other and says nothing while it does. So one is in flight; the
-others wait here, where they can still be called back, and whoever waited too long is told that nothing was done.
+others wait here, where they can still be called back, and a request that waited too long is answered unsent.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from enum import Enum, auto
+from typing import TYPE_CHECKING
 
 from afspm.logic.coordinate_frame import MappedRequest
-from afspm.logic.events import Forward
+from afspm.logic.events import Forward, RequestIn
 from afspm.model import ControlResponse, Request, Response, ResponseDetail
 
+if TYPE_CHECKING:
+    from afspm.logic.state import StateDraft
 
-@dataclass(slots=True, eq=False)
+OwnAnswer = Callable[["StateDraft", Response], None]
+"""Called with the answer to a request of the scheduler's own."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ForwardedRequest:
     """A request for the translator.
 
     Attributes:
         client: who asked; empty for the scheduler's own.
-        connection: the one it was asked by.
-        deadline_s: when (real) it must be answered at the latest.
         command: whether it is a command, which only who is in control may give.
+        deadline_s: when (real) it must be answered at the latest; 0: none yet.
         sent_s: when it was sent; None while it waits.
         answered: the client has been told that there was no response in time.
+        connection: the one it was asked by.
         states_seen: how many states the microscope had told when it was sent on its way.
+        mapped: what is sent in place of `request`, where the microscope has other coordinates.
         heard_s: when it was asked, real.
-        mapped: what is sent in place of `request`, where the microscope has other coordinates; None: that itself.
+        on_answer: takes the answer to one of the scheduler's own.
     """
 
     client: str
@@ -43,15 +50,20 @@ class ForwardedRequest:
     states_seen: int = 0
     mapped: MappedRequest | None = None
     heard_s: float = 0.0
+    on_answer: OwnAnswer | None = None
+
+    @classmethod
+    def of(cls, event: RequestIn, *, command: bool = True) -> ForwardedRequest:
+        return cls(event.name, event.request, command, connection=event.connection, heard_s=event.heard_s)
 
     @property
     def outgoing(self) -> Request:
-        """What the microscope is asked."""
+        """The request as the microscope gets it."""
         return self.request if self.mapped is None else self.mapped.request
 
 
 class ForwardOutcome(Enum):
-    """How a job ended."""
+    """The end of a forwarded request."""
 
     ANSWERED = auto()
     NOT_SENT = auto()
@@ -60,157 +72,151 @@ class ForwardOutcome(Enum):
     """The true answer, after the client was told that none had come."""
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class SettledRequest:
     job: ForwardedRequest
     end: ForwardOutcome
     response: Response
 
 
+Settled = tuple[SettledRequest, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Forwarder:
     """The one line to the translator.
 
-    Every call returns what it settled; requests to be sent are appended to `outbox`, which the caller empties.
-
-    Args:
+    Attributes:
         timeout_s: how long (real) a client waits for an answer.
         patience_s: how much longer the line is kept for an answer that is overdue, before the next is sent.
         longest_queue: how many may wait.
+        up: the translator is connected.
+        flight: the request that is with the translator.
+        own, queue: those that wait: of the scheduler, which go first, and of clients.
+        overdue: those whose answer may still come, by number.
+        outbox: to be sent now; the caller empties it.
     """
 
-    def __init__(self, timeout_s: float = 5.0, patience_s: float = 5.0, longest_queue: int = 64) -> None:
-        self.timeout_s = timeout_s
-        self.patience_s = patience_s
-        self.longest_queue = longest_queue
-        self.outbox: list[Forward] = []
-        self.up = False
-        self.flight: ForwardedRequest | None = None
-        self.number = 0
-        self._own: deque[ForwardedRequest] = deque()
-        self._queue: deque[ForwardedRequest] = deque()
-        self._overdue: OrderedDict[int, ForwardedRequest] = OrderedDict()
+    timeout_s: float = 5.0
+    patience_s: float = 5.0
+    longest_queue: int = 64
+    up: bool = False
+    number: int = 0
+    flight: ForwardedRequest | None = None
+    own: tuple[ForwardedRequest, ...] = ()
+    queue: tuple[ForwardedRequest, ...] = ()
+    overdue: Mapping[int, ForwardedRequest] = field(default_factory=dict)
+    outbox: tuple[Forward, ...] = ()
 
-    def connected(self) -> list[SettledRequest]:
-        """The translator can be asked, for the first time or again. (A reconnection is a loss before it.)"""
-        settled = self.lost() if self.up else []
-        self.up = True
-        return settled
+    def connected(self) -> tuple[Forwarder, Settled]:
+        """Open the line. A reconnection is a loss before it."""
+        forwarder, settled = self.lost() if self.up else (self, ())
+        return replace(forwarder, up=True), settled
 
-    def lost(self) -> list[SettledRequest]:
-        """The translator is gone: all are answered at once."""
-        self.up = False
-        settled = []
-        if self.flight is not None:
-            if not self.flight.answered:
-                settled.append(_unknown(self.flight, "the connection to the translator was lost before it answered"))
-            self.flight = None
-        waiting = [*self._own, *self._queue]
-        self._own.clear()
-        self._queue.clear()
-        return settled + [_not_sent(job, "the translator is not connected") for job in waiting]
+    def lost(self) -> tuple[Forwarder, Settled]:
+        """Answer all at once: the translator is gone."""
+        waiting = tuple(_not_sent(job, "the translator is not connected") for job in (*self.own, *self.queue))
+        if self.flight is not None and not self.flight.answered:
+            why = "the connection to the translator was lost before it answered"
+            waiting = (_unknown(self.flight, why), *waiting)
+        return replace(self, up=False, flight=None, own=(), queue=()), waiting
 
-    def ask(self, job: ForwardedRequest, now_s: float) -> SettledRequest | None:
-        """Send a client's request, now or when its turn comes. Returns what it was refused with, if it was.
+    def ask(self, job: ForwardedRequest, now_s: float) -> tuple[Forwarder, SettledRequest | None]:
+        """Send a client's request, now or when its turn comes. Returns also its refusal, if it was refused.
 
-        One that has a deadline already, since it waited for something else before, keeps it.
+        A request that has a deadline already, since it waited for something else before, keeps it.
         """
-        self.number += 1
-        job.number, job.deadline_s = self.number, job.deadline_s or now_s + self.timeout_s
+        forwarder, job = self._numbered(job, now_s)
         if not self.up:
-            return _not_sent(job, "the translator is not connected")
+            return forwarder, _not_sent(job, "the translator is not connected")
         if self.flight is None:
-            self._send(job, now_s)
-        elif len(self._queue) >= self.longest_queue:
-            return _not_sent(job, f"{self.longest_queue} requests wait for the translator already")
-        else:
-            at = len(self._queue)
-            while at and self._queue[at - 1].deadline_s > job.deadline_s:
-                at -= 1
-            self._queue.insert(at, job)
-        return None
+            return forwarder._sending(job, now_s), None
+        if len(self.queue) >= self.longest_queue:
+            return forwarder, _not_sent(job, f"{self.longest_queue} requests wait for the translator already")
+        queue = sorted((*self.queue, job), key=lambda waiting: waiting.deadline_s)
+        return replace(forwarder, queue=tuple(queue)), None
 
-    def ask_own(self, request: Request, now_s: float) -> ForwardedRequest | None:
+    def ask_own(
+        self, request: Request, now_s: float, on_answer: OwnAnswer | None = None, mapped: MappedRequest | None = None
+    ) -> tuple[Forwarder, ForwardedRequest | None]:
         """Send a request of the scheduler's own before all that wait. None: the translator is not connected."""
         if not self.up:
-            return None
-        self.number += 1
-        deadline_s = now_s + self.timeout_s
-        job = ForwardedRequest("", request, command=True, number=self.number, deadline_s=deadline_s, heard_s=now_s)
+            return self, None
+        own = ForwardedRequest("", request, command=True, heard_s=now_s, on_answer=on_answer, mapped=mapped)
+        forwarder, job = self._numbered(own, now_s)
         if self.flight is None:
-            self._send(job, now_s)
-        else:
-            self._own.append(job)
-        return job
+            return forwarder._sending(job, now_s), job
+        return replace(forwarder, own=(*self.own, job)), job
 
-    def answered(self, number: int, response: Response, now_s: float) -> SettledRequest | None:
-        """The translator answered. None: nobody knows what (it was settled long ago, or never asked)."""
+    def answered(self, number: int, response: Response, now_s: float) -> tuple[Forwarder, SettledRequest | None]:
+        """Take an answer of the translator. None: it belongs to no request that is open."""
         job = self.flight
         if job is not None and job.number == number:
-            self.flight = None
-            self._next(now_s)
-            return SettledRequest(job, ForwardOutcome.LATE if job.answered else ForwardOutcome.ANSWERED, response)
-        late = self._overdue.pop(number, None)
-        return None if late is None else SettledRequest(late, ForwardOutcome.LATE, response)
+            outcome = ForwardOutcome.LATE if job.answered else ForwardOutcome.ANSWERED
+            return self._next(now_s), SettledRequest(job, outcome, response)
+        late = self.overdue.get(number)
+        if late is None:
+            return self, None
+        rest = {other: one for other, one in self.overdue.items() if other != number}
+        return replace(self, overdue=rest), SettledRequest(late, ForwardOutcome.LATE, response)
 
-    def expire(self, now_s: float) -> list[SettledRequest]:
-        """Answer whoever has waited too long."""
-        settled = []
-        job = self.flight
-        if job is not None and not job.answered and now_s >= job.deadline_s:
-            job.answered = True
-            settled.append(_unknown(job, f"the translator did not answer within {self.timeout_s:g} s"))
-        for queue in (self._own, self._queue):
-            while queue and now_s >= queue[0].deadline_s:
-                settled.append(_not_sent(queue.popleft(), f"the translator was busy for {self.timeout_s:g} s"))
-        if job is not None and job.answered and now_s >= self._patience_ends_s(job):
-            self._overdue[job.number] = job
-            if len(self._overdue) > self.longest_queue:
-                self._overdue.popitem(last=False)
-            self.flight = None
-            self._next(now_s)
-        return settled
+    def expired(self, now_s: float) -> tuple[Forwarder, Settled]:
+        """Answer those that have waited too long."""
+        settled, flight = list[SettledRequest](), self.flight
+        if flight is not None and not flight.answered and now_s >= flight.deadline_s:
+            flight = replace(flight, answered=True)
+            settled.append(_unknown(flight, f"the translator did not answer within {self.timeout_s:g} s"))
+        late = [job for job in (*self.own, *self.queue) if now_s >= job.deadline_s]
+        settled += [_not_sent(job, f"the translator was busy for {self.timeout_s:g} s") for job in late]
+        own, queue = (tuple(job for job in jobs if now_s < job.deadline_s) for jobs in (self.own, self.queue))
+        forwarder = replace(self, flight=flight, own=own, queue=queue)
+        if flight is not None and flight.answered and now_s >= self._patience_ends_s(flight):
+            overdue = [*self.overdue.items(), (flight.number, flight)][-self.longest_queue :]
+            forwarder = replace(forwarder, overdue=dict(overdue))._next(now_s)
+        return forwarder, tuple(settled)
 
     def requests(self) -> list[tuple[str, Request]]:
-        """What clients have asked that is on its way: who, and what."""
-        jobs = [job for job in (self.flight, *self._queue) if job is not None and job.client]
-        return [(job.client, job.request) for job in jobs]
+        """Return the requests of clients that are on their way: who asked, and for what."""
+        return [(job.client, job.request) for job in (self.flight, *self.queue) if job is not None and job.client]
 
-    def ask_again(self, client: str, request_id: str, now_s: float) -> bool:
-        """The client repeats a request that it was told is overdue: if it still is, it waits for it once more."""
+    def asked_again(self, client: str, request_id: str, now_s: float) -> Forwarder | None:
+        """Wait once more for an overdue request that its client repeats; None: it is not at the translator."""
         job = self.flight
         if job is None or job.client != client or job.request.id != request_id:
-            return False
-        job.answered, job.deadline_s = False, now_s + self.timeout_s
-        return True
+            return None
+        return replace(self, flight=replace(job, answered=False, deadline_s=now_s + self.timeout_s))
 
-    def call_back(self, which: Callable[[ForwardedRequest], bool]) -> list[ForwardedRequest]:
-        """Take back what waits and has not been sent; the caller answers it."""
-        called = [job for job in self._queue if which(job)]
-        for job in called:
-            self._queue.remove(job)
-        return called
+    def called_back(self, which: Callable[[ForwardedRequest], bool]) -> tuple[Forwarder, list[ForwardedRequest]]:
+        """Take back requests that wait and have not been sent; the caller answers them."""
+        called = [job for job in self.queue if which(job)]
+        return replace(self, queue=tuple(job for job in self.queue if job not in called)), called
 
     def deadline_s(self) -> float | None:
-        """When `expire` has something to do."""
-        times = [queue[0].deadline_s for queue in (self._own, self._queue) if queue]
+        """Return when `expired` has something to do."""
+        times = [jobs[0].deadline_s for jobs in (self.own, self.queue) if jobs]
         if self.flight is not None:
             times.append(self._patience_ends_s(self.flight) if self.flight.answered else self.flight.deadline_s)
         return min(times, default=None)
 
-    def _send(self, job: ForwardedRequest, now_s: float) -> None:
-        job.sent_s = now_s
-        self.flight = job
-        self.outbox.append(Forward(job.number, job.outgoing))
+    def _numbered(self, job: ForwardedRequest, now_s: float) -> tuple[Forwarder, ForwardedRequest]:
+        number, deadline_s = self.number + 1, job.deadline_s or now_s + self.timeout_s
+        return replace(self, number=number), replace(job, number=number, deadline_s=deadline_s)
+
+    def _sending(self, job: ForwardedRequest, now_s: float) -> Forwarder:
+        forward = Forward(job.number, job.outgoing)
+        return replace(self, flight=replace(job, sent_s=now_s), outbox=(*self.outbox, forward))
 
     def _patience_ends_s(self, job: ForwardedRequest) -> float:
         assert job.sent_s is not None
         return job.sent_s + self.timeout_s + self.patience_s
 
-    def _next(self, now_s: float) -> None:
-        if self._own:
-            self._send(self._own.popleft(), now_s)
-        elif self._queue:
-            self._send(self._queue.popleft(), now_s)
+    def _next(self, now_s: float) -> Forwarder:
+        """Send the next of those that wait."""
+        if self.own:
+            return replace(self, own=self.own[1:])._sending(self.own[0], now_s)
+        if self.queue:
+            return replace(self, queue=self.queue[1:])._sending(self.queue[0], now_s)
+        return replace(self, flight=None)
 
 
 def _not_sent(job: ForwardedRequest, why: str) -> SettledRequest:
@@ -218,9 +224,8 @@ def _not_sent(job: ForwardedRequest, why: str) -> SettledRequest:
 
 
 def _unknown(job: ForwardedRequest, why: str) -> SettledRequest:
-    return SettledRequest(
-        job, ForwardOutcome.UNKNOWN, _no_response(job, "outcome unknown: " + why, ResponseDetail.OUTCOME_UNKNOWN)
-    )
+    response = _no_response(job, "outcome unknown: " + why, ResponseDetail.OUTCOME_UNKNOWN)
+    return SettledRequest(job, ForwardOutcome.UNKNOWN, response)
 
 
 def _no_response(job: ForwardedRequest, reason: str, detail: ResponseDetail) -> Response:

@@ -1,71 +1,99 @@
-"""Nothing is done twice: what became of each request id, for when it is asked again."""
+"""The idempotency cache: the outcome of each request id, so that a repeated request is not carried out twice."""
 
 from __future__ import annotations
 
 import zlib
-from collections import OrderedDict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 
 from afspm.model import ControlResponse, Request, Response
 
+_SENT_REMEMBERED = 100
+
 
 class RequestStatus(Enum):
-    """What became of a request that has no answer to repeat."""
+    """The state of a request that has no answer to repeat."""
 
     PENDING = auto()
     """It waits or is with the translator: whoever asks again gets the same answer."""
     UNKNOWN = auto()
-    """It was sent and nobody knows what became of it."""
+    """It was sent and nobody knows whether it was carried out."""
 
 
+SentAction = tuple[str, str, int]
+"""An action that was sent: client, request id, fingerprint."""
+
+
+@dataclass(frozen=True, slots=True)
 class IdempotencyCache:
-    """The fate or answer of the latest request ids of each client.
+    """The status or answer of the latest request ids of each client.
 
-    Args:
-        per_client: how many ids of a client are remembered.
-        clients: of how many clients.
+    Attributes:
+        per_client: most ids remembered of a client.
+        clients: most clients.
+        sent_actions: those that only we know of, kept over a restart. A translator of version 1 would do them again;
+            one of ours would not, but for an action that was done already the microscope must not be moved.
+        ids_known: whether the translator knows request ids; None: not known yet.
     """
 
-    def __init__(self, per_client: int = 256, clients: int = 256) -> None:
-        self._per_client = per_client
-        self._clients = clients
-        self._table: OrderedDict[str, OrderedDict[str, tuple[int, RequestStatus | Response]]] = OrderedDict()
+    per_client: int = 256
+    clients: int = 256
+    sent_actions: tuple[SentAction, ...] = ()
+    ids_known: bool | None = None
+    table: Mapping[str, Mapping[str, tuple[int, RequestStatus | Response]]] = field(default_factory=dict)
 
     def look_up(self, client: str, request: Request) -> RequestStatus | Response | None:
-        """None: the id is new, or long forgotten, or there is none."""
-        of_client = self._table.get(client)
-        entry = None if of_client is None else of_client.get(request.id)
+        """Return the status or answer of an id; None: it is new, or long forgotten, or there is none."""
+        entry = self.table.get(client, {}).get(request.id) if request.id else None
         if entry is None:
             return None
         if entry[0] != fingerprint(request):
             return Response(ControlResponse.FAILURE, reason="its id was used for another request before", id=request.id)
         return entry[1]
 
-    def note(self, client: str, request: Request, outcome: RequestStatus | Response) -> None:
-        """Remember what became of a request; of one without an id nothing is."""
-        if request.id:
-            self.restore(client, request.id, fingerprint(request), outcome)
+    def noted(self, client: str, request: Request, outcome: RequestStatus | Response) -> IdempotencyCache:
+        """Remember the status or answer of a request that has an id."""
+        return self._with(client, request.id, fingerprint(request), outcome) if request.id else self
 
-    def restore(self, client: str, request_id: str, print_: int, outcome: RequestStatus | Response) -> None:
-        """The same of a request of which only its fingerprint is known."""
-        of_client = self._table.get(client)
-        if of_client is None:
-            of_client = self._table[client] = OrderedDict()
-            if len(self._table) > self._clients:
-                self._table.popitem(last=False)
-        else:
-            self._table.move_to_end(client)
+    def forgotten(self, client: str, request: Request) -> IdempotencyCache:
+        """Forget a request that was not carried out: it may be tried anew."""
+        of_client = dict(self.table.get(client, {}))
+        of_client.pop(request.id, None)
+        return replace(self, table={**self.table, client: of_client})
+
+    def sent(self, client: str, request: Request) -> IdempotencyCache:
+        """Remember an action over a restart."""
+        action = (client, request.id, fingerprint(request))
+        return replace(self, sent_actions=(*self.sent_actions, action)[-_SENT_REMEMBERED:])
+
+    def not_sent(self, client: str, request: Request) -> IdempotencyCache:
+        """Forget a request, and the action that it was."""
+        rest = tuple(one for one in self.sent_actions if one[:2] != (client, request.id))
+        return replace(self.forgotten(client, request), sent_actions=rest)
+
+    def was_sent(self, client: str, request: Request) -> bool:
+        return any(one[:2] == (client, request.id) for one in self.sent_actions)
+
+    def restored(self, sent_actions: Iterable[SentAction]) -> IdempotencyCache:
+        """Take up the actions that were sent before a restart: nobody knows whether they were carried out."""
+        cache = replace(self, sent_actions=tuple(sent_actions))
+        for client, request_id, print_ in cache.sent_actions:
+            cache = cache._with(client, request_id, print_, RequestStatus.UNKNOWN)
+        return cache
+
+    def _with(self, client: str, request_id: str, print_: int, outcome: RequestStatus | Response) -> IdempotencyCache:
+        table = dict(self.table)
+        of_client = dict(table.pop(client, {}))  # the client heard last is last
         of_client[request_id] = (print_, outcome)
-        if len(of_client) > self._per_client:
-            of_client.popitem(last=False)
-
-    def forget(self, client: str, request: Request) -> None:
-        """It was not done and may be tried anew."""
-        of_client = self._table.get(client)
-        if of_client is not None:
-            of_client.pop(request.id, None)
+        if len(of_client) > self.per_client:
+            del of_client[next(iter(of_client))]
+        table[client] = of_client
+        if len(table) > self.clients:
+            del table[next(iter(table))]
+        return replace(self, table=table)
 
 
 def fingerprint(request: Request) -> int:
-    """Tells requests apart that were given the same id; the same in every process."""
+    """Return a number that tells requests apart that were given the same id; the same in every process."""
     return zlib.crc32(request.payload, request.kind)

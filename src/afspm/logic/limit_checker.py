@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 from afspm.errors import InvalidValue
-from afspm.logic.limit_state import LastUse, LimitState
+from afspm.logic.limit_state import LastUse, LimitState, Usage
 from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.logic.parameter_values import ParameterValue, ParameterValueError, numbers, values_of
-from afspm.logic.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES, KnownPosition, changes_by, moved
+from afspm.logic.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES, changes_by, moved
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -50,19 +49,15 @@ class _Breach(Exception):
         self.reason = reason
 
 
+@dataclass(frozen=True)
 class LimitChecker:
     """Checks requests against the limits, and keeps in mind what steps and rates are measured from."""
 
-    def __init__(self, limits: ExperimentLimits | None = None) -> None:
-        self._limits = limits or ExperimentLimits()
-        self._usage = LimitState()
-        self._at = KnownPosition()
-        parameters, actions = self._limits.parameters, self._limits.actions
-        self._bounded = {name for name, limit in parameters.items() if limit.bounds_changes}
-        self._counted = {name for name, limit in {**parameters, **actions}.items() if limit.interval_s is not None}
+    limits: ExperimentLimits = field(default_factory=ExperimentLimits)
+    state: LimitState = field(default_factory=LimitState)
 
     def check(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> Response | None:
-        """The refusal of a request that breaks a limit or has no meaning; None: it may be sent.
+        """Return the refusal of a request that breaks a limit or has no meaning; None: it may be sent.
 
         Args:
             used: the parameters that `who` means to set; the others of the request only change with them. None: all.
@@ -75,26 +70,8 @@ class LimitChecker:
             return Response(int(ControlResponse.PARAM_ERROR), b"", str(error), request.id)
         return None
 
-    def to_be_read(self, request: Request) -> list[str]:
-        """The parameters that a request sets, whose values in force its limits depend on, and which nobody publishes.
-
-        They are read from the microscope first: somebody at the panel may have changed them, or a request of which
-        nobody knows what became of it.
-        """
-        unpublished = self._bounded - _TOLD
-        return [name for name in self._names_set_by(request) if name in unpublished] if unpublished else []
-
-    def to_be_known(self) -> list[str]:
-        """The parameters that it is good to know of before anybody sets them: how fast one changes takes two looks."""
-        rated = (name for name, limit in self._limits.parameters.items() if limit.rate_per_s is not None)
-        return [name for name in rated if name not in _TOLD]
-
-    def forget(self, name: str) -> None:
-        """The value of a parameter could not be read."""
-        self._usage.forget(name)
-
     def check_place(self, request: Request) -> Response | None:
-        """The refusal of an action where the scan, or the probe, is now: somebody at the panel may have set that."""
+        """Return the refusal of an action where the scan, or the probe, is now: a person may have moved it."""
         try:
             self._check_place(str(request.subject))
         except _Breach as breach:
@@ -102,31 +79,37 @@ class LimitChecker:
             return Response(int(ControlResponse.ACTION_ERROR), b"", reason, request.id)
         return None
 
-    def sending(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> bool:
-        """A request that was checked is about to be sent. Returns whether that is to be saved first."""
-        counted = self._uses(request, used)
-        for name in counted:
-            self._usage.sending(name, LastUse(now_ns, who, request.id))
-        return bool(counted)
+    def to_be_read(self, request: Request) -> list[str]:
+        """Return the parameters that a request sets, whose limits depend on values that nobody publishes.
 
-    def not_done(self, who: str, request: Request, used: Collection[str] | None = None) -> None:
-        """A request was not carried out, for sure."""
+        They are read from the microscope first: somebody at the panel may have changed them, or a request of unknown
+        outcome.
+        """
+        unpublished = self.limits.bounded - _TOLD
+        return [name for name in self._names_set_by(request) if name in unpublished] if unpublished else []
+
+    def to_be_known(self) -> list[str]:
+        """Return the parameters to be read before anybody sets them: how fast one changes takes two looks."""
+        rated = (name for name, limit in self.limits.parameters.items() if limit.rate_per_s is not None)
+        return [name for name in rated if name not in _TOLD]
+
+    def forget(self, name: str) -> LimitChecker:
+        """Drop the value of a parameter that could not be read."""
+        return self._using(self.state.usage.forget(name))
+
+    def sending(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> LimitChecker:
+        """Count what a request uses: it was checked, and is about to be sent."""
+        usage = self.state.usage
         for name in self._uses(request, used):
-            self._usage.not_done(name, who, request.id)
+            usage = usage.use_sent(name, LastUse(now_ns, who, request.id))
+        return self._using(usage)
 
-    def _uses(self, request: Request, used: Collection[str] | None) -> list[str]:
-        """What a request uses of that which may be used every so often only."""
-        if not self._counted:
-            return []
-        uses = [name for name in self._names_set_by(request) if used is None or name in used]
-        if request.kind == ControlRequest.ACTION:
-            uses.append(str(request.subject))
-        return [name for name in uses if name in self._counted]
-
-    def _names_set_by(self, request: Request) -> list[str]:
-        """The parameters that a request sets, each once; none if it makes no sense."""
-        values = [value for subject in self._set_by(request) for value in self._sensible(subject)]
-        return list(dict.fromkeys(value.name for value in values))
+    def not_done(self, who: str, request: Request, used: Collection[str] | None = None) -> LimitChecker:
+        """Take back what a request used: it was not carried out, for sure."""
+        usage = self.state.usage
+        for name in self._uses(request, used):
+            usage = usage.use_undone(name, who, request.id)
+        return self._using(usage)
 
     def carried_out(
         self,
@@ -135,67 +118,65 @@ class LimitChecker:
         told: Parameter | None = None,
         used: Collection[str] | None = None,
         who: str = "",
-    ) -> bool:
-        """A request that was checked succeeded; `told` is the parameter as the translator answered it.
-
-        Returns:
-            Whether what steps, rates and intervals are measured from has changed.
-        """
+    ) -> LimitChecker:
+        """Take a request that succeeded; `told` is the parameter as the translator answered it."""
         if is_get(request):
-            return self._was_read(request.subject, told, now_ns)
-        counted = self._uses(request, used)
-        for name in counted:
-            self._usage.done(name, LastUse(now_ns, who, request.id))
-        is_new = bool(counted)
+            if told is None or not _tells_of(told, request.subject):
+                return self.forget(request.subject.name)
+            return self.in_force(told, now_ns, was_read=True)
+        usage = self.state.usage
+        for name in self._uses(request, used):
+            usage = usage.use_done(name, LastUse(now_ns, who, request.id))
+        checker = self._using(usage)
         for subject in self._set_by(request):
             # what was set is what the microscope says it is now
             said = told if isinstance(subject, Parameter) and told is not None and _tells_of(told, subject) else subject
-            is_new |= self._is_in_force(said, now_ns)
-        return is_new
+            checker = checker.in_force(said, now_ns)
+        return checker
 
-    def _was_read(self, asked: Any, told: Parameter | None, now_ns: int) -> bool:
-        if told is not None and _tells_of(told, asked):
-            return self._is_in_force(told, now_ns, was_read=True)
-        self._usage.forget(asked.name)
-        return False
-
-    def published(self, subject: object, now_ns: int) -> bool:
-        """The translator said what is in force: a ScanParameters, Feedback or ProbePosition. Returns as above."""
-        return self._is_in_force(subject, now_ns)
-
-    def _is_in_force(self, subject: object, now_ns: int, *, was_read: bool = False) -> bool:
-        values = numbers(self._sensible(subject))
-        if isinstance(subject, Parameter) and not values:  # what a microscope tells is not ours to judge
-            self._usage.forget(subject.name)
-        bounded = [(name, value) for name, value in values if name in self._bounded]
-        new = [name for name, value in bounded if self._usage.learn(name, value, now_ns, was_read=was_read)]
+    def in_force(self, subject: object, now_ns: int, *, was_read: bool = False) -> LimitChecker:
+        """Take what the translator said is in force, or what was set: a ScanParameters, Feedback, Parameter …"""
+        values, usage, position = numbers(self._sensible(subject)), self.state.usage, self.state.position
         if isinstance(subject, Parameter):
-            self._at.has_values(values)
-        self._at.is_at(subject)
-        return bool(new)
+            if not values:  # what a microscope tells is not ours to judge
+                usage = usage.forget(subject.name)
+            position = position.learn_values(values)
+        for name, value in values:
+            if name in self.limits.bounded:
+                usage = usage.learn(name, value, now_ns, was_read=was_read)
+        return replace(self, state=LimitState(usage, position.learn(subject)))
+
+    def _using(self, usage: Usage) -> LimitChecker:
+        return self if usage is self.state.usage else replace(self, state=replace(self.state, usage=usage))
+
+    def _uses(self, request: Request, used: Collection[str] | None) -> list[str]:
+        """Return what a request uses of that which may be used every so often only."""
+        counted = self.limits.counted
+        if not counted:
+            return []
+        uses = [name for name in self._names_set_by(request) if used is None or name in used]
+        if request.kind == ControlRequest.ACTION:
+            uses.append(str(request.subject))
+        return [name for name in uses if name in counted]
+
+    def _names_set_by(self, request: Request) -> list[str]:
+        """Return the parameters that a request sets, each once; none if it makes no sense."""
+        values = [value for subject in self._set_by(request) for value in self._sensible(subject)]
+        return list(dict.fromkeys(value.name for value in values))
 
     def _sensible(self, subject: object) -> list[ParameterValue]:
-        """What a subject sets; nothing if it makes no sense."""
+        """Return what a subject sets; nothing if it makes no sense."""
         try:
-            return values_of(subject, self._limits.parameters)
+            return values_of(subject, self.limits.parameters)
         except ParameterValueError:
             return []
-
-    def snapshot(self) -> dict[str, Any]:
-        """What must survive a kill, as plain JSON."""
-        return {"usage": self._usage.snapshot(), "at": self._at.snapshot()}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Take up what `snapshot` wrote."""
-        self._usage.restore(state["usage"])
-        self._at.restore(state["at"])  # until it is published again
 
     # --- checks ---
 
     def _check(self, who: str, request: Request, now_ns: int, used: Collection[str] | None) -> None:
         if request.kind == ControlRequest.ACTION:
             action = str(request.subject)
-            self._check_use(who, request.id, action, self._limits.actions.get(action), now_ns, "action")
+            self._check_use(who, request.id, action, self.limits.actions.get(action), now_ns, "action")
             try:
                 self._check_settings(who, request, now_ns, used)
             except (_Breach, ParameterValueError, InvalidValue) as breach:
@@ -205,7 +186,7 @@ class LimitChecker:
 
     def _check_settings(self, who: str, request: Request, now_ns: int, used: Collection[str] | None) -> None:
         subjects = self._set_by(request)
-        values = [value for subject in subjects for value in values_of(subject, self._limits.parameters)]
+        values = [value for subject in subjects for value in values_of(subject, self.limits.parameters)]
         # parameters may move or turn the scan, or make it too many pixels, as well; several do so together
         are_parameters = all(isinstance(subject, Parameter) for subject in subjects)
         for place in changes_by(numbers(values)) if are_parameters else subjects:
@@ -216,7 +197,7 @@ class LimitChecker:
             elif isinstance(place, PositionChange):
                 self._check_move(place)
         for name, value in values:
-            limit = self._limits.parameters.get(name)
+            limit = self.limits.parameters.get(name)
             if used is None or name in used:
                 self._check_use(who, request.id, name, limit, now_ns, "parameter")
             if limit is not None and value is not None:
@@ -225,7 +206,7 @@ class LimitChecker:
     def _set_by(self, request: Request) -> Collection[object]:
         """What a request sets: its subject, or for an action what the microscope does as that."""
         if request.kind == ControlRequest.ACTION:
-            return self._limits.sets.get(str(request.subject), ())
+            return self.limits.sets.get(str(request.subject), ())
         return () if is_get(request) else (request.subject,)
 
     def _check_use(self, who: str, request_id: str, name: str, limit: Limit | None, now_ns: int, what: str) -> None:
@@ -235,7 +216,7 @@ class LimitChecker:
         if limit.only is not None and not {who, component_of(who)} & set(limit.only):
             allowed = ", ".join(sorted(limit.only)) or "nobody"
             raise _Breach(error, f"{who} may not use the {what} {name}, only {allowed} ({limit.source})")
-        last_ns = self._usage.last_ns(name, who, request_id)
+        last_ns = self.state.usage.last_ns(name, who, request_id)
         if limit.interval_s is not None and last_ns is not None and now_ns - last_ns < limit.interval_s * 1e9:
             ago_s = (now_ns - last_ns) / 1e9
             raise _Breach(
@@ -251,7 +232,7 @@ class LimitChecker:
             raise _param_error(f"{said} is above the highest allowed, {limit.high:g}{unit} ({limit.source})")
         if not limit.bounds_changes:
             return
-        known = self._usage.known(name)
+        known = self.state.usage.known.get(name)
         if known is None:
             raise _param_error(
                 f"{said}: the microscope does not tell the value now, so the step can't be checked ({limit.source})"
@@ -274,19 +255,19 @@ class LimitChecker:
         """What is checked is the scan as it would be afterwards: a request may give only a part of it."""
         shape, region = wanted.shape, wanted.region
         if isinstance(shape, ShapeChange):
-            shape = shape.onto(self._at.shape or (1, 1))
-        if shape is not None and shape[0] * shape[1] > self._limits.most_pixels:
-            raise _param_error(f"a scan of {shape[1]} x {shape[0]} pixels; the most are {self._limits.most_pixels}")
+            shape = shape.onto(self.state.position.shape or (1, 1))
+        if shape is not None and shape[0] * shape[1] > self.limits.most_pixels:
+            raise _param_error(f"a scan of {shape[1]} x {shape[0]} pixels; the most are {self.limits.most_pixels}")
         if isinstance(region, RegionChange):
             region = self._region_after(region)
-        allowed = self._limits.region
+        allowed = self.limits.region
         if region is None or allowed is None:
             return
         for x, y in region.corners_m():
             if not _inside(allowed, (float(x), float(y)), reach):
                 raise _param_error(
                     f"the scan's corner ({x:.6g}, {y:.6g}) m lies outside the region allowed"
-                    f" ({self._limits.region_source})"
+                    f" ({self.limits.region_source})"
                 )
 
     def _region_after(self, change: RegionChange) -> Region | None:
@@ -297,40 +278,40 @@ class LimitChecker:
         for size in (change.width_m, change.height_m):
             if size is not None and size <= 0:
                 raise _param_error(f"a scan region of size {size:g} m is empty")
-        if self._at.region is not None:
-            return change.onto(self._at.region)
-        if self._limits.region is not None:
+        if self.state.position.region is not None:
+            return change.onto(self.state.position.region)
+        if self.limits.region is not None:
             raise _param_error("where the scan is now is not known, so a part of its place can't be checked")
         return None
 
     def _check_point(self, xy_m: XY, reach: float = _REACH) -> None:
         if not all(map(math.isfinite, xy_m)):
             raise _param_error(f"the probe can't go to {xy_m}: not a place")
-        allowed = self._limits.region
+        allowed = self.limits.region
         if allowed is not None and not _inside(allowed, xy_m, reach):
             raise _param_error(
                 f"the probe position ({xy_m[0]:.6g}, {xy_m[1]:.6g}) m lies outside the region allowed"
-                f" ({self._limits.region_source})"
+                f" ({self.limits.region_source})"
             )
 
     def _check_place(self, action: str) -> None:
-        if self._limits.region is None:
+        if self.limits.region is None:
             return
         if action == names.START_SCAN:
-            if self._at.region is None:
+            if self.state.position.region is None:
                 raise _param_error("where the scan is now is not known")
-            self._check_scan(ScanParameters(self._at.region), _TOLD_REACH)
+            self._check_scan(ScanParameters(self.state.position.region), _TOLD_REACH)
         elif action in names.AT_PROBE:
-            if self._at.probe is None:
+            if self.state.position.probe_m is None:
                 raise _param_error("where the probe is now is not known")
-            self._check_point(self._at.probe, _TOLD_REACH)
+            self._check_point(self.state.position.probe_m, _TOLD_REACH)
 
     def _check_move(self, change: PositionChange) -> None:
-        if self._limits.region is None:
+        if self.limits.region is None:
             return
-        if self._at.probe is None:
+        if self.state.position.probe_m is None:
             raise _param_error("where the probe is now is not known, so a part of its place can't be checked")
-        self._check_point(moved(self._at.probe, change))
+        self._check_point(moved(self.state.position.probe_m, change))
 
 
 def _param_error(reason: str) -> _Breach:

@@ -1,9 +1,14 @@
-"""What intervals, steps and rates are measured from: when something was used last, and the values in force."""
+"""The values in force and the latest uses, from which steps, rates and intervals are measured."""
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+from afspm.logic.positions import KnownPosition
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,81 +27,70 @@ class KnownValue:
 
 @dataclass(frozen=True, slots=True)
 class LastUse:
-    """When something was used, by whom, and the id of the request; empty: it had none."""
+    """A use of a parameter or action, and the id of the request; empty: it had none."""
 
     at_ns: int
     who: str
     request_id: str
 
     def is_of(self, who: str, request_id: str) -> bool:
-        """Whether it is that very request, which may be asked again."""
+        """Return whether it is that very request, which may be asked again."""
         return bool(request_id) and (self.who, self.request_id) == (who, request_id)
 
 
-class LimitState:
-    """Kept over a restart: a scheduler that was killed must not allow sooner what was to be waited with."""
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """Values and uses, by name. Kept over a restart: a scheduler that was killed must not allow anything sooner.
 
-    def __init__(self) -> None:
-        self._known: dict[str, KnownValue] = {}
-        self._done: dict[str, LastUse] = {}
-        self._sent: dict[str, LastUse] = {}  # what became of these is not known (yet), so they count
+    Attributes:
+        sent: uses of unknown outcome, which count.
+    """
 
-    def known(self, name: str) -> KnownValue | None:
-        """The value in force, as far as it was learned."""
-        return self._known.get(name)
+    known: Mapping[str, KnownValue] = field(default_factory=dict)
+    done: Mapping[str, LastUse] = field(default_factory=dict)
+    sent: Mapping[str, LastUse] = field(default_factory=dict)
 
-    def learn(self, name: str, value: float, now_ns: int, *, was_read: bool = False) -> bool:
-        """A value is in force. Returns whether that is new.
+    def learn(self, name: str, value: float, now_ns: int, *, was_read: bool = False) -> Usage:
+        """Take a value in force.
 
         Args:
-            was_read: it was asked for, and may have been so for long.
+            was_read: it was asked for, and may have been in force for long.
         """
-        known = self._known.get(name)
+        known = self.known.get(name)
         if known is not None and known.value == value:
-            return False
-        if known is not None and was_read:
-            self._known[name] = replace(known, value=value)
-        else:
-            self._known[name] = KnownValue(value, now_ns, value)
-        return True
+            return self
+        new = replace(known, value=value) if known is not None and was_read else KnownValue(value, now_ns, value)
+        return replace(self, known={**self.known, name: new})
 
-    def forget(self, name: str) -> None:
-        """The value in force is not known any more."""
-        self._known.pop(name, None)
+    def forget(self, name: str) -> Usage:
+        """Drop a value that is not known any more."""
+        return replace(self, known=_without(self.known, name)) if name in self.known else self
 
     def last_ns(self, name: str, who: str, request_id: str) -> int | None:
-        """When it was used last, by another request than this one."""
-        uses = (uses.get(name) for uses in (self._done, self._sent))
+        """Return when it was used last, by another request than this one."""
+        uses = (uses.get(name) for uses in (self.done, self.sent))
         return max((use.at_ns for use in uses if use is not None and not use.is_of(who, request_id)), default=None)
 
-    def sending(self, name: str, use: LastUse) -> None:
-        """It is sent to the microscope."""
-        self._sent[name] = use
+    def use_sent(self, name: str, use: LastUse) -> Usage:
+        return replace(self, sent={**self.sent, name: use})
 
-    def done(self, name: str, use: LastUse) -> None:
-        """It was carried out."""
-        self._done[name] = use
-        self._sent.pop(name, None)
+    def use_done(self, name: str, use: LastUse) -> Usage:
+        return replace(self, done={**self.done, name: use}, sent=_without(self.sent, name))
 
-    def not_done(self, name: str, who: str, request_id: str) -> None:
-        """It was sent, or was to be, and was not carried out."""
-        use = self._sent.get(name)
-        if use is not None and (use.who, use.request_id) == (who, request_id):
-            del self._sent[name]
+    def use_undone(self, name: str, who: str, request_id: str) -> Usage:
+        """Take back a use that was sent, or was to be, and was not carried out."""
+        use = self.sent.get(name)
+        is_it = use is not None and (use.who, use.request_id) == (who, request_id)
+        return replace(self, sent=_without(self.sent, name)) if is_it else self
 
-    def snapshot(self) -> dict[str, Any]:
-        """As plain JSON."""
-        return {
-            "known": {name: astuple(one) for name, one in self._known.items()},
-            "done": {name: astuple(one) for name, one in self._done.items()},
-            "sent": {name: astuple(one) for name, one in self._sent.items()},
-        }
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """Take up what `snapshot` wrote."""
-        self._known = {
-            name: KnownValue(float(value), int(ns), float(origin))
-            for name, (value, ns, origin) in state["known"].items()
-        }
-        for kept, table in ((self._done, state["done"]), (self._sent, state["sent"])):
-            kept.update((name, LastUse(int(ns), str(who), str(id_))) for name, (ns, who, id_) in table.items())
+@dataclass(frozen=True, slots=True)
+class LimitState:
+    """All that requests are checked against beside the limits themselves."""
+
+    usage: Usage = field(default_factory=Usage)
+    position: KnownPosition = field(default_factory=KnownPosition)
+
+
+def _without(uses: Mapping[str, T], name: str) -> dict[str, T]:
+    return {other: use for other, use in uses.items() if other != name}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from afspm.model import Parameter, Region
 
@@ -63,3 +64,14 @@ class ExperimentLimits:
     region_source: str = "[limits] region"
     most_pixels: int = 8192 * 8192
     sets: Mapping[str, Collection[Parameter]] = field(default_factory=dict)
+
+    @cached_property
+    def bounded(self) -> frozenset[str]:
+        """The parameters of which the values in force matter."""
+        return frozenset(name for name, limit in self.parameters.items() if limit.bounds_changes)
+
+    @cached_property
+    def counted(self) -> frozenset[str]:
+        """The parameters and actions of which it matters when they were used last."""
+        both = {**self.parameters, **self.actions}
+        return frozenset(name for name, limit in both.items() if limit.interval_s is not None)

@@ -1,103 +1,138 @@
-"""What is known of the danger that the tip is in."""
+"""The microscope as far as it is known: what it does, whether it can be trusted, and what endangers its tip."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Any
+from dataclasses import dataclass, replace
 
-from afspm.model import Feedback, ScopeState
+from afspm.model import Feedback, Parameter, Request, ScopeState, names
 
 FEEDBACK_OFF = "feedback-off"
 """The name of the dangerous state in which the feedback is known to be switched off."""
+STOPS = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
+"""The actions that stop what runs."""
+STARTS = {names.START_SCAN: names.STOP_SCAN, names.START_SPEC: names.STOP_SPEC}
+"""The actions that start something, with those that stop it."""
+_OFF = names.OFF_WORDS | {"0.0"}  # a translator that is not ours may take a number
 
 
+@dataclass(frozen=True, slots=True)
 class TipRisk:
-    """Knows what the microscope does, as far as that endangers the tip.
+    """The part of the status that endangers the tip; it survives a restart.
 
-    Args:
-        dangerous: names of ScopeState, and "feedback-off".
+    Attributes:
+        state: the last that is known; a microscope that is lost goes on with it.
+        feedback_on: None: not known.
+        tip_away: the tip is withdrawn: neither the coarse motor nor a feedback that is off does harm.
     """
 
-    def __init__(self, dangerous: Collection[str]) -> None:
-        self._dangerous = dangerous
-        self._state = ScopeState.UNDEFINED
-        self._feedback_on: bool | None = None
-        self._before: bool | None = None  # what it was before a request of unknown outcome, while there is such a
-        self._in_doubt = False
-        self._is_away = False  # the tip: neither the motor that retracts it nor a feedback that is off does harm
-        self._told: str | None = None
+    state: ScopeState = ScopeState.UNDEFINED
+    feedback_on: bool | None = None
+    tip_away: bool = False
 
-    def snapshot(self) -> dict[str, Any]:
-        """As plain JSON."""
-        return {"state": int(self._state), "feedback_on": self._feedback_on, "is_away": self._is_away}
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """Take up what `snapshot` wrote."""
-        self._state = ScopeState(state["state"])
-        self._feedback_on, self._is_away = state["feedback_on"], bool(state["is_away"])
+@dataclass(frozen=True, slots=True)
+class MicroscopeStatus:
+    """Everything that is known of the microscope's activity.
 
-    def scope_is(self, state: ScopeState) -> None:
-        """A microscope that is lost goes on with what it did."""
-        if state is not ScopeState.UNDEFINED:
-            self._state = state
-        self._see()
+    Attributes:
+        dangerous: names of ScopeState, and "feedback-off".
+        patience_s: how long (real) the controller may be lost before that is a problem: one that is found again within
+            that time costs nothing, what runs there goes on.
+        state: as it was told last; UNDEFINED of a microscope whose controller is gone or makes no sense.
+        states_seen: how many states have been told.
+        lost_since_s: since when (real) nothing is known of it.
+        feedback_before: what the feedback was before a request of unknown outcome.
+        in_doubt: there is such a request.
+        told: the danger that was logged.
+    """
 
-    def feedback_is(self, feedback: Feedback) -> bool:
-        """Returns whether that is new."""
+    dangerous: Collection[str] = ()
+    patience_s: float = 5.0
+    state: ScopeState = ScopeState.UNDEFINED
+    states_seen: int = 0
+    lost_since_s: float | None = None
+    risk: TipRisk = TipRisk()
+    feedback_before: bool | None = None
+    in_doubt: bool = False
+    told: str | None = None
+
+    @property
+    def is_free(self) -> bool:
+        """True while it does nothing, as far as is known."""
+        return self.state is ScopeState.FREE or not self.states_seen
+
+    @property
+    def lost_at_s(self) -> float | None:
+        """When, real, it has been lost for too long; None: it is not lost."""
+        return None if self.lost_since_s is None else self.lost_since_s + self.patience_s
+
+    def with_state(self, state: ScopeState, now_s: float) -> MicroscopeStatus:
+        """Take the state that the translator told."""
+        told = replace(self, state=state, states_seen=self.states_seen + 1)
+        if state is ScopeState.UNDEFINED:
+            return replace(told, lost_since_s=now_s) if self.lost_since_s is None else told
+        return replace(told, lost_since_s=None)._with_risk(replace(self.risk, state=state))
+
+    def with_feedback(self, feedback: Feedback) -> MicroscopeStatus:
+        """Take what is known of the feedback now."""
         if feedback.on is None:
-            return False
-        self._in_doubt = False
-        if feedback.on is self._feedback_on:
-            return False
-        self._feedback_on = feedback.on
-        self._is_away = self._is_away and not feedback.on
-        self._see()
-        return True
+            return self
+        certain = replace(self, in_doubt=False)
+        if feedback.on is self.risk.feedback_on:
+            return certain
+        away = self.risk.tip_away and not feedback.on
+        return certain._with_risk(replace(self.risk, feedback_on=feedback.on, tip_away=away))
 
-    def feedback_may_be_off(self) -> None:
-        """A request switches it off, or nobody knows whether one did."""
-        before = self._feedback_on
-        if self.feedback_is(Feedback(on=False)):
-            self._before, self._in_doubt = before, True
+    def feedback_may_be_off(self) -> MicroscopeStatus:
+        """Reckon with a feedback that is off: a request switches it off, or may have done so."""
+        changed = self.with_feedback(Feedback(on=False))
+        if changed.risk.feedback_on is self.risk.feedback_on:
+            return changed
+        return replace(changed, feedback_before=self.risk.feedback_on, in_doubt=True)
 
-    def feedback_was_left(self) -> None:
-        """It turns out that the request was refused."""
-        if self._in_doubt:
-            self._feedback_on, self._in_doubt = self._before, False
-            self._see()
+    def feedback_was_left(self) -> MicroscopeStatus:
+        """Undo `feedback_may_be_off`: the request was refused."""
+        if not self.in_doubt:
+            return self
+        return replace(self, in_doubt=False)._with_risk(replace(self.risk, feedback_on=self.feedback_before))
 
-    def tip_is_away(self, *, is_away: bool) -> bool:
-        """Returns whether that is new."""
-        changed, self._is_away = is_away is not self._is_away, is_away
-        self._see()
-        return changed
+    def with_tip(self, *, away: bool) -> MicroscopeStatus:
+        return self._with_risk(replace(self.risk, tip_away=away))
 
-    @property
-    def by_feedback(self) -> bool:
-        """It is that the feedback is off."""
-        return self._feedback_on is False and FEEDBACK_OFF in self._dangerous and not self._is_away
+    def after_action(self, action: str, *, is_away: bool) -> MicroscopeStatus:
+        """Take an action that was, or may have been, carried out: what does not just start or stop may move the tip."""
+        only_runs = action in STARTS or action in STOPS.values()
+        return self if only_runs else self.with_tip(away=is_away)
 
     @property
-    def feedback_is_on(self) -> bool:
-        """It is known to be."""
-        return self._feedback_on is True
+    def endangered_by_feedback(self) -> bool:
+        risk = self.risk
+        return risk.feedback_on is False and FEEDBACK_OFF in self.dangerous and not risk.tip_away
 
     @property
-    def now(self) -> str | None:
-        """What is dangerous now, in words; None: nothing, or it was seen to."""
-        if self._is_away:
+    def danger(self) -> str | None:
+        """The danger that the tip is in, in words; None: none, or it was seen to."""
+        if self.risk.tip_away:
             return None
-        if self.by_feedback:
+        if self.endangered_by_feedback:
             return "the feedback is off"
-        return f"the microscope is in {self._state.name}" if self._state.name in self._dangerous else None
+        name = self.risk.state.name
+        return f"the microscope is in {name}" if name in self.dangerous else None
 
-    def untold(self) -> str | None:
-        """The danger now, if people have not been told of it: each once."""
-        if self.now == self._told:
-            return None
-        self._told = self.now
-        return self.now
+    def telling(self) -> tuple[MicroscopeStatus, str | None]:
+        """Return the danger if it was not logged yet: each once."""
+        danger = self.danger
+        return replace(self, told=danger), None if danger == self.told else danger
 
-    def _see(self) -> None:
-        if self.now is None:
-            self._told = None
+    def _with_risk(self, risk: TipRisk) -> MicroscopeStatus:
+        changed = replace(self, risk=risk)
+        return replace(changed, told=None) if changed.danger is None else changed
+
+
+def feedback_of(request: Request) -> Feedback | None:
+    """Return the feedback that a request sets; None: it sets none of it."""
+    subject = request.subject
+    if isinstance(subject, Parameter) and subject.name == names.FEEDBACK_ON and subject.value is not None:
+        return Feedback(on=subject.value.strip().lower() not in _OFF)
+    return subject if isinstance(subject, Feedback) else None

@@ -1,67 +1,89 @@
-"""What the translator publishes, on its way to everybody."""
+"""Packets of the translator: each gets its envelope, its time and its coordinates, and tells of the microscope."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from afspm.errors import AfspmError
-from afspm.logic.cache import PacketCache
-from afspm.logic.coordinate_frame import CoordinateFrame
-from afspm.logic.events import Log, Publish
-from afspm.logic.scheduler_publisher import CONTROL_STATE
-from afspm.model import Packet, PacketHeader
+from afspm.logic import control_change, safety_commands
+from afspm.logic.arbitration import ArbitrationEvent, ControlInput
+from afspm.logic.control_change import TRANSLATOR
+from afspm.logic.events import PacketIn, Publish
+from afspm.logic.publishing import CONTROL_STATE
+from afspm.logic.request_pipeline import act_when_moved
+from afspm.logic.state import StateDraft
+from afspm.model import Feedback, Packet, PacketHeader, ProbePosition, Problem, ScanParameters, ScopeState, ScopeStatus
 
 SPECTRUM = "Spec1d"
-_MOST_TOLD = 1000
+_TELLING = frozenset({"ScopeStateMsg", "ZCtrlParameters", "ScanParameters2d", "ProbePosition"})
+"""Messages from which we learn what the microscope is in. All others pass unread."""
+_MOST_LOGGED = 1000
 _DOUBT = (
     "the translator is of version 1: those of the published implementation for Nanonis and Asylum send the values of a "
     "spectrum variable after variable; if curves look scrambled, set spectra_by_variable = true in [control]"
 )
 
 
-class PacketIntake:
-    """Takes packets in: each is given its envelope, its time and its coordinates, or is dropped.
+def take_packet(draft: StateDraft, event: PacketIn) -> None:
+    """Publish a packet, and learn from it what the microscope does."""
+    message, codec, move = event.header.message, draft.env.codec, draft.pending.move
+    told = codec.decode_packet(message, event.packet.payload) if message in _TELLING else None
+    if move is not None and move.hides(told):
+        if draft.env.cache.pass_over(event.packet):
+            _learn(draft, told)
+        return
+    published = _published(draft, event.packet, event.header)
+    if published is None:
+        return
+    draft.effects.append(published)
+    by_variable = draft.env.settings.spectra_by_variable
+    if draft.idempotency.ids_known is False and message == SPECTRUM and not by_variable:
+        _log_once(draft, "WARNING", _DOUBT)
+    if told is not None:
+        _learn(draft, told)
 
-    Args:
-        frame: the coordinates that components speak of, where they are not those of the microscope.
-        by_point: puts the values of a spectrum in order; None: they are.
-    """
 
-    def __init__(
-        self,
-        cache: PacketCache,
-        frame: CoordinateFrame | None = None,
-        by_point: Callable[[bytes | memoryview], bytes] | None = None,
-    ) -> None:
-        self._cache = cache
-        self._frame = frame
-        self._by_point = by_point
-        self._told: set[str] = set()
+def _published(draft: StateDraft, packet: Packet, header: PacketHeader) -> Publish | None:
+    """Return what to publish; None: it is dropped, or we have had it."""
+    env, source_ns = draft.env, packet.time_ns
+    if header.message == CONTROL_STATE:
+        _log_once(draft, "WARNING", "the translator publishes a ControlState, which is the scheduler's: dropped")
+        return None
+    try:
+        if env.settings.spectra_by_variable and header.message == SPECTRUM:
+            packet = Packet(packet.envelope, env.codec.by_point(packet.payload), packet.time_ns)
+        if env.frame is not None:
+            packet = env.frame.incoming(packet, header, draft.now_ns)
+        taken = env.cache.take(packet, header, draft.now_ns)
+    except AfspmError as error:
+        _log_once(draft, "ERROR", f"{header.message} is not published: {error}")
+        return None
+    return None if taken is None else Publish(taken[0], source_ns, taken[1])
 
-    def take(self, packet: Packet, header: PacketHeader, now_ns: int) -> Publish | Log | None:
-        """What to publish; or why it is dropped, if that has not been told yet; None: we have had it."""
-        if header.message == CONTROL_STATE:
-            return self._once("WARNING", "the translator publishes a ControlState, which is the scheduler's: dropped")
-        source_ns = packet.time_ns
-        try:
-            if self._by_point is not None and header.message == SPECTRUM:
-                packet = Packet(packet.envelope, self._by_point(packet.payload), packet.time_ns)
-            if self._frame is not None:
-                packet = self._frame.incoming(packet, header, now_ns)
-            taken = self._cache.take(packet, header, now_ns)
-        except AfspmError as error:
-            return self._once("ERROR", f"{header.message} is not published: {error}")
-        return None if taken is None else Publish(taken[0], source_ns, taken[1])
 
-    def doubted(self, header: PacketHeader) -> Log | None:
-        """What is to be said, once, of a packet of a translator of version 1."""
-        if header.message != SPECTRUM or self._by_point is not None:
-            return None
-        return self._once("WARNING", _DOUBT)
+def _log_once(draft: StateDraft, level: str, text: str) -> None:
+    if text not in draft.logged and len(draft.logged) < _MOST_LOGGED:
+        draft.logged |= {text}
+        draft.log(level, text)
 
-    def _once(self, level: str, text: str) -> Log | None:
-        """What is to be logged, if it was not yet."""
-        if text in self._told or len(self._told) >= _MOST_TOLD:
-            return None
-        self._told.add(text)
-        return Log(level, text)
+
+def _learn(draft: StateDraft, told: object) -> None:
+    if isinstance(told, ScopeStatus):
+        _take_state(draft, told.state)
+    elif isinstance(told, Feedback):
+        before, draft.microscope = draft.microscope, draft.microscope.with_feedback(told)
+        if draft.microscope.risk != before.risk:
+            safety_commands.send(draft)
+    if isinstance(told, Feedback | ScanParameters | ProbePosition):
+        draft.limits = draft.limits.in_force(told, draft.now_ns)
+
+
+def _take_state(draft: StateDraft, state: ScopeState) -> None:
+    was_free = draft.microscope.is_free
+    draft.microscope = draft.microscope.with_state(state, draft.now_s)
+    draft.watchdog = draft.watchdog.state_told(draft.microscope)
+    if draft.microscope.is_free != was_free:
+        draft.lease = draft.lease.used(draft.now_ns)
+    flagged_by = draft.control.problems.get(Problem.DEVICE_MALFUNCTION)
+    if draft.microscope.lost_since_s is None and flagged_by == TRANSLATOR:
+        control_change.decide(draft, ControlInput(ArbitrationEvent.CLEAR, TRANSLATOR, Problem.DEVICE_MALFUNCTION))
+    safety_commands.send(draft)
+    act_when_moved(draft)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from afspm.errors import InvalidValue
@@ -28,63 +28,39 @@ REGION_CHANGES: dict[str, Callable[[float], RegionChange]] = {
 }
 
 
+@dataclass(frozen=True, slots=True)
 class KnownPosition:
-    """What is known of it, from what was set and what is published.
+    """The place of the scan and of the probe, as far as it was set or published.
 
     Attributes:
-        scan: the region and shape; None in it, or a part of one: not known.
-        probe: the probe position, m; None: not known.
+        region, shape: of the scan; the shape as (rows, columns).
+        probe_m: the probe position.
     """
 
-    def __init__(self) -> None:
-        self.scan = ScanParameters()
-        self.probe: XY | None = None
+    region: Region | None = None
+    shape: tuple[int, int] | None = None
+    probe_m: XY | None = None
 
-    @property
-    def region(self) -> Region | None:
-        """Where the scan is; None: not known."""
-        return self.scan.region if isinstance(self.scan.region, Region) else None
-
-    @property
-    def shape(self) -> tuple[int, int] | None:
-        """Its pixels as (rows, columns); None: not known."""
-        return self.scan.shape if isinstance(self.scan.shape, tuple) else None
-
-    def is_at(self, subject: object) -> None:
-        """What was set, or told."""
+    def learn(self, subject: object) -> KnownPosition:
+        """Take a place, or a part of one, that was set or told."""
         if isinstance(subject, ScanParameters):
             with suppress(InvalidValue):  # a part of a region that is not known yet
-                self.scan = subject.onto(self.scan)
+                scan = subject.onto(ScanParameters(self.region, self.shape))
+                region = scan.region if isinstance(scan.region, Region) else None
+                return replace(self, region=region, shape=scan.shape if isinstance(scan.shape, tuple) else None)
         elif isinstance(subject, ProbePosition):
-            self.probe = subject.xy_m
-        elif isinstance(subject, PositionChange) and self.probe is not None:
-            self.probe = moved(self.probe, subject)
+            return replace(self, probe_m=subject.xy_m)
+        elif isinstance(subject, PositionChange) and self.probe_m is not None:
+            return replace(self, probe_m=moved(self.probe_m, subject))
+        return self
 
-    def has_values(self, values: Iterable[tuple[str, float]]) -> None:
-        """Single parameters, by their names, in SI; what is no place is not learned."""
+    def learn_values(self, values: Iterable[tuple[str, float]]) -> KnownPosition:
+        """Take single parameters, by their names, in SI; what is no place is not learned."""
+        known = self
         with suppress(InvalidValue):
             for change in changes_by(values):
-                self.is_at(change)
-
-    def snapshot(self) -> dict[str, Any]:
-        """As plain JSON."""
-        region, shape = self.region, self.shape
-        return {
-            "region": None if region is None else [*region.center_m, *region.size_m, region.angle_rad],
-            "shape": None if shape is None else list(shape),
-            "probe": None if self.probe is None else list(self.probe),
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Take up what `snapshot` wrote."""
-        region, shape, probe = state["region"], state["shape"], state["probe"]
-        if region is not None:
-            x, y, width, height, angle = map(float, region)
-            self.scan = ScanParameters(Region((x, y), (width, height), angle))
-        if shape is not None:
-            self.scan = replace(self.scan, shape=(int(shape[0]), int(shape[1])))
-        if probe is not None:
-            self.probe = (float(probe[0]), float(probe[1]))
+                known = known.learn(change)
+        return known
 
 
 def changes_by(values: Iterable[tuple[str, float]]) -> list[PositionChange | ScanParameters]:

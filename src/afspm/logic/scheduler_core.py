@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
-from afspm.logic.arbiter import CONTROL_EVENTS, Arbiter, ask_of
-from afspm.logic.arbitration import ArbitrationState, ControlEvent, ControlInput
+from afspm.logic import answers, control_change, packet_intake, publishing, request_pipeline, safety_commands
+from afspm.logic.arbitration import ArbitrationEvent, ArbitrationState, ControlInput
 from afspm.logic.cache import TIME_STEP_NS, PacketCache
-from afspm.logic.controller_timeout import TRANSLATOR, ControllerTimeout
+from afspm.logic.control_change import TRANSLATOR
 from afspm.logic.coordinate_frame import CoordinateFrame
-from afspm.logic.event_log import SCHEDULER, EventLog
+from afspm.logic.event_log import SCHEDULER, start_entry, unreadable_entry
 from afspm.logic.events import (
     Announced,
     Codec,
@@ -21,15 +22,11 @@ from afspm.logic.events import (
     Greeted,
     Input,
     Kill,
-    Log,
     PacketIn,
     ProblemSeen,
-    Publish,
     Replay,
     ReplayRequested,
-    Reply,
     RequestIn,
-    SaveState,
     Stopped,
     Tick,
     TranslatorCaughtUp,
@@ -38,51 +35,38 @@ from afspm.logic.events import (
     TranslatorUp,
     Unreadable,
 )
-from afspm.logic.experiment_end import ExperimentEnd
-from afspm.logic.holder_timeout import HolderTimeout
-from afspm.logic.lease import Lease
-from afspm.logic.lifecycle import StartupBarrier
-from afspm.logic.packet_intake import PacketIntake
-from afspm.logic.request_pipeline import OwnEnd, RequestPipeline
-from afspm.logic.scheduler_publisher import CONTROL_STATE, SchedulerPublisher
+from afspm.logic.microscope_status import STOPS
 from afspm.logic.settings import SchedulerSettings
-from afspm.logic.shutdown_grace import ShutdownGrace
-from afspm.logic.watchdog import Watchdog
-from afspm.model import (
-    CLOCK_REQUEST,
-    HAS_ENDED,
-    RELAY_REQUEST,
-    RESTART_REQUEST,
-    ControlMode,
-    ControlResponse,
-    ControlState,
-    Feedback,
-    Packet,
-    ProbePosition,
-    Problem,
-    Request,
-    Response,
-    ResponseDetail,
-    ScanParameters,
-    ScopeState,
-    ScopeStatus,
-    component_of,
-    names,
-)
+from afspm.logic.state import Environment, SavedState, SchedulerState, StateDraft, restored_state, saved_state
+from afspm.model import ControlMode, ControlState, LoggedPacket, Problem, Request, Response, component_of
 
-__all__ = ["CONTROL_STATE", "SchedulerCore", "SchedulerSettings"]
-
-_TELLING = frozenset({"ScopeStateMsg", "ZCtrlParameters", "ScanParameters2d", "ProbePosition"})
-"""Messages from which we learn what the microscope is in. All others pass unread."""
-_STOPS = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
+_MALFUNCTION = Problem.DEVICE_MALFUNCTION
 _AT_ONCE_S = 0.0  # in real monotonic time: always past
+OwnEnd = Callable[[Response, float, int], Iterable[Effect]]
+"""Takes the answer to a request of the scheduler's own, with now_s and now_ns; returns what follows from it."""
+
+
+def step(
+    state: SchedulerState, event: Input, env: Environment, now_s: float, now_ns: int
+) -> tuple[SchedulerState, list[Effect]]:
+    """Return the state after an event, and what is to be done, in order."""
+    draft = StateDraft(state, env, now_s, now_ns)
+    _HANDLERS[type(event)](draft, event)
+    _end_when_safe(draft)
+    return draft.finish()
+
+
+def due_s(state: SchedulerState) -> float | None:
+    """Return when, in real monotonic time, a Tick is due at the latest."""
+    dues = (state.due_s(), _malfunction(state)[0], _entries_due_s(state), _dead_at_s(state))
+    return min((one_s for one_s in dues if one_s is not None), default=None)
 
 
 class SchedulerCore:
     """The scheduler without its sockets.
 
         core = SchedulerCore(settings, codec)
-        core.restore(state); core.restore_cache(packets)     # after a restart only
+        core.restore(saved); core.restore_cache(packets)     # after a restart only
         effects = core.start(now_s, now_ns)                  # then, for whatever happens:
         effects = core.step(RequestIn(...), now_s, now_ns)
 
@@ -91,394 +75,310 @@ class SchedulerCore:
 
     Args:
         frame: the coordinates that components speak of, where they are not those of the microscope.
+
+    Attributes:
+        state: all that it decides by; replaced by every step.
     """
 
     def __init__(self, settings: SchedulerSettings, codec: Codec, frame: CoordinateFrame | None = None) -> None:
-        self._settings = settings
-        self._codec = codec
-        self._cache = PacketCache(settings.envelopes, settings.cache_bytes)
-        self._lease = Lease(None if settings.lease_s is None else round(settings.lease_s * 1e9))
-        self._watchdog = Watchdog(settings.watchdog)
-        self._controller_timeout = ControllerTimeout(settings.malfunction_after_s)
-        self._frame = frame
-        self._intake = PacketIntake(self._cache, frame, codec.by_point if settings.spectra_by_variable else None)
-        self._startup_barrier = StartupBarrier(settings.catch_up_s)
-        self._event_log = chronicle = EventLog(settings.rules.problems)
-        self._bulletin = SchedulerPublisher(codec, self._cache, chronicle, settings.rules.roles, self._save)
-        self._pipeline = desk = RequestPipeline(
-            settings, codec, self._watchdog, self._lease, self._control, self._save, chronicle, frame
-        )
-        self._sessions, self._forwarder, self._guard = desk.sessions, desk.forwarder, desk.guard
-        self._holder_timeout = HolderTimeout(
-            desk.sessions, settings.grace_s, settings.restart_grace_s, self._bulletin.telling.over_since_s
-        )
-        self._ending = ExperimentEnd(settings, desk, self._watchdog)
-        self._farewell = ShutdownGrace()
-        self._arbiter = Arbiter(
-            settings.rules, desk, self._bulletin, chronicle, self._watchdog, self._lease,
-            self._startup_barrier, self._ending, self._save,
-        )  # fmt: skip
-        self._is_restarted = False
-        self._recent: list[tuple[int, int]] = []
-        self._effects: list[Effect] = []
-        self._handlers: dict[type, Callable[[Any, float, int], None]] = {
-            RequestIn: self._on_request,
-            Unreadable: self._on_unreadable,
-            TranslatorReply: self._on_reply,
-            PacketIn: self._on_packet,
-            Connected: self._on_connected,
-            Disconnected: self._on_disconnected,
-            Greeted: self._on_greeted,
-            ReplayRequested: self._on_subscriber,
-            TranslatorUp: self._on_translator_up,
-            TranslatorDown: self._on_translator_down,
-            TranslatorCaughtUp: self._on_translator_caught_up,
-            ProblemSeen: self._on_problem,
-            Announced: self._on_announced,
-            Stopped: self._on_stopped,
-            Tick: self._on_tick,
-        }
-
-    # --- life ---
+        self._env = Environment(settings, codec, PacketCache(settings.envelopes, settings.cache_bytes), frame)
+        self.state = SchedulerState.initial(settings)
+        self._restored: SavedState | None = None
 
     def start(self, now_s: float, now_ns: int) -> list[Effect]:
         """Begin. The control state is published as soon as the translator's packets have been caught up with."""
-        self._effects = self._pipeline.effects = []
-        self._holder_timeout.started(now_s)
-        self._watchdog.begin(now_s)
-        self._lease.held_by(self.control.holder, now_ns)
-        self._cache.remember(self._recent)
-        self._event_log.at(now_s, now_ns)
-        if self.control.ended:
-            self._ending.begin(now_s)
-            self._end_when_safe(now_s, now_ns)
+        draft, is_restart = StateDraft(self.state, self._env, now_s, now_ns), self._restored is not None
+        draft.holder_timeout = replace(draft.holder_timeout, started_s=now_s)
+        draft.watchdog = draft.watchdog.begun(now_s)
+        draft.lease = draft.lease.held_by(draft.control.holder, now_ns)
+        if self._restored is not None:
+            self._env.cache.remember(self._restored.recent)
+        if draft.control.ended:
+            control_change.begin_end(draft)
+            _end_when_safe(draft)
         else:
-            self._startup_barrier.begin(now_s, again=self._is_restarted)
-            self._event_log.began(self.control, again=self._is_restarted)
-        return self._effects
+            draft.barrier = draft.barrier.begin(now_s, is_restart=is_restart)
+            entry = start_entry(now_ns, draft.control, is_restart=is_restart)
+            draft.event_log = draft.event_log.add(now_s, entry)
+        return self._finish(draft)
 
     def step(self, event: Input, now_s: float, now_ns: int) -> list[Effect]:
-        """Take in what happened; `now_s` is real and monotonic, `now_ns` the experiment's time."""
-        self._effects = self._pipeline.effects = []
-        self._event_log.at(now_s, now_ns)
-        self._handlers[type(event)](event, now_s, now_ns)
-        self._end_when_safe(now_s, now_ns)
-        return self._with_forwards()
-
-    def _end_when_safe(self, now_s: float, now_ns: int) -> None:
-        """The experiment that is over ends, once the tip is out of danger or that takes too long."""
-        if self._ending.is_due(now_s):
-            self._ending.end()
-            self._with_forwards()
-            stop = _STOPS.get(self._watchdog.state, "")
-            self._effects += [*self._bulletin.entries(now_ns), Kill(not self._watchdog.owes_retract, stop)]
-            self._farewell.begin(now_s)
-
-    def _with_forwards(self) -> list[Effect]:
-        if self._forwarder.outbox:
-            self._effects += self._forwarder.outbox
-            self._forwarder.outbox.clear()
-        return self._effects
-
-    def deadline_s(self) -> float | None:
-        """When, in real monotonic time, a Tick is due at the latest; None: no deadline."""
-        soonest_s = self._forwarder.deadline_s()
-        others_s = (
-            self._dead_at_s(),
-            self._startup_barrier.due_s(),
-            self._ending.by_s,
-            self._pipeline.unclear_until_s(),
-            self._pipeline.mover.due_s(),
-            self._malfunction()[0],
-            self._watchdog.due_s,
-            self._entries_due_s(),
-        )
-        for deadline_s in others_s:
-            if deadline_s is not None and (soonest_s is None or deadline_s < soonest_s):
-                soonest_s = deadline_s
-        return soonest_s
-
-    def deadline_ns(self) -> int | None:
-        """When, in experiment time, a Tick is due at the latest; None: no deadline (only a lease makes one)."""
-        return self._lease.deadline_ns()
-
-    def snapshot(self) -> dict[str, Any]:
-        """What must survive a kill, but for the cache, as plain JSON."""
-        return {
-            **self._arbiter.snapshot(),
-            "last_ns": self._cache.last_ns,
-            "recent": self._cache.recent(),
-            "watchdog": self._watchdog.snapshot(),
-            "supervisors": self._bulletin.telling.snapshot(),
-            **self._pipeline.snapshot(),
-            **({} if self._frame is None else {"frame": self._frame.snapshot()}),
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Take up what `snapshot` wrote, before `start`.
-
-        Raises:
-            KeyError, TypeError, ValueError: it is not what `snapshot` writes.
-        """
-        self._is_restarted = True
-        self._arbiter.restore(state)
-        self._cache.not_before(int(state["last_ns"]))
-        self._watchdog.restore(state["watchdog"])
-        self._recent = [(int(source_ns), int(first_ns)) for source_ns, first_ns in state["recent"]]
-        self._bulletin.telling.restore(state.get("supervisors", {}))
-        self._pipeline.restore(state)
-        if self._frame is not None and "frame" in state:
-            self._frame.restore(state["frame"])
-
-    def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None:
-        """Take up packets that were published (with their `source_ns`), oldest first, before `start`."""
-        self._cache.restore(packets)
-
-    def cached(self) -> Iterable[tuple[Packet, int | None]]:
-        """What is cached now (with `source_ns`), oldest first: for whoever tidies the journal."""
-        return self._cache
+        """Take an event; `now_s` is real and monotonic, `now_ns` the experiment's time."""
+        self.state, effects = step(self.state, event, self._env, now_s, now_ns)
+        return effects
 
     def ask_own(self, request: Request, now_s: float, ended: OwnEnd) -> list[Effect]:
-        """ControlInput the microscope in the scheduler's own name, if it is there."""
-        self._effects = self._pipeline.effects = []
-        self._pipeline.ask_own(request, now_s, ended)
-        return self._with_forwards()
+        """Ask the microscope in the scheduler's own name, if it is there."""
+        draft = StateDraft(self.state, self._env, now_s, 0)
+
+        def on_answer(draft: StateDraft, response: Response) -> None:
+            draft.effects += ended(response, draft.now_s, draft.now_ns)
+
+        draft.forwarder, _ = draft.forwarder.ask_own(request, now_s, on_answer)
+        return self._finish(draft)
+
+    def _finish(self, draft: StateDraft) -> list[Effect]:
+        self.state, effects = draft.finish()
+        return effects
 
     def put_off(self, until_s: float) -> None:
-        """More of what was published before a restart is to come: who is in control is told after that."""
-        self._startup_barrier.put_off(until_s)
+        """Wait longer before telling who is in control: more of what was published before a restart is to come."""
+        self.state = replace(self.state, barrier=self.state.barrier.put_off(until_s))
+
+    def deadline_s(self) -> float | None:
+        """Return when, in real monotonic time, a Tick is due at the latest; None: no deadline."""
+        return due_s(self.state)
+
+    def deadline_ns(self) -> int | None:
+        """Return when, in experiment time, a Tick is due at the latest; None: no deadline (only a lease makes one)."""
+        return self.state.lease.deadline_ns(is_free=self.state.microscope.is_free)
+
+    def snapshot(self) -> SavedState:
+        """Return what must survive a kill, but for the cache."""
+        return saved_state(self.state, self._env)
+
+    def restore(self, saved: SavedState) -> None:
+        """Take up what `snapshot` gave, before `start`."""
+        self._restored = saved
+        self.state = restored_state(saved, self._env.settings)
+        self._env.cache.not_before(saved.last_ns)
+        if self._env.frame is not None and saved.frame is not None:
+            self._env.frame.restore(json.loads(saved.frame))
+
+    def restore_cache(self, packets: Iterable[LoggedPacket]) -> None:
+        """Take up packets that were published (with their `source_ns`), oldest first, before `start`."""
+        self._env.cache.restore(packets)
+
+    def cached(self) -> Iterable[LoggedPacket]:
+        """Return what is cached now (with `source_ns`), oldest first."""
+        return self._env.cache
 
     @property
     def newest_source_ns(self) -> int:
         """The translator's newest packet that was taken in: where to subscribe from; -1 if there is none."""
-        return self._cache.newest_source_ns
+        return self._env.cache.newest_source_ns
 
     @property
     def leave_at_s(self) -> float:
         """When, in real monotonic time, the scheduler may leave after the end; inf: it has not ended."""
-        return self._farewell.until_s
+        return self.state.end.leave_at_s
 
     @property
     def control(self) -> ArbitrationState:
         """Who is in control, for what, and who flagged which problem."""
-        return self._arbiter.control
+        return self.state.control
 
     @property
     def control_state(self) -> ControlState:
         """The same as all peers are told it."""
         return self.control.published()
 
-    # --- peers ---
 
-    def _on_connected(self, event: Connected, now_s: float, now_ns: int) -> None:
-        self._sessions.connected(event.connection)
+# --- peers ----------------------------------------------------------------------------------------------------------
 
-    def _on_disconnected(self, event: Disconnected, now_s: float, now_ns: int) -> None:
-        name = self._pipeline.disconnected(event.connection, now_s)
-        if name is None:
+
+def _on_connected(draft: StateDraft, event: Connected) -> None:
+    draft.sessions = draft.sessions.connected(event.connection)
+
+
+def _on_disconnected(draft: StateDraft, event: Disconnected) -> None:
+    draft.pending = replace(draft.pending, refused=draft.pending.refused - {event.connection})
+    draft.sessions, name = draft.sessions.disconnected(event.connection, draft.now_s)
+    if name is None:
+        return
+    draft.pending, waiting = draft.pending.clear_up(name)
+    timeout = draft.holder_timeout
+    if waiting is not None:
+        request_pipeline.handle(draft, waiting)
+    elif name == draft.control.holder and draft.now_s >= timeout.told_again_s:
+        draft.holder_timeout = timeout.told(draft.now_s)
+        draft.log("WARNING", f"{name} is in control and gone; it has {timeout.grace_s:g} s to come back")
+
+
+def _on_greeted(draft: StateDraft, event: Greeted) -> None:
+    if event.name and (event.user is None or event.user == component_of(event.name)):
+        draft.sessions, _ = draft.sessions.hear(event.connection, event.name, None, draft.now_s)
+
+
+def _on_unreadable(draft: StateDraft, event: Unreadable) -> None:
+    entry = unreadable_entry(draft.now_ns, event.name, event.response)
+    draft.event_log = draft.event_log.add_request(draft.now_s, entry)
+
+
+def _on_subscriber(draft: StateDraft, event: ReplayRequested) -> None:
+    draft.effects.append(Replay(event.subscriber, draft.env.cache.replay(event.prefixes, event.since_ns)))
+
+
+def _on_problem(draft: StateDraft, event: ProblemSeen) -> None:
+    what = ArbitrationEvent.FLAG if event.flagged else ArbitrationEvent.CLEAR
+    control_change.decide(draft, ControlInput(what, event.name, event.problem))
+
+
+def _on_announced(draft: StateDraft, event: Announced) -> None:
+    # what goes before a packet must not put off its time: should that come again after a kill, it is to keep it
+    time_ns = None if event.before_ns is None else event.before_ns - TIME_STEP_NS
+    publishing.publish(draft, event.envelope, event.payload, time_ns)
+
+
+# --- the translator -------------------------------------------------------------------------------------------------
+
+
+def _on_reply(draft: StateDraft, event: TranslatorReply) -> None:
+    draft.forwarder, settled = draft.forwarder.answered(event.number, event.response, draft.now_s)
+    if settled is not None:
+        request_pipeline.settle(draft, settled)
+
+
+def _on_translator_up(draft: StateDraft, event: TranslatorUp) -> None:
+    draft.forwarder, settled = draft.forwarder.connected()
+    for one in settled:
+        request_pipeline.settle(draft, one)
+    if event.knows_ids is not None:
+        draft.idempotency = replace(draft.idempotency, ids_known=event.knows_ids)
+    safety_commands.begin(draft)
+    request_pipeline.read_ahead(draft)
+
+
+def _on_translator_down(draft: StateDraft, event: TranslatorDown) -> None:
+    draft.forwarder, settled = draft.forwarder.lost()
+    for one in settled:
+        request_pipeline.settle(draft, one)
+
+
+def _on_translator_caught_up(draft: StateDraft, event: TranslatorCaughtUp) -> None:
+    if draft.barrier.until_s is not None:
+        publishing.publish_control(draft)
+
+
+# --- the end, and time ----------------------------------------------------------------------------------------------
+
+
+def _on_stopped(draft: StateDraft, event: Stopped) -> None:
+    """See to it that whoever resumes the run finds the tip retracted, or worse. A person in control knows."""
+    if draft.control.mode is ControlMode.MANUAL:
+        return
+    danger = draft.microscope.danger
+    if danger is not None and not draft.forwarder.up:
+        draft.log("CRITICAL", f"the run is stopped, {danger}, and no translator is there to retract the tip")
+    draft.watchdog = draft.watchdog.leave_to_people(draft.microscope)
+    draft.save()
+
+
+def _end_when_safe(draft: StateDraft) -> None:
+    """End the experiment that is over, once the tip is out of danger or that takes too long."""
+    owes_retract, kept = draft.watchdog.owes_retract, draft.end.kept
+    if not draft.end.is_due(draft.now_s, owes_retract=owes_retract):
+        return
+    draft.end = draft.end.ended(draft.now_s)
+    if owes_retract:
+        draft.log("CRITICAL", "the experiment ends, and the tip was left in danger: the microscope did not retract it")
+    for event, code, why, detail in kept:
+        answers.answer(draft, event, code, why, detail=detail)
+    draft.send_forwards()
+    publishing.publish_entries(draft)
+    draft.effects.append(Kill(not owes_retract, STOPS.get(draft.microscope.state, "")))
+
+
+def _on_tick(draft: StateDraft, event: Tick) -> None:
+    _see_to_deadlines(draft)
+    entries_due_s = _entries_due_s(draft)
+    if entries_due_s is not None and draft.now_s >= entries_due_s:
+        publishing.publish_entries(draft)
+
+
+def _see_to_deadlines(draft: StateDraft) -> None:
+    # one change of control in a step: it is saved and told before the next is decided
+    for see_to in (_open_barrier, _flag_malfunction, _have_watchdog_look):
+        if see_to(draft):
             return
-        if (waiting := self._pipeline.clear_up(name)) is not None:
-            self._on_request(waiting, now_s, now_ns)
-        elif name == self.control.holder and self._holder_timeout.is_told(now_s):
-            self._log("WARNING", f"{name} is in control and gone; it has {self._settings.grace_s:g} s to come back")
+    if (holder := draft.control.holder) is not None and _has_come(_dead_at_s(draft), draft.now_s):
+        control_change.decide(draft, ControlInput(ArbitrationEvent.DEAD, holder))
+    lease_ns = draft.lease.deadline_ns(is_free=draft.microscope.is_free)
+    if (holder := draft.control.holder) is not None and lease_ns is not None and draft.now_ns >= lease_ns:
+        control_change.decide(draft, ControlInput(ArbitrationEvent.IDLE, holder))
+    for name in draft.pending.still_unclear(draft.now_s):  # both connections go on: they are two
+        draft.pending, waiting = draft.pending.clear_up(name)
+        if waiting is not None:
+            request_pipeline.refuse_second(draft, waiting)
+    request_pipeline.act_when_moved(draft)
+    draft.forwarder, settled = draft.forwarder.expired(draft.now_s)
+    for one in settled:
+        request_pipeline.settle(draft, one)
 
-    def _on_greeted(self, event: Greeted, now_s: float, now_ns: int) -> None:
-        if event.name and (event.user is None or event.user == component_of(event.name)):
-            self._sessions.hear(event.connection, event.name, None, now_s)
 
-    def _on_problem(self, event: ProblemSeen, now_s: float, now_ns: int) -> None:
-        what = ControlEvent.FLAG if event.flagged else ControlEvent.CLEAR
-        self._arbiter.decide(ControlInput(what, event.name, event.problem), None, now_s, now_ns)
+def _open_barrier(draft: StateDraft) -> bool:
+    if _has_come(draft.barrier.until_s, draft.now_s):
+        publishing.publish_control(draft)
+        return True
+    draft.barrier, kept = draft.barrier.let_in()
+    if kept is not None:
+        request_pipeline.handle(draft, kept)
+    return kept is not None
 
-    def _on_announced(self, event: Announced, now_s: float, now_ns: int) -> None:
-        # what goes before a packet must not put off its time: should that come again after a kill, it is to keep it
-        time_ns = now_ns if event.before_ns is None else event.before_ns - TIME_STEP_NS
-        self._effects += self._bulletin.announce(event.envelope, event.payload, time_ns)
 
-    def _on_subscriber(self, event: ReplayRequested, now_s: float, now_ns: int) -> None:
-        self._effects.append(Replay(event.subscriber, self._cache.replay(event.prefixes, event.since_ns)))
+def _flag_malfunction(draft: StateDraft) -> bool:
+    at_s, told_by = _malfunction(draft)
+    if not _has_come(at_s, draft.now_s):
+        return False
+    if told_by == SCHEDULER:
+        draft.watchdog = draft.watchdog.people_called()
+        draft.log("WARNING", "the tip was in danger: bring it back to the surface, then clear device-malfunction")
+    control_change.decide(draft, ControlInput(ArbitrationEvent.FLAG, told_by, _MALFUNCTION))
+    return True
 
-    # --- requests ---
 
-    def _on_request(self, event: RequestIn, now_s: float, now_ns: int) -> None:
-        if event.heard_s < 0.0:
-            event.heard_s = now_s
-        kind = event.request.kind
-        if kind in CONTROL_EVENTS and self._startup_barrier.keeps(event):
-            return
-        if not self._pipeline.take(event, now_s):
-            return
-        if kind == RELAY_REQUEST:  # a supervisor's last words come after the end
-            self._follow(event, self._bulletin.told(event, now_s, now_ns))
-            self._farewell.told(self._bulletin.telling.states_of(event.name), now_s)
-        elif self.control.ended:
-            self._ending.answer(event, ControlResponse.FAILURE, HAS_ENDED, ResponseDetail.EXPERIMENT_ENDED)
-        elif kind == RESTART_REQUEST:
-            self._follow(event, self._bulletin.ordered(event, now_s))
-        elif kind == CLOCK_REQUEST:
-            self._tell_time(event, now_ns)
-        elif kind <= 0:
-            self._pipeline.answer(
-                event, ControlResponse.CMD_NOT_SUPPORTED, f"there is no request with the number {kind}"
-            )
-        else:
-            self._arbiter.decide(ask_of(event.name, event.request), event, now_s, now_ns)
+def _have_watchdog_look(draft: StateDraft) -> bool:
+    if not _has_come(draft.watchdog.due_s, draft.now_s):
+        return False
+    is_seen_to = draft.control.sees_to_tip
+    draft.watchdog, told = draft.watchdog.look_again(draft.microscope, draft.now_s, is_seen_to=is_seen_to)
+    if told is not None:
+        draft.log("CRITICAL", told)
+    safety_commands.send(draft)
+    return True
 
-    def _tell_time(self, event: RequestIn, now_ns: int) -> None:
-        """What all parts of an experiment have in common: the run, what time it is, and how it passes."""
-        common = {"run": self._settings.run, "simulated": self._settings.simulated, "now_ns": now_ns}
-        told = json.dumps({**self._settings.clock, **common}).encode()
-        response = Response(int(ControlResponse.SUCCESS), told, "", event.request.id)
-        self._effects.append(Reply(event.connection, event.name, response, CLOCK_REQUEST))
 
-    def _on_unreadable(self, event: Unreadable, now_s: float, now_ns: int) -> None:
-        self._event_log.unreadable(event.name, event.response)
+def _has_come(due_s: float | None, now_s: float) -> bool:
+    return due_s is not None and now_s >= due_s
 
-    def _follow(self, event: RequestIn, outcome: tuple[list[Effect], Response]) -> None:
-        """What followed from something that was told, or ordered, and its answer."""
-        effects, response = outcome
-        self._effects += effects
-        self._pipeline.answer(event, ControlResponse(response.code), response.reason, response.payload)
 
-    # --- the translator ---
+def _entries_due_s(state: SchedulerState | StateDraft) -> float | None:
+    """Return when the event log is to be published; not while what was before a restart may still come again."""
+    return None if state.barrier.until_s is not None else state.event_log.due_s
 
-    def _on_reply(self, event: TranslatorReply, now_s: float, now_ns: int) -> None:
-        settled = self._forwarder.answered(event.number, event.response, now_s)
-        if settled is not None:
-            self._pipeline.settle(settled, now_s, now_ns)
 
-    def _on_translator_up(self, event: TranslatorUp, now_s: float, now_ns: int) -> None:
-        self._pipeline.settle_all(self._forwarder.connected(), now_s, now_ns)
-        if event.knows_ids is not None:
-            self._pipeline.ids_known = event.knows_ids
-        self._pipeline.errands.begin(now_s)
-        self._pipeline.read_ahead(now_s)
+def _dead_at_s(state: SchedulerState | StateDraft) -> float | None:
+    """Return when control is taken from a holder that is gone, after what was before a restart is told."""
+    holder, told_at_s = state.control.holder, state.barrier.until_s
+    if holder is None:
+        return None
+    over_since_s = state.supervisors.over_since_s(component_of(holder))
+    dead_at_s = state.holder_timeout.dead_at_s(holder, state.sessions, over_since_s)
+    return dead_at_s if dead_at_s is None or told_at_s is None else max(dead_at_s, told_at_s)
 
-    def _on_translator_down(self, event: TranslatorDown, now_s: float, now_ns: int) -> None:
-        self._pipeline.settle_all(self._forwarder.lost(), now_s, now_ns)
 
-    def _on_translator_caught_up(self, event: TranslatorCaughtUp, now_s: float, now_ns: int) -> None:
-        if self._startup_barrier.until_s is not None:
-            self._arbiter.publish(now_s, now_ns)
+def _malfunction(state: SchedulerState | StateDraft) -> tuple[float | None, str]:
+    """Return when a problem is made of it that the microscope can't be used, and in whose name; None: it can, or it is
+    flagged already."""
+    if _MALFUNCTION in state.control.problems or state.control.ended:
+        return None, ""
+    return (_AT_ONCE_S, SCHEDULER) if state.watchdog.left_to_people else (state.microscope.lost_at_s, TRANSLATOR)
 
-    def _on_packet(self, event: PacketIn, now_s: float, now_ns: int) -> None:
-        message = event.header.message
-        told = self._codec.decode_packet(message, event.packet.payload) if message in _TELLING else None
-        if self._pipeline.mover.is_passing(told):
-            if self._cache.pass_over(event.packet):
-                self._on_telling(told, now_s, now_ns)
-            return
-        taken = self._intake.take(event.packet, event.header, now_ns)
-        if taken is None:
-            return
-        self._effects.append(taken)
-        if self._pipeline.ids_known is False and (doubt := self._intake.doubted(event.header)) is not None:
-            self._effects.append(doubt)
-        if isinstance(taken, Publish) and told is not None:
-            self._on_telling(told, now_s, now_ns)
 
-    def _on_telling(self, told: object, now_s: float, now_ns: int) -> None:
-        if isinstance(told, ScopeStatus):
-            self._watchdog.scope_is(told.state)
-            self._lease.scope_is(told.state, now_ns)
-            self._trust_is(told.state, now_s, now_ns)
-            self._pipeline.errands.send(now_s)
-            if self._pipeline.mover.busy:
-                self._pipeline.act_when_moved(now_s, now_ns)
-        elif isinstance(told, Feedback) and self._watchdog.danger.feedback_is(told):
-            self._effects.append(self._save())
-            self._pipeline.errands.send(now_s)
-        if isinstance(told, Feedback | ScanParameters | ProbePosition) and self._guard.published(told, now_ns):
-            self._effects.append(self._save())
-
-    def _trust_is(self, state: ScopeState, now_s: float, now_ns: int) -> None:
-        self._controller_timeout.scope_is(state, now_s)
-        if not self._controller_timeout.lost and self.control.problems.get(Problem.DEVICE_MALFUNCTION) == TRANSLATOR:
-            self._arbiter.decide(
-                ControlInput(ControlEvent.CLEAR, TRANSLATOR, Problem.DEVICE_MALFUNCTION), None, now_s, now_ns
-            )
-
-    def _malfunction(self) -> tuple[float | None, str]:
-        """When a problem is made of it that the microscope can't be used, and in whose name; None: it can, or it is
-        flagged already."""
-        if Problem.DEVICE_MALFUNCTION in self.control.problems or self.control.ended:
-            return None, ""
-        return (
-            (_AT_ONCE_S, SCHEDULER) if self._watchdog.left_to_people else (self._controller_timeout.due_s(), TRANSLATOR)
-        )
-
-    # --- time ---
-
-    def _on_stopped(self, event: Stopped, now_s: float, now_ns: int) -> None:
-        """Whoever resumes the run finds the tip retracted, or worse. A person in control knows."""
-        if self.control.mode is ControlMode.MANUAL:
-            return
-        danger = self._watchdog.danger.now
-        if danger is not None and not self._pipeline.forwarder.up:
-            self._log("CRITICAL", f"the run is stopped, {danger}, and no translator is there to retract the tip")
-        self._watchdog.leave_to_people()
-        self._effects.append(self._save())
-
-    def _on_tick(self, event: Tick, now_s: float, now_ns: int) -> None:
-        self._see_to_deadlines(now_s, now_ns)
-        entries_due_s = self._entries_due_s()
-        if entries_due_s is not None and now_s >= entries_due_s:
-            self._effects += self._bulletin.entries(now_ns)
-
-    def _entries_due_s(self) -> float | None:
-        """When what has happened is to be published; not while what was before a restart may still come again."""
-        return None if self._startup_barrier.until_s is not None else self._event_log.due_s
-
-    def _dead_at_s(self) -> float | None:
-        """When control is taken from a holder that is gone, after what was before a restart is told."""
-        dead_at_s, told_at_s = self._holder_timeout.dead_at_s(self.control.holder), self._startup_barrier.until_s
-        return dead_at_s if dead_at_s is None or told_at_s is None else max(dead_at_s, told_at_s)
-
-    def _see_to_deadlines(self, now_s: float, now_ns: int) -> None:
-        # one change of control in a step: it is saved and told before the next is decided
-        announce_at_s = self._startup_barrier.until_s
-        if announce_at_s is not None and now_s >= announce_at_s:
-            self._arbiter.publish(now_s, now_ns)
-            return
-        if (kept := self._startup_barrier.let_in()) is not None:
-            self._on_request(kept, now_s, now_ns)
-            return
-        malfunction_at_s, told_by = self._malfunction()
-        if malfunction_at_s is not None and now_s >= malfunction_at_s:
-            if told_by == SCHEDULER:
-                self._watchdog.people_called()
-                self._log(
-                    "WARNING", "the tip was in danger: bring it back to the surface, then clear device-malfunction"
-                )
-            self._arbiter.decide(
-                ControlInput(ControlEvent.FLAG, told_by, Problem.DEVICE_MALFUNCTION), None, now_s, now_ns
-            )
-            return
-        look_at_s = self._watchdog.due_s
-        if look_at_s is not None and now_s >= look_at_s:
-            told = self._watchdog.look_again(now_s, is_seen_to=self.control.sees_to_tip)
-            if told is not None:
-                self._log("CRITICAL", told)
-            self._effects.append(self._save())
-            self._pipeline.errands.send(now_s)
-            return
-        holder, dead_at_s = self.control.holder, self._dead_at_s()
-        if holder is not None and dead_at_s is not None and now_s >= dead_at_s:
-            self._arbiter.decide(ControlInput(ControlEvent.DEAD, holder), None, now_s, now_ns)
-        lease_ns, holder = self._lease.deadline_ns(), self.control.holder
-        if holder is not None and lease_ns is not None and now_ns >= lease_ns:
-            self._arbiter.decide(ControlInput(ControlEvent.IDLE, holder), None, now_s, now_ns)
-        self._pipeline.refuse_unclear(now_s)
-        self._pipeline.act_when_moved(now_s, now_ns)
-        self._pipeline.settle_all(self._forwarder.expire(now_s), now_s, now_ns)
-
-    # --- what the parts ask of the whole, and telling people ---
-
-    def _control(self) -> ArbitrationState:
-        return self.control
-
-    def _save(self) -> SaveState:
-        return SaveState(self.snapshot())
-
-    def _log(self, level: str, text: str) -> None:
-        self._effects.append(Log(level, text))
+_HANDLERS: dict[type, Callable[[StateDraft, Any], None]] = {
+    RequestIn: request_pipeline.handle,
+    Unreadable: _on_unreadable,
+    TranslatorReply: _on_reply,
+    PacketIn: packet_intake.take_packet,
+    Connected: _on_connected,
+    Disconnected: _on_disconnected,
+    Greeted: _on_greeted,
+    ReplayRequested: _on_subscriber,
+    TranslatorUp: _on_translator_up,
+    TranslatorDown: _on_translator_down,
+    TranslatorCaughtUp: _on_translator_caught_up,
+    ProblemSeen: _on_problem,
+    Announced: _on_announced,
+    Stopped: _on_stopped,
+    Tick: _on_tick,
+}

@@ -1,4 +1,4 @@
-"""Who is connected: names, connections, restarts, and two that call themselves the same.
+"""Which connection may speak for which name: restarts, and two processes under one name.
 
 A name belongs to one session at a time: one life of one process. Its first connection binds it. It is recognised on
 later connections by the token in its request ids ("<name>/<token>/<n>"); of peers without ids the connection is the
@@ -17,17 +17,19 @@ from __future__ import annotations
 
 import math
 import re
-from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import Enum, auto
+from typing import TypeVar
 
+K = TypeVar("K")
+V = TypeVar("V")
 _FORMERS = 8
 _RUN = re.compile("[0-9a-f]{16}")
 
 
 class Hearing(Enum):
-    """What to make of a message from a connection."""
+    """The verdict on a message from a connection."""
 
     ACCEPTED = auto()
     STALE = auto()
@@ -38,7 +40,7 @@ class Hearing(Enum):
     """The same, but the two may be one: hear it again when the other's connection closes, or a moment later."""
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _Session:
     token: str | None
     connection: int | None
@@ -54,7 +56,7 @@ KEYED = "key"
 
 
 def token_of(name: str, request_id: str) -> str | None:
-    """The session's token in a request id; None if the id says nothing of it (a caller's own key)."""
+    """Return the session's token in a request id; None if the id has none (a caller's own key)."""
     who, *rest = request_id.split("/")
     if who != name or not 2 <= len(rest) <= 3 or rest[0] == KEYED:
         return None
@@ -62,99 +64,99 @@ def token_of(name: str, request_id: str) -> str | None:
 
 
 def run_of(name: str, request_id: str) -> str:
-    """The identity of the run in a request id, "<name>/<run>-<life>/<n>"; empty: the id says nothing of it."""
+    """Return the identity of the run in a request id, "<name>/<run>-<life>/<n>"; empty if it has none."""
     run, dash, _ = (token_of(name, request_id) or "").partition("-")
     return run if dash and _RUN.fullmatch(run) else ""
 
 
+@dataclass(frozen=True, slots=True)
 class SessionTable:
     """The names in use.
 
-    Args:
+    Attributes:
         takeover_s: for how long (real) a name that was handed over is kept for its owner to come back. A peer whose
             connection died without our noticing is restarted under its name after that long at the latest.
-        keep: how many names that are not connected are remembered at most.
+        keep: most names remembered that are not connected.
+        opened: open connections, with when, in order, each was opened.
+        lost: names without a connection, oldest first.
     """
 
-    def __init__(self, takeover_s: float = 3.0, keep: int = 1000) -> None:
-        self._takeover_s = takeover_s
-        self._keep = keep
-        self._order = 0
-        self._highest = -1
-        self._open: dict[int, int] = {}  # connection -> when, in order, it was opened
-        self._names: dict[str, _Session] = {}
-        self._name_of: dict[int, str] = {}
-        self._lost: OrderedDict[str, None] = OrderedDict()
+    takeover_s: float = 3.0
+    keep: int = 1000
+    order: int = 0
+    highest: int = -1
+    opened: Mapping[int, int] = field(default_factory=dict)
+    names: Mapping[str, _Session] = field(default_factory=dict)
+    name_of: Mapping[int, str] = field(default_factory=dict)
+    lost: tuple[str, ...] = ()
 
-    def connected(self, connection: int) -> None:
-        self._order += 1
-        self._open[connection] = self._order
-        self._highest = max(self._highest, connection)
+    def connected(self, connection: int) -> SessionTable:
+        """Register a new connection."""
+        order = self.order + 1
+        highest = max(self.highest, connection)
+        return replace(self, order=order, opened={**self.opened, connection: order}, highest=highest)
 
-    def disconnected(self, connection: int, now_s: float) -> str | None:
-        """A connection is gone. Returns the name whose session lost its connection by that, if one did."""
-        self._order += 1
-        self._open.pop(connection, None)
-        name = self._name_of.pop(connection, None)
+    def disconnected(self, connection: int, now_s: float) -> tuple[SessionTable, str | None]:
+        """Drop a connection. Returns also the name whose session lost its connection by that, if one did."""
+        table = replace(self, order=self.order + 1, opened=_without(self.opened, connection))
+        name = self.name_of.get(connection)
         if name is None:
-            return None
-        session = self._names[name]
-        session.connection, session.lost_order, session.lost_s = None, self._order, now_s
-        self._lost[name] = None
-        if len(self._lost) > self._keep:
-            del self._names[self._lost.popitem(last=False)[0]]
-        return name
+            return table, None
+        session = replace(self.names[name], connection=None, lost_order=table.order, lost_s=now_s)
+        names, lost = {**self.names, name: session}, (*self.lost, name)
+        if len(lost) > self.keep:
+            names, lost = _without(names, lost[0]), lost[1:]
+        return replace(table, names=names, lost=lost, name_of=_without(self.name_of, connection)), name
 
-    def hear(self, connection: int, name: str, request_id: str | None, now_s: float) -> Hearing:
-        """A message came from `name` by `connection`: may it speak for that name?
+    def hear(self, connection: int, name: str, request_id: str | None, now_s: float) -> tuple[SessionTable, Hearing]:
+        """Judge a message from `name` by `connection`, and bind the name where it is accepted.
 
         Args:
             request_id: of the request, empty if it has none; None: it only said its name.
         """
-        session = self._names.get(name)
-        has_ids = request_id != ""
+        session = self.names.get(name)
+        has_ids, token = request_id != "", token_of(name, request_id or "")
         if session is not None and session.connection == connection:
-            if session.token is None:
-                session.token, session.has_ids = token_of(name, request_id or ""), has_ids
-                if session.token in session.formers:
-                    session.formers = ()
-            return Hearing.ACCEPTED
-        if connection not in self._open:
-            if connection <= self._highest:
-                return Hearing.STALE
-            self.connected(connection)
-        token = token_of(name, request_id or "")
+            if session.token is None and (token is not None or session.has_ids != has_ids):
+                formers = () if token in session.formers else session.formers
+                session = replace(session, token=token, has_ids=has_ids, formers=formers)
+                return replace(self, names={**self.names, name: session}), Hearing.ACCEPTED
+            return self, Hearing.ACCEPTED
+        table = self
+        if connection not in self.opened:
+            if connection <= self.highest:
+                return self, Hearing.STALE
+            table = self.connected(connection)
         without_ids = session is not None and not (session.has_ids or has_ids)
-        if session is not None and not self._gives_way(session, token, connection, now_s, without_ids=without_ids):
-            return Hearing.UNCLEAR if without_ids else Hearing.TAKEN
-        self._bind(name, token, connection)
-        self._names[name].has_ids, self._names[name].since_s = has_ids, now_s
-        return Hearing.ACCEPTED
+        if session is not None and not table._gives_way(session, token, connection, now_s, without_ids=without_ids):
+            return table, Hearing.UNCLEAR if without_ids else Hearing.TAKEN
+        return table.bound(name, token, connection, has_ids=has_ids, since_s=now_s), Hearing.ACCEPTED
 
     def connection_of(self, name: str) -> int | None:
-        """The connection by which to answer `name`; None while it has none."""
-        session = self._names.get(name)
+        """Return the connection by which to answer `name`; None while it has none."""
+        session = self.names.get(name)
         return session.connection if session is not None else None
 
     def lost_since_s(self, name: str) -> float | None:
-        """Since when (real) a name that was heard of is without a connection; None if it has one, or is unknown."""
-        session = self._names.get(name)
-        lost = session is not None and session.connection is None and session.lost_s > -math.inf
-        return session.lost_s if session is not None and lost else None
+        """Return since when (real) a known name is without a connection; None if it has one, or is unknown."""
+        session = self.names.get(name)
+        if session is None or session.connection is not None or session.lost_s == -math.inf:
+            return None
+        return session.lost_s
 
     def since_s(self, name: str) -> float:
-        """Since when (real) a name speaks by the connection that it has, or had last; -inf: it was not heard of yet."""
-        session = self._names.get(name)
+        """Return since when (real) a name speaks by its newest connection; -inf: it was not heard of yet."""
+        session = self.names.get(name)
         return -math.inf if session is None else session.since_s
 
     def tokens(self) -> dict[str, str]:
-        """The tokens of the sessions that are connected, to be kept over a restart."""
-        return {name: s.token for name, s in self._names.items() if s.token is not None and s.connection is not None}
+        """Return the tokens of the connected sessions, to be kept over a restart."""
+        return {name: s.token for name, s in self.names.items() if s.token is not None and s.connection is not None}
 
-    def restore(self, tokens: Mapping[str, str]) -> None:
-        """These sessions had the names before we were restarted; whether they still live will be seen."""
-        for name, token in tokens.items():
-            self._names[name] = _Session(token, None, lost_s=-math.inf)
+    def restored(self, tokens: Mapping[str, str]) -> SessionTable:
+        """Add the sessions that were connected before a restart; whether they still live will be seen."""
+        restored = {name: _Session(token, None, lost_s=-math.inf) for name, token in tokens.items()}
+        return replace(self, names={**self.names, **restored})
 
     def _gives_way(
         self, session: _Session, token: str | None, connection: int, now_s: float, *, without_ids: bool
@@ -166,17 +168,23 @@ class SessionTable:
             return False
         if without_ids:
             return True
-        handed_over = self._open[connection] < session.lost_order
-        return not handed_over or now_s - session.lost_s >= self._takeover_s
+        handed_over = self.opened[connection] < session.lost_order
+        return not handed_over or now_s - session.lost_s >= self.takeover_s
 
-    def _bind(self, name: str, token: str | None, connection: int) -> None:
-        former = self._names.get(name)
+    def bound(
+        self, name: str, token: str | None, connection: int, *, has_ids: bool = True, since_s: float = -math.inf
+    ) -> SessionTable:
+        """Bind a name to a connection."""
+        former, name_of, formers = self.names.get(name), dict(self.name_of), tuple[str, ...]()
         if former is not None and former.connection is not None:
-            self._name_of.pop(former.connection, None)
-        self._lost.pop(name, None)
-        formers: tuple[str, ...] = ()
+            name_of.pop(former.connection, None)
         # one that is back leaves whoever came in between without a claim
         if former is not None and (token is None or token not in (former.token, *former.formers)):
             formers = (*former.formers, *filter(None, [former.token]))[-_FORMERS:]
-        self._names[name] = _Session(token, connection, formers)
-        self._name_of[connection] = name
+        session = _Session(token, connection, formers, has_ids=has_ids, since_s=since_s)
+        lost = tuple(one for one in self.lost if one != name)
+        return replace(self, names={**self.names, name: session}, name_of={**name_of, connection: name}, lost=lost)
+
+
+def _without(mapping: Mapping[K, V], key: K) -> dict[K, V]:
+    return {one: value for one, value in mapping.items() if one != key}

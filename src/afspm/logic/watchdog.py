@@ -1,4 +1,4 @@
-"""The watchdog: what the scheduler itself tells the microscope to do when control is taken from somebody.
+"""The watchdog: what the scheduler itself tells the microscope to do when control is taken from a holder.
 
 It stops the scan or spectrum that is running, and retracts the tip where its holder did not itself give control back
 and left it in a dangerous state: it can't put that right any more, and nobody else knows of it.
@@ -7,20 +7,57 @@ and left it in a dangerous state: it can't put that right any more, and nobody e
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any
 
 from afspm.logic.arbitration import Cause
-from afspm.logic.microscope_status import FEEDBACK_OFF, TipRisk
-from afspm.logic.tip_duty import TipDuties, TipDuty, TipEvent
-from afspm.model import ControlResponse, Feedback, Parameter, Request, ScopeState, names
+from afspm.logic.microscope_status import FEEDBACK_OFF, STARTS, STOPS, MicroscopeStatus
+from afspm.model import ControlResponse, ScopeState, names
 
-_STOP = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
-_STARTS = {names.START_SCAN: names.STOP_SCAN, names.START_SPEC: names.STOP_SPEC}
-_OFF = names.OFF_WORDS | {"0.0"}  # a translator that is not ours may take a number
 _DEFAULT_STOPS = frozenset({Cause.PROBLEM, Cause.MANUAL, Cause.DEAD, Cause.IDLE})
 _SOON_S = 1.0
+
+
+class TipDuty(Enum):
+    """The duty of the scheduler towards a tip that its holder left in danger."""
+
+    NONE = "nothing"
+    OWED = "it is to be retracted"
+    ASKED = "the microscope is asked to retract it"
+    PUT_OFF = "it was not retracted, which is tried again later"
+
+
+class TipEvent(Enum):
+    """An event that changes the duty."""
+
+    ENDANGERED = "its holder lost control and left it in danger"
+    SEEN_TO = "somebody sees to it, or it is out of danger"
+    SENT = "the microscope is asked to retract it"
+    NOT_YET = "the microscope could not be asked, was not free, or did not answer"
+    RETRACTED = "the microscope has retracted it"
+    RETRACTED_LATE = "it has, when nobody waited for the answer any more"
+    IMPOSSIBLE = "the microscope has no such action"
+    FAILED = "the microscope refuses, or was waited for in vain"
+    DUE = "it is time to try again"
+    LEFT = "the run is stopped with the tip in danger"
+
+
+_NONE, _OWED, _ASKED, _PUT_OFF = TipDuty
+_CALLS = True  # a person is to decide how to go on
+
+# after an event, by what was owed before it: NONE, OWED, ASKED, PUT_OFF; and whether people are called
+_TABLE: dict[TipEvent, tuple[TipDuty, TipDuty, TipDuty, TipDuty, bool]] = {
+    TipEvent.ENDANGERED: (_OWED, _OWED, _ASKED, _OWED, False),
+    TipEvent.SEEN_TO: (_NONE, _NONE, _ASKED, _NONE, False),
+    TipEvent.SENT: (_NONE, _ASKED, _ASKED, _PUT_OFF, False),
+    TipEvent.NOT_YET: (_NONE, _OWED, _OWED, _PUT_OFF, False),
+    TipEvent.RETRACTED: (_NONE, _NONE, _NONE, _NONE, _CALLS),
+    TipEvent.RETRACTED_LATE: (_NONE, _NONE, _ASKED, _NONE, _CALLS),
+    TipEvent.IMPOSSIBLE: (_NONE, _NONE, _NONE, _NONE, _CALLS),
+    TipEvent.FAILED: (_NONE, _PUT_OFF, _PUT_OFF, _PUT_OFF, _CALLS),
+    TipEvent.DUE: (_NONE, _OWED, _ASKED, _OWED, False),
+    TipEvent.LEFT: (_NONE, _OWED, _ASKED, _PUT_OFF, _CALLS),
+}
 
 
 @dataclass(frozen=True)
@@ -47,329 +84,284 @@ class WatchdogSettings:
 
 
 class SafetyResult(Enum):
-    """What became of an action of the watchdog's."""
+    """The result of an action of the watchdog's."""
 
     DONE = "done"
     AGAIN = "to be tried again"
     FAILED = "failed"
 
 
+@dataclass(frozen=True, slots=True)
+class TipState:
+    """The part of the watchdog that survives a restart.
+
+    Attributes:
+        calls_people: it has retracted the tip, or could not, and nobody was called yet: to go on is for a person.
+        stops: actions wanted before the tip is retracted.
+        for_feedback: why the tip is to be retracted.
+    """
+
+    duty: TipDuty = TipDuty.NONE
+    calls_people: bool = False
+    stops: tuple[str, ...] = ()
+    for_feedback: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Watchdog:
-    """Knows what the microscope is doing, and what the scheduler wants it to do.
+    """The actions that the scheduler itself wants of the microscope.
 
     The caller sends `next_action()` before anything else, reports by `answered` or `unsent`, and calls `look_again`
     when it is `due_s`. While it `owes_retract` nobody commands; but when that is `put_off`, since the microscope does
-    not do it, whoever is there to see to the tip may. What is owed to the tip follows from a table: see `tip_duty`.
+    not do it, whoever is there to see to the tip may. The duty towards the tip follows from a table.
 
     Attributes:
-        danger: what is known of it.
+        starting: the action that stops what was just started.
+        sent: the action that was sent and is not answered.
+        can_retract: as far as we know.
+        refused_at: states seen when the microscope last was not free.
+        told_to_stop, unstoppable: what runs.
+        due_s: when, real, `look_again` is to be called.
     """
 
-    def __init__(self, settings: WatchdogSettings | None = None) -> None:
-        self._settings = settings or WatchdogSettings()
-        self.danger = TipRisk(self._settings.dangerous)
-        self._state = ScopeState.UNDEFINED
-        self._starting: str | None = None
-        self._states_seen = 0
-        self._stops: list[str] = []  # wanted before the tip is retracted
-        self._tip = TipDuties()
-        self._sent: str | None = None
-        self._attempts = 0
-        self._can_retract = True  # as far as we know
-        self._refused_at = -1  # states seen when the microscope last was not free
-        self._told_to_stop = self._unstoppable = False  # what runs
-        self._for_feedback = False  # why the tip is to be retracted
-        self._due_s: float | None = None
-        self._retries = 0
-        self._in_haste = False
+    settings: WatchdogSettings = field(default_factory=WatchdogSettings)
+    tip: TipState = TipState()
+    starting: str | None = None
+    sent: str | None = None
+    attempts: int = 0
+    can_retract: bool = True
+    refused_at: int = -1
+    told_to_stop: bool = False
+    unstoppable: bool = False
+    due_s: float | None = None
+    retries: int = 0
+    in_haste: bool = False
 
-    def snapshot(self) -> dict[str, Any]:
-        """What must survive a kill, as plain JSON."""
-        return {
-            "stops": list(self._stops),
-            "for_feedback": self._for_feedback,
-            "tip": self._tip.snapshot(),
-            "danger": self.danger.snapshot(),
-        }
+    def restored(self, tip: TipState) -> Watchdog:
+        """Take up the duty of before a restart: what the microscope was being asked is not known any more."""
+        duty = TipDuty.OWED if tip.duty is TipDuty.ASKED else tip.duty
+        return replace(self, tip=replace(tip, duty=duty))
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """Take up what `snapshot` wrote."""
-        self._stops = [str(action) for action in state["stops"]]
-        self._for_feedback = bool(state["for_feedback"])
-        self._tip.restore(state["tip"])
-        self.danger.restore(state["danger"])
-
-    def begin(self, now_s: float) -> None:
-        """After `restore`: what has happened meanwhile is heard of first, and the translator may not be there."""
-        if self.owes_retract:
-            self._due_s = now_s + self._settings.again_s
-
-    @property
-    def left_to_people(self) -> bool:
-        """It has retracted the tip, or could not, and nobody was called yet: to go on is for a person to decide."""
-        return self._tip.calls_people
-
-    def leave_to_people(self) -> None:
-        """Nobody can be told any more what to do with a tip in danger: the translator sees to it as it leaves."""
-        if self._settings.retract is not None and self.danger.now is not None:
-            self._tip.see(TipEvent.LEFT)
-
-    def people_called(self) -> None:
-        """The problem was flagged."""
-        self._tip.calls_people = False
+    def begun(self, now_s: float) -> Watchdog:
+        """Wait: what has happened meanwhile is heard of first, and the translator may not be there."""
+        return replace(self, due_s=now_s + self.settings.again_s) if self.owes_retract else self
 
     @property
     def owes_retract(self) -> bool:
-        """The tip is to be retracted, now or later."""
-        return self._tip.now is not TipDuty.NONE
+        """True while the tip is to be retracted, now or later."""
+        return self.tip.duty is not TipDuty.NONE
 
     @property
     def put_off(self) -> bool:
-        """The tip is to be retracted, but that is not done: it is tried again later."""
-        return self._tip.now is TipDuty.PUT_OFF
+        """True while the tip is to be retracted, but only later."""
+        return self.tip.duty is TipDuty.PUT_OFF
 
     @property
-    def _wanted(self) -> list[str]:
+    def left_to_people(self) -> bool:
+        """True until people are called: how to go on is for a person to decide."""
+        return self.tip.calls_people
+
+    @property
+    def wanted(self) -> tuple[str, ...]:
         """The actions wanted, in order."""
-        retract = self._settings.retract
-        return [*self._stops, retract] if self.owes_retract and retract is not None else list(self._stops)
-
-    @property
-    def state(self) -> ScopeState:
-        return self._state
-
-    @property
-    def states_seen(self) -> int:
-        """How many states the microscope has told; see `started`."""
-        return self._states_seen
-
-    def scope_is(self, state: ScopeState) -> None:
-        self._state = state
-        self._states_seen += 1
-        self._starting = None
-        self.danger.scope_is(state)
-        if state not in _STOP:
-            self._told_to_stop = self._unstoppable = False
-        if (
-            state is ScopeState.FREE and self._sent is None
-        ):  # it ended while the translator could not be told to stop it
-            self._stops = []
-
-    def started(self, action: str, states_seen: int, *, certain: bool = True) -> bool:
-        """An action succeeded, or may have, that was sent when `states_seen` states were known.
-
-        The answer may overtake the state that the microscope is in by it, or be overtaken.
-
-        Returns:
-            whether what is known of the danger has changed.
-        """
-        if states_seen == self._states_seen:
-            self._starting = _STARTS.get(action, self._starting)
-        if action in _STARTS or action in _STOP.values():
-            return False
-        # what else there is may bring the tip back
-        return self.danger.tip_is_away(is_away=certain and action == self._settings.retract)
-
-    def cannot_retract(self) -> None:
-        """The microscope has no such action."""
-        self._can_retract = False
+        retract = self.settings.retract
+        return (*self.tip.stops, retract) if self.owes_retract and retract is not None else self.tip.stops
 
     @property
     def question(self) -> str:
         """The action of which the translator is asked first whether the microscope has it."""
-        return self._settings.retract or names.STOP_SCAN
+        return self.settings.retract or names.STOP_SCAN
 
-    # --- what is wanted ---
+    def without_retract(self) -> Watchdog:
+        """Take it that the microscope has no action to retract."""
+        return replace(self, can_retract=False)
+
+    def people_called(self) -> Watchdog:
+        return replace(self, tip=replace(self.tip, calls_people=False))
+
+    def leave_to_people(self, microscope: MicroscopeStatus) -> Watchdog:
+        """Leave a tip in danger: the run is stopped, and the translator sees to it as it leaves."""
+        return self._see(TipEvent.LEFT) if self.settings.retract is not None and microscope.danger is not None else self
+
+    # --- events of the microscope ---
+
+    def state_told(self, microscope: MicroscopeStatus) -> Watchdog:
+        """Take a new state of the microscope."""
+        dog = replace(self, starting=None)
+        if microscope.state not in STOPS:
+            dog = replace(dog, told_to_stop=False, unstoppable=False)
+        # it ended while the translator could not be told to stop it
+        return dog._with_stops(()) if microscope.state is ScopeState.FREE and self.sent is None else dog
+
+    def started(self, action: str, states_seen: int, microscope: MicroscopeStatus) -> Watchdog:
+        """Take an action that succeeded, or may have; it was sent when `states_seen` states were known.
+
+        The answer may overtake the state that the microscope is in by it, or be overtaken.
+        """
+        is_new = states_seen == microscope.states_seen
+        return replace(self, starting=STARTS.get(action, self.starting)) if is_new else self
+
+    # --- events of control ---
 
     def control_taken(
         self,
         cause: Cause,
         in_flight: str | None,
+        microscope: MicroscopeStatus,
         *,
         had_died: bool = False,
         by_holder: bool = False,
         was_seen_to: bool = False,
-    ) -> list[str]:
-        """Control was taken for `cause` while the action `in_flight` was with the translator.
+    ) -> Watchdog:
+        """Take the loss of control for `cause` while the action `in_flight` was with the translator.
 
         Args:
             had_died: the process that got control has died; who gives it back is the one started in its place.
             by_holder: it is the holder's own doing.
             was_seen_to: the holder was there to see to a tip that was not retracted.
-
-        Returns:
-            What is wanted now and was not before, in order.
         """
         # whoever gives control back knows what it leaves, and so does a person who takes it
         knows = cause in (Cause.RELEASED, Cause.MANUAL) or (cause is Cause.SOLVED and by_holder)
+        dog = self
         if cause is Cause.MANUAL or (was_seen_to and knows and not had_died):
-            self.seen_to()
-        before = [] if self.put_off else self._wanted
-        if self._can_retract and (had_died or not knows) and self.danger.now is not None:
-            self._want_retract()
-        stop = _STOP.get(self._state) or self._starting or _STARTS.get(in_flight or "")
-        if stop is not None and (cause in self._settings.stop_when or self.owes_retract) and stop not in self._stops:
-            self._stops.insert(0, stop)
-        return [] if self.put_off else [action for action in self._wanted if action not in before]
+            dog = dog.seen_to()
+        if dog.can_retract and (had_died or not knows) and microscope.danger is not None:
+            dog = dog._endangered(microscope)
+        stop = STOPS.get(microscope.state) or dog.starting or STARTS.get(in_flight or "")
+        if stop is None or stop in dog.tip.stops:
+            return dog
+        is_to_stop = cause in dog.settings.stop_when or dog.owes_retract
+        return dog._with_stops((stop, *dog.tip.stops)) if is_to_stop else dog
 
-    def _want_retract(self) -> None:
-        if self._settings.retract is None:
-            return
-        self._for_feedback = self.danger.by_feedback
-        if self.put_off:  # whoever was there to see to it is gone
-            self._due_s = None
-        self._tip.see(TipEvent.ENDANGERED)
+    def newly_wanted(self, before: Watchdog) -> list[str]:
+        """Return the actions wanted now that were not before."""
+        known = () if before.put_off else before.wanted
+        return [] if self.put_off else [action for action in self.wanted if action not in known]
 
-    def seen_to(self) -> None:
-        """Somebody sees to the tip: it is not retracted any more, unless it is just being."""
-        self._see(TipEvent.SEEN_TO)
+    def _endangered(self, microscope: MicroscopeStatus) -> Watchdog:
+        if self.settings.retract is None:
+            return self
+        tip = replace(self.tip, for_feedback=microscope.endangered_by_feedback)
+        # whoever was there to see to a tip that was put off is gone
+        due_s = None if self.put_off else self.due_s
+        return replace(self, tip=tip, due_s=due_s)._see(TipEvent.ENDANGERED)
 
-    def put_right(self) -> None:
-        """Somebody says that the tip is well again: it may be at the surface, where it can be endangered anew."""
-        self.seen_to()
-        self.danger.tip_is_away(is_away=False)
+    def seen_to(self) -> Watchdog:
+        """Leave the tip to whoever sees to it: it is not retracted any more, unless it is just being."""
+        return self._see(TipEvent.SEEN_TO)
 
-    def hurry(self, now_s: float) -> None:
-        """The experiment ends: nothing is waited for any longer than a moment."""
-        self._in_haste = True
-        if self._due_s is not None:
-            self._due_s = min(self._due_s, now_s + _SOON_S)
+    def hurry(self, now_s: float) -> Watchdog:
+        """Wait for nothing longer than a moment: the experiment ends."""
+        due_s = None if self.due_s is None else min(self.due_s, now_s + _SOON_S)
+        return replace(self, in_haste=True, due_s=due_s)
 
     # --- what is sent ---
 
-    def next_action(self) -> str | None:
-        """The action to send now, if one is; it counts as sent."""
-        if self._for_feedback and self.danger.feedback_is_on:
-            self.seen_to()
-        if self._sent is not None or self.put_off or self._refused_at == self._states_seen:
-            return None
-        runs = _STOP.get(self._state)
-        if self.owes_retract and runs is not None and not self._told_to_stop and runs not in self._stops:
-            self._stops.insert(0, runs)
-        if not self._wanted or self._waits_for_stop():
-            return None
-        self._sent, self._due_s = self._wanted[0], None
-        self._told_to_stop |= self._sent == runs
-        if not self._stops:
-            self._tip.see(TipEvent.SENT)
-        return self._sent
+    def next_action(self, microscope: MicroscopeStatus) -> tuple[Watchdog, str | None]:
+        """Return the action to send now, if one is; it counts as sent."""
+        dog = self
+        if dog.tip.for_feedback and microscope.risk.feedback_on is True:
+            dog = dog.seen_to()
+        if dog.sent is not None or dog.put_off or dog.refused_at == microscope.states_seen:
+            return dog, None
+        runs = STOPS.get(microscope.state)
+        if dog.owes_retract and runs is not None and not dog.told_to_stop and runs not in dog.tip.stops:
+            dog = dog._with_stops((runs, *dog.tip.stops))
+        if not dog.wanted or dog._waits_for_stop(microscope):
+            return dog, None
+        action = dog.wanted[0]
+        dog = replace(dog, sent=action, due_s=None, told_to_stop=dog.told_to_stop or action == runs)
+        return (dog if dog.tip.stops else dog._see(TipEvent.SENT)), action
 
-    def _waits_for_stop(self) -> bool:
-        """It has been told to stop, and the tip is retracted when it has."""
-        return not self._stops and self._state in _STOP and not self._unstoppable
+    def _waits_for_stop(self, microscope: MicroscopeStatus) -> bool:
+        """True while what was told to stop still runs: the tip is retracted when it has stopped."""
+        return not self.tip.stops and microscope.state in STOPS and not self.unstoppable
 
-    def answered(self, code: int, now_s: float) -> SafetyResult:
-        """The translator answered what was sent (or NO_RESPONSE)."""
-        action, self._sent = self._sent or "", None
-        is_retract = self._tip.now is TipDuty.ASKED
+    def answered(self, code: int, microscope: MicroscopeStatus, now_s: float) -> tuple[Watchdog, SafetyResult]:
+        """Take the translator's answer to what was sent (or NO_RESPONSE)."""
+        action, dog, is_retract = self.sent or "", replace(self, sent=None), self.tip.duty is TipDuty.ASKED
         if code == ControlResponse.SUCCESS:
-            self._starting = None
+            dog = replace(dog, starting=None)
             if is_retract:
-                self.danger.tip_is_away(is_away=True)
-                self._see(TipEvent.RETRACTED)
-            else:
-                self._forget_stop(action)
-                self._due_s = now_s + self._wait_s if self.owes_retract else None
-            return SafetyResult.DONE
+                return dog._see(TipEvent.RETRACTED), SafetyResult.DONE
+            due_s = now_s + dog._wait_s if dog.owes_retract else None
+            return replace(dog._without_stop(action), due_s=due_s), SafetyResult.DONE
         if code == ControlResponse.NOT_FREE:
-            self._refused_at = self._states_seen
-            self._due_s = now_s + self._wait_s
-            self._see(TipEvent.NOT_YET)
-            return SafetyResult.AGAIN
-        self._attempts += 1
-        if code == ControlResponse.NO_RESPONSE and self._attempts < self._settings.attempts:
-            self._see(TipEvent.NOT_YET)
-            return SafetyResult.AGAIN
+            dog = replace(dog, refused_at=microscope.states_seen, due_s=now_s + dog._wait_s)
+            return dog._see(TipEvent.NOT_YET), SafetyResult.AGAIN
+        dog = replace(dog, attempts=dog.attempts + 1)
+        if code == ControlResponse.NO_RESPONSE and dog.attempts < dog.settings.attempts:
+            return dog._see(TipEvent.NOT_YET), SafetyResult.AGAIN
         if not is_retract:
-            self._unstoppable = True
-            self._forget_stop(action)
-        elif code == ControlResponse.ACTION_NOT_SUPPORTED:
-            self._see(TipEvent.IMPOSSIBLE)
-        else:
-            self._retract_later(now_s)
-        return SafetyResult.FAILED
+            return replace(dog, unstoppable=True)._without_stop(action), SafetyResult.FAILED
+        if code == ControlResponse.ACTION_NOT_SUPPORTED:
+            return dog._see(TipEvent.IMPOSSIBLE), SafetyResult.FAILED
+        return dog._retract_later(now_s), SafetyResult.FAILED
 
-    def done_late(self, action: str) -> None:
-        """The translator did what nobody waited for any more: a tip withdrawn late is left to people, too."""
-        if action == self._settings.retract:
-            self._see(TipEvent.RETRACTED_LATE)
+    def done_late(self, action: str) -> Watchdog:
+        """Take what the translator did when nobody waited any more: a tip withdrawn late is left to people, too."""
+        return self._see(TipEvent.RETRACTED_LATE) if action == self.settings.retract else self
 
-    def unsent(self, now_s: float) -> None:
-        """What `next_action` said could not be sent: the translator is not connected. Again when it is."""
-        self._sent = None
-        self._attempts = 0
-        self._refused_at = -1
-        self._told_to_stop = False
-        self._see(TipEvent.NOT_YET)
-        if self.owes_retract and self._due_s is None:
-            self._due_s = now_s + self._wait_s
+    def unsent(self, now_s: float) -> Watchdog:
+        """Take back what `next_action` gave: the translator is not connected. It is sent when that is."""
+        dog = replace(self, sent=None, attempts=0, refused_at=-1, told_to_stop=False)._see(TipEvent.NOT_YET)
+        return replace(dog, due_s=now_s + dog._wait_s) if dog.owes_retract and dog.due_s is None else dog
 
-    def translator_is_there(self, now_s: float) -> None:
-        """Another, or again: what was put off is due, once it has told how it is with the microscope."""
-        if self.put_off:
-            self._due_s = now_s + _SOON_S
+    def translator_is_there(self, now_s: float) -> Watchdog:
+        """Try what was put off, once another translator has told how it is with the microscope."""
+        return replace(self, due_s=now_s + _SOON_S) if self.put_off else self
 
     # --- what does not come about ---
 
-    @property
-    def due_s(self) -> float | None:
-        """When, real, `look_again` is to be called; None: not."""
-        return self._due_s
-
-    def look_again(self, now_s: float, *, is_seen_to: bool) -> str | None:
-        """What was waited for has not happened, or what was put off is due.
+    def look_again(
+        self, microscope: MicroscopeStatus, now_s: float, *, is_seen_to: bool
+    ) -> tuple[Watchdog, str | None]:
+        """Go on where something was waited for in vain, or what was put off is due.
 
         Args:
             is_seen_to: somebody is there to see to the tip, if it was not retracted.
 
         Returns:
-            what people are to be told, if that is new.
+            also what people are to be told, if that is new.
         """
-        self._due_s = None
-        if self.put_off:
-            self._refused_at = -1
-            self._see(TipEvent.SEEN_TO if is_seen_to else TipEvent.DUE)
-            return None
-        if not self._wanted or self._sent is not None:
-            return None
-        if self._stops:
-            action = self._stops[0]
-            self._forget_stop(action)
-            self._unstoppable, self._refused_at = True, -1
-            return f"the microscope is never free to {action}"
-        if self._refused_at != self._states_seen and self._waits_for_stop():
-            self._unstoppable = True
-            return "the microscope was told to stop, and does not"
-        is_refused, is_new = self._refused_at == self._states_seen, not self._retries
-        self._retract_later(now_s)
+        dog = replace(self, due_s=None)
+        if dog.put_off:
+            return replace(dog, refused_at=-1)._see(TipEvent.SEEN_TO if is_seen_to else TipEvent.DUE), None
+        if not dog.wanted or dog.sent is not None:
+            return dog, None
+        if dog.tip.stops:
+            action = dog.tip.stops[0]
+            dog = replace(dog._without_stop(action), unstoppable=True, refused_at=-1)
+            return dog, f"the microscope is never free to {action}"
+        is_refused = dog.refused_at == microscope.states_seen
+        if not is_refused and dog._waits_for_stop(microscope):
+            return replace(dog, unstoppable=True), "the microscope was told to stop, and does not"
         why = "the microscope is never free for that" if is_refused else "its translator is not there"
-        return f"the tip was left in danger and can't be retracted: {why}" if is_new else None
+        told = None if dog.retries else f"the tip was left in danger and can't be retracted: {why}"
+        return dog._retract_later(now_s), told
 
     @property
     def _wait_s(self) -> float:
-        return _SOON_S if self._in_haste else self._settings.again_s
+        return _SOON_S if self.in_haste else self.settings.again_s
 
-    def _retract_later(self, now_s: float) -> None:
-        self._tip.see(TipEvent.FAILED)
-        wait_s = min(self._wait_s * 2**self._retries, self._settings.longest_s)
-        self._due_s = now_s + (_SOON_S if self._in_haste else wait_s)
-        self._retries = min(self._retries + 1, 32)
-        self._attempts = 0
+    def _retract_later(self, now_s: float) -> Watchdog:
+        wait_s = min(self._wait_s * 2**self.retries, self.settings.longest_s)
+        due_s = now_s + (_SOON_S if self.in_haste else wait_s)
+        dog = self._see(TipEvent.FAILED)
+        return replace(dog, due_s=due_s, retries=min(self.retries + 1, 32), attempts=0)
 
-    def _forget_stop(self, action: str) -> None:
-        self._stops = [other for other in self._stops if other != action]
-        self._attempts = 0
+    def _with_stops(self, stops: tuple[str, ...]) -> Watchdog:
+        return self if stops == self.tip.stops else replace(self, tip=replace(self.tip, stops=stops))
 
-    def _see(self, event: TipEvent) -> None:
+    def _without_stop(self, action: str) -> Watchdog:
+        stops = tuple(other for other in self.tip.stops if other != action)
+        return replace(self, attempts=0)._with_stops(stops)
+
+    def _see(self, event: TipEvent) -> Watchdog:
         """Go on by the table; what was waited for is forgotten where nothing is owed any more."""
-        if self._tip.see(event):
-            self._due_s, self._for_feedback = None, False
-            self._attempts = self._retries = 0
-
-
-def feedback_of(request: Request) -> Feedback | None:
-    """What a request sets of the feedback."""
-    subject = request.subject
-    if isinstance(subject, Parameter) and subject.name == names.FEEDBACK_ON and subject.value is not None:
-        return Feedback(on=subject.value.strip().lower() not in _OFF)
-    return subject if isinstance(subject, Feedback) else None
+        *after, calls = _TABLE[event]
+        duty = after[list(TipDuty).index(self.tip.duty)]
+        tip = replace(self.tip, duty=duty, calls_people=self.tip.calls_people or calls)
+        if duty is TipDuty.NONE and self.owes_retract:
+            return replace(self, tip=replace(tip, for_feedback=False), due_s=None, attempts=0, retries=0)
+        return replace(self, tip=tip)

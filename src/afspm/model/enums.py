@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class ScopeState(IntEnum):
-    """What the microscope is doing."""
+    """The states of a microscope."""
 
     UNDEFINED = 0
     MOVING = 1
@@ -19,7 +19,7 @@ class ScopeState(IntEnum):
 
 
 class ControlMode(IntEnum):
-    """Whether components may control the microscope (AUTOMATED) or only the person at it (MANUAL)."""
+    """Components control the microscope (AUTOMATED), or only the person at it (MANUAL)."""
 
     UNDEFINED = 0
     MANUAL = 1
@@ -27,7 +27,7 @@ class ControlMode(IntEnum):
 
 
 class Problem(IntEnum):
-    """What may be wrong with an experiment. Experiment files name more of them, with numbers above these."""
+    """Problems of an experiment. Experiment files name more of them, with numbers above these."""
 
     NONE = 0
     TIP_SHAPE_CHANGED = 1
@@ -37,7 +37,7 @@ class Problem(IntEnum):
 
 
 class ControlRequest(IntEnum):
-    """What may be asked of scheduler and translator."""
+    """The requests to scheduler and translator."""
 
     UNDEFINED = 0
     ACTION = 1
@@ -68,13 +68,13 @@ _OURS = {CLOCK_REQUEST: "CLOCK", RELAY_REQUEST: "TELL", RESTART_REQUEST: "RESTAR
 
 
 def request_name(kind: int) -> str:
-    """A request in words."""
+    """Return a request in words."""
     known = next((request.name for request in ControlRequest if request == kind), None)
     return known or _OURS.get(kind, f"request {kind}")
 
 
 class ControlResponse(IntEnum):
-    """How a request is answered."""
+    """The answers to a request."""
 
     SUCCESS = 0
     FAILURE = 1
@@ -92,7 +92,7 @@ class ControlResponse(IntEnum):
 
 
 class RescanKind(IntEnum):
-    """What a Rescanner is asked to do; a message of ours."""
+    """Requests to a Rescanner; a message of ours."""
 
     AGAIN = 1
     """The same region."""

@@ -115,7 +115,7 @@ def _theil_sen(columns: Floats, heights: Floats) -> Floats:
 
 
 def _ransac(columns: Floats, heights: Floats) -> Floats:
-    """The surface that most pixels agree with, to within their scatter about the best median; fitted to those."""
+    """Return the surface that most pixels agree with, within their scatter; fitted to those."""
     columns, heights = _few(columns, heights)
     residuals = np.abs(heights - _samples(columns, heights) @ columns.T)
     limit = max(2.5 * _MAD * float(np.median(residuals, axis=1).min()), 1e-9)

@@ -39,7 +39,7 @@ class ProblemNames(Mapping[str, int]):
         return f"ProblemNames({self._numbers})"
 
     def number(self, problem: str | int) -> int:
-        """The number of a problem given by number or by name ("tip-shape-changed", "EP_TIP_SHAPE_CHANGED").
+        """Return the number of a problem given by number or by name ("tip-shape-changed", "EP_TIP_SHAPE_CHANGED").
 
         Raises:
             InvalidValue: no such problem.
@@ -58,7 +58,7 @@ class ProblemNames(Mapping[str, int]):
         return int(problem)
 
     def name(self, number: int) -> str:
-        """The name of a problem; a number that nobody named is told as such."""
+        """Return the name of a problem; a number that nobody named is told as such."""
         return self._names.get(number, f"problem {number}")
 
     def __getitem__(self, name: str) -> int:

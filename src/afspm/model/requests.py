@@ -45,7 +45,7 @@ class Request:
 
 
 class ResponseDetail(IntEnum):
-    """What a program must know of a response beside its code; the numbers of the wire."""
+    """The detail of a response that a program needs beside its code; the numbers of the wire."""
 
     NONE = 0
     NOT_SENT = 1

@@ -1,4 +1,4 @@
-"""What the microscope and the experiment are in."""
+"""States of the microscope and of the experiment."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from afspm.model.geometry import XY
 
 @dataclass(frozen=True)
 class ScopeStatus:
-    """What the microscope is doing.
+    """The activity of the microscope.
 
     Attributes:
         paused: a scan is running but stands still; None if the microscope does not say.
@@ -52,7 +52,7 @@ class PositionChange:
 
 @dataclass(frozen=True)
 class ControlState:
-    """Who is in control, and what stands in the way.
+    """The holder of control, and the problems that stand in the way.
 
     Attributes:
         mode: automated or manual.

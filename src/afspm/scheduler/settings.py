@@ -10,7 +10,7 @@ from afspm.errors import ConfigError
 from afspm.logic.arbitration import Cause, RoleTable, Rules
 from afspm.logic.envelopes import CacheRule, EnvelopeMapping, Envelopes
 from afspm.logic.limits import ExperimentLimits, Limit
-from afspm.logic.scheduler_core import SchedulerSettings
+from afspm.logic.settings import SchedulerSettings
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import Parameter, ProblemNames, Region
 

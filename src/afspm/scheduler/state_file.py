@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import logging
 from pathlib import Path
-from typing import Any
 
+from afspm.errors import InvalidValue
+from afspm.logic.state import KIND, VERSION, SavedState
+from afspm.model.snapshot import restored, snapshot
 from afspm.storage.atomic import CheckpointFile, OutageLog, load_checkpoint
 
 
@@ -23,8 +25,8 @@ class StateFile:
         self._log = log
         self._told = OutageLog("a restart would not know what is in force now", log)
 
-    def load(self) -> dict[str, Any]:
-        """What was saved last; empty if nothing was.
+    def load(self) -> SavedState | None:
+        """Return what was saved last; None if nothing was.
 
         If that is damaged, as a power cut may leave it, the generation before is taken up: the mode, and the problems
         that stand, but nobody in control. Who was then may not be now, and asks again.
@@ -33,19 +35,16 @@ class StateFile:
             FileError: neither can be read. To begin without a problem that is flagged could cost a tip.
         """
         if self.path is None:
-            return {}
+            return None
         state, damage = load_checkpoint(self.path, _read)
-        if state is None:
-            return {}
-        if damage:
-            self._log.critical(
-                "what was in force is damaged, the generation before is taken up, with nobody in control: %s", damage
-            )
-            control = {**state["control"], "holder": None, "solving": 0}
-            state = {**state, "control": control, "granted_to": None}
-        return state
+        if state is None or not damage:
+            return state
+        self._log.critical(
+            "what was in force is damaged, the generation before is taken up, with nobody in control: %s", damage
+        )
+        return state.without_holder()
 
-    def save(self, state: dict[str, Any]) -> None:
+    def save(self, state: SavedState) -> None:
         """Write it down; when this returns it outlives a kill.
 
         A disk that is full must not end the experiment: it is said, and the experiment goes on.
@@ -53,7 +52,7 @@ class StateFile:
         if self._generations is None:
             return
         with self._told.trying():
-            self._generations.save(json.dumps(state, ensure_ascii=False).encode())
+            self._generations.save(json.dumps(snapshot(state, KIND, VERSION), ensure_ascii=False).encode())
 
     def close(self) -> None:
         """Make sure that what was saved last is on the disk."""
@@ -61,8 +60,8 @@ class StateFile:
             self._generations.close()
 
 
-def _read(content: bytes) -> dict[str, Any]:
-    state = json.loads(content)
-    if not isinstance(state, dict) or not isinstance(state.get("control"), dict):
-        raise ValueError("it is not the state of a scheduler")
-    return state
+def _read(content: bytes) -> SavedState:
+    try:
+        return restored(SavedState, json.loads(content), KIND, VERSION)
+    except (InvalidValue, AttributeError) as error:
+        raise ValueError(str(error)) from error

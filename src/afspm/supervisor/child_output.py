@@ -55,7 +55,7 @@ class OutputLimit:
         self.pausing = False
 
     def passes(self, line: bytes, now_s: float) -> bool:
-        """Whether a line is to go on now. If not it is held back, as one that may be the last.
+        """Return whether a line is to go on now. If not it is held back, as one that may be the last.
 
         Args:
             now_s: real monotonic time.

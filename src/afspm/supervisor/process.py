@@ -58,7 +58,7 @@ class Task:
 
     @property
     def essential(self) -> bool:
-        """Whether the experiment can't go on without it."""
+        """True where the experiment can't go on without it."""
         return self.role is not Role.COMPONENT
 
 

@@ -100,7 +100,7 @@ class Reporter:
         self._thread.start()
 
     def states(self, states: tuple[ProcessState, ...], *, changed: bool) -> None:
-        """How it is now with all processes; `changed`: that is to be told at once."""
+        """Take the states of all processes; report them at once if they have `changed`."""
         self._states, self._is_new = states, self._is_new or changed
         if changed:
             self._wake()
@@ -275,7 +275,7 @@ def reporter_of(
 
 
 def _local(scheduler: ProcessStart) -> Launch | None:
-    """How a scheduler is asked that is started here."""
+    """Return how a scheduler is asked that is started here."""
     launch = scheduler.launch
     if scheduler.command or launch.sockets.serve is None:
         return None

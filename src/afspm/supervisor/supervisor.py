@@ -56,7 +56,7 @@ REPORT_PERIOD_S = 0.1
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """How a run ended."""
+    """The outcome of a run."""
 
     why: EndReason
     text: str

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable
 
 from afspm.clock import Clock
-from afspm.logic.watchdog import feedback_of
+from afspm.logic.microscope_status import feedback_of
 from afspm.model import ControlRequest, Request, Response, ScopeState, names
 from afspm.translator.connection import RETRY_S, Connection
 from afspm.translator.driver import LOST

@@ -14,7 +14,7 @@ from afspm.transport.frames import receive_frames, send_frames
 from afspm.transport.network import CONNECTED, DISCONNECTED, Monitor, Network
 from afspm.transport.port import ControlConnected, ControlDisconnected, Incoming, ReplyReceived
 from afspm.transport.rate_limited_log import RateLimitedLog
-from afspm.wire.version import ANSWER, QUESTION, Version, as_version_1, is_of_version_1, not_of_version_1
+from afspm.wire.protocol import ANSWER, QUESTION, Version, as_version_1, is_of_version_1, not_of_version_1
 
 
 class ControlClient:

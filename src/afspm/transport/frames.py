@@ -11,6 +11,8 @@ from afspm.wire import Buffer
 
 Socket = zmq.Socket[bytes]
 
+# as numbers: to combine the library's flags, or to ask for an option, takes longer than to send or to receive
+_NOW, _MORE = int(zmq.NOBLOCK), int(zmq.SNDMORE)
 _LARGE_BYTES = 32 * 1024
 """Below this a copy is cheaper than keeping the received buffer."""
 
@@ -18,14 +20,17 @@ _LARGE_BYTES = 32 * 1024
 def receive_frames(socket: Socket) -> list[zmq.Frame]:
     """Return the frames of the next message; empty if there is none. Never blocks."""
     try:
-        return socket.recv_multipart(zmq.NOBLOCK, copy=False)
+        frames = [socket.recv(_NOW, copy=False)]
     except zmq.Again:
         return []
+    while frames[-1].more:
+        frames.append(socket.recv(_NOW, copy=False))
+    return frames
 
 
 def is_readable(socket: Socket) -> bool:
     """Return whether a message can be received at once."""
-    return bool(int(socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
+    return bool(socket.poll(0))
 
 
 def contents(frames: Sequence[zmq.Frame]) -> list[Buffer]:
@@ -40,7 +45,9 @@ def send_frames(socket: Socket, frames: Sequence[bytes]) -> bool:
         zmq.ZMQError: it is addressed to a peer that is gone, where the socket tells.
     """
     try:
-        socket.send_multipart(frames, zmq.NOBLOCK)
+        for frame in frames[:-1]:
+            socket.send(frame, _NOW | _MORE)
+        socket.send(frames[-1], _NOW)
     except zmq.Again:
         return False
     return True
@@ -58,12 +65,12 @@ def send_packet(socket: Socket, packet: Packet, stamp: bytes | None, *, topic: b
         origin = payload.obj
         # any other buffer may change after we return
         payload = origin if isinstance(origin, zmq.Frame) and len(origin) == payload.nbytes else payload.tobytes()
-    frames = [packet.envelope.encode(), payload]
     if topic is not None:
-        frames.insert(0, topic)
+        socket.send(topic, _MORE)
+    socket.send(packet.envelope.encode(), _MORE)
+    socket.send(payload, 0 if stamp is None else _MORE, copy=False)  # what is small is copied all the same
     if stamp is not None:
-        frames.append(stamp)
-    socket.send_multipart(frames, copy=False)
+        socket.send(stamp)
 
 
 def descriptor_of(frame: zmq.Frame) -> int:

@@ -234,7 +234,7 @@ class Monitor:
     def drain(self) -> list[ConnectionEvent]:
         """Return all events that have come."""
         events: list[ConnectionEvent] = []
-        while int(self.socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+        while self.socket.poll(0):
             kind, value = _EVENT.unpack(self.socket.recv_multipart(zmq.NOBLOCK)[0])
             events.append(ConnectionEvent(kind & 0xFFFF, value))
         return events

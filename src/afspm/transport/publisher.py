@@ -10,7 +10,7 @@ from afspm.transport.frames import descriptor_of, property_of, receive_frames, s
 from afspm.transport.network import ACCEPTED, DISCONNECTED, Monitor, Network
 from afspm.transport.replay import LONGEST, History, Marker, is_reserved, spelled_out
 from afspm.transport.tcp_guard import MOST_SUBSCRIBED_BYTES, MOST_UNSENT_BYTES, TcpGuard
-from afspm.wire.version import prefixes_of_version_1
+from afspm.wire.protocol import prefixes_of_version_1
 
 _BATCH, _MOST_REPLAYS = 100, 5
 """Messages taken in, and replays made, before everything else is looked at again."""

@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import zmq
 
-from afspm.transport.frames import descriptor_of, property_of, receive_frames, send_frames, user_of
+from afspm.transport.frames import descriptor_of, is_readable, property_of, receive_frames, send_frames, user_of
 from afspm.transport.keys import MARK
 from afspm.transport.network import ACCEPTED, DISCONNECTED, REFUSED, Monitor, Network
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.tcp_guard import TcpGuard
-from afspm.wire.version import ANSWER, QUESTION
+from afspm.wire.protocol import ANSWER, QUESTION
 
 MOST_A_TURN = 20
 """Messages taken before everything else is looked at again. The socket takes one of each client in turn."""
@@ -106,11 +106,10 @@ class Router:
     def _messages(self, most: int) -> list[list[zmq.Frame]]:
         """The next messages, at most so many."""
         messages: list[list[zmq.Frame]] = []
-        while len(messages) < most:
-            frames = receive_frames(self.socket)
-            if not frames:
-                break
-            messages.append(frames)
+        while is_readable(self.socket):
+            if len(messages) == most:
+                return messages
+            messages.append(receive_frames(self.socket))
         self._guard.settled({descriptor_of(frames[0]) for frames in messages})
         return messages
 

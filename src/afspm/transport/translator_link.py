@@ -10,7 +10,7 @@ import zmq
 from afspm.transport.frames import receive_frames, send_frames
 from afspm.transport.network import CONNECTED, DISCONNECTED, Monitor, Network
 from afspm.transport.rate_limited_log import RateLimitedLog
-from afspm.wire.version import ANSWER, QUESTION, Version, as_version_1, is_of_version_1
+from afspm.wire.protocol import ANSWER, QUESTION, Version, as_version_1, is_of_version_1
 
 _LONGEST_NUMBER = 18
 _VERSION = b"version"  # stands where the numbers of requests do

@@ -16,7 +16,7 @@ from afspm.transport.publisher import Publisher
 from afspm.transport.replay import Published
 from afspm.transport.tcp_guard import TcpGuard
 from afspm.transport.wakeup import WakeUp
-from afspm.wire.version import ANSWER, QUESTION, answer_as_version_1
+from afspm.wire.protocol import ANSWER, QUESTION, answer_as_version_1
 
 _WITH_ID = 3  # frames of a request
 _WITHOUT_EPOCH = 3  # frames up to the empty one: connection, number; the epoch comes behind them

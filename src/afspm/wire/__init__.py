@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from afspm.wire.codec import Buffer, by_point, decode, encode, header
+from afspm.wire.codec import by_point, decode, encode, header
 from afspm.wire.frames import (
-    BEAT,
-    CLOSE,
-    CLOSING,
-    KILL,
     decode_packet,
     decode_parameter,
     decode_request,
@@ -19,17 +15,20 @@ from afspm.wire.frames import (
     encode_subject,
     encode_time,
 )
-from afspm.wire.journal import decode_orders, encode_orders
+from afspm.wire.mapping import decode_orders, encode_orders
 from afspm.wire.messages import known_messages, message_of, message_type, messages_of_the_experiment, register
-from afspm.wire.places import encode_place, place_in, relocated
-from afspm.wire.version import Version, version_of
+from afspm.wire.protocol import BEAT, CLOSE, CLOSING, KILL, PROTOCOL_VERSION, Topic, Version, version_of
+from afspm.wire.split import Buffer
+from afspm.wire.values import encode_place, place_in, relocated
 
 __all__ = [
     "BEAT",
     "CLOSE",
     "CLOSING",
     "KILL",
+    "PROTOCOL_VERSION",
     "Buffer",
+    "Topic",
     "Version",
     "by_point",
     "decode",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from google.protobuf.message import Message
@@ -11,12 +12,11 @@ from google.protobuf.message import Message
 from afspm import model
 from afspm.errors import AfspmError, InvalidValue, UnitError, WireError
 from afspm.units import convert as convert_unit
-from afspm.wire import convert, journal
-from afspm.wire.generated import analysis_pb2, control_pb2, feedback_pb2, lines_pb2, scan_pb2, spectroscopy_pb2
+from afspm.wire import convert
+from afspm.wire.generated import analysis_pb2, lines_pb2, scan_pb2, spectroscopy_pb2
+from afspm.wire.mapping import MAPPINGS, MessageMapping, time_ns, timestamp
 from afspm.wire.messages import message_type, parse
-from afspm.wire.split import doubles, nested, packed, split
-
-Buffer = bytes | memoryview
+from afspm.wire.split import Buffer, doubles, nested, packed, split
 
 _VALUES_OF_SCAN = _VALUES_OF_LINES = 4
 _DATA_OF_SPECTRUM = 4
@@ -30,7 +30,7 @@ def encode(thing: Any) -> tuple[str, bytes]:
         InvalidValue: it is neither.
     """
     if isinstance(thing, Message):
-        return thing.DESCRIPTOR.name, thing.SerializeToString()
+        return _serialised(thing)
     encoder = _ENCODERS.get(type(thing))
     if encoder is None:
         raise InvalidValue(f"a {type(thing).__name__} can't be sent", hint="send a Scan, a Spectrum, … or a message")
@@ -74,7 +74,7 @@ def _encode_scan(scan: model.Scan) -> tuple[str, bytes]:
         channel=scan.channel,
     )
     if scan.time_ns is not None:
-        message.timestamp.CopyFrom(convert.timestamp(scan.time_ns))
+        message.timestamp.CopyFrom(timestamp(scan.time_ns))
     if scan.filename:
         message.filename = scan.filename
     if not scan.values.size:
@@ -97,7 +97,7 @@ def _decode_scan(payload: Buffer) -> model.Scan:
         message.channel,
         message.params.data.units,
         values.reshape(shape.y, shape.x) if values.size else values.reshape(0, 0),
-        convert.time_ns(message.timestamp) if message.HasField("timestamp") else None,
+        time_ns(message.timestamp) if message.HasField("timestamp") else None,
         message.filename,
         None if values.size or not (shape.x and shape.y) else (shape.y, shape.x),
     )
@@ -110,7 +110,7 @@ def _scan_header(payload: Buffer) -> model.PacketHeader:
     if spatial.roi.HasField("size"):
         unit = spatial.length_units or "m"
         size_m = (convert_unit(spatial.roi.size.x, unit, "m"), convert_unit(spatial.roi.size.y, unit, "m"))
-    stamp = convert.time_ns(message.timestamp) if message.HasField("timestamp") else None
+    stamp = time_ns(message.timestamp) if message.HasField("timestamp") else None
     return model.PacketHeader("Scan2d", message.channel, size_m, None, stamp)
 
 
@@ -121,7 +121,7 @@ def _encode_lines(lines: model.ScanLines) -> tuple[str, bytes]:
         first_row=lines.first_row,
     )
     if lines.began_ns is not None:
-        message.timestamp.CopyFrom(convert.timestamp(lines.began_ns))
+        message.timestamp.CopyFrom(timestamp(lines.began_ns))
     return "ScanLines", b"".join((message.SerializeToString(), *packed(lines.values, _VALUES_OF_LINES)))
 
 
@@ -139,7 +139,7 @@ def _decode_lines(payload: Buffer) -> model.ScanLines:
         message.params.data.units,
         message.first_row,
         values.reshape(-1, shape.x),
-        convert.time_ns(message.timestamp) if message.HasField("timestamp") else None,
+        time_ns(message.timestamp) if message.HasField("timestamp") else None,
     )
 
 
@@ -155,7 +155,7 @@ def _encode_spectrum(spectrum: model.Spectrum) -> tuple[str, bytes]:
     if spectrum.filename:
         message.filename = spectrum.filename
     if spectrum.time_ns is not None:
-        message.timestamp.CopyFrom(convert.timestamp(spectrum.time_ns))
+        message.timestamp.CopyFrom(timestamp(spectrum.time_ns))
     data = spectroscopy_pb2.SpecData(
         num_variables=len(spectrum.names),
         data_per_variable=spectrum.values.shape[0],
@@ -183,7 +183,7 @@ def _decode_spectrum(payload: Buffer) -> model.Spectrum:
         tuple(data.names),
         tuple(data.units),
         values.reshape(data.data_per_variable, data.num_variables),
-        convert.time_ns(message.timestamp) if message.HasField("timestamp") else None,
+        time_ns(message.timestamp) if message.HasField("timestamp") else None,
         message.filename,
     )
 
@@ -202,7 +202,7 @@ def by_point(payload: Buffer) -> bytes:
 
 def _spectrum_header(payload: Buffer) -> model.PacketHeader:
     message = parse(spectroscopy_pb2.Spec1d, split(payload, _DATA_OF_SPECTRUM)[0])
-    stamp = convert.time_ns(message.timestamp) if message.HasField("timestamp") else None
+    stamp = time_ns(message.timestamp) if message.HasField("timestamp") else None
     return model.PacketHeader("Spec1d", kind=message.type, time_ns=stamp)
 
 
@@ -216,8 +216,12 @@ def _points_header(payload: Buffer) -> model.PacketHeader:
     return model.PacketHeader("SpatialPointWithScoreList", message.channel)
 
 
-def _plain_encoder(name: str, to_wire: Callable[[Any], Message]) -> Callable[[Any], tuple[str, bytes]]:
-    return lambda thing: (name, to_wire(thing).SerializeToString())
+def _serialised(message: Message) -> tuple[str, bytes]:
+    return message.DESCRIPTOR.name, message.SerializeToString()
+
+
+def _encode_mapped(mapping: MessageMapping[Any], thing: Any) -> tuple[str, bytes]:
+    return _serialised(mapping.to_wire(thing))
 
 
 def _published_parameters(payload: Buffer) -> model.ScanParameters:
@@ -234,17 +238,9 @@ _ENCODERS: dict[type, Callable[[Any], tuple[str, bytes]]] = {
     model.Scan: _encode_scan,
     model.ScanLines: _encode_lines,
     model.Spectrum: _encode_spectrum,
-    model.ScanParameters: _plain_encoder("ScanParameters2d", convert.scan_parameters_to_wire),
-    model.Feedback: _plain_encoder("ZCtrlParameters", convert.feedback_to_wire),
-    model.ProbePosition: _plain_encoder("ProbePosition", convert.position_to_wire),
-    model.ScopeStatus: _plain_encoder("ScopeStateMsg", convert.status_to_wire),
-    model.ControlState: _plain_encoder("ControlState", convert.control_state_to_wire),
-    model.Parameter: _plain_encoder("ParameterMsg", convert.parameter_to_wire),
-    model.JournalEntries: _plain_encoder("JournalEntries", journal.entries_to_wire),
-    model.ProcessStates: _plain_encoder("ProcessStates", journal.processes_to_wire),
-    model.LogLines: _plain_encoder("LogLines", journal.log_to_wire),
-    model.Progress: _plain_encoder("Progress", journal.progress_to_wire),
-    model.RelayedMessage: _plain_encoder("Told", journal.told_to_wire),
+    model.ScanParameters: lambda thing: _serialised(convert.scan_parameters_to_wire(thing)),
+    model.ProbePosition: lambda thing: _serialised(convert.position_to_wire(thing)),
+    **{mapping.kind: partial(_encode_mapped, mapping) for mapping in MAPPINGS},
 }
 
 _DECODERS: dict[str, Callable[[Buffer], Any]] = {
@@ -252,15 +248,8 @@ _DECODERS: dict[str, Callable[[Buffer], Any]] = {
     "ScanLines": _decode_lines,
     "Spec1d": _decode_spectrum,
     "ScanParameters2d": _published_parameters,
-    "ZCtrlParameters": lambda payload: convert.feedback_from_wire(parse(feedback_pb2.ZCtrlParameters, payload)),
     "ProbePosition": lambda payload: convert.position_from_wire(parse(spectroscopy_pb2.ProbePosition, payload)),
-    "ScopeStateMsg": lambda payload: convert.status_from_wire(parse(control_pb2.ScopeStateMsg, payload)),
-    "ControlState": lambda payload: convert.control_state_from_wire(parse(control_pb2.ControlState, payload)),
-    "ParameterMsg": lambda payload: convert.parameter_from_wire(parse(control_pb2.ParameterMsg, payload)),
-    "JournalEntries": journal.entries_from_wire,
-    "ProcessStates": journal.processes_from_wire,
-    "LogLines": journal.log_from_wire,
-    "Progress": journal.progress_from_wire,
+    **{mapping.name: mapping.decode for mapping in MAPPINGS},
 }
 
 _HEADERS: dict[str, Callable[[Buffer], model.PacketHeader]] = {

@@ -1,4 +1,4 @@
-"""Model objects to and from the messages of the contract. Only here do units and corners of the wire matter.
+"""Places, positions and scan parameters to and from messages. Only here do units and corners of the wire matter.
 
 We send metres, degrees and full presence; any unit and any absence is read.
 """
@@ -6,42 +6,14 @@ We send metres, degrees and full presence; any unit and any absence is read.
 from __future__ import annotations
 
 import math
-import struct
-from enum import IntEnum
-from typing import TypeVar
-
-from google.protobuf.timestamp_pb2 import Timestamp
 
 from afspm import model
-from afspm.clock import NS_PER_S
 from afspm.errors import InvalidValue
 from afspm.units import convert
-from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
+from afspm.wire.generated import control_pb2, scan_pb2, spectroscopy_pb2
 
 LENGTH_UNIT = "m"
 ANGLE_UNIT = "deg"
-_TIMES = 2**63
-_FLOAT32 = struct.Struct("<f")
-
-
-E = TypeVar("E", bound=IntEnum)
-
-
-def known(kind: type[E], number: int) -> E:
-    """Return the member with this number; UNDEFINED (0) for one that only a newer peer knows."""
-    return kind(number) if number in kind._value2member_map_ else kind(0)
-
-
-def timestamp(time_ns: int) -> Timestamp:
-    return Timestamp(seconds=time_ns // NS_PER_S, nanos=time_ns % NS_PER_S)
-
-
-def time_ns(stamp: Timestamp) -> int:
-    """Raises InvalidValue: 64 bits, the years 1678 to 2261, don't hold it; no record could keep it."""
-    found = int(stamp.seconds) * NS_PER_S + stamp.nanos
-    if not -_TIMES <= found < _TIMES:
-        raise InvalidValue(f"a time {stamp.seconds} s from 1970")
-    return found
 
 
 def spatial_to_wire(region: model.Region | model.RegionChange) -> scan_pb2.SpatialAspects:
@@ -143,38 +115,6 @@ def _finite(change: model.RegionChange | None) -> None:
         raise InvalidValue(f"the region's size ({change.width_m} m, {change.height_m} m) must be above zero")
 
 
-def feedback_to_wire(feedback: model.Feedback) -> feedback_pb2.ZCtrlParameters:
-    return feedback_pb2.ZCtrlParameters(
-        feedbackOn=feedback.on,
-        proportionalGain=feedback.proportional_gain,
-        integralGain=feedback.integral_gain,
-        setPoint=feedback.setpoint,
-    )
-
-
-def feedback_from_wire(message: feedback_pb2.ZCtrlParameters) -> model.Feedback:
-    """Raises InvalidValue for numbers that are not finite."""
-    for name in ("proportionalGain", "integralGain", "setPoint"):
-        if not math.isfinite(getattr(message, name)):
-            raise InvalidValue(f"{name} is {getattr(message, name)}")
-    return model.Feedback(
-        message.feedbackOn if message.HasField("feedbackOn") else None,
-        *(
-            shortest(getattr(message, name)) if message.HasField(name) else None
-            for name in ("proportionalGain", "integralGain", "setPoint")
-        ),
-    )
-
-
-def shortest(number: float) -> float:
-    """The decimal number that was meant by a float32: 0.1, not 0.10000000149011612, which is above a limit of 0.1."""
-    for digits in range(6, 9):
-        told = float(f"{number:.{digits}g}")
-        if _FLOAT32.unpack(_FLOAT32.pack(told)) == (number,):
-            return told
-    return float(f"{number:.9g}")  # which tells any two of them apart
-
-
 def position_to_wire(position: model.ProbePosition) -> spectroscopy_pb2.ProbePosition:
     message = spectroscopy_pb2.ProbePosition(units=LENGTH_UNIT)
     message.point.x, message.point.y = position.xy_m
@@ -208,46 +148,6 @@ def position_change_from_wire(
     if x_m is None or y_m is None:
         return model.PositionChange(x_m, y_m)
     return model.ProbePosition((x_m, y_m))
-
-
-def status_to_wire(status: model.ScopeStatus) -> control_pb2.ScopeStateMsg:
-    return control_pb2.ScopeStateMsg(scope_state=int(status.state), scan_paused=status.paused)  # type: ignore[arg-type]
-
-
-def status_from_wire(message: control_pb2.ScopeStateMsg) -> model.ScopeStatus:
-    """A state that a newer peer has and we don't know is UNDEFINED."""
-    state = known(model.ScopeState, message.scope_state)
-    return model.ScopeStatus(state, message.scan_paused if message.HasField("scan_paused") else None)
-
-
-def control_state_to_wire(state: model.ControlState) -> control_pb2.ControlState:
-    return control_pb2.ControlState(
-        control_mode=int(state.mode),  # type: ignore[arg-type]
-        client_in_control_id=state.holder,
-        problems_set=state.problems,  # type: ignore[arg-type]
-    )
-
-
-def control_state_from_wire(message: control_pb2.ControlState) -> model.ControlState:
-    return model.ControlState(
-        known(model.ControlMode, message.control_mode),
-        message.client_in_control_id or None,
-        tuple(sorted({int(problem) for problem in message.problems_set})),
-    )
-
-
-def parameter_to_wire(parameter: model.Parameter) -> control_pb2.ParameterMsg:
-    return control_pb2.ParameterMsg(parameter=parameter.name, value=parameter.value, units=parameter.unit)
-
-
-def parameter_from_wire(message: control_pb2.ParameterMsg) -> model.Parameter:
-    if not message.parameter:
-        raise InvalidValue("a parameter without a name")
-    return model.Parameter(
-        message.parameter,
-        message.value if message.HasField("value") else None,
-        message.units if message.HasField("units") else None,
-    )
 
 
 def action_from_wire(message: control_pb2.ActionMsg) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, Final
+from typing import Any
 
 from google.protobuf.message import DecodeError
 from google.protobuf.timestamp_pb2 import Timestamp
@@ -23,26 +23,18 @@ from afspm.model import (
     ResponseDetail,
     request_name,
 )
-from afspm.wire import convert, journal
-from afspm.wire.codec import Buffer, encode
-from afspm.wire.convert import known
-from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
+from afspm.wire import convert
+from afspm.wire.codec import encode
+from afspm.wire.generated import control_pb2, scan_pb2, spectroscopy_pb2
+from afspm.wire.mapping import FEEDBACK, PARAMETER, RELAYED, known, time_ns, timestamp
 from afspm.wire.messages import parse
-from afspm.wire.version import answer_as_version_1, as_version_1
-
-KILL: Final = b"KILL"
-"""The packet of one frame by which everybody who subscribes learns that the experiment has ended."""
-CLOSE: Final = bytes([100])
-"""The request of one frame by which the scheduler tells its translator the same, which subscribes to nobody."""
-BEAT: Final = b"\x00"
-CLOSING: Final = b"\x01"
-LONGEST_ID = 200
-LONGEST_ENVELOPE = 1000
+from afspm.wire.protocol import LONGEST_ENVELOPE, LONGEST_ID, answer_as_version_1, as_version_1
+from afspm.wire.split import Buffer
 
 
 def encode_time(time_ns: int) -> bytes:
     """The third frame of a packet: a serialised google.protobuf.Timestamp."""
-    return convert.timestamp(time_ns).SerializeToString()
+    return timestamp(time_ns).SerializeToString()
 
 
 def decode_time(frame: Buffer) -> int:
@@ -52,7 +44,7 @@ def decode_time(frame: Buffer) -> int:
         WireError: it is none.
     """
     try:
-        return convert.time_ns(Timestamp.FromString(bytes(frame)))
+        return time_ns(Timestamp.FromString(bytes(frame)))
     except (DecodeError, InvalidValue) as error:
         raise WireError(f"the bytes are no Timestamp: {error}") from None
 
@@ -182,7 +174,7 @@ def decode_parameter(payload: Buffer) -> Parameter:
         WireError: it is none.
     """
     try:
-        return convert.parameter_from_wire(parse(control_pb2.ParameterMsg, payload))
+        return PARAMETER.decode(payload)
     except AfspmError as error:
         raise WireError(f"the answer holds no parameter: {error}") from error
 
@@ -212,9 +204,9 @@ def _number(payload: bytes) -> int:
 
 _SUBJECTS: dict[int, Callable[[bytes], Any]] = {
     ControlRequest.ACTION: _action,
-    ControlRequest.PARAM: lambda p: convert.parameter_from_wire(parse(control_pb2.ParameterMsg, p)),
+    ControlRequest.PARAM: PARAMETER.decode,
     ControlRequest.SET_SCAN_PARAMS: lambda p: convert.scan_parameters_from_wire(parse(scan_pb2.ScanParameters2d, p)),
-    ControlRequest.SET_ZCTRL_PARAMS: lambda p: convert.feedback_from_wire(parse(feedback_pb2.ZCtrlParameters, p)),
+    ControlRequest.SET_ZCTRL_PARAMS: FEEDBACK.decode,
     ControlRequest.SET_PROBE_POS: lambda p: convert.position_change_from_wire(parse(spectroscopy_pb2.ProbePosition, p)),
     ControlRequest.REQUEST_CTRL: _number,
     ControlRequest.RELEASE_CTRL: _nothing,
@@ -223,7 +215,7 @@ _SUBJECTS: dict[int, Callable[[bytes], Any]] = {
     ControlRequest.SET_CONTROL_MODE: _number,
     ControlRequest.END_EXPERIMENT: _nothing,
     CLOCK_REQUEST: lambda p: None,
-    RELAY_REQUEST: journal.told_from_wire,
+    RELAY_REQUEST: RELAYED.decode,
     RESTART_REQUEST: _action,
     ControlRequest.ACTION_SUPPORT: _action,
 }

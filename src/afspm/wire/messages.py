@@ -1,4 +1,7 @@
-"""Every message type by its name: those of the contract, and those that users add."""
+"""Every message type by its name: those of the contract, and those that users add.
+
+Nothing outside of this package imports the generated modules; a message class that is needed elsewhere comes from here.
+"""
 
 from __future__ import annotations
 
@@ -7,57 +10,34 @@ from typing import TypeVar
 from google.protobuf.message import DecodeError, Message
 
 from afspm.errors import InvalidValue, WireError
-from afspm.wire.generated.analysis_pb2 import (
-    SpatialPoint,
-    SpatialPointWithScore,
-    SpatialPointWithScoreList,
-    SpatialROIWithScore,
-    SpatialROIWithScoreList,
+from afspm.wire.generated import (
+    analysis_pb2,
+    control_pb2,
+    drift_pb2,
+    feedback_pb2,
+    geometry_pb2,
+    journal_pb2,
+    lines_pb2,
+    scan_pb2,
+    spectroscopy_pb2,
 )
-from afspm.wire.generated.control_pb2 import ActionMsg, ControlState, ParameterMsg, ScopeStateMsg
+from afspm.wire.generated.control_pb2 import ParameterMsg
 from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
-from afspm.wire.generated.feedback_pb2 import FeedbackAnalysis, ZCtrlParameters
-from afspm.wire.generated.geometry_pb2 import (
-    Point2d,
-    Point2u,
-    Rect2d,
-    Rect2i,
-    RotRect2d,
-    RotRect2i,
-    Size2d,
-    Size2u,
-    Size3u,
-)
-from afspm.wire.generated.journal_pb2 import (
-    JournalEntries,
-    JournalEntry,
-    LogLine,
-    LogLines,
-    Orders,
-    ProcessState,
-    ProcessStates,
-    Progress,
-    Told,
-)
-from afspm.wire.generated.lines_pb2 import ScanLines
-from afspm.wire.generated.scan_pb2 import DataAspects, Scan2d, ScanParameters2d, SpatialAspects
-from afspm.wire.generated.spectroscopy_pb2 import ProbePosition, Spec1d, SpecData
+from afspm.wire.generated.feedback_pb2 import ZCtrlParameters
+from afspm.wire.generated.scan_pb2 import ScanParameters2d
+from afspm.wire.generated.spectroscopy_pb2 import ProbePosition
+
+__all__ = ["DriftMapping", "DriftRescan", "ParameterMsg", "ProbePosition", "ScanParameters2d", "ZCtrlParameters"]
 
 M = TypeVar("M", bound=Message)
 
-_BESIDE = "journal.proto"
-
+_MODULES = (
+    analysis_pb2, control_pb2, drift_pb2, feedback_pb2, geometry_pb2,
+    journal_pb2, lines_pb2, scan_pb2, spectroscopy_pb2,
+)  # fmt: skip
 _messages: dict[str, type[Message]] = {
-    message.DESCRIPTOR.name: message
-    for message in (
-        ActionMsg, ControlState, DataAspects, DriftMapping, DriftRescan, FeedbackAnalysis, JournalEntries,
-        JournalEntry, LogLine, LogLines, Orders, ParameterMsg, Point2d, Point2u, ProbePosition, ProcessState,
-        ProcessStates, Progress, Rect2d, Rect2i, RotRect2d, RotRect2i, Scan2d, ScanLines, ScanParameters2d,
-        ScopeStateMsg, Size2d, Size2u, Size3u, SpatialAspects, SpatialPoint, SpatialPointWithScore,
-        SpatialPointWithScoreList, SpatialROIWithScore, SpatialROIWithScoreList, Spec1d, SpecData, Told,
-        ZCtrlParameters,
-    )
-}  # fmt: skip
+    name: getattr(module, name) for module in _MODULES for name in module.DESCRIPTOR.message_types_by_name
+}
 
 
 def register(message: type[Message]) -> type[Message]:
@@ -74,7 +54,7 @@ def register(message: type[Message]) -> type[Message]:
 
 
 def message_type(name: str) -> type[Message]:
-    """The class of the message `name`.
+    """Return the class of the message `name`.
 
     Raises:
         WireError: nobody registered it.
@@ -88,17 +68,18 @@ def message_type(name: str) -> type[Message]:
 
 
 def known_messages() -> tuple[str, ...]:
-    """The names of all message types, those of users included."""
+    """Return the names of all message types, those of users included."""
     return tuple(_messages)
 
 
 def messages_of_the_experiment() -> tuple[str, ...]:
-    """Those of them that are about sample, microscope and control; not what is told of processes, requests and logs."""
-    return tuple(name for name, message in _messages.items() if message.DESCRIPTOR.file.name != _BESIDE)
+    """Return the names of those about sample, microscope and control; not about processes, requests and logs."""
+    beside = journal_pb2.DESCRIPTOR.name
+    return tuple(name for name, message in _messages.items() if message.DESCRIPTOR.file.name != beside)
 
 
 def message_of(envelope: str) -> str:
-    """The name of the message in a packet: its envelope is that name, or begins with that name and an underscore.
+    """Return the name of the message in a packet: the envelope is that name, or begins with it and an underscore.
 
     Raises:
         WireError: it begins with no known message's name.
@@ -115,7 +96,7 @@ def message_of(envelope: str) -> str:
 
 
 def parse(message: type[M], payload: bytes | memoryview) -> M:
-    """Bytes as a message of the given class.
+    """Return bytes as a message of the given class.
 
     Raises:
         WireError: they are none.

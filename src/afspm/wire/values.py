@@ -1,11 +1,18 @@
-"""Messages without their values, which are kept elsewhere, and with them again."""
+"""Messages with other values or at another place, changed without decoding all that is in them."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
-from afspm.wire.codec import Buffer
-from afspm.wire.split import nested, packed, split
+from google.protobuf.message import Message
+
+from afspm.errors import WireError
+from afspm.model import ProbePosition, Region
+from afspm.wire import convert
+from afspm.wire.generated import lines_pb2, scan_pb2, spectroscopy_pb2
+from afspm.wire.messages import parse
+from afspm.wire.split import Buffer, nested, packed, packed_chunks, split
 
 if TYPE_CHECKING:
     import numpy as np
@@ -13,10 +20,18 @@ if TYPE_CHECKING:
 
 _VALUES = {"Scan2d": 4, "ScanLines": 4}
 _DATA_OF_SPECTRUM, _VALUES_OF_DATA = 4, 5
+_NO_VALUES = 1 << 28  # a field that no message has
+_PLACES: dict[str, tuple[type[Message], Callable[[Any], Message], int]] = {
+    "Scan2d": (scan_pb2.Scan2d, lambda scan: scan.params.spatial, _VALUES["Scan2d"]),
+    "ScanLines": (lines_pb2.ScanLines, lambda lines: lines.params.spatial, _VALUES["ScanLines"]),
+    "ScanParameters2d": (scan_pb2.ScanParameters2d, lambda parameters: parameters.spatial, _NO_VALUES),
+    "Spec1d": (spectroscopy_pb2.Spec1d, lambda spectrum: spectrum.position, _DATA_OF_SPECTRUM),
+}
+"""By the name of a message: its class, the part that says where it is, and the field that is left alone."""
 
 
 def without_values(message: str, payload: Buffer) -> bytes:
-    """A message as bytes, without the values of a scan, of lines or of a spectrum; any other as it is.
+    """Return a message without the values of a scan, of lines or of a spectrum; any other as it is.
 
     Raises:
         WireError: the bytes are no message.
@@ -30,7 +45,7 @@ def without_values(message: str, payload: Buffer) -> bytes:
 
 
 def with_values(message: str, head: bytes, values: NDArray[np.float64]) -> bytes:
-    """What `without_values` made, with values again: of a scan or of lines [y, x], of a spectrum (points, variables).
+    """Put values into what `without_values` made: of a scan or of lines [y, x], of a spectrum (points, variables).
 
     Raises:
         WireError: the bytes are no message.
@@ -40,3 +55,41 @@ def with_values(message: str, head: bytes, values: NDArray[np.float64]) -> bytes
     rest, inner = split(head, _DATA_OF_SPECTRUM)
     data = b"".join((*inner, *packed(values, _VALUES_OF_DATA)))
     return rest + nested(data, _DATA_OF_SPECTRUM)
+
+
+def encode_place(place: Region | ProbePosition) -> bytes:
+    """Return a place as the part of a message that says it: a SpatialAspects, or a ProbePosition."""
+    if isinstance(place, Region):
+        return convert.spatial_to_wire(place).SerializeToString()
+    return convert.position_to_wire(place).SerializeToString()
+
+
+def place_in(name: str, payload: Buffer) -> bytes:
+    """Return the place in a ScanParameters2d or a ProbePosition, to the last bit and in its own unit.
+
+    Raises:
+        WireError: the bytes are no such message.
+    """
+    if name == "ProbePosition":
+        return parse(spectroscopy_pb2.ProbePosition, payload).SerializeToString()
+    return parse(scan_pb2.ScanParameters2d, payload).spatial.SerializeToString()
+
+
+def relocated(name: str, payload: Buffer, place: bytes) -> bytes:
+    """Return a Scan2d, ScanLines, ScanParameters2d, Spec1d or ProbePosition with another place, else as it was.
+
+    Raises:
+        WireError: the bytes are no such message, or messages of this name have no place.
+    """
+    if name == "ProbePosition":
+        return place
+    if name not in _PLACES:
+        raise WireError(f"a {name} has no place")
+    kind, part_of, values_field = _PLACES[name]
+    rest, values = split(payload, values_field)
+    message = parse(kind, rest)
+    part = part_of(message)
+    part.Clear()
+    part.ParseFromString(place)
+    part.SetInParent()
+    return b"".join((message.SerializeToString(), *(packed_chunks(values, values_field) if values else [])))

@@ -179,7 +179,7 @@ class Lab:
     def parent_goes(self) -> None:
         self._inbox.append(ParentGone())
 
-    def does(self, event: a.ControlEvent, who: str, number: int = 0) -> Response:
+    def does(self, event: a.ArbitrationEvent, who: str, number: int = 0) -> Response:
         """Somebody asks the scheduler."""
         ask = a.ControlInput(event, who, number)
         rules = a.Rules(problems=PROBLEMS)
@@ -195,13 +195,13 @@ class Lab:
         return Response(int(row.response or 0), reason=reason)
 
     def flag(self, problem: int) -> None:
-        self.does(a.ControlEvent.FLAG, "classifier", problem)
+        self.does(a.ArbitrationEvent.FLAG, "classifier", problem)
 
     def clear(self, problem: int) -> None:
-        self.does(a.ControlEvent.CLEAR, "corrector", problem)
+        self.does(a.ArbitrationEvent.CLEAR, "corrector", problem)
 
     def set_mode(self, mode: int) -> None:
-        self.does(a.ControlEvent.SET_MODE, "person", mode)
+        self.does(a.ArbitrationEvent.SET_MODE, "person", mode)
 
     def stop(self) -> None:
         """Stop what the microscope is doing."""
@@ -258,13 +258,13 @@ class Lab:
         return response
 
     def _answer(self, request: Request) -> Response:
-        asks: Mapping[int, a.ControlEvent] = {
-            ControlRequest.REQUEST_CTRL: a.ControlEvent.REQUEST_CONTROL,
-            ControlRequest.RELEASE_CTRL: a.ControlEvent.RELEASE_CONTROL,
-            ControlRequest.ADD_EXP_PRBLM: a.ControlEvent.FLAG,
-            ControlRequest.RMV_EXP_PRBLM: a.ControlEvent.CLEAR,
-            ControlRequest.SET_CONTROL_MODE: a.ControlEvent.SET_MODE,
-            ControlRequest.END_EXPERIMENT: a.ControlEvent.END,
+        asks: Mapping[int, a.ArbitrationEvent] = {
+            ControlRequest.REQUEST_CTRL: a.ArbitrationEvent.REQUEST_CONTROL,
+            ControlRequest.RELEASE_CTRL: a.ArbitrationEvent.RELEASE_CONTROL,
+            ControlRequest.ADD_EXP_PRBLM: a.ArbitrationEvent.FLAG,
+            ControlRequest.RMV_EXP_PRBLM: a.ArbitrationEvent.CLEAR,
+            ControlRequest.SET_CONTROL_MODE: a.ArbitrationEvent.SET_MODE,
+            ControlRequest.END_EXPERIMENT: a.ArbitrationEvent.END,
         }
         if request.kind in asks:
             return self.does(asks[request.kind], self.name, request.subject or 0)

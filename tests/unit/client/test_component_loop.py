@@ -422,10 +422,10 @@ def test_packets_of_other_publishers_are_handled_and_are_no_state_of_the_microsc
 
 
 def test_control_of_an_earlier_life_is_given_back_when_it_is_not_needed() -> None:
-    from afspm.logic.arbitration import ControlEvent
+    from afspm.logic.arbitration import ArbitrationEvent
 
     lab = Lab("corrector")
-    lab.does(ControlEvent.REQUEST_CONTROL, "corrector")
+    lab.does(ArbitrationEvent.REQUEST_CONTROL, "corrector")
     lab.at(1.0, lab.kill)
     run(Diary(), lab)
     assert lab.control.holder is None

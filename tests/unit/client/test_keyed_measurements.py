@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from afspm.client.link import ExperimentLink
 from afspm.client.scope import Scope
 from afspm.errors import InvalidValue, NoResponse, Refused
-from afspm.logic.arbitration import ControlEvent
+from afspm.logic.arbitration import ArbitrationEvent
 from afspm.model import ControlRequest, ControlResponse, Problem, Request, Response, ScanSet
 
 TILES = [REGION.moved_to((i * 2e-6, 0.0)) for i in range(3)]
@@ -45,7 +45,7 @@ def survive(lab: Lab, folder: Path, kills_s: list[float], *, is_noticed: bool) -
             return survey(scope_of(lab, folder, life, port))
         except Kill9:
             if is_noticed:  # the scheduler takes control from the dead, and stops the scan
-                lab.does(ControlEvent.DEAD, lab.name)
+                lab.does(ArbitrationEvent.DEAD, lab.name)
             lab.restart_component()
     raise AssertionError
 
@@ -87,7 +87,7 @@ def test_every_tile_is_scanned_exactly_once_at_whichever_step_it_is_killed(*, is
             except Kill9:
                 pass
             if is_noticed:
-                lab.does(ControlEvent.DEAD, lab.name)
+                lab.does(ArbitrationEvent.DEAD, lab.name)
             lab.restart_component()
             survey(scope_of(lab, Path(folder), 1))
         assert lab.finished == TILES, f"killed at call {deadly_call}"

@@ -105,10 +105,10 @@ def test_a_scan_asked_for_while_a_problem_is_flagged_waits_without_asking_again_
 
 
 def test_another_solver_in_control_is_waited_for(lab: Lab, scope: Scope) -> None:
-    from afspm.logic.arbitration import ControlEvent
+    from afspm.logic.arbitration import ArbitrationEvent
 
-    lab.does(ControlEvent.REQUEST_CONTROL, "other")
-    lab.at(7.0, lambda: lab.does(ControlEvent.RELEASE_CONTROL, "other"))
+    lab.does(ArbitrationEvent.REQUEST_CONTROL, "other")
+    lab.at(7.0, lambda: lab.does(ArbitrationEvent.RELEASE_CONTROL, "other"))
     scope.scan(REGION)
     assert lab.count(ControlRequest.REQUEST_CTRL) == 2
 
@@ -441,10 +441,10 @@ def test_solving_what_is_not_flagged_is_refused_at_once(lab: Lab, scope: Scope) 
 
 
 def test_a_solver_that_waits_is_told_when_another_has_solved_it(lab: Lab, scope: Scope) -> None:
-    from afspm.logic.arbitration import ControlEvent
+    from afspm.logic.arbitration import ArbitrationEvent
 
     lab.flag(TIP)
-    lab.does(ControlEvent.REQUEST_CONTROL, "other", TIP)
+    lab.does(ArbitrationEvent.REQUEST_CONTROL, "other", TIP)
     lab.at(5.0, lambda: lab.clear(TIP))
     with pytest.raises(ControlLost, match="nothing to solve"), scope.control(solving=TIP):
         pass

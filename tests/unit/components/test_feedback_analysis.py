@@ -26,7 +26,7 @@ def night(
     lab.values[names.ZCTRL_SETPOINT] = str(SETPOINT)
     lab.publish(Feedback(on=on, setpoint=SETPOINT))
     if solver:
-        lab.at(250.0, lambda: lab.does(a.ControlEvent.REQUEST_CONTROL, solver, Problem.FEEDBACK_NON_OPTIMAL))
+        lab.at(250.0, lambda: lab.does(a.ArbitrationEvent.REQUEST_CONTROL, solver, Problem.FEEDBACK_NON_OPTIMAL))
     if cleared_s is not None:
         lab.at(cleared_s, lambda: lab.clear(Problem.FEEDBACK_NON_OPTIMAL))
 

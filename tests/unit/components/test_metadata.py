@@ -32,7 +32,7 @@ def scanned(lab: Lab, at_s: float) -> None:
 
 
 def held_by(lab: Lab, name: str, at_s: float) -> None:
-    lab.at(at_s, lambda: lab.does(a.ControlEvent.REQUEST_CONTROL, name))
+    lab.at(at_s, lambda: lab.does(a.ArbitrationEvent.REQUEST_CONTROL, name))
 
 
 def test_a_row_for_each_channel_says_where_and_who_was_in_control_when_the_scan_began(tmp_path: Path) -> None:

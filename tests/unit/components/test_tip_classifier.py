@@ -13,7 +13,7 @@ from afspm import wire
 from afspm.components.tip_classifier import TipClassifier
 from afspm.components.tip_verdict import BAD, GOOD, MESSAGE, read_verdict
 from afspm.exit_codes import ExitCode
-from afspm.logic.arbitration import ControlEvent
+from afspm.logic.arbitration import ArbitrationEvent
 from afspm.model import ControlRequest, Problem, Region, Scan
 
 TIP = Problem.TIP_SHAPE_CHANGED
@@ -126,7 +126,7 @@ def test_what_was_rightly_not_learnt_from_is_not_after_a_restart_either(tmp_path
     lab.at(50.0, lambda: lab.flag(TIP))
     publish_at(lab, 100.0, channels(1, "double", 5)[5])
     lab.at(
-        120.0, lambda: lab.does(ControlEvent.REQUEST_CONTROL, "tip_corrector", TIP)
+        120.0, lambda: lab.does(ArbitrationEvent.REQUEST_CONTROL, "tip_corrector", TIP)
     )  # who is in control is told after it
     lab.at(200.0, lab.parent_goes)
     run(classifier(), lab, tmp_path)

@@ -26,6 +26,7 @@ from afspm.logic.events import (
 )
 from afspm.logic.scheduler_core import SchedulerCore
 from afspm.logic.settings import SchedulerSettings
+from afspm.logic.state import KIND, VERSION, SavedState
 from afspm.model import (
     RELAY_REQUEST,
     ControlMode,
@@ -44,6 +45,7 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
+from afspm.model.snapshot import restored, snapshot
 
 NS = 10**9
 
@@ -51,8 +53,14 @@ NS = 10**9
 class Lab:
     """A core, what it has done, and short ways to make things happen. Names get a connection when they first speak."""
 
-    def __init__(self, settings: SchedulerSettings | None = None, *, state: dict[str, Any] | None = None) -> None:
-        self.codec = TableCodec()
+    def __init__(
+        self,
+        settings: SchedulerSettings | None = None,
+        *,
+        state: SavedState | None = None,
+        codec: TableCodec | None = None,
+    ) -> None:
+        self.codec = codec or TableCodec()
         self.core = SchedulerCore(settings or SchedulerSettings(), self.codec)
         self.now_s = 100.0
         self.now_ns = 1_750_000_000 * NS
@@ -62,7 +70,7 @@ class Lab:
         self.newest = 0
         self.entries_seen = 0
         if state is not None:
-            self.core.restore(state)
+            self.core.restore(as_saved(state))
         self.effects += self.core.start(self.now_s, self.now_ns)
 
     def step(self, event: Input) -> list[Effect]:
@@ -158,6 +166,11 @@ class Lab:
         return self.core.control.holder
 
 
+def as_saved(state: SavedState) -> SavedState:
+    """As it comes out of a file."""
+    return restored(SavedState, json.loads(json.dumps(snapshot(state, KIND, VERSION))), KIND, VERSION)
+
+
 def replies(effects: list[Effect]) -> list[Reply]:
     return [effect for effect in effects if isinstance(effect, Reply)]
 
@@ -180,7 +193,7 @@ def in_control(settings: SchedulerSettings) -> Lab:
 def killed(lab: Lab, settings: SchedulerSettings) -> Lab:
     """The scheduler that is started with what was saved last."""
     saved = [effect.state for effect in lab.effects if isinstance(effect, SaveState)][-1]
-    again = Lab(settings, state=json.loads(json.dumps(saved)))
+    again = Lab(settings, state=saved)
     again.now_s, again.now_ns = lab.now_s, lab.now_ns
     again.translator()
     return again

@@ -169,7 +169,7 @@ def test_what_was_published_is_replayed_to_who_comes_late(lab: Lab) -> None:
     for n in range(5):
         lab.take_control(f"series-{n}")
         lab.entries()
-    assert sum(packet.envelope == "JournalEntries" for packet, _ in lab.core.cached()) == 6
+    assert sum(packet.envelope == "JournalEntries" for packet, *_ in lab.core.cached()) == 6
 
 
 def test_it_is_saved_before_it_is_published_so_that_its_time_is_not_given_twice(lab: Lab) -> None:
@@ -177,7 +177,7 @@ def test_it_is_saved_before_it_is_published_so_that_its_time_is_not_given_twice(
     lab.later(event_log.PERIOD_S)
     save, publish = lab.step(Tick())
     assert isinstance(save, SaveState)
-    assert save.state["last_ns"] == published([publish])[0].time_ns
+    assert save.state.last_ns == published([publish])[0].time_ns
 
 
 def test_a_restart_is_written_down_once_control_has_been_told() -> None:
@@ -185,14 +185,13 @@ def test_a_restart_is_written_down_once_control_has_been_told() -> None:
     lab.translator()
     lab.take_control("series")
     state = [effect for effect in lab.effects if isinstance(effect, SaveState)][-1].state
-    again = Lab(state=state)
-    again.codec = lab.codec
+    again = Lab(state=state, codec=lab.codec)
     again.later(0.5)
     assert published(again.step(Tick())) == []  # what was published before may still come again
     again.later(0.6)
     packets = published(again.step(Tick()))
     assert [packet.envelope for packet in packets] == ["ControlState", "JournalEntries"]
-    (entry,) = again.core._codec.decode(packets[1].payload).entries  # type: ignore[attr-defined]
+    (entry,) = again.codec.decode(packets[1].payload).entries
     assert entry.what == "started again; series is in control"
 
 

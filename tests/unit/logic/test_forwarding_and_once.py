@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from parts import Held
+
 from afspm.logic.forwarder import ForwardedRequest, Forwarder, ForwardOutcome, SettledRequest
 from afspm.logic.idempotency_cache import IdempotencyCache, RequestStatus
 from afspm.model import ControlResponse, Request, Response, ResponseDetail
@@ -13,14 +17,14 @@ def job(client: str, id_: str = "", command: bool = True) -> ForwardedRequest:
     return ForwardedRequest(client, Request(1, "start-scan", b"x", id_), command)
 
 
-def sent(forwarder: Forwarder) -> list[int]:
+def sent(forwarder: Held[Forwarder]) -> list[int]:
     numbers = [forward.number for forward in forwarder.outbox]
-    forwarder.outbox.clear()
+    forwarder.part = replace(forwarder.part, outbox=())
     return numbers
 
 
-def up(**settings: float) -> Forwarder:
-    forwarder = Forwarder(**settings)  # type: ignore[arg-type]
+def up(**settings: float) -> Held[Forwarder]:
+    forwarder = Held(Forwarder(**settings))  # type: ignore[arg-type]
     forwarder.connected()
     return forwarder
 
@@ -36,7 +40,7 @@ def test_one_is_in_flight_and_the_others_wait_their_turn() -> None:
 
 
 def test_without_a_translator_everybody_is_answered_at_once() -> None:
-    refused = Forwarder().ask(job("a"), 0.0)
+    refused = Held(Forwarder()).ask(job("a"), 0.0)
     assert refused is not None
     assert (refused.end, refused.response.code) == (ForwardOutcome.NOT_SENT, ControlResponse.NO_RESPONSE)
     assert refused.response.detail is ResponseDetail.NOT_SENT
@@ -57,18 +61,18 @@ def test_after_its_timeout_everybody_is_told_there_was_no_response() -> None:
     forwarder.ask(job("a"), 0.0)
     forwarder.ask(job("b"), 1.0)
     assert forwarder.deadline_s() == 5.0
-    assert [(s.job.client, s.end) for s in forwarder.expire(5.0)] == [("a", ForwardOutcome.UNKNOWN)]
-    assert [(s.job.client, s.end) for s in forwarder.expire(6.0)] == [("b", ForwardOutcome.NOT_SENT)]
+    assert [(s.job.client, s.end) for s in forwarder.expired(5.0)] == [("a", ForwardOutcome.UNKNOWN)]
+    assert [(s.job.client, s.end) for s in forwarder.expired(6.0)] == [("b", ForwardOutcome.NOT_SENT)]
     assert sent(forwarder) == [1]
 
 
 def test_a_late_answer_is_never_another_s() -> None:
     forwarder = up(timeout_s=5.0, patience_s=5.0)
     forwarder.ask(job("a"), 0.0)
-    forwarder.expire(5.0)
+    forwarder.expired(5.0)
     forwarder.ask(job("b"), 6.0)
     assert sent(forwarder) == [1]
-    forwarder.expire(10.0)
+    forwarder.expired(10.0)
     assert sent(forwarder) == [2]
     late = forwarder.answered(1, OK, 10.5)
     assert late is not None
@@ -82,8 +86,10 @@ def test_a_late_answer_is_never_another_s() -> None:
 def test_an_overdue_request_that_is_repeated_is_waited_for_again() -> None:
     forwarder = up(timeout_s=5.0, patience_s=5.0)
     forwarder.ask(job("a", "k"), 0.0)
-    forwarder.expire(5.0)
-    assert forwarder.ask_again("a", "k", 5.5)
+    forwarder.expired(5.0)
+    again = forwarder.part.asked_again("a", "k", 5.5)
+    assert again is not None
+    forwarder.part = again
     settled = forwarder.answered(1, OK, 6.0)
     assert settled is not None
     assert settled.end is ForwardOutcome.ANSWERED
@@ -92,11 +98,13 @@ def test_an_overdue_request_that_is_repeated_is_waited_for_again() -> None:
 def test_who_repeats_for_ever_does_not_keep_the_line() -> None:
     forwarder = up(timeout_s=5.0, patience_s=5.0)
     forwarder.ask(job("a", "k"), 0.0)
-    forwarder.expire(5.0)
-    assert forwarder.ask_again("a", "k", 9.9)
+    forwarder.expired(5.0)
+    again = forwarder.part.asked_again("a", "k", 9.9)
+    assert again is not None
+    forwarder.part = again
     forwarder.ask(job("b"), 11.0)
-    assert [s.job.client for s in forwarder.expire(14.9)] == ["a"]
-    assert not forwarder.ask_again("a", "k", 15.0)
+    assert [s.job.client for s in forwarder.expired(14.9)] == ["a"]
+    assert forwarder.asked_again("a", "k", 15.0) is None
     assert sent(forwarder) == [1, 2]
 
 
@@ -123,36 +131,36 @@ def test_what_waits_can_be_called_back_and_what_was_sent_not() -> None:
     forwarder = up()
     for name in ("a", "a", "b"):
         forwarder.ask(job(name), 0.0)
-    assert [j.number for j in forwarder.call_back(lambda j: j.client == "a")] == [2]
+    assert [j.number for j in forwarder.called_back(lambda j: j.client == "a")] == [2]
     assert forwarder.flight is not None
 
 
 def test_a_repeated_id_has_the_fate_of_the_first() -> None:
-    once = IdempotencyCache()
+    once = Held(IdempotencyCache())
     request = Request(1, "start-scan", b"x", "exp/a/1")
     assert once.look_up("exp", request) is None
-    once.note("exp", request, RequestStatus.PENDING)
+    once.noted("exp", request, RequestStatus.PENDING)
     assert once.look_up("exp", request) is RequestStatus.PENDING
-    once.note("exp", request, OK)
+    once.noted("exp", request, OK)
     assert once.look_up("exp", request) is OK
     assert once.look_up("other", request) is None
-    once.forget("exp", request)
+    once.forgotten("exp", request)
     assert once.look_up("exp", request) is None
 
 
 def test_an_id_used_for_another_request_is_refused() -> None:
-    once = IdempotencyCache()
-    once.note("exp", Request(1, "start-scan", b"x", "key"), OK)
+    once = Held(IdempotencyCache())
+    once.noted("exp", Request(1, "start-scan", b"x", "key"), OK)
     other = once.look_up("exp", Request(1, "x-pulse", b"y", "key"))
     assert isinstance(other, Response)
     assert other.code == ControlResponse.FAILURE
 
 
 def test_the_table_is_bounded_and_forgets_the_oldest() -> None:
-    once = IdempotencyCache(per_client=5, clients=3)
+    once = Held(IdempotencyCache(per_client=5, clients=3))
     for n in range(100):
-        once.note("exp", Request(1, id=str(n)), OK)
-        once.note(f"other-{n}", Request(1, id="1"), OK)
+        once.noted("exp", Request(1, id=str(n)), OK)
+        once.noted(f"other-{n}", Request(1, id="1"), OK)
     assert once.look_up("exp", Request(1, id="99")) is OK
     assert once.look_up("exp", Request(1, id="94")) is None
     assert once.look_up("other-50", Request(1, id="1")) is None

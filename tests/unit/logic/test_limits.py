@@ -6,9 +6,11 @@ import json
 import math
 
 import pytest
+from parts import Held
 
 from afspm import wire
 from afspm.logic.limit_checker import LimitChecker
+from afspm.logic.limit_state import LimitState
 from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.model import (
     ControlRequest,
@@ -23,14 +25,19 @@ from afspm.model import (
     ScanParameters,
     ShapeChange,
 )
+from afspm.model.snapshot import from_plain, to_plain
 
 NS = 10**9
 BIAS = "tip-bias-voltage"
 STAGE = Region((0.0, 0.0), (10e-6, 10e-6))
 
 
-def guard(**parameters: Limit) -> LimitChecker:
-    return LimitChecker(ExperimentLimits({name.replace("_", "-"): limit for name, limit in parameters.items()}))
+def checker(limits: ExperimentLimits | None = None) -> Held[LimitChecker]:
+    return Held(LimitChecker(limits or ExperimentLimits()))
+
+
+def guard(**parameters: Limit) -> Held[LimitChecker]:
+    return checker(ExperimentLimits({name.replace("_", "-"): limit for name, limit in parameters.items()}))
 
 
 def set_(value: str, unit: str | None = None, name: str = BIAS) -> Request:
@@ -45,7 +52,7 @@ def probe(x: float, y: float) -> Request:
     return Request(int(ControlRequest.SET_PROBE_POS), ProbePosition((x, y)))
 
 
-def why(guard: LimitChecker, request: Request, who: str = "experiment", now_ns: int = 0) -> str:
+def why(guard: Held[LimitChecker], request: Request, who: str = "experiment", now_ns: int = 0) -> str:
     """The reason of the refusal; empty if there is none."""
     refusal = guard.check(who, request, now_ns)
     if refusal is None:
@@ -70,15 +77,15 @@ def test_a_range_is_checked_in_any_unit(value: str, unit: str | None, fits: bool
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf", "NaN", "abc", "", "0x10"])
 def test_base_parameters_are_finite_numbers_with_or_without_a_limit(value: str) -> None:
-    assert why(LimitChecker(), set_(value, "V"))
+    assert why(checker(), set_(value, "V"))
 
 
 def test_a_unit_of_the_wrong_kind_is_refused() -> None:
-    assert why(LimitChecker(), set_("1", "nm"))
+    assert why(checker(), set_("1", "nm"))
 
 
 def test_a_parameter_of_one_s_own_may_be_text_unless_it_is_limited() -> None:
-    assert not why(LimitChecker(), set_("fast", None, "x-mode"))
+    assert not why(checker(), set_("fast", None, "x-mode"))
     assert why(guard(x_mode=Limit(0.0, 1.0)), set_("fast", None, "x-mode"))
 
 
@@ -112,7 +119,7 @@ def test_a_rate_allows_more_with_time() -> None:
 
 
 def test_an_interval_lies_between_two_uses() -> None:
-    g = LimitChecker(ExperimentLimits(actions={"x-pulse": Limit(interval_s=60.0, source="toml:3")}))
+    g = checker(ExperimentLimits(actions={"x-pulse": Limit(interval_s=60.0, source="toml:3")}))
     pulse = Request(int(ControlRequest.ACTION), "x-pulse")
     assert not why(g, pulse)
     g.carried_out(pulse, 0)
@@ -121,7 +128,7 @@ def test_an_interval_lies_between_two_uses() -> None:
 
 
 def test_only_those_named_may() -> None:
-    g = LimitChecker(ExperimentLimits({BIAS: Limit(only={"corrector"})}, {"x-crash": Limit(only={"corrector"})}))
+    g = checker(ExperimentLimits({BIAS: Limit(only={"corrector"})}, {"x-crash": Limit(only={"corrector"})}))
     crash = Request(int(ControlRequest.ACTION), "x-crash")
     for request in (crash, set_("1", "V")):
         assert "corrector" in why(g, request, "experiment")
@@ -144,7 +151,7 @@ def test_the_fields_of_messages_are_limited_like_the_parameters_of_their_names()
 
 
 def test_scans_stay_in_the_region_with_all_their_corners() -> None:
-    g = LimitChecker(ExperimentLimits(region=STAGE, region_source="toml:9"))
+    g = checker(ExperimentLimits(region=STAGE, region_source="toml:9"))
     assert not why(g, scan(Region((0, 0), (10e-6, 10e-6))))
     assert "toml:9" in why(g, scan(Region((0, 0), (9e-6, 9e-6), math.pi / 4)))
     assert why(g, scan(Region((4e-6, 0), (3e-6, 1e-6))))
@@ -152,23 +159,23 @@ def test_scans_stay_in_the_region_with_all_their_corners() -> None:
 
 
 def test_a_turned_region_is_respected() -> None:
-    g = LimitChecker(ExperimentLimits(region=Region((0, 0), (10e-6, 2e-6), math.pi / 2)))
+    g = checker(ExperimentLimits(region=Region((0, 0), (10e-6, 2e-6), math.pi / 2)))
     assert not why(g, probe(0.5e-6, 4.5e-6))
     assert why(g, probe(4.5e-6, 0.5e-6))
 
 
 def test_the_probe_stays_in_the_region_and_goes_to_real_places() -> None:
-    g = LimitChecker(ExperimentLimits(region=STAGE))
+    g = checker(ExperimentLimits(region=STAGE))
     assert not why(g, probe(5e-6, -5e-6))
     assert why(g, probe(5.1e-6, 0.0))
     assert why(g, probe(math.nan, 0.0))
 
 
 def test_a_scan_moved_by_single_parameters_stays_in_the_region_too() -> None:
-    g = LimitChecker(ExperimentLimits(region=STAGE))
+    g = checker(ExperimentLimits(region=STAGE))
     move = set_("4", "um", "scan-top-left-x")
     assert "not known" in why(g, move)
-    g.published(ScanParameters(Region((0, 0), (2e-6, 2e-6)), (64, 64)), 0)
+    g.in_force(ScanParameters(Region((0, 0), (2e-6, 2e-6)), (64, 64)), 0)
     assert why(g, move)
     assert not why(g, set_("3", "um", "scan-top-left-x"))
     assert why(g, set_("90", "deg", "scan-angle")) == ""
@@ -176,33 +183,33 @@ def test_a_scan_moved_by_single_parameters_stays_in_the_region_too() -> None:
 
 
 def test_a_part_of_a_region_is_checked_with_the_rest_of_it() -> None:
-    g = LimitChecker(ExperimentLimits(region=STAGE))
+    g = checker(ExperimentLimits(region=STAGE))
     assert "not known" in why(g, scan(RegionChange(left_m=0.0)))
-    g.published(ScanParameters(Region((0, 0), (2e-6, 2e-6)), (64, 64)), 0)
+    g.in_force(ScanParameters(Region((0, 0), (2e-6, 2e-6)), (64, 64)), 0)
     assert not why(g, scan(RegionChange(left_m=3e-6)))
     assert why(g, scan(RegionChange(left_m=3.5e-6)))
 
 
 @pytest.mark.parametrize("size", [0.0, -1e-6, math.nan, math.inf])
 def test_a_scan_of_no_size_is_refused(size: float) -> None:
-    assert why(LimitChecker(), scan(RegionChange(width_m=size)))
-    assert why(LimitChecker(), set_(str(size), "m", "scan-size-x"))
+    assert why(checker(), scan(RegionChange(width_m=size)))
+    assert why(checker(), set_(str(size), "m", "scan-size-x"))
 
 
 def test_absurd_numbers_of_pixels_are_refused() -> None:
-    assert why(LimitChecker(), scan(shape=(10**5, 10**4)))
-    g = LimitChecker()
-    g.published(ScanParameters(shape=(10**5, 10)), 0)
+    assert why(checker(), scan(shape=(10**5, 10**4)))
+    g = checker()
+    g.in_force(ScanParameters(shape=(10**5, 10)), 0)
     assert why(g, set_("10000", None, "scan-resolution-x"))
     for value in ("0", "-4", "1.5"):
         assert why(g, set_(value, None, "scan-resolution-x"))
 
 
 def test_a_part_of_a_position_is_checked_with_the_rest_of_it() -> None:
-    limits = LimitChecker(ExperimentLimits(region=STAGE))
+    limits = checker(ExperimentLimits(region=STAGE))
     half = Request(int(ControlRequest.SET_PROBE_POS), PositionChange(x_m=4e-6))
     assert "not known" in why(limits, half)
-    limits.published(ProbePosition((0.0, 4.9e-6)), 0)
+    limits.in_force(ProbePosition((0.0, 4.9e-6)), 0)
     assert why(limits, half) == ""
     limits.carried_out(half, 0)
     beyond = Request(int(ControlRequest.SET_PROBE_POS), PositionChange(y_m=5.1e-6))
@@ -210,8 +217,8 @@ def test_a_part_of_a_position_is_checked_with_the_rest_of_it() -> None:
 
 
 def test_pixels_along_one_axis_are_counted_with_those_along_the_other() -> None:
-    limits = LimitChecker(ExperimentLimits(most_pixels=1000))
-    limits.published(ScanParameters(STAGE, (100, 5)), 0)
+    limits = checker(ExperimentLimits(most_pixels=1000))
+    limits.in_force(ScanParameters(STAGE, (100, 5)), 0)
     assert why(limits, scan(shape=ShapeChange(columns=10))) == ""
     assert "11 x 100" in why(limits, scan(shape=ShapeChange(columns=11)))
 
@@ -226,7 +233,7 @@ def act(action: str, id_: str = "") -> Request:
     return Request(int(ControlRequest.ACTION), action, id=id_)
 
 
-def here(guard: LimitChecker, action: str) -> str:
+def here(guard: Held[LimitChecker], action: str) -> str:
     """The reason why it is refused where the scan and the probe are; empty if it is not."""
     refusal = guard.check_place(act(action))
     if refusal is None:
@@ -235,50 +242,49 @@ def here(guard: LimitChecker, action: str) -> str:
     return refusal.reason
 
 
-def restarted(limits: ExperimentLimits, before: LimitChecker) -> LimitChecker:
-    again = LimitChecker(limits)
-    again.restore(json.loads(json.dumps(before.snapshot())))
-    return again
+def restarted(limits: ExperimentLimits, before: Held[LimitChecker]) -> Held[LimitChecker]:
+    plain = json.loads(json.dumps(to_plain(before.state)))
+    return Held(LimitChecker(limits, from_plain(LimitState, plain)))
 
 
 def test_nothing_is_scanned_outside_the_region_whoever_set_the_frame() -> None:
-    g = LimitChecker(ExperimentLimits(region=STAGE, region_source="toml:9"))
+    g = checker(ExperimentLimits(region=STAGE, region_source="toml:9"))
     assert "not known" in here(g, "start-scan")
-    g.published(ScanParameters(Region((4.9e-6, 0), (1e-6, 1e-6)), (8, 8)), 0)
+    g.in_force(ScanParameters(Region((4.9e-6, 0), (1e-6, 1e-6)), (8, 8)), 0)
     assert "toml:9" in here(g, "start-scan")
     assert here(g, "stop-scan") == here(g, "x-retract") == ""
-    g.published(ScanParameters(Region((4e-6, 0), (1e-6, 1e-6)), (8, 8)), 0)
+    g.in_force(ScanParameters(Region((4e-6, 0), (1e-6, 1e-6)), (8, 8)), 0)
     assert here(g, "start-scan") == ""
-    assert here(LimitChecker(), "start-scan") == ""
+    assert here(checker(), "start-scan") == ""
 
 
 @pytest.mark.parametrize("action", ["start-spec", "x-pulse", "x-crash"])
 def test_nothing_is_done_at_the_probe_outside_the_region_whoever_moved_it(action: str) -> None:
-    g = LimitChecker(ExperimentLimits(region=STAGE, region_source="toml:9"))
+    g = checker(ExperimentLimits(region=STAGE, region_source="toml:9"))
     assert "not known" in here(g, action)
-    g.published(ProbePosition((9e-6, 0.0)), 0)
+    g.in_force(ProbePosition((9e-6, 0.0)), 0)
     assert "(9e-06, 0)" in here(g, action)
     assert "toml:9" in here(g, action)
-    g.published(ProbePosition((5e-6, 0.0)), 0)
+    g.in_force(ProbePosition((5e-6, 0.0)), 0)
     assert here(g, action) == ""
 
 
 def test_a_frame_up_to_the_border_may_be_told_in_the_precision_of_the_controller() -> None:
-    g = LimitChecker(ExperimentLimits(region=STAGE))
+    g = checker(ExperimentLimits(region=STAGE))
     assert why(g, scan(Region((4.5e-6, 0.0), (1.0000002e-6, 1e-6))))
-    g.published(ScanParameters(Region((4.5e-6, 0.0), (1.0000002e-6, 1e-6)), (8, 8)), 0)
-    g.published(ProbePosition((5.0000002e-6, 0.0)), 0)
+    g.in_force(ScanParameters(Region((4.5e-6, 0.0), (1.0000002e-6, 1e-6)), (8, 8)), 0)
+    g.in_force(ProbePosition((5.0000002e-6, 0.0)), 0)
     assert here(g, "start-scan") == here(g, "x-pulse") == ""
-    g.published(ScanParameters(Region((4.5e-6, 0.0), (1.02e-6, 1e-6)), (8, 8)), 0)
-    g.published(ProbePosition((5.01e-6, 0.0)), 0)
+    g.in_force(ScanParameters(Region((4.5e-6, 0.0), (1.02e-6, 1e-6)), (8, 8)), 0)
+    g.in_force(ProbePosition((5.01e-6, 0.0)), 0)
     assert here(g, "start-scan")
     assert here(g, "x-pulse")
 
 
 def test_a_place_set_by_single_parameters_is_known_before_it_is_published() -> None:
-    g = LimitChecker(ExperimentLimits(region=STAGE))
-    g.published(ProbePosition((0.0, 0.0)), 0)
-    g.published(ScanParameters(Region((0, 0), (1e-6, 1e-6)), (8, 8)), 0)
+    g = checker(ExperimentLimits(region=STAGE))
+    g.in_force(ProbePosition((0.0, 0.0)), 0)
+    g.in_force(ScanParameters(Region((0, 0), (1e-6, 1e-6)), (8, 8)), 0)
     g.carried_out(set_("9", "um", "probe-pos-x"), 0)
     g.carried_out(set_("9", "um", "scan-top-left-y"), 0)
     assert here(g, "x-pulse")
@@ -287,8 +293,8 @@ def test_a_place_set_by_single_parameters_is_known_before_it_is_published() -> N
 
 def test_an_interval_counts_from_the_sending_and_over_a_restart() -> None:
     limits = ExperimentLimits(actions={"x-pulse": Limit(interval_s=60.0)})
-    g = LimitChecker(limits)
-    assert g.sending("corrector", act("x-pulse", "corrector/1"), 0)
+    g = checker(limits)
+    g.sending("corrector", act("x-pulse", "corrector/1"), 0)
     again = restarted(limits, g)
     assert why(again, act("x-pulse", "corrector/2"), "corrector", 59 * NS)
     assert not why(again, act("x-pulse", "corrector/2"), "corrector", 60 * NS)
@@ -297,7 +303,7 @@ def test_an_interval_counts_from_the_sending_and_over_a_restart() -> None:
 
 
 def test_a_request_that_is_asked_again_is_not_too_soon_after_itself() -> None:
-    g = LimitChecker(ExperimentLimits(actions={"x-pulse": Limit(interval_s=60.0)}))
+    g = checker(ExperimentLimits(actions={"x-pulse": Limit(interval_s=60.0)}))
     g.sending("corrector", act("x-pulse", "corrector/1"), 0)
     assert not why(g, act("x-pulse", "corrector/1"), "corrector", NS)
     assert why(g, act("x-pulse", "corrector/1"), "another", NS)
@@ -305,35 +311,40 @@ def test_a_request_that_is_asked_again_is_not_too_soon_after_itself() -> None:
 
 
 def test_what_was_refused_by_the_microscope_does_not_count_as_used() -> None:
-    g = LimitChecker(ExperimentLimits(actions={"x-pulse": Limit(interval_s=60.0)}))
+    g = checker(ExperimentLimits(actions={"x-pulse": Limit(interval_s=60.0)}))
     g.sending("corrector", act("x-pulse", "corrector/1"), 0)
     g.not_done("corrector", act("x-pulse", "corrector/1"))
     assert not why(g, act("x-pulse", "corrector/2"), "corrector", NS)
 
 
 def test_only_what_is_measured_from_is_to_be_saved() -> None:
-    g = LimitChecker(
+    g = checker(
         ExperimentLimits({BIAS: Limit(step=0.5), "scan-speed": Limit(high=1.0)}, {"x-crash": Limit(only=["corrector"])})
     )
-    assert not g.sending("corrector", act("x-crash"), 0)
-    assert not g.carried_out(set_("1e-6", "m/s", "scan-speed"), 0)
-    assert g.carried_out(set_("1", "V"), 0)
-    assert not g.carried_out(set_("1", "V"), 0)
+    fresh = g.state.usage
+    g.sending("corrector", act("x-crash"), 0)
+    g.carried_out(set_("1e-6", "m/s", "scan-speed"), 0)
+    assert g.state.usage == fresh
+    g.carried_out(set_("1", "V"), 0)
+    known = g.state.usage
+    assert known != fresh
+    g.carried_out(set_("1", "V"), 0)
+    assert g.state.usage == known
 
 
 def test_steps_rates_and_places_are_known_after_a_restart() -> None:
     limits = ExperimentLimits({BIAS: Limit(step=0.5, rate_per_s=0.1)}, region=STAGE)
-    g = LimitChecker(limits)
+    g = checker(limits)
     g.carried_out(set_("1", "V"), 0)
-    g.published(ScanParameters(Region((4.9e-6, 0), (1e-6, 1e-6), 0.5), (8, 9)), 0)
-    g.published(ProbePosition((4e-6, 0.0)), 0)
+    g.in_force(ScanParameters(Region((4.9e-6, 0), (1e-6, 1e-6), 0.5), (8, 9)), 0)
+    g.in_force(ProbePosition((4e-6, 0.0)), 0)
     again = restarted(limits, g)
     assert "step" in why(again, set_("1.6", "V"), now_ns=60 * NS)
     assert "per second" in why(again, set_("1.4", "V"), now_ns=3 * NS)
     assert not why(again, set_("1.4", "V"), now_ns=4 * NS)
     assert here(again, "x-pulse") == ""
     assert "corner" in here(again, "start-scan")
-    assert again.snapshot() == g.snapshot()
+    assert again.state == g.state
 
 
 def test_a_setpoint_that_is_the_limit_is_not_above_it() -> None:
@@ -355,7 +366,7 @@ def test_what_a_microscope_tells_without_sense_is_no_value_and_no_harm(name: str
     assert not why(g, set_("1.2", "V", name))
     assert not g.carried_out(get, 0, Parameter(name, value, unit))
     assert "does not tell" in why(g, set_("1.2", "V", name))
-    assert not g.published(Feedback(setpoint=math.nan), 0)
+    assert not g.in_force(Feedback(setpoint=math.nan), 0)
 
 
 def test_who_may_set_counts_for_switches_and_texts_too() -> None:
@@ -379,17 +390,17 @@ def test_an_action_is_limited_by_what_it_sets() -> None:
         (Limit(only={"corrector"}), "only corrector"),
         (Limit(step=0.5), "step of 7 V"),
     ):
-        g = LimitChecker(ExperimentLimits({BIAS: limit}, sets=HIGH))
+        g = checker(ExperimentLimits({BIAS: limit}, sets=HIGH))
         g.carried_out(set_("1", "V"), 0)
         assert word in why(g, act)
         assert "x-high" in why(g, act)
-    away = LimitChecker(ExperimentLimits(region=STAGE, sets={"x-away": (Parameter("probe-pos-x", "20", "um"),)}))
-    away.published(ProbePosition((0.0, 0.0)), 0)
+    away = checker(ExperimentLimits(region=STAGE, sets={"x-away": (Parameter("probe-pos-x", "20", "um"),)}))
+    away.in_force(ProbePosition((0.0, 0.0)), 0)
     assert "outside the region" in why(away, Request(int(ControlRequest.ACTION), "x-away", id="i"))
 
 
 def test_what_an_action_has_set_is_in_force() -> None:
-    g = LimitChecker(ExperimentLimits({BIAS: Limit(step=0.5)}, sets=HIGH))
+    g = checker(ExperimentLimits({BIAS: Limit(step=0.5)}, sets=HIGH))
     g.carried_out(Request(int(ControlRequest.ACTION), "x-high"), 0)
     assert not why(g, set_("8.4", "V"))
     assert why(g, set_("1.0", "V"))
@@ -398,10 +409,8 @@ def test_what_an_action_has_set_is_in_force() -> None:
 def test_what_an_action_sets_is_limited_as_a_whole() -> None:
     large = (Parameter("scan-resolution-x", "2048"), Parameter("scan-resolution-y", "2048"))
     to_the_left = (Parameter("scan-top-left-x", "-5", "um"), Parameter("scan-size-x", "10", "um"))
-    g = LimitChecker(
-        ExperimentLimits(region=STAGE, most_pixels=1_000_000, sets={"x-large": large, "x-left": to_the_left})
-    )
-    g.published(ScanParameters(Region((4e-6, 0.0), (2e-6, 2e-6)), (256, 256)), 0)
+    g = checker(ExperimentLimits(region=STAGE, most_pixels=1_000_000, sets={"x-large": large, "x-left": to_the_left}))
+    g.in_force(ScanParameters(Region((4e-6, 0.0), (2e-6, 2e-6)), (256, 256)), 0)
     assert "2048 x 2048" in why(g, Request(int(ControlRequest.ACTION), "x-large", id="i"))
     assert not why(g, Request(int(ControlRequest.ACTION), "x-left", id="i"))
 
@@ -410,15 +419,15 @@ def test_what_an_action_sets_is_limited_as_a_whole() -> None:
     ("name", "value"), [("scan-resolution-x", "0"), ("scan-resolution-y", "2.5"), ("scan-size-x", "0")]
 )
 def test_a_place_without_sense_that_a_microscope_tells_is_none_and_no_harm(name: str, value: str) -> None:
-    g = LimitChecker(ExperimentLimits(region=STAGE))
-    g.published(ScanParameters(Region((0.0, 0.0), (2e-6, 2e-6)), (256, 256)), 0)
+    g = checker(ExperimentLimits(region=STAGE))
+    g.in_force(ScanParameters(Region((0.0, 0.0), (2e-6, 2e-6)), (256, 256)), 0)
     g.carried_out(Request(int(ControlRequest.PARAM), Parameter(name)), 0, Parameter(name, value))
     assert here(g, "start-scan") == ""
 
 
 def test_what_a_request_without_sense_would_have_set_is_still_known() -> None:
     g = guard(zctrl_setpoint=Limit(step=0.5))
-    g.published(Feedback(setpoint=1.0), 0)
+    g.in_force(Feedback(setpoint=1.0), 0)
     assert why(g, set_("nan", None, "zctrl-setpoint"))
     assert g.to_be_read(set_("nan", None, "zctrl-setpoint")) == []
     assert not why(g, set_("1.2", None, "zctrl-setpoint"))
@@ -451,8 +460,9 @@ def test_a_microscope_that_does_not_say_the_value_when_asked_is_not_taken_to_hav
 def test_a_parameter_that_may_be_set_every_so_often_counts_from_when_it_is_sent(by_action: bool) -> None:
     limits = ExperimentLimits({BIAS: Limit(interval_s=600.0)}, sets=HIGH)
     request = Request(int(ControlRequest.ACTION), "x-high", id="1") if by_action else set_("1", "V")
-    g = LimitChecker(limits)
-    assert g.sending("experiment", request, 0)
+    g = checker(limits)
+    g.sending("experiment", request, 0)
+    assert g.state.usage.sent
     again = restarted(limits, g)
     other = Request(int(ControlRequest.PARAM), Parameter(BIAS, "2", "V"), id="2")
     for one in (g, again):
@@ -462,7 +472,7 @@ def test_a_parameter_that_may_be_set_every_so_often_counts_from_when_it_is_sent(
 
 
 def test_only_what_nobody_publishes_is_to_be_read_and_only_where_it_matters() -> None:
-    g = LimitChecker(
+    g = checker(
         ExperimentLimits(
             {BIAS: Limit(step=0.5), "scan-size-x": Limit(step=1e-6), "scan-speed": Limit(high=1.0)}, sets=HIGH
         )

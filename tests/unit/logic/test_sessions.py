@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from parts import Held
+
 from afspm.logic.sessions import Hearing, SessionTable, token_of
 
 ACCEPTED, TAKEN, STALE, UNCLEAR = Hearing.ACCEPTED, Hearing.TAKEN, Hearing.STALE, Hearing.UNCLEAR
@@ -18,7 +20,7 @@ def test_the_token_is_read_from_ids_of_our_form_only() -> None:
 
 
 def test_a_restarted_component_is_the_same_client() -> None:
-    sessions = SessionTable()
+    sessions = Held(SessionTable())
     sessions.connected(1)
     assert sessions.hear(1, "exp", "exp/a/1", 0.0) is ACCEPTED
     assert sessions.disconnected(1, 1.0) == "exp"
@@ -29,7 +31,7 @@ def test_a_restarted_component_is_the_same_client() -> None:
 
 
 def test_a_second_live_one_of_the_same_name_is_refused() -> None:
-    sessions = SessionTable()
+    sessions = Held(SessionTable())
     for connection in (1, 2):
         sessions.connected(connection)
     assert sessions.hear(1, "exp", "exp/a/1", 0.0) is ACCEPTED
@@ -39,7 +41,7 @@ def test_a_second_live_one_of_the_same_name_is_refused() -> None:
 
 def test_handing_the_name_over_does_not_make_the_impostor_its_owner() -> None:
     """ROUTER closes the owner's connection when the impostor connects; the owner comes back, and so on."""
-    sessions = SessionTable(takeover_s=3.0)
+    sessions = Held(SessionTable(takeover_s=3.0))
     sessions.connected(1)
     assert sessions.hear(1, "exp", "exp/a/1", 0.0) is ACCEPTED
     sessions.connected(2)
@@ -54,7 +56,7 @@ def test_handing_the_name_over_does_not_make_the_impostor_its_owner() -> None:
 
 
 def test_a_peer_without_ids_that_connects_anew_is_the_same_client_whichever_is_seen_first() -> None:
-    sessions = SessionTable()
+    sessions = Held(SessionTable())
     sessions.connected(1)
     assert sessions.hear(1, "old", "", 0.0) is ACCEPTED
     sessions.connected(2)
@@ -64,7 +66,7 @@ def test_a_peer_without_ids_that_connects_anew_is_the_same_client_whichever_is_s
 
 
 def test_a_peer_without_ids_does_not_take_the_name_of_one_with_ids() -> None:
-    sessions = SessionTable(takeover_s=3.0)
+    sessions = Held(SessionTable(takeover_s=3.0))
     sessions.connected(1)
     assert sessions.hear(1, "exp", "exp/a/1", 0.0) is ACCEPTED
     sessions.connected(2)
@@ -75,7 +77,7 @@ def test_a_peer_without_ids_does_not_take_the_name_of_one_with_ids() -> None:
 
 def test_a_name_whose_owner_never_comes_back_is_free_in_the_end() -> None:
     """Its connection had died without our noticing: the restarted process looked like an impostor."""
-    sessions = SessionTable(takeover_s=3.0)
+    sessions = Held(SessionTable(takeover_s=3.0))
     sessions.connected(1)
     sessions.hear(1, "exp", "exp/a/1", 0.0)
     sessions.connected(2)
@@ -85,7 +87,7 @@ def test_a_name_whose_owner_never_comes_back_is_free_in_the_end() -> None:
 
 
 def test_who_was_taken_for_dead_has_its_name_back_when_it_speaks() -> None:
-    sessions = SessionTable()
+    sessions = Held(SessionTable())
     sessions.connected(1)
     sessions.hear(1, "exp", "exp/a/1", 0.0)
     sessions.disconnected(1, 1.0)
@@ -97,7 +99,7 @@ def test_who_was_taken_for_dead_has_its_name_back_when_it_speaks() -> None:
 
 
 def test_also_when_others_had_it_in_between_that_never_said_who_they_are() -> None:
-    sessions = SessionTable()
+    sessions = Held(SessionTable())
     sessions.connected(1)
     sessions.hear(1, "exp", "exp/a/1", 0.0)
     for connection in (2, 3, 4):
@@ -109,7 +111,7 @@ def test_also_when_others_had_it_in_between_that_never_said_who_they_are() -> No
 
 
 def test_what_comes_by_a_closed_connection_is_stale() -> None:
-    sessions = SessionTable()
+    sessions = Held(SessionTable())
     sessions.connected(1)
     sessions.hear(1, "exp", "exp/a/1", 0.0)
     sessions.disconnected(1, 1.0)
@@ -117,7 +119,7 @@ def test_what_comes_by_a_closed_connection_is_stale() -> None:
 
 
 def test_a_connection_that_never_speaks_is_nobody() -> None:
-    sessions = SessionTable()
+    sessions = Held(SessionTable())
     sessions.connected(1)
     sessions.hear(1, "exp", "exp/a/1", 0.0)
     sessions.disconnected(1, 1.0)
@@ -126,11 +128,11 @@ def test_a_connection_that_never_speaks_is_nobody() -> None:
 
 
 def test_an_owner_that_lives_on_over_our_restart_has_its_name_back() -> None:
-    before = SessionTable()
+    before = Held(SessionTable())
     before.connected(1)
     before.hear(1, "exp", "exp/a/1", 0.0)
-    sessions = SessionTable()
-    sessions.restore(before.tokens())
+    sessions = Held(SessionTable())
+    sessions.restored(before.tokens())
     for connection in (1, 2):
         sessions.connected(connection)
     assert sessions.hear(1, "exp", "exp/b/1", 0.0) is ACCEPTED  # it may as well be the restarted one
@@ -139,11 +141,11 @@ def test_an_owner_that_lives_on_over_our_restart_has_its_name_back() -> None:
 
 
 def test_names_that_are_gone_are_forgotten_some_day() -> None:
-    sessions = SessionTable(keep=10)
+    sessions = Held(SessionTable(keep=10))
     for n in range(1000):
         sessions.connected(n)
         sessions.hear(n, f"peer-{n}", "", 0.0)
         sessions.disconnected(n, 0.0)
-    assert len(sessions._names) <= 11
-    assert sessions._open == {}
-    assert sessions._name_of == {}
+    assert len(sessions.names) <= 11
+    assert sessions.opened == {}
+    assert sessions.name_of == {}

@@ -7,7 +7,7 @@ import math
 import pytest
 from logic_lab import Lab
 
-from afspm.logic.shutdown_grace import LONGEST_GRACE_S, SHUTDOWN_GRACE_S
+from afspm.logic.lifecycle import LONGEST_GRACE_S, SHUTDOWN_GRACE_S
 from afspm.model import ControlRequest, ProcessCondition, ProcessState
 
 ALIVE, ENDED = ProcessCondition.ALIVE, ProcessCondition.ENDED

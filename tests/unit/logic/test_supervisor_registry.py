@@ -60,7 +60,7 @@ def order(lab: Lab, process: str, who: str = "dashboard:Ada") -> Response:
 
 
 def cached(lab: Lab) -> list[str]:
-    return [packet.envelope for packet, _ in lab.core.cached()]
+    return [packet.envelope for packet, *_ in lab.core.cached()]
 
 
 def test_what_a_supervisor_tells_is_published_cached_and_not_forwarded(lab: Lab) -> None:
@@ -178,10 +178,8 @@ def test_orders_outlive_a_kill_of_the_scheduler(lab: Lab) -> None:
 def test_what_a_killed_scheduler_had_published_and_not_answered_is_published_once(lab: Lab) -> None:
     lines = LogLines((LogLine(1, "a", "INFO", "hello"),))
     tell(lab, lines, id_="supervisor:host/x/1")
-    again = Lab(state=[effect for effect in lab.effects if isinstance(effect, SaveState)][-1].state)
-    again.codec = lab.codec
-    again.core._bulletin.telling._codec = lab.codec  # type: ignore[attr-defined]
-    again.core._bulletin._codec = lab.codec  # type: ignore[attr-defined]
+    state = [effect for effect in lab.effects if isinstance(effect, SaveState)][-1].state
+    again = Lab(state=state, codec=lab.codec)
     again.core.restore_cache(list(lab.core.cached()))
     assert tell(again, lines, id_="supervisor:host/x/1").code == OK
     assert cached(again).count("LogLines") == 1

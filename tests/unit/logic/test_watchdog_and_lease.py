@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
+from logic_lab import Lab
+from parts import Dog
 
 from afspm.logic.arbitration import Cause
-from afspm.logic.lease import Lease
-from afspm.logic.watchdog import SafetyResult, Watchdog, WatchdogSettings
-from afspm.model import ControlResponse, Feedback, ScopeState
+from afspm.logic.holder_timeout import Lease
+from afspm.logic.settings import SchedulerSettings
+from afspm.logic.watchdog import SafetyResult, WatchdogSettings
+from afspm.model import ControlResponse, ScopeState
 
 OK, NOT_FREE, SILENCE = (
     int(c) for c in (ControlResponse.SUCCESS, ControlResponse.NOT_FREE, ControlResponse.NO_RESPONSE)
@@ -15,10 +20,10 @@ OK, NOT_FREE, SILENCE = (
 SCANNING, SPEC, FREE = ScopeState.SCANNING, ScopeState.SPEC, ScopeState.FREE
 
 
-def watchdog(*states: ScopeState, **settings: object) -> Watchdog:
-    made = Watchdog(WatchdogSettings(**settings))  # type: ignore[arg-type]
+def watchdog(*states: ScopeState, **settings: object) -> Dog:
+    made = Dog(WatchdogSettings(**settings))  # type: ignore[arg-type]
     for state in states:
-        made.scope_is(state)
+        made.state(state)
     return made
 
 
@@ -46,36 +51,36 @@ def test_a_scan_that_is_just_being_started_is_stopped_too() -> None:
 def test_a_start_whose_states_have_come_already_is_not_taken_for_running() -> None:
     done = watchdog(FREE)
     seen = done.states_seen
-    done.scope_is(SCANNING)
-    done.scope_is(FREE)
+    done.state(SCANNING)
+    done.state(FREE)
     done.started("start-scan", seen)
     assert done.control_taken(Cause.PROBLEM, None) == []
 
 
 def test_a_dead_holder_s_tip_is_retracted_in_a_dangerous_state_once_it_has_stopped() -> None:
     dog = watchdog(FREE)
-    dog.danger.feedback_is(Feedback(on=False))
-    dog.scope_is(SCANNING)
+    dog.feedback(on=False)
+    dog.state(SCANNING)
     assert dog.control_taken(Cause.DEAD, None) == ["stop-scan", "x-retract"]
     assert dog.owes_retract
     assert dog.next_action() == "stop-scan"
     assert dog.next_action() is None
     assert dog.answered(OK, 0.0) is SafetyResult.DONE
     assert dog.next_action() is None
-    dog.scope_is(ScopeState.INTERRUPTED)
+    dog.state(ScopeState.INTERRUPTED)
     assert dog.next_action() == "x-retract"
     assert dog.answered(NOT_FREE, 0.0) is SafetyResult.AGAIN
     assert dog.next_action() is None
-    dog.scope_is(FREE)
+    dog.state(FREE)
     assert dog.next_action() == "x-retract"
     assert dog.answered(OK, 0.0) is SafetyResult.DONE
     assert not dog.owes_retract
 
 
-def off(*states: ScopeState, **settings: object) -> Watchdog:
+def off(*states: ScopeState, **settings: object) -> Dog:
     """One that knows that the feedback is off."""
     made = watchdog(*states, **settings)
-    made.danger.feedback_is(Feedback(on=False))
+    made.feedback(on=False)
     return made
 
 
@@ -90,12 +95,12 @@ def test_the_tip_is_retracted_where_the_holder_could_not_put_the_danger_right(ca
 def test_what_the_holder_or_a_person_does_knowingly_is_told_once_and_left_alone(cause: Cause) -> None:
     dog = off(FREE)
     assert dog.control_taken(cause, None, by_holder=cause is not Cause.MANUAL) == []
-    assert dog.danger.untold() == "the feedback is off"
-    assert dog.danger.untold() is None
-    dog.danger.feedback_is(Feedback(on=True))
-    assert dog.danger.untold() is None
-    dog.danger.feedback_is(Feedback(on=False))
-    assert dog.danger.untold() == "the feedback is off"
+    assert dog.untold() == "the feedback is off"
+    assert dog.untold() is None
+    dog.feedback(on=True)
+    assert dog.untold() is None
+    dog.feedback(on=False)
+    assert dog.untold() == "the feedback is off"
 
 
 def test_a_danger_that_is_seen_to_is_not_told_nor_seen_to_again() -> None:
@@ -103,55 +108,55 @@ def test_a_danger_that_is_seen_to_is_not_told_nor_seen_to_again() -> None:
     dog.control_taken(Cause.PROBLEM, None)
     assert dog.next_action() == "x-retract"
     assert dog.answered(OK, 0.0) is SafetyResult.DONE
-    assert dog.danger.untold() is None
+    assert dog.untold() is None
     assert dog.control_taken(Cause.ENDED, None) == []
 
 
-def retracted() -> Watchdog:
+def retracted() -> Dog:
     dog = off(FREE)
     dog.control_taken(Cause.PROBLEM, None)
     dog.next_action()
     dog.answered(OK, 0.0)
-    dog.scope_is(ScopeState.COARSE_MOTOR)
-    dog.danger.feedback_is(Feedback(on=False))  # as a controller says that has withdrawn its tip
+    dog.state(ScopeState.COARSE_MOTOR)
+    dog.feedback(on=False)  # as a controller says that has withdrawn its tip
     return dog
 
 
 def test_a_tip_that_is_away_is_in_no_danger_until_it_may_be_back() -> None:
     dog = retracted()
     dog.started("start-scan", dog.states_seen)
-    assert dog.danger.now is None
+    assert dog.danger is None
     assert dog.control_taken(Cause.PROBLEM, None) == ["stop-scan"]
-    dog.danger.feedback_is(Feedback(on=True))
-    dog.danger.feedback_is(Feedback(on=False))
-    assert dog.danger.now == "the feedback is off"
+    dog.feedback(on=True)
+    dog.feedback(on=False)
+    assert dog.danger == "the feedback is off"
     for action in ("x-engage", "x-approach-of-mine"):
         dog = retracted()
         dog.started(action, dog.states_seen)
-        assert dog.danger.now == "the feedback is off"
+        assert dog.danger == "the feedback is off"
         dog.started("x-retract", dog.states_seen, certain=False)
-        assert dog.danger.now == "the feedback is off"
+        assert dog.danger == "the feedback is off"
         dog.started("x-retract", dog.states_seen)
-        assert dog.danger.now is None
+        assert dog.danger is None
 
 
 def test_a_danger_that_can_not_be_seen_to_is_told() -> None:
     dog = off(FREE, retract=None)
     assert dog.control_taken(Cause.PROBLEM, None) == []
-    assert dog.danger.untold() == "the feedback is off"
-    assert watchdog(ScopeState.COARSE_MOTOR).danger.untold() == "the microscope is in COARSE_MOTOR"
-    assert off(FREE, dangerous=()).danger.untold() is None
+    assert dog.untold() == "the feedback is off"
+    assert watchdog(ScopeState.COARSE_MOTOR).untold() == "the microscope is in COARSE_MOTOR"
+    assert off(FREE, dangerous=()).untold() is None
 
 
 def test_with_the_feedback_on_a_scan_of_the_dead_is_only_stopped() -> None:
     dog = watchdog(SCANNING)
-    dog.danger.feedback_is(Feedback(on=True))
+    dog.feedback(on=True)
     assert dog.control_taken(Cause.DEAD, None) == ["stop-scan"]
 
 
 def test_a_microscope_that_can_not_retract_is_not_asked_to() -> None:
     dog = watchdog(ScopeState.COARSE_MOTOR)
-    dog.cannot_retract()
+    dog.tell("without_retract")
     assert dog.control_taken(Cause.DEAD, None) == []
     assert watchdog(ScopeState.COARSE_MOTOR, retract=None).control_taken(Cause.DEAD, None) == []
 
@@ -164,24 +169,24 @@ def test_silence_is_tried_again_and_given_up_loudly() -> None:
         assert dog.next_action() == "stop-scan"
         results.append(dog.answered(SILENCE, 0.0))
     assert results == [SafetyResult.AGAIN, SafetyResult.AGAIN, SafetyResult.FAILED]
-    assert dog.snapshot()["stops"] == []
+    assert dog.tip.stops == ()
 
 
 def test_what_could_not_be_sent_is_sent_when_the_translator_is_back_unless_it_is_free_by_then() -> None:
     dog = watchdog(SCANNING)
     dog.control_taken(Cause.MANUAL, None)
     dog.next_action()
-    dog.unsent(0.0)
+    dog.tell("unsent", 0.0)
     assert dog.next_action() == "stop-scan"
-    dog.unsent(0.0)
-    dog.scope_is(FREE)
+    dog.tell("unsent", 0.0)
+    dog.state(FREE)
     assert dog.next_action() is None
 
 
 ERROR = int(ControlResponse.ACTION_ERROR)
 
 
-def refused(**settings: object) -> Watchdog:
+def refused(**settings: object) -> Dog:
     """One whose tip the microscope did not retract, at 100 s."""
     dog = off(FREE, **settings)
     dog.control_taken(Cause.DEAD, None)
@@ -208,7 +213,7 @@ def test_a_tip_that_was_not_retracted_is_tried_again_and_again_ever_less_often()
     dog.look_again(now_s + 30.0, is_seen_to=False)
     assert dog.next_action() == "x-retract"
     assert dog.answered(OK, now_s + 30.0) is SafetyResult.DONE
-    assert (dog.due_s, dog.danger.now, dog.owes_retract) == (None, None, False)
+    assert (dog.due_s, dog.danger, dog.owes_retract) == (None, None, False)
 
 
 def test_who_is_there_to_see_to_a_tip_is_not_disturbed() -> None:
@@ -239,7 +244,7 @@ def test_who_came_to_see_to_a_tip_and_died_leaves_it_to_be_retracted_at_once() -
 
 def test_a_tip_that_is_out_of_danger_by_then_is_left_where_it_is() -> None:
     dog = refused()
-    dog.danger.feedback_is(Feedback(on=True))
+    dog.feedback(on=True)
     dog.look_again(110.0, is_seen_to=False)
     assert (dog.next_action(), dog.due_s) == (None, None)
 
@@ -261,21 +266,27 @@ def test_nobody_who_could_retract_is_there() -> None:
     dog = off(FREE, again_s=10.0)
     dog.control_taken(Cause.DEAD, None)
     dog.next_action()
-    dog.unsent(100.0)
+    dog.tell("unsent", 100.0)
     assert dog.due_s == 110.0
     told = dog.look_again(110.0, is_seen_to=False)
     assert told == "the tip was left in danger and can't be retracted: its translator is not there"
     assert dog.left_to_people
-    dog.translator_is_there(115.0)
+    dog.tell("translator_is_there", 115.0)
     assert dog.due_s == 116.0, "what it says of the feedback is heard first"
+
+
+def restarted(dog: Dog) -> Dog:
+    again = Dog(WatchdogSettings())
+    again.tell("restored", dog.tip)
+    again.microscope = replace(again.microscope, risk=dog.microscope.risk)
+    return again
 
 
 def test_nor_is_one_there_for_a_scheduler_that_is_restarted() -> None:
     dog = off(FREE)
     dog.control_taken(Cause.DEAD, None)
-    again = Watchdog()
-    again.restore(dog.snapshot())
-    again.begin(100.0)
+    again = restarted(dog)
+    again.tell("begun", 100.0)
     assert again.look_again(110.0, is_seen_to=False) is not None
     assert again.left_to_people
 
@@ -284,17 +295,16 @@ def test_a_restarted_scheduler_asks_again_for_what_it_was_asking() -> None:
     dog = off(FREE)
     dog.control_taken(Cause.DEAD, None)
     assert dog.next_action() == "x-retract"
-    again = Watchdog()
-    again.restore(dog.snapshot())
+    again = restarted(dog)
     assert again.next_action() == "x-retract"
-    again.put_right()
+    again.tell("seen_to")
     assert again.owes_retract, "what the microscope is being asked can't be called off"
 
 
 def test_a_late_withdrawal_leaves_nothing_owed_but_a_person_to_call() -> None:
     dog = refused()
-    dog.people_called()
-    dog.done_late("x-retract")
+    dog.tell("people_called")
+    dog.tell("done_late", "x-retract")
     assert (dog.owes_retract, dog.due_s, dog.left_to_people) == (False, None, True)
 
 
@@ -304,7 +314,7 @@ def test_a_scan_that_goes_on_whatever_it_is_told_does_not_keep_the_tip_at_the_su
     dog.control_taken(Cause.DEAD, None)
     assert dog.next_action() == "stop-scan"
     dog.answered(answer, 100.0)
-    dog.scope_is(SCANNING)
+    dog.state(SCANNING)
     if answer == NOT_FREE:
         assert dog.next_action() == "stop-scan"
         dog.answered(answer, 100.0)
@@ -318,30 +328,30 @@ def test_a_scan_that_goes_on_whatever_it_is_told_does_not_keep_the_tip_at_the_su
 def test_a_scan_that_was_not_seen_when_control_was_taken_is_stopped_first() -> None:
     dog = off(ScopeState.UNDEFINED)
     assert dog.control_taken(Cause.PROBLEM, None) == ["x-retract"]
-    dog.scope_is(SCANNING)
+    dog.state(SCANNING)
     assert dog.next_action() == "stop-scan"
     dog.answered(OK, 0.0)
-    dog.scope_is(ScopeState.INTERRUPTED)
+    dog.state(ScopeState.INTERRUPTED)
     assert dog.next_action() == "x-retract"
 
 
 def test_a_lost_microscope_goes_on_with_what_it_did() -> None:
     dog = watchdog(ScopeState.COARSE_MOTOR, ScopeState.UNDEFINED)
-    assert dog.danger.now == "the microscope is in COARSE_MOTOR"
+    assert dog.danger == "the microscope is in COARSE_MOTOR"
     assert dog.control_taken(Cause.PROBLEM, None) == ["x-retract"]
 
 
 def test_what_nobody_knows_of_the_feedback_counts_as_off_until_it_is_known() -> None:
     dog = watchdog(FREE)
-    dog.danger.feedback_is(Feedback(on=True))
-    dog.danger.feedback_may_be_off()
-    assert dog.danger.now == "the feedback is off"
-    dog.danger.feedback_was_left()
-    assert dog.danger.now is None
-    dog.danger.feedback_may_be_off()
-    dog.danger.feedback_is(Feedback(on=False))
-    dog.danger.feedback_was_left()
-    assert dog.danger.now == "the feedback is off"
+    dog.feedback(on=True)
+    dog.feedback_may_be_off()
+    assert dog.danger == "the feedback is off"
+    dog.feedback_was_left()
+    assert dog.danger is None
+    dog.feedback_may_be_off()
+    dog.feedback(on=False)
+    dog.feedback_was_left()
+    assert dog.danger == "the feedback is off"
 
 
 def test_what_a_microscope_can_not_do_is_not_tried_again() -> None:
@@ -356,31 +366,28 @@ NS = 10**9
 
 
 def test_a_holder_that_does_nothing_has_a_deadline_and_using_control_moves_it() -> None:
-    lease = Lease(60 * NS)
-    lease.held_by("greedy", 0)
-    assert lease.deadline_ns() == 60 * NS
-    lease.used(30 * NS)
-    assert lease.deadline_ns() == 90 * NS
+    lease = Lease(60 * NS).held_by("greedy", 0)
+    assert lease.deadline_ns(is_free=True) == 60 * NS
+    assert lease.used(30 * NS).deadline_ns(is_free=True) == 90 * NS
 
 
 def test_while_the_microscope_works_its_holder_is_not_idle() -> None:
-    lease = Lease(60 * NS)
-    lease.held_by("experiment", 0)
-    lease.scope_is(SCANNING, 10 * NS)
-    assert lease.deadline_ns() is None
-    lease.scope_is(FREE, 1000 * NS)
-    assert lease.deadline_ns() == 1060 * NS
+    lab = Lab(SchedulerSettings(lease_s=60.0))
+    lab.translator()
+    lab.take_control("experiment")
+    assert lab.core.deadline_ns() is not None
+    lab.scope_is(SCANNING)
+    assert lab.core.deadline_ns() is None
+    lab.later(experiment_s=1000.0)
+    lab.scope_is(FREE)
+    assert lab.core.deadline_ns() == lab.now_ns + 60 * NS
 
 
 def test_asking_again_does_not_renew_a_lease() -> None:
-    lease = Lease(60 * NS)
-    lease.held_by("greedy", 0)
-    lease.held_by("greedy", 59 * NS)
-    assert lease.deadline_ns() == 60 * NS
+    lease = Lease(60 * NS).held_by("greedy", 0).held_by("greedy", 59 * NS)
+    assert lease.deadline_ns(is_free=True) == 60 * NS
 
 
 def test_without_a_lease_or_a_holder_there_is_no_deadline() -> None:
-    lease = Lease()
-    lease.held_by("greedy", 0)
-    assert lease.deadline_ns() is None
-    assert Lease(NS).deadline_ns() is None
+    assert Lease().held_by("greedy", 0).deadline_ns(is_free=True) is None
+    assert Lease(NS).deadline_ns(is_free=True) is None

@@ -190,13 +190,6 @@ def test_no_answer_of_a_microscope_ends_the_scheduler(said: str) -> None:
     assert reply.response.code == ControlResponse.SUCCESS
 
 
-def test_what_an_older_scheduler_saved_is_taken_up() -> None:
-    lab = in_control(PULSES)
-    state = lab.core.snapshot()
-    del state["guard"]
-    assert Lab(PULSES, state=state).holder == "experiment"
-
-
 def test_the_time_of_a_use_is_that_of_the_experiment() -> None:
     lab = in_control(PULSES)
     lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")

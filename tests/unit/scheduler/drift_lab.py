@@ -28,6 +28,7 @@ from afspm.logic.events import (
 )
 from afspm.logic.limits import ExperimentLimits
 from afspm.logic.settings import SchedulerSettings
+from afspm.logic.state import SavedState
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -132,9 +133,10 @@ class Lab:
         drift: DriftCompensationSettings | None = None,
         limits: ExperimentLimits | None = None,
         *,
-        state: dict[str, Any] | None = None,
+        state: SavedState | None = None,
         now_s: float = START_S,
         answer_start: bool = True,
+        translator: bool = True,
     ) -> None:
         self.worker = FakeWorker()
         self.now_s = now_s
@@ -148,8 +150,9 @@ class Lab:
         self.asked = 0
         self.connections: dict[str, int] = {}
         self.done(self.core.start(self.now_s, self.now_ns))
-        self.step(TranslatorUp())
-        self.step(TranslatorCaughtUp())
+        if translator:
+            self.step(TranslatorUp())
+            self.step(TranslatorCaughtUp())
         while answer_start and (forwards := self.forwards()):  # one is asked after the other
             for forward in forwards:
                 self.answer(forward, ControlResponse.PARAM_NOT_SUPPORTED)
@@ -262,6 +265,6 @@ class Lab:
     def replies(self) -> list[Response]:
         return [effect.response for effect in self.effects if isinstance(effect, Reply)]
 
-    def saved(self) -> dict[str, Any]:
+    def saved(self) -> SavedState:
         """What was saved last."""
         return [effect.state for effect in self.effects if isinstance(effect, SaveState)][-1]

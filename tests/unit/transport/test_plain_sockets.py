@@ -16,7 +16,7 @@ from afspm.transport.network import Network
 from afspm.transport.port import CaughtUp, ControlConnected, Killed, PacketReceived, ReplyReceived
 from afspm.transport.zmq_port import ZmqPort
 from afspm.transport.zmq_server import ZmqServerPort
-from afspm.wire.version import ANSWER, QUESTION
+from afspm.wire.protocol import ANSWER, QUESTION
 
 ANY = "tcp://127.0.0.1:0"
 CLOCK = ExperimentClock.real()

@@ -217,7 +217,7 @@ def test_last_words_are_not_taken_for_those_of_who_has_the_descriptor_next(
     gone, told = happened(listening, DISCONNECTED), []
     if not in_time:  # the socket told of the end before it gave out the last words
         with monkeypatch.context() as patched:
-            patched.setattr(router, "receive_frames", lambda socket: [])
+            patched.setattr(router, "is_readable", lambda socket: False)
             told += follows(listening, patched, gone)
         assert told == [PeerDisconnected(first.connection)]
         gone = []

@@ -5,9 +5,8 @@ from __future__ import annotations
 from afspm.clock import NS_PER_S
 from afspm.scheduler.drift.messages import Matrix, Registered, RescanWanted, ScanJob
 from afspm.scheduler.wire_codec import WireCodec
-from afspm.wire.convert import timestamp
-from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
-from afspm.wire.generated.scan_pb2 import ScanParameters2d
+from afspm.wire.mapping import timestamp
+from afspm.wire.messages import DriftMapping, DriftRescan, ScanParameters2d
 
 
 class DriftWireCodec(WireCodec):

@@ -22,11 +22,14 @@ from afspm.logic.events import (
     TranslatorCaughtUp,
     TranslatorUp,
 )
-from afspm.logic.scheduler_core import SchedulerCore, SchedulerSettings
+from afspm.logic.scheduler_core import SchedulerCore
+from afspm.logic.settings import SchedulerSettings
+from afspm.logic.state import SavedState
 from afspm.model import (
     ControlRequest,
     ControlState,
     Frame,
+    LoggedPacket,
     Packet,
     PacketHeader,
     Parameter,
@@ -152,11 +155,11 @@ class DriftCore:
     def deadline_ns(self) -> int | None:
         return self.core.deadline_ns()
 
-    def snapshot(self) -> dict[str, Any]:
+    def snapshot(self) -> SavedState:
         return self.core.snapshot()
 
-    def restore(self, state: dict[str, Any]) -> None:
-        self.core.restore(state)
+    def restore(self, saved: SavedState) -> None:
+        self.core.restore(saved)
         kept = self.frame.restored
         if kept:
             self.knowledge.restore(kept["knowledge"])
@@ -164,10 +167,10 @@ class DriftCore:
             self._gate.restore(kept["scans"])
             self._channel = self._settings.channel or kept["channel"]
 
-    def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None:
+    def restore_cache(self, packets: Iterable[LoggedPacket]) -> None:
         entries = list(packets)
         self.core.restore_cache(entries)
-        for packet, source_ns in entries:
+        for packet, source_ns, _ in entries:
             if packet.envelope == "ScopeStateMsg":
                 self._note_state(packet.payload, packet.time_ns if source_ns is None else source_ns)
 
@@ -175,7 +178,7 @@ class DriftCore:
     def leave_at_s(self) -> float:
         return self.core.leave_at_s
 
-    def cached(self) -> Iterable[tuple[Packet, int | None]]:
+    def cached(self) -> Iterable[LoggedPacket]:
         return self.core.cached()
 
     @property

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from afspm.logic.events import Announced, Effect, Input, Log, ProblemSeen
-from afspm.logic.request_pipeline import OwnEnd
-from afspm.logic.scheduler_core import SchedulerCore
+from afspm.logic.scheduler_core import OwnEnd, SchedulerCore
 from afspm.model import (
     ControlMode,
     ControlRequest,

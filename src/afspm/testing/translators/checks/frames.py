@@ -18,7 +18,7 @@ from afspm.model import (
 from afspm.testing.translators.client import Observation, states, told
 from afspm.testing.translators.measuring import NEAR, CheckMeasurements, FrameSetting, difference, in_words, number
 from afspm.testing.translators.registry import Failed, Skipped, check, expect, near
-from afspm.wire.generated import spectroscopy_pb2
+from afspm.wire import messages
 
 
 @check("published/in-force", "what is in force is published at the start, the state last")
@@ -187,7 +187,7 @@ def one_axis(kit: CheckMeasurements) -> None:
     kit.move_probe(kit.frames.other.region.center_m)
     x_m, y_m = kit.frames.other.region.center_m
     y_m += 0.1 * min(kit.frames.whole.size_m)
-    message = spectroscopy_pb2.ProbePosition(units="nm")
+    message = messages.ProbePosition(units="nm")
     message.point.y = y_m * 1e9
     mark = kit.client.observations.mark()
     kit.client.asked(ControlRequest.SET_PROBE_POS, message, "moving the probe in y, given in nm")

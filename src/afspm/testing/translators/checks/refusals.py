@@ -18,7 +18,7 @@ from afspm.testing.translators.checks.parameters import require_param_error
 from afspm.testing.translators.client import answer_in_words, told
 from afspm.testing.translators.measuring import CheckMeasurements
 from afspm.testing.translators.registry import check, expect
-from afspm.wire.generated import feedback_pb2, scan_pb2, spectroscopy_pb2
+from afspm.wire import messages
 
 _UNKNOWN = "no-such-thing"
 
@@ -68,7 +68,7 @@ def too_large(kit: CheckMeasurements) -> None:
 
 @check("refused/whole-frame", "a frame that can't be set as a whole changes nothing", needs=(names.SCAN_SIZE_X,))
 def whole_frame(kit: CheckMeasurements) -> None:
-    message = scan_pb2.ScanParameters2d()
+    message = messages.ScanParameters2d()
     message.spatial.length_units = "m"
     message.spatial.roi.size.x = 0.9 * kit.frames.whole.size_m[0]
     message.spatial.roi.top_left.x = 1000.0
@@ -78,21 +78,21 @@ def whole_frame(kit: CheckMeasurements) -> None:
 @check("refused/nan", "NaN in a frame, a position or the feedback is refused, and changes nothing")
 def nan(kit: CheckMeasurements) -> None:
     if kit.support.has(names.SCAN_TOP_LEFT_X):
-        frame = scan_pb2.ScanParameters2d()
+        frame = messages.ScanParameters2d()
         frame.spatial.roi.top_left.x = math.nan
         _require_unchanged(kit, ControlRequest.SET_SCAN_PARAMS, frame, ScanParameters, "a frame at NaN")
     if kit.support.has(names.PROBE_POS_X):
-        place = spectroscopy_pb2.ProbePosition()
+        place = messages.ProbePosition()
         place.point.x = math.nan
         _require_unchanged(kit, ControlRequest.SET_PROBE_POS, place, ProbePosition, "the probe at NaN")
     if kit.support.has(names.ZCTRL_IGAIN):
-        gain = feedback_pb2.ZCtrlParameters(integralGain=math.nan)
+        gain = messages.ZCtrlParameters(integralGain=math.nan)
         _require_unchanged(kit, ControlRequest.SET_ZCTRL_PARAMS, gain, Feedback, "an integral gain of NaN")
 
 
 @check("refused/unit-of-frame", "a frame in kilograms is refused, and changes nothing", needs=(names.SCAN_SIZE_X,))
 def unit_of_frame(kit: CheckMeasurements) -> None:
-    message = scan_pb2.ScanParameters2d()
+    message = messages.ScanParameters2d()
     message.spatial.length_units = "kg"
     message.spatial.roi.size.x = 0.9 * kit.frames.whole.size_m[0]
     _require_unchanged(kit, ControlRequest.SET_SCAN_PARAMS, message, ScanParameters, "a frame in kg")

@@ -1,0 +1,65 @@
+"""The scheduler's own packets: control, the event log, and what other processes have it publish."""
+
+from __future__ import annotations
+
+from afspm.logic import answers
+from afspm.logic.arbitration import may
+from afspm.logic.event_log import ENTRIES
+from afspm.logic.events import Publish, RequestIn
+from afspm.logic.state import StateDraft
+from afspm.logic.supervisor_registry import announcement
+from afspm.model import ControlResponse
+
+CONTROL_STATE = "ControlState"
+
+
+def publish(draft: StateDraft, envelope: str, payload: bytes, time_ns: int | None = None) -> None:
+    """Publish a packet of the scheduler's own; its time is saved before."""
+    packet, history = draft.env.cache.stamp(envelope, payload, draft.now_ns if time_ns is None else time_ns)
+    draft.effects.append(Publish(packet, None, history))
+    draft.save()
+
+
+def publish_control(draft: StateDraft) -> None:
+    """Tell all peers who is in control; with that, the startup is over."""
+    draft.barrier = draft.barrier.opened(draft.now_s)
+    publish(draft, CONTROL_STATE, draft.env.codec.encode(draft.control.published()))
+
+
+def publish_entries(draft: StateDraft) -> None:
+    """Publish what has happened since the last time."""
+    draft.event_log, entries = draft.event_log.take(draft.env.settings.rules.problems, draft.now_ns)
+    if entries.entries:
+        publish(draft, ENTRIES, draft.env.codec.encode(entries))
+
+
+def publish_for_process(draft: StateDraft, event: RequestIn) -> None:
+    """Publish what a process tells; a supervisor is told in return what it is to do."""
+    codec, told = draft.env.codec, announcement(event, draft.env.codec)
+    if not told.envelope:
+        answers.answer(draft, event, ControlResponse.FAILURE, told.why)
+        return
+    if told.states is not None:
+        draft.supervisors = draft.supervisors.told(event.name, told.states, draft.now_s)
+    draft.supervisors, orders = draft.supervisors.orders_for(event.name)
+    payload = event.request.subject.payload
+    # if it is published already, we were killed before we could answer
+    if not draft.env.cache.holds(told.envelope, payload):
+        publish(draft, told.envelope, payload)
+    answers.answer(draft, event, ControlResponse.SUCCESS, payload=codec.encode_orders(orders))
+    draft.end = draft.end.processes_told(draft.supervisors.states_of(event.name), draft.now_s)
+
+
+def order_restart(draft: StateDraft, event: RequestIn) -> None:
+    """Order that a process is started anew."""
+    process = str(event.request.subject)
+    if may(draft.env.settings.rules.roles.restart, event.name):
+        draft.supervisors, why = draft.supervisors.order(process, draft.now_s)
+    else:
+        why = f"{event.name} has not the role 'restart' ([control] roles)"
+    if why:
+        answers.answer(draft, event, ControlResponse.FAILURE, why)
+        return
+    draft.save()
+    draft.log("INFO", f"{process} is to be started anew, as {event.name} wishes")
+    answers.answer(draft, event, ControlResponse.SUCCESS)

@@ -1,0 +1,231 @@
+"""The state of a scheduler: a tree of frozen parts, the draft of its next state, and what survives a restart."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from afspm.logic.arbitration import ArbitrationState
+from afspm.logic.cache import PacketCache
+from afspm.logic.coordinate_frame import CoordinateFrame
+from afspm.logic.event_log import EventLog
+from afspm.logic.events import Codec, Effect, Log, SaveState
+from afspm.logic.forwarder import Forwarder
+from afspm.logic.holder_timeout import HolderTimeout, Lease
+from afspm.logic.idempotency_cache import IdempotencyCache, SentAction
+from afspm.logic.lifecycle import ExperimentEnd, StartupBarrier
+from afspm.logic.limit_checker import LimitChecker
+from afspm.logic.limit_state import LimitState
+from afspm.logic.microscope_status import MicroscopeStatus, TipRisk
+from afspm.logic.pending_requests import PendingRequests
+from afspm.logic.sessions import SessionTable
+from afspm.logic.settings import SchedulerSettings
+from afspm.logic.supervisor_registry import SavedSupervisor, SupervisorRegistry
+from afspm.logic.watchdog import TipState, Watchdog
+
+KIND, VERSION = "scheduler", 1
+"""Of snapshots of `SavedState`."""
+
+
+@dataclass(frozen=True, slots=True)
+class SavedState:
+    """The state that survives a restart.
+
+    Attributes:
+        granted_to: the token of the life of the holder that was granted control.
+        sessions: the token of each session that was connected.
+        last_ns: the time of the newest packet.
+        recent: (translator's time, ours) of the packets published last.
+        frame: of a scheduler whose components have other coordinates, as JSON.
+    """
+
+    control: ArbitrationState = field(default_factory=ArbitrationState)
+    granted_to: str | None = None
+    sessions: Mapping[str, str] = field(default_factory=dict)
+    sent_actions: tuple[SentAction, ...] = ()
+    limits: LimitState = field(default_factory=LimitState)
+    tip: TipState = field(default_factory=TipState)
+    tip_risk: TipRisk = field(default_factory=TipRisk)
+    supervisors: Mapping[str, SavedSupervisor] = field(default_factory=dict)
+    last_ns: int = 0
+    recent: tuple[tuple[int, int], ...] = ()
+    frame: str | None = None
+
+    def without_holder(self) -> SavedState:
+        """Return the state with nobody in control: an older state does not know who was."""
+        return replace(self, control=replace(self.control, holder=None, solving=0), granted_to=None)
+
+
+@dataclass(frozen=True, slots=True)
+class SchedulerState:
+    """All that a scheduler decides by, but for the packets in its cache.
+
+    Attributes:
+        logged: what is logged only once.
+    """
+
+    control: ArbitrationState
+    lease: Lease
+    holder_timeout: HolderTimeout
+    sessions: SessionTable
+    idempotency: IdempotencyCache
+    pending: PendingRequests
+    forwarder: Forwarder
+    limits: LimitChecker
+    microscope: MicroscopeStatus
+    watchdog: Watchdog
+    supervisors: SupervisorRegistry
+    event_log: EventLog
+    barrier: StartupBarrier
+    end: ExperimentEnd
+    logged: frozenset[str]
+
+    @classmethod
+    def initial(cls, settings: SchedulerSettings) -> SchedulerState:
+        dog = settings.watchdog
+        return cls(
+            control=ArbitrationState(),
+            lease=Lease(None if settings.lease_s is None else round(settings.lease_s * 1e9)),
+            holder_timeout=HolderTimeout(settings.grace_s, settings.restart_grace_s),
+            sessions=SessionTable(settings.takeover_s),
+            idempotency=IdempotencyCache(),
+            pending=PendingRequests(),
+            forwarder=Forwarder(settings.request_timeout_s, settings.patience_s, settings.longest_queue),
+            limits=LimitChecker(settings.limits),
+            microscope=MicroscopeStatus(dog.dangerous, settings.malfunction_after_s),
+            watchdog=Watchdog(dog),
+            supervisors=SupervisorRegistry(),
+            event_log=EventLog(),
+            barrier=StartupBarrier(settings.catch_up_s),
+            end=ExperimentEnd(),
+            logged=frozenset(),
+        )
+
+    def saved_parts(self) -> tuple[object, ...]:
+        """The parts of which every change is saved before it is told."""
+        saved = self.control, self.lease.token, self.watchdog.tip, self.microscope.risk
+        return *saved, self.limits.state.usage, self.idempotency.sent_actions
+
+    def due_s(self) -> float | None:
+        """Return when, in real monotonic time, a part has something to do that depends on no other."""
+        dues = (
+            self.forwarder.deadline_s(),
+            self.barrier.due_s(),
+            self.end.by_s,
+            self.pending.due_s(),
+            self.watchdog.due_s,
+        )
+        return min((due_s for due_s in dues if due_s is not None), default=None)
+
+
+@dataclass(frozen=True, slots=True)
+class Environment:
+    """What a step needs beside the state.
+
+    Attributes:
+        cache: the packets published lately; the one part that is changed in place, since it holds up to all memory that
+            it may.
+        frame: the coordinates that components speak of, where they are not those of the microscope.
+    """
+
+    settings: SchedulerSettings
+    codec: Codec
+    cache: PacketCache
+    frame: CoordinateFrame | None = None
+
+
+@dataclass(slots=True)
+class StateParts:
+    """The parts of a state, each to be replaced."""
+
+    control: ArbitrationState
+    lease: Lease
+    holder_timeout: HolderTimeout
+    sessions: SessionTable
+    idempotency: IdempotencyCache
+    pending: PendingRequests
+    forwarder: Forwarder
+    limits: LimitChecker
+    microscope: MicroscopeStatus
+    watchdog: Watchdog
+    supervisors: SupervisorRegistry
+    event_log: EventLog
+    barrier: StartupBarrier
+    end: ExperimentEnd
+    logged: frozenset[str]
+
+
+PARTS = tuple(StateParts.__slots__)
+
+
+class StateDraft(StateParts):
+    """One step in progress: the parts of the state so far, the effects so far, and the time.
+
+    Attributes:
+        now_s: real and monotonic, for timeouts.
+        now_ns: of the experiment, for whatever means something in it.
+    """
+
+    def __init__(self, state: SchedulerState, env: Environment, now_s: float, now_ns: int) -> None:
+        for part in PARTS:
+            setattr(self, part, getattr(state, part))
+        self.env = env
+        self.now_s = now_s
+        self.now_ns = now_ns
+        self.effects: list[Effect] = []
+        self._before = state.saved_parts()
+        self._is_to_be_saved = False
+
+    def save(self) -> None:
+        """Have the state saved, though no part changed of which every change is."""
+        self._is_to_be_saved = True
+
+    def log(self, level: str, text: str) -> None:
+        self.effects.append(Log(level, text))
+
+    def send_forwards(self) -> None:
+        if self.forwarder.outbox:
+            self.effects += self.forwarder.outbox
+            self.forwarder = replace(self.forwarder, outbox=())
+
+    def finish(self) -> tuple[SchedulerState, list[Effect]]:
+        """Return the new state and the effects: first of all it is saved, and requests are sent last."""
+        self.send_forwards()
+        state = SchedulerState(*(getattr(self, part) for part in PARTS))
+        if self._is_to_be_saved or state.saved_parts() != self._before:
+            self.effects.insert(0, SaveState(saved_state(state, self.env)))
+        return state, self.effects
+
+
+def saved_state(state: SchedulerState, env: Environment) -> SavedState:
+    """Return the part of a state that survives a restart."""
+    return SavedState(
+        control=state.control,
+        granted_to=state.lease.token,
+        sessions=state.sessions.tokens(),
+        sent_actions=state.idempotency.sent_actions,
+        limits=state.limits.state,
+        tip=state.watchdog.tip,
+        tip_risk=state.microscope.risk,
+        supervisors=state.supervisors.saved(),
+        last_ns=env.cache.last_ns,
+        recent=tuple(env.cache.recent()),
+        frame=None if env.frame is None else json.dumps(env.frame.snapshot()),
+    )
+
+
+def restored_state(saved: SavedState, settings: SchedulerSettings) -> SchedulerState:
+    """Return the state in which a scheduler goes on after a restart."""
+    state = SchedulerState.initial(settings)
+    return replace(
+        state,
+        control=saved.control,
+        lease=replace(state.lease, token=saved.granted_to),
+        sessions=state.sessions.restored(saved.sessions),
+        idempotency=state.idempotency.restored(saved.sent_actions),
+        limits=replace(state.limits, state=saved.limits),
+        watchdog=state.watchdog.restored(saved.tip),
+        microscope=replace(state.microscope, risk=saved.tip_risk),
+        supervisors=SupervisorRegistry.restored(saved.supervisors),
+    )

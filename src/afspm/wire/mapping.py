@@ -1,0 +1,224 @@
+"""Model objects to and from messages, field by field: a table for each, of those that need no more than that."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterable
+from dataclasses import fields
+from enum import IntEnum
+from functools import partial
+from typing import Any, Generic, NamedTuple, TypeVar
+
+from google.protobuf.message import Message
+from google.protobuf.timestamp_pb2 import Timestamp
+
+from afspm import model
+from afspm.clock import NS_PER_S
+from afspm.errors import InvalidValue
+from afspm.wire.generated import control_pb2, feedback_pb2, journal_pb2
+from afspm.wire.messages import parse
+from afspm.wire.split import Buffer
+
+T = TypeVar("T")
+E = TypeVar("E", bound=IntEnum)
+
+_TIMES = 2**63
+_FLOAT32 = struct.Struct("<f")
+
+
+def timestamp(time_ns: int) -> Timestamp:
+    return Timestamp(seconds=time_ns // NS_PER_S, nanos=time_ns % NS_PER_S)
+
+
+def time_ns(stamp: Timestamp) -> int:
+    """Raises InvalidValue: 64 bits, the years 1678 to 2261, don't hold it; no record could keep it."""
+    found = int(stamp.seconds) * NS_PER_S + stamp.nanos
+    if not -_TIMES <= found < _TIMES:
+        raise InvalidValue(f"a time {stamp.seconds} s from 1970")
+    return found
+
+
+def known(kind: type[E], number: int) -> E:
+    """Return the member with this number; UNDEFINED (0) for one that only a newer peer knows."""
+    return kind(number) if number in kind._value2member_map_ else kind(0)
+
+
+def shortest(number: float) -> float:
+    """Return the decimal number that a float32 means: 0.1, not 0.10000000149011612, which is above a limit of 0.1."""
+    for digits in range(6, 9):
+        decimal = float(f"{number:.{digits}g}")
+        if _FLOAT32.unpack(_FLOAT32.pack(decimal)) == (number,):
+            return decimal
+    return float(f"{number:.9g}")  # which tells any two of them apart
+
+
+class FieldMapping(NamedTuple):
+    """One field of a message, and how its value is converted each way.
+
+    Attributes:
+        sparse: it is not sent where it is empty or zero.
+    """
+
+    name: str
+    to_wire: Callable[[Any], Any] | None = None
+    from_wire: Callable[[Any], Any] | None = None
+    sparse: bool = False
+
+
+class MessageMapping(Generic[T]):
+    """A model class and its message. An attribute that is None is absent; one whose default is None may be absent.
+
+    Args:
+        same: attributes that are fields of the same name and type.
+        other: all other attributes.
+    """
+
+    def __init__(self, kind: type[T], message: type[Message], /, *same: str, **other: str | FieldMapping) -> None:
+        self.kind = kind
+        self.name = message.DESCRIPTOR.name
+        self._message = message
+        self._fields = {
+            attribute: FieldMapping(field) if isinstance(field, str) else field
+            for attribute, field in {**{name: name for name in same}, **other}.items()
+        }
+        defaults = {field.name: field.default for field in fields(kind)}  # type: ignore[arg-type]
+        self._optional = {attribute for attribute in self._fields if defaults[attribute] is None}
+
+    def to_wire(self, thing: T) -> Message:
+        values = {}
+        for attribute, field in self._fields.items():
+            value = getattr(thing, attribute)
+            if value is not None and (value or not field.sparse):
+                values[field.name] = field.to_wire(value) if field.to_wire else value
+        return self._message(**values)
+
+    def from_wire(self, message: Message) -> T:
+        """Raises InvalidValue: a value makes no sense."""
+        return self.kind(
+            **{
+                attribute: None
+                if attribute in self._optional and not message.HasField(field.name)
+                else _converted(field, getattr(message, field.name))
+                for attribute, field in self._fields.items()
+            }
+        )
+
+    def decode(self, payload: Buffer) -> T:
+        """Raises WireError: the bytes are no such message; InvalidValue: a value makes no sense."""
+        return self.from_wire(parse(self._message, payload))
+
+
+def _converted(field: FieldMapping, value: Any) -> Any:
+    return field.from_wire(value) if field.from_wire else value
+
+
+def _time(name: str = "timestamp") -> FieldMapping:
+    return FieldMapping(name, timestamp, time_ns)
+
+
+def _enum(name: str, kind: type[E], *, sparse: bool = False) -> FieldMapping:
+    return FieldMapping(name, int, partial(known, kind), sparse)
+
+
+def _each(name: str, mapping: MessageMapping[Any]) -> FieldMapping:
+    return FieldMapping(
+        name,
+        lambda things: [mapping.to_wire(thing) for thing in things],
+        lambda messages: tuple(map(mapping.from_wire, messages)),
+    )
+
+
+def _gain(name: str) -> FieldMapping:
+    def finite(value: float) -> float:
+        if not math.isfinite(value):
+            raise InvalidValue(f"{name} is {value}")
+        return shortest(value)
+
+    return FieldMapping(name, from_wire=finite)
+
+
+def _needed(what: str) -> Callable[[str], str]:
+    def checked(name: str) -> str:
+        if not name:
+            raise InvalidValue(f"{what} without a name")
+        return name
+
+    return checked
+
+
+FEEDBACK = MessageMapping(
+    model.Feedback,
+    feedback_pb2.ZCtrlParameters,
+    on="feedbackOn",
+    proportional_gain=_gain("proportionalGain"),
+    integral_gain=_gain("integralGain"),
+    setpoint=_gain("setPoint"),
+)
+SCOPE_STATUS = MessageMapping(
+    model.ScopeStatus, control_pb2.ScopeStateMsg, state=_enum("scope_state", model.ScopeState), paused="scan_paused"
+)
+CONTROL_STATE = MessageMapping(
+    model.ControlState,
+    control_pb2.ControlState,
+    mode=_enum("control_mode", model.ControlMode),
+    holder=FieldMapping("client_in_control_id", from_wire=lambda holder: holder or None),
+    problems=FieldMapping("problems_set", from_wire=lambda problems: tuple(sorted({int(one) for one in problems}))),
+)
+PARAMETER = MessageMapping(
+    model.Parameter,
+    control_pb2.ParameterMsg,
+    name=FieldMapping("parameter", from_wire=_needed("a parameter")),
+    value="value",
+    unit="units",
+)
+_JOURNAL_ENTRY = MessageMapping(
+    model.JournalEntry,
+    journal_pb2.JournalEntry,
+    *("kind", "who", "what", "response", "request", "problem"),
+    time_ns=_time(),
+    reason=FieldMapping("reason", sparse=True),
+    took_s="took",
+    event=_enum("event", model.ControlEvent, sparse=True),
+    mode=_enum("mode", model.ControlMode, sparse=True),
+    late=FieldMapping("late", sparse=True),
+)
+_PROCESS_STATE = MessageMapping(
+    model.ProcessState,
+    journal_pb2.ProcessState,
+    *("name", "role", "starts", "pid", "last_exit"),
+    condition=_enum("condition", model.ProcessCondition),
+    since_ns=_time("since"),
+    step_age_s="step_age",
+)
+_LOG_LINE = MessageMapping(model.LogLine, journal_pb2.LogLine, "name", "level", "text", time_ns=_time())
+RELAYED = MessageMapping(
+    model.RelayedMessage, journal_pb2.Told, "payload", message=FieldMapping("message", from_wire=_needed("a message"))
+)
+MAPPINGS: tuple[MessageMapping[Any], ...] = (
+    FEEDBACK,
+    SCOPE_STATUS,
+    CONTROL_STATE,
+    PARAMETER,
+    RELAYED,
+    MessageMapping(model.JournalEntries, journal_pb2.JournalEntries, entries=_each("entries", _JOURNAL_ENTRY)),
+    MessageMapping(
+        model.ProcessStates,
+        journal_pb2.ProcessStates,
+        "supervisor",
+        time_ns=_time(),
+        processes=_each("processes", _PROCESS_STATE),
+    ),
+    MessageMapping(model.LogLines, journal_pb2.LogLines, lines=_each("lines", _LOG_LINE)),
+    MessageMapping(model.Progress, journal_pb2.Progress, "name", "done", "of", time_ns=_time(), left_s="remaining"),
+)
+
+
+def encode_orders(restart: Iterable[str]) -> bytes:
+    """Return the object of the answer to RELAY_REQUEST."""
+    return journal_pb2.Orders(restart=restart).SerializeToString()
+
+
+def decode_orders(payload: Buffer) -> tuple[str, ...]:
+    """Return the processes that are to be started anew. Raises WireError: the bytes are no orders."""
+    return tuple(parse(journal_pb2.Orders, payload).restart)
