@@ -14,6 +14,7 @@ from afspm.microscopes.asylum.session import Session
 from afspm.microscopes.asylum.xop import MISSING, XopError
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.translator.result_files import SCAN, as_list, as_region
+from afspm.translator.state import Kept
 
 FORCE: Final = "force"
 
@@ -39,7 +40,7 @@ class Activity:
         self,
         session: Session,
         files: AsylumFiles,
-        kept: dict[str, Any],
+        kept: Kept,
         folders: Mapping[str, str],
         frame_in_force: Callable[[], Region],
         clock: Clock,

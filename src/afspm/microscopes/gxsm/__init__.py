@@ -118,7 +118,7 @@ class Gxsm(Driver):
         self._offered = Offered(refnames, actions, hardware)
         self._find_parameters()
         self.lacking = self._missing_actions()
-        self._frame = ScanFrame(ask, user_unit_m(ask))
+        scan_frame = ScanFrame(ask, user_unit_m(ask))
         if self._saving.by_us and AUTOSAVE_OFF in self._offered.actions:
             ask.call("action", AUTOSAVE_OFF)
             self.log.info("GXSM's Auto Save of scans is off from now on, and stays off: see the setting saving")
@@ -128,7 +128,7 @@ class Gxsm(Driver):
         self._activity = Activity(
             ask,
             hardware,
-            self._frame,
+            scan_frame,
             self._files,
             self.memory,
             self.clock,
@@ -137,8 +137,8 @@ class Gxsm(Driver):
             shows_s=self.patience_s(SHOWS_S),
             saving=self._saving,
         )
-        self._tip = TipPlace(self._frame, self.memory, self._sets_out)
-        own = FrameSettings(self._frame, self._tip, is_led=self._offered.hardware is Hardware.RPSPMC)
+        self._tip = TipPlace(scan_frame, self.memory, self._sets_out)
+        own = FrameSettings(scan_frame, self._tip, is_led=self._offered.hardware is Hardware.RPSPMC)
         feedback = FeedbackSwitch(ask, self._activity.doing, self._feedback_actions)
         self.groups = (own, self._tip, self._kept, feedback)
 
@@ -252,7 +252,7 @@ class Gxsm(Driver):
         if execute(kind) not in self._offered.actions:
             reason = f"this GXSM has no {execute(kind)} with its hardware ({self._offered.kind}): see x-spec-kind"
             raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, reason)
-        reach_m = math.hypot(*self._frame.region().size_m)
+        reach_m = math.hypot(*self._tip.frame.region().size_m)
         self._activity.start_curve(kind, self._tip.xy_m(), self._way_s(reach_m))
 
     @action(names.STOP_SPEC)

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from afspm.clock import Clock
 from afspm.microscopes.gxsm.errors import GxsmError
@@ -17,6 +17,7 @@ from afspm.microscopes.gxsm.scan_memory import Rows, is_unfinished, looked_at
 from afspm.microscopes.gxsm.settings import ScanFrame
 from afspm.model import Region, ScopeState, ScopeStatus
 from afspm.translator.result_files import SCAN, as_list
+from afspm.translator.state import Kept
 
 SETTLES_S: Final = 0.3
 """So long GXSM needs from the end of a scan until it is done with it: a file that is saved before lacks its end."""
@@ -67,7 +68,7 @@ class Activity:
         hardware: Hardware,
         frame: ScanFrame,
         files: GxsmFiles,
-        kept: dict[str, Any],
+        kept: Kept,
         clock: Clock,
         log: logging.Logger,
         *,

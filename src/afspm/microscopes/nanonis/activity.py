@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Final
+from typing import Final
 
 from afspm.clock import Clock
 from afspm.errors import Refused
@@ -17,6 +17,7 @@ from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.translator.driver import ControllerLost
 from afspm.translator.result_files import SCAN, as_list
 from afspm.translator.settings import frame
+from afspm.translator.state import Kept
 
 _SETTLES_S: Final = 1.0
 """Real time that a spectrum may take to be seen running."""
@@ -42,7 +43,7 @@ class Activity:
         session: Session,
         files: NanonisFiles,
         probe: Probe,
-        kept: dict[str, Any],
+        kept: Kept,
         clock: Clock,
         log: logging.Logger,
     ) -> None:

@@ -31,9 +31,13 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+Table = dict[str, Any]
+"""Settings as the experiment file has them."""
+Rows = dict[str, Table]
+
 _FAULT = "x-fault"
 _FAULT_PARAMETERS = ("x-fault-kind", "x-fault-count", "x-fault-duration")
-_AT_FIRST: dict[str, Any] = {
+_AT_FIRST: Table = {
     names.SCAN_TOP_LEFT_X: "-0.5 um",
     names.SCAN_TOP_LEFT_Y: "-0.5 um",
     names.SCAN_SIZE_X: "1 um",
@@ -105,28 +109,28 @@ class Simulator(Driver):
         self,
         *,
         seed: int = 1,
-        surface: str | dict[str, Any] = "steps",
-        tip: dict[str, Any] | None = None,
-        tip_changes: dict[str, Any] | None = None,
-        drift: dict[str, Any] | None = None,
-        feedback: dict[str, Any] | None = None,
-        scanner: dict[str, Any] | None = None,
-        noise: dict[str, Any] | None = None,
-        signals: dict[str, Any] | None = None,
-        iv: dict[str, Any] | None = None,
-        force: dict[str, Any] | None = None,
-        initial: dict[str, Any] | None = None,
+        surface: str | Table = "steps",
+        tip: Table | None = None,
+        tip_changes: Table | None = None,
+        drift: Table | None = None,
+        feedback: Table | None = None,
+        scanner: Table | None = None,
+        noise: Table | None = None,
+        signals: Table | None = None,
+        iv: Table | None = None,
+        force: Table | None = None,
+        initial: Table | None = None,
         approach_s: Duration = 1.0,
-        faults: list[dict[str, Any]] | None = None,
+        faults: list[Table] | None = None,
         fault_action: bool = False,
-        panel: list[dict[str, Any]] | None = None,
-        parameters: dict[str, dict[str, Any]] | None = None,
-        actions: dict[str, dict[str, Any]] | None = None,
+        panel: list[Table] | None = None,
+        parameters: Rows | None = None,
+        actions: Rows | None = None,
         poll_period_s: Duration = 0.25,
         result_timeout_s: Duration = 10.0,
         live_lines_s: Duration | None = None,
     ) -> None:
-        world: dict[str, Any] = {
+        world: Table = {
             "surface": surface,
             "tip": tip,
             "tip_changes": tip_changes,
@@ -179,7 +183,7 @@ class Simulator(Driver):
                 errors.add(ConfigError(f"there is no action {event.action!r}", where=f"panel[{i}].action"))
 
     @classmethod
-    def rows(cls, settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    def rows(cls, settings: Mapping[str, Any]) -> Rows:
         loop = _loop_of(settings)
         return _merged({} if loop is None else _rows_for(loop.mode), settings.get("parameters") or {})
 
@@ -269,20 +273,20 @@ class Simulator(Driver):
         return run_translator(self, context, FaultyTranslator)
 
 
-_SETPOINTS: Final[dict[str, dict[str, Any]]] = {
+_SETPOINTS: Final[Rows] = {
     "amplitude": {"unit": "V", "range": ["1 mV", "10 V"]},
     "current": {"unit": "A", "range": ["1 pA", "100 nA"]},
     "frequency-shift": {"unit": "Hz", "range": ["-100 kHz", "-1 mHz"]},
 }
 
 
-def _rows_for(mode: str) -> dict[str, dict[str, Any]]:
+def _rows_for(mode: str) -> Rows:
     """Return the rows that depend on the operating mode: what its setpoint is."""
     return {names.ZCTRL_SETPOINT: _SETPOINTS[mode], names.SPEC_KIND: {"choices": ["IV", "force"]}}
 
 
-def _merged(*tables: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    merged: dict[str, dict[str, Any]] = {}
+def _merged(*tables: Mapping[str, Mapping[str, Any]]) -> Rows:
+    merged: Rows = {}
     for table in tables:
         for name, row in table.items():
             # what is no table is for the table of parameters to refuse
