@@ -13,8 +13,8 @@ from afspm.components.line_file import LineFile, csv_line
 from afspm.model import ControlState, Scan, ScopeState, ScopeStatus, Spectrum
 
 COLUMNS = (
-    "time", "measurement", "filename", "channel", "center_x", "center_y", "width", "height", "length_units", "angle_deg",
-    "columns", "rows", "units", "in_control", "mode", "problems", "state",
+    "time", "measurement", "filename", "channel", "center_x", "center_y", "width", "height", "length_units",
+    "angle_deg", "columns", "rows", "units", "in_control", "mode", "problems", "state",
 )  # fmt: skip
 _IDENTITY = 4  # columns that no two rows share: time, measurement, file and channel
 _BUSY = {ScopeState.SCANNING: "scan", ScopeState.SPEC: "spectrum"}
