@@ -40,7 +40,7 @@ _SCANS_OF_A_RUN = "scans"
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """What came of all scans of a channel.
+    """The result for all scans of a channel.
 
     Attributes:
         record: of the tracker.
@@ -54,7 +54,7 @@ class Analysis:
 
 
 def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Path, jobs: int | None) -> None:
-    """Analyse and tell.
+    """Analyse files, print the table and write the results.
 
     Raises:
         InvalidValue: nothing in it that can be followed. ConfigError: no such estimator or tracker.
@@ -77,7 +77,7 @@ def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Pa
 
 
 def read_all(paths: Sequence[Path]) -> tuple[list[FileContent], list[str]]:
-    """What is in files and folders, and what could not be read."""
+    """Return the content of files and folders, and what could not be read."""
     contents: list[FileContent] = []
     unreadable: list[str] = []
     for path in _files(paths):
@@ -101,12 +101,12 @@ def _files(paths: Sequence[Path]) -> Iterator[Path]:
 
 
 def register_pair(by: str, reference: DriftScan, scan: DriftScan) -> Registration:
-    """What a worker does."""
+    """Register a pair, in a worker."""
     return estimator(by).register(reference, scan)
 
 
 def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int | None, console: Console) -> Analysis:
-    """Followed in this process, one scan after the other, while others compare each with the first."""
+    """Follow the scans in this process, while others compare each with the first."""
     tracking = tracker(following, estimator(by))
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as progress, ThreadPoolExecutor(1) as beside:
@@ -123,7 +123,7 @@ def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int | No
 
 
 def _others(scans: Sequence[DriftScan], jobs: int | None) -> int:
-    """How many processes compare; 1 is this one."""
+    """Return how many processes compare; 1 is this one."""
     wanted = processes(jobs, sum(scan.values.size for scan in scans))
     return 1 if wanted == 1 else max(wanted - 1, 2)
 

@@ -45,7 +45,7 @@ class ChannelFrame:
 
 
 class FrameStore:
-    """What pictures are made of. Not for several threads at once.
+    """Keeps frames, of which pictures are made. Not for several threads at once.
 
     Args:
         memory_bytes: of finished frames that are kept, beside the newest of each channel; of growing ones, too.

@@ -135,7 +135,7 @@ def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: 
 
 
 class Restarter(Protocol):
-    """What the panel of processes needs of steering."""
+    """The part of steering that the panel of processes needs."""
 
     @property
     def may_steer(self) -> bool: ...
@@ -148,7 +148,7 @@ class HealthPanel:
 
     def __init__(self, steering: Restarter) -> None:
         self._steering = steering
-        self._rows: dict[str, ProcessRow] = {}
+        self._rows: dict[str, HealthRow] = {}
         self._nothing = ui.html("Nothing has been heard of processes yet.", sanitize=False).classes("nothing")
         self._list = ui.element("div").classes("processes").props('role="table" aria-label="Processes"')
 
@@ -159,11 +159,11 @@ class HealthPanel:
             row = self._rows.get(state.name)
             if row is None:
                 with self._list:
-                    row = self._rows[state.name] = ProcessRow(state.name, self._steering)
+                    row = self._rows[state.name] = HealthRow(state.name, self._steering)
             row.show(state, unheard.get(state.name))
 
 
-class ProcessRow:
+class HealthRow:
     """The condition of one process, and a button to restart it."""
 
     def __init__(self, name: str, steering: Restarter) -> None:

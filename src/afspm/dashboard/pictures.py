@@ -18,7 +18,7 @@ KEPT = 8
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """How a viewer wants to see a scan."""
+    """Levelling, contrast and colours in which a viewer wants to see a scan."""
 
     levelling: Levelling = Levelling.PLANE
     contrast: Contrast = Contrast.ROBUST
@@ -36,8 +36,8 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
-    """A frame as it is seen.
+class RenderedFrame:
+    """A frame as a viewer sees it.
 
     Attributes:
         values: levelled, [y, x].
@@ -78,9 +78,9 @@ class PictureCache:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._drawn: OrderedDict[tuple[int, Look], Picture] = OrderedDict()
+        self._drawn: OrderedDict[tuple[int, Look], RenderedFrame] = OrderedDict()
 
-    def draw(self, frame: ChannelFrame, look: Look) -> Picture:
+    def draw(self, frame: ChannelFrame, look: Look) -> RenderedFrame:
         """Return the picture of a frame."""
         key = (frame.number, look)
         with self._lock:  # two that want the same wait for one; two that want others share a core anyway
@@ -94,10 +94,10 @@ class PictureCache:
             return drawn
 
 
-def _draw(frame: ChannelFrame, look: Look) -> Picture:
+def _draw(frame: ChannelFrame, look: Look) -> RenderedFrame:
     values = levelled(frame.values, look.levelling)
     span = value_range(values, look.contrast)
-    return Picture(frame, look, values, span, png(indices(values, span), look.palette))
+    return RenderedFrame(frame, look, values, span, png(indices(values, span), look.palette))
 
 
 def number_or_none(value: float) -> float | None:

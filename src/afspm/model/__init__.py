@@ -31,7 +31,7 @@ from afspm.model.events import (
     is_process_name,
 )
 from afspm.model.geometry import Frame, Region, RegionChange
-from afspm.model.packet import Packet, PacketHeader
+from afspm.model.packet import LoggedPacket, Packet, PacketHeader
 from afspm.model.problems import ProblemNames
 from afspm.model.requests import HAS_ENDED, Parameter, Request, Response, ResponseDetail
 from afspm.model.scan import Scan, ScanParameters, ScanSet, ShapeChange
@@ -56,6 +56,7 @@ __all__ = [
     "JournalEntry",
     "LogLine",
     "LogLines",
+    "LoggedPacket",
     "Packet",
     "PacketHeader",
     "Parameter",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 
 @dataclass(slots=True)
@@ -18,6 +19,19 @@ class Packet:
     envelope: str
     payload: bytes | memoryview
     time_ns: int | None = None
+
+
+class LoggedPacket(NamedTuple):
+    """A packet as it stands in the packet log.
+
+    Attributes:
+        source_ns: the time that the translator gave it; None: it is the scheduler's own.
+        history: how many packets of its envelope the scheduler's cache keeps; 0: this one is not cached.
+    """
+
+    packet: Packet
+    source_ns: int | None
+    history: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,11 +19,11 @@ from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
 from afspm.experiment import Experiment, load, load_expanded
 from afspm.logic.supervision.run_end import EndReason
-from afspm.record import ahead
 from afspm.record.journal import open_to_read
 from afspm.record.run_json import EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, read_run_json
 from afspm.record.run_lock import lock_run, quoted, resume_command
 from afspm.storage.atomic import load_checkpoint
+from afspm.storage.packet_log import log_folder, logged_packets
 from afspm.supervisor import run as running
 from afspm.supervisor.ports import require_free
 from afspm.supervisor.run import FILES, HOMES, HOW, ONLY, RUN, WITHOUT, FinishedRun, RunOptions
@@ -125,8 +125,7 @@ def last_seen_ns(folder: Path) -> int:
     """The last time in the experiment that anything of the run's folder knows of; 0 if nothing does."""
     seen = [0]
     state = folder / STATE_DIR
-    for written in ahead.folders(state):
-        seen += [one.packet.time_ns or 0 for one in ahead.written_ahead(written)]
+    seen += [entry.packet.time_ns or 0 for entry in logged_packets(log_folder(state))]
     for file in state.glob("*.json"):
         try:
             kept, _ = load_checkpoint(file, json.loads)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -16,10 +17,10 @@ from afspm.errors import ConfigError
 from afspm.experiment import Experiment, ProcessStart, Role
 from afspm.launch import Launch, Sockets
 from afspm.logic.supervisor_registry import LOGGED_AS
-from afspm.record import ahead
 from afspm.record.run_json import ENDED, STATE_DIR, run_json_or_empty
 from afspm.record.run_lock import lock_run
 from afspm.storage.disk import run_bounded
+from afspm.storage.packet_log import discard_if_recorded, expect_recorder, log_folder
 from afspm.supervisor import key_handout, post_run, run_folder, run_identity
 from afspm.supervisor.log import RunLog
 from afspm.supervisor.ports import FreePorts, require_free
@@ -112,7 +113,7 @@ def go(
         facts = {**run_facts(name, starts, common), **facts_to_resume(experiment, starts, options), FILES: files}
         run_folder.write_run(folder, facts)
         if {start.launch.name for start in starts} & set(experiment.recorders):
-            ahead.expect_record(folder / STATE_DIR)
+            expect_recorder(log_folder(folder / STATE_DIR))
         log.write(LOGGED_AS, logging.INFO, f"{name}: {len(starts)} processes, into {folder}")
         handed = key_handout.hand_over(experiment, starts)
         reporter = reporter_of(experiment, starts, clock, common.run, handed.supervisor)
@@ -125,6 +126,9 @@ def go(
             run_bounded(lambda: run_folder.write_run(folder, ending), WRITTEN_WITHIN_S)
         except OSError as error:  # a full disk must not keep people from being told of the end
             log.write(LOGGED_AS, logging.ERROR, f"how it ended is not in run.json: {error}")
+        if outcome.why.is_final:
+            with suppress(OSError):  # what stays is only space
+                run_bounded(lambda: discard_if_recorded(log_folder(folder / STATE_DIR)), WRITTEN_WITHIN_S)
         ended = EndedRun(name, folder, outcome, common.simulated)
         post_run.follow(experiment, ended, starts, clock, log, with_report=options.report)
     finally:

@@ -24,6 +24,11 @@ class EndReason(Enum):
     """A process that the experiment can't do without was given up, or all were."""
 
     @property
+    def is_final(self) -> bool:
+        """Return whether there is nothing to resume."""
+        return self in (EndReason.EXPERIMENT_ENDED, EndReason.ALL_DONE)
+
+    @property
     def exit_code(self) -> int:
         """Of `afspm run`."""
         return {EndReason.EXPERIMENT_ENDED: 0, EndReason.ALL_DONE: 0, EndReason.STOPPED: 130, EndReason.LOST: 1}[self]
