@@ -21,7 +21,7 @@ from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatu
 from afspm.simulation import World
 from afspm.simulation.feedback import FeedbackSettings
 from afspm.simulation.settings import build
-from afspm.simulation.world_settings import read_settings
+from afspm.simulation.world import read_settings
 from afspm.translator.driver import Action, Driver, action
 from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.units import Duration
