@@ -1,4 +1,4 @@
-"""What a process is told when it starts: one JSON line on its standard input.
+"""The launch line: one JSON line on standard input from which a process learns its part in an experiment.
 
 The same line goes to Python components (`python -m afspm.process.host`) and to commands in any other
 language. Standard input then stays open: its end means that the parent is gone or wants us to stop.
@@ -16,6 +16,7 @@ import difflib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import NoneType
 from typing import Any
 
 from afspm.errors import ConfigError
@@ -39,7 +40,7 @@ class Sockets:
 
 @dataclass(frozen=True)
 class Launch:
-    """All that a process needs to know to take part in an experiment. Values are JSON's own types."""
+    """A process's part in an experiment, in JSON's own types."""
 
     name: str
     class_: str = ""
@@ -73,13 +74,13 @@ class Launch:
     controller: str = ""
     """Of a translator: the name of the emulator of this run that it talks to, and to nobody else; empty: none."""
     sample_coordinates: bool = False
-    """Whether places are those of the sample, which the scheduler maps to those of the tip."""
+    """Places are those of the sample, which the scheduler maps to those of the tip."""
     retracts: bool = False
-    """Of a translator: whether it retracts the tip when its standard input ends and a request of the run has switched
-    the feedback off."""
+    """Of a translator: it retracts the tip when its standard input ends and a request of the run has switched the
+    feedback off."""
 
     def to_json(self) -> str:
-        """One line, without the newline at its end."""
+        """Return one line, without the newline at its end."""
         plain = dataclasses.asdict(self)
         plain["class"] = plain.pop("class_")
         return json.dumps(plain, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
@@ -104,46 +105,40 @@ class Launch:
         return cls(**values, sockets=Sockets(**_fields(Sockets, sockets, "launch line, sockets")))
 
 
-_STRINGS = {"name", "class_", "run", "controller", "beat_token", "run_dir", "state_dir", "log_level"}
-_NUMBERS = {"beat_period_s", "request_timeout_s", "request_retries"}
-_TABLES = {"settings", "clock", "problems"}
-_LISTS = {"subscribe", "envelopes", "messages"}
+_JSON_TYPES: Mapping[str, tuple[type, ...]] = {
+    "str": (str,),
+    "str | None": (str, NoneType),
+    "int": (int, float),
+    "float": (int, float),
+    "bool": (bool,),
+    "Mapping[str, Any]": (dict,),
+    "Mapping[str, int]": (dict,),
+    "Mapping[str, Any] | None": (dict, NoneType),
+    "tuple[str, ...]": (list,),
+    "tuple[str, ...] | None": (list, NoneType),
+}
+"""By the annotation of a field."""
 
 
 def _fields(cls: type[Any], plain: Any, where: str) -> dict[str, Any]:
-    """The values of `plain` as arguments of the dataclass `cls`, each of the JSON type that belongs there."""
+    """Return the values of `plain` as arguments of the dataclass `cls`, each of the JSON type that belongs there."""
     if not isinstance(plain, dict):
         raise ConfigError(f"expected a JSON object, got {type(plain).__name__}", where=where)
-    names = {f.name for f in dataclasses.fields(cls)}
     if cls is Launch and not plain.get("name"):
         raise ConfigError("the process has no name", where=where)
-    values: dict[str, Any] = {}
-    for key, value in plain.items():
-        if key not in names:
-            near = difflib.get_close_matches(key, names, n=1)
-            raise ConfigError(f"unknown entry {key!r}", where=where, hint=f"did you mean {near[0]!r}?" if near else "")
-        values[key] = _checked(cls, key, value, where)
-    return values
+    kinds = {field.name: str(field.type) for field in dataclasses.fields(cls)}
+    for key in plain.keys() - kinds.keys():
+        near = difflib.get_close_matches(key, kinds, n=1)
+        raise ConfigError(f"unknown entry {key!r}", where=where, hint=f"did you mean {near[0]!r}?" if near else "")
+    return {key: _checked(key, value, kinds[key], where) for key, value in plain.items()}
 
 
-def _checked(cls: type[Any], key: str, value: Any, where: str) -> Any:
-    """`value`, lists made tuples; refused if its type can't be right for the field `key`."""
-    if key in _LISTS and isinstance(value, list):
-        if not all(isinstance(item, str) for item in value):
-            raise ConfigError(f"{key!r} must be a list of strings", where=where)
-        return tuple(value)
-    if key in _LISTS:
-        fits = value is None and key == "envelopes"
-    elif cls is Sockets:
-        fits = isinstance(value, str) or value is None
-    elif key in _STRINGS:
-        fits = isinstance(value, str)
-    elif key in _NUMBERS:
-        fits = isinstance(value, int | float) and not isinstance(value, bool) and value >= 0
-    elif key in _TABLES:
-        fits = isinstance(value, dict)
-    else:
-        fits = value is None or isinstance(value, dict | bool)
+def _checked(key: str, value: Any, kind: str, where: str) -> Any:
+    fits = isinstance(value, _JSON_TYPES[kind]) and (kind == "bool" or not isinstance(value, bool))
+    if isinstance(value, int | float):
+        fits = fits and value >= 0
+    if isinstance(value, list):
+        fits = fits and all(isinstance(item, str) for item in value)
     if not fits:
         raise ConfigError(f"{key!r} can't be {value!r}", where=where)
-    return value
+    return tuple(value) if isinstance(value, list) else value

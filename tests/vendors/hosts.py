@@ -70,5 +70,5 @@ def _run(stdin: Connection, stderr: Connection, environment: Mapping[str, str], 
     os.chdir(folder)
     tempfile.tempdir = None  # the environment says where
     code = int(host.main())
-    host.end_within(host.FAREWELL_S, code)
+    host.end_within(host.EXIT_GRACE_S, code)
     sys.exit(code)

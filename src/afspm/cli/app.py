@@ -2,26 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
 
-from afspm.cli import (
-    check,
-    dashboard,
-    drift,
-    emulate,
-    export,
-    graph,
-    keys,
-    new,
-    replay,
-    report,
-    run,
-    status,
-    steer,
-    test_translator,
-)
+from afspm import plugins
+from afspm.cli import dashboard, drift, drivers, experiment_file, recorded, run, status, steer
+from afspm.errors import ConfigError
 
 app = typer.Typer(
     name="afspm",
@@ -50,12 +38,13 @@ def _afspm(
     """Automate scanning probe microscopes: run experiments of several components that share one microscope."""
 
 
-BEFORE, MEANWHILE, AFTERWARDS, MICROSCOPES = "Before", "While it runs", "Afterwards", "Microscopes"
+BEFORE, MEANWHILE, AFTERWARDS = "Before", "While it runs", "Afterwards"
+MICROSCOPES, PLUGINS = "Microscopes", "Plug-ins"
 
 app.command("run")(run.run)
-app.command("check", rich_help_panel=BEFORE)(check.check)
-app.command("graph", rich_help_panel=BEFORE)(graph.graph)
-app.command("keys", rich_help_panel=BEFORE)(keys.keys)
+app.command("check", rich_help_panel=BEFORE)(experiment_file.check)
+app.command("graph", rich_help_panel=BEFORE)(experiment_file.graph)
+app.command("keys", rich_help_panel=BEFORE)(experiment_file.keys)
 app.command("dashboard", rich_help_panel=MEANWHILE)(dashboard.dashboard)
 app.command("status", rich_help_panel=MEANWHILE)(status.status)
 app.command("watch", rich_help_panel=MEANWHILE)(status.watch)
@@ -63,10 +52,34 @@ app.command("pause", rich_help_panel=MEANWHILE)(steer.pause)
 app.command("resume", rich_help_panel=MEANWHILE)(steer.resume)
 app.command("end", rich_help_panel=MEANWHILE)(steer.end)
 app.command("problems", rich_help_panel=MEANWHILE)(steer.problems)
-app.command("report", rich_help_panel=AFTERWARDS)(report.report)
-app.command("export", rich_help_panel=AFTERWARDS)(export.export)
-app.command("replay", rich_help_panel=AFTERWARDS)(replay.replay)
+app.command("report", rich_help_panel=AFTERWARDS)(recorded.report)
+app.command("export", rich_help_panel=AFTERWARDS)(recorded.export)
+app.command("replay", rich_help_panel=AFTERWARDS)(recorded.replay)
 app.add_typer(drift.app, name="drift", rich_help_panel=AFTERWARDS)
-app.add_typer(new.app, name="new", rich_help_panel=MICROSCOPES)
-app.command("test-translator", rich_help_panel=MICROSCOPES)(test_translator.check_translator)
-app.command("emulate", rich_help_panel=MICROSCOPES)(emulate.emulate)
+app.add_typer(drivers.new, name="new", rich_help_panel=MICROSCOPES)
+app.command("test-translator", rich_help_panel=MICROSCOPES)(drivers.check_translator)
+app.command("emulate", rich_help_panel=MICROSCOPES)(drivers.emulate)
+
+
+def _add_plugins() -> None:
+    """Add the commands of installed packages: one that can't be loaded says so when it is called."""
+    for name in plugins.names(plugins.COMMANDS):
+        try:
+            command = plugins.load(plugins.COMMANDS, name)
+        except ConfigError as error:
+            command = _unloadable(error)
+        if isinstance(command, typer.Typer):
+            app.add_typer(command, name=name, rich_help_panel=PLUGINS)
+        else:
+            app.command(name, rich_help_panel=PLUGINS)(command)
+
+
+def _unloadable(error: ConfigError) -> Callable[[], None]:
+    def command() -> None:
+        """Not available: its package can't be loaded."""
+        raise error
+
+    return command
+
+
+_add_plugins()

@@ -1,31 +1,32 @@
-"""Arguments that several commands share."""
+"""Arguments and options that several commands share."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-Files = Annotated[
-    list[Path],
-    typer.Argument(
-        metavar="FILE [OVERLAY…]",
-        help="The experiment file; each further file is laid over it and needs to hold only what differs.",
-        show_default=False,
-    ),
-]
+_FILES = "The experiment file; each further file is laid over it and needs to hold only what differs."
+_WHERE = "The folder of a run, a folder of runs (its newest is meant), or the experiment file."
+RUNS = Path("runs")
 
+Files = Annotated[list[Path], typer.Argument(metavar="FILE [OVERLAY…]", help=_FILES, show_default=False)]
 FilesUnlessResumed = Annotated[
-    list[Path] | None,
-    typer.Argument(
-        metavar="FILE [OVERLAY…]",
-        help="The experiment file; each further file is laid over it and needs to hold only what differs.",
-        show_default=False,
-    ),
+    list[Path] | None, typer.Argument(metavar="FILE [OVERLAY…]", help=_FILES, show_default=False)
 ]
+Where = Annotated[Path, typer.Argument(metavar="RUN|FILE", help=_WHERE)]
+RecordedRun = Annotated[
+    Path, typer.Argument(metavar="RUN", help="The folder of a run, or of all runs: its newest is meant.")
+]
+Runs = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Where to make the run's folder.")]
+
+
+def opt(help_text: str, *flags: str, **more: Any) -> Any:
+    """Return an option whose default is said in its help, if at all."""
+    return typer.Option(*flags, help=help_text, show_default=False, **more)
 
 
 def names_in(given: list[str] | None) -> tuple[str, ...]:
-    """Names given by repeating the option, by commas, or both."""
+    """Return names given by repeating the option, by commas, or both."""
     return tuple(name.strip() for names in given or () for name in names.split(",") if name.strip())

@@ -7,31 +7,25 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from afspm.cli.arguments import RUNS, Where, opt
+
 if TYPE_CHECKING:
     from afspm.experiment import Experiment
     from afspm.supervisor.resume import ResumableRun
 
-RUNS = Path("runs")
 NAME_OF_CLASS = "Dashboard"
 
 
 def dashboard(
-    where: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RUN|FILE",
-            help="The folder of a run, a folder of runs (its newest is meant), or the experiment file.",
-        ),
-    ] = RUNS,
+    where: Where = RUNS,
     host: Annotated[
         str, typer.Option(help="The address to listen at; others than this computer's own need a password.")
     ] = "127.0.0.1",
-    port: Annotated[int | None, typer.Option(help="By default 8080, or any that is free.", show_default=False)] = None,
-    certificate: Annotated[Path | None, typer.Option(help="PEM file, for https.", show_default=False)] = None,
-    certificate_key: Annotated[Path | None, typer.Option(help="PEM file, its key.", show_default=False)] = None,
+    port: Annotated[int | None, opt("By default 8080, or any that is free.")] = None,
+    certificate: Annotated[Path | None, opt("PEM file, for https.")] = None,
+    certificate_key: Annotated[Path | None, opt("PEM file, its key.")] = None,
     people: Annotated[
-        Path | None,
-        typer.Option(help='TOML file with a line for each person who may steer: Ada = "scrypt:…".', show_default=False),
+        Path | None, opt('TOML file with a line for each person who may steer: Ada = "scrypt:…".')
     ] = None,
     make_password: Annotated[
         bool, typer.Option("--make-password", help="Ask for a name and a password, print their line, and end.")
@@ -57,7 +51,7 @@ def dashboard(
 
 
 def with_dashboard(files: list[Path]) -> Experiment:
-    """The experiment, with a dashboard if its file has none."""
+    """Return the experiment, with a dashboard if its file has none."""
     from afspm.experiment import load
 
     experiment = load(*files)
@@ -65,7 +59,7 @@ def with_dashboard(files: list[Path]) -> Experiment:
 
 
 def resumed_with_dashboard(found: ResumableRun) -> ResumableRun:
-    """The run that is to go on, with a dashboard if it has none."""
+    """Return the run that is to go on, with a dashboard if it has none."""
     return found if _has_dashboard(found.experiment) else found.with_overlay(_overlay())
 
 
@@ -76,7 +70,7 @@ def _has_dashboard(experiment: Experiment) -> bool:
 
 
 def _overlay() -> Path:
-    """The file that is laid over an experiment to give it a dashboard."""
+    """Return the file that is laid over an experiment to give it a dashboard."""
     from afspm import dashboard
 
     return Path(dashboard.__file__).with_name("assets") / "dashboard.toml"
@@ -91,7 +85,7 @@ def _print_password() -> None:
 
 
 def _people_in(file: Path) -> dict[str, str]:
-    """The names and hashes in a file of `--people`, with or without the `people.` that an experiment file needs."""
+    """Return the names and hashes in a file of `--people`, with or without a leading `people.`."""
     import tomllib
 
     from afspm.errors import ConfigError
@@ -107,7 +101,7 @@ def _people_in(file: Path) -> dict[str, str]:
 
 
 def _running_here(where: Path) -> Path | None:
-    """The folder of the run that is meant; None: the file is of one that was started elsewhere."""
+    """Return the folder of the run that is meant; None: the file is of one that was started elsewhere."""
     from afspm.client.connect import find_run
     from afspm.errors import FileError
     from afspm.record.run_json import ENDED, read_run_json
@@ -148,7 +142,7 @@ def _join(folder: Path, settings: dict[str, Any]) -> int:
 
 
 def _start_part(file: Path) -> int:
-    """The dashboard of an experiment whose scheduler runs elsewhere, as `afspm run --only` would start it."""
+    """Run the dashboard of an experiment whose scheduler runs elsewhere, as `afspm run --only` would start it."""
     import sys
 
     from afspm.errors import ConfigError

@@ -1,4 +1,4 @@
-"""How the commands of the terminal find a running experiment, and in whose name they speak there."""
+"""Connections of the terminal's commands to a running experiment, in the name of the user."""
 
 from __future__ import annotations
 
@@ -7,26 +7,18 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import typer
 
 if TYPE_CHECKING:
-    from afspm.cli.telling import About
+    from afspm.cli.status_text import RunDescription
     from afspm.client.follower import Follower
     from afspm.client.scope import Scope
 
 NOT_RUNNING = 3
 """The exit code where nothing runs."""
 TERMINAL = "terminal"
-
-Where = Annotated[
-    Path,
-    typer.Argument(
-        metavar="RUN|FILE",
-        help="The folder of a run, a folder of runs (its newest is meant), or the experiment file.",
-    ),
-]
 
 
 def person() -> str:
@@ -40,7 +32,7 @@ def person() -> str:
 
 @contextmanager
 def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
-    """Look on at the run that is meant; ends the command where nothing runs.
+    """Follow the run that is meant; end the command where nothing runs.
 
     Args:
         lines: also of scans that are being taken.
@@ -58,7 +50,7 @@ def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
 
 @contextmanager
 def acting(where: Path) -> Iterator[Scope]:
-    """A handle on the run that is meant, in the name of whoever sits here; ends the command where nothing runs."""
+    """Connect to the run that is meant, in the name of the user; end the command where nothing runs."""
     from afspm.client.connect import connect
 
     folder = _running(where)
@@ -68,13 +60,13 @@ def acting(where: Path) -> Iterator[Scope]:
         yield scope
 
 
-def about(follower: Follower, *, fancy: bool = True) -> About:
-    """What is known of the run besides what it publishes."""
-    from afspm.cli.telling import About
+def describe(follower: Follower, *, fancy: bool = True) -> RunDescription:
+    """Return what is known of the run besides what it publishes."""
+    from afspm.cli.status_text import RunDescription
     from afspm.record.run_json import read_run_json
 
     clock = follower.launch.clock
-    return About(
+    return RunDescription(
         name=str(read_run_json(follower.folder).get("name", follower.folder.name)),
         folder=str(follower.folder),
         simulated=follower.launch.simulated,
@@ -85,7 +77,7 @@ def about(follower: Follower, *, fancy: bool = True) -> About:
 
 
 def can_show_blocks() -> bool:
-    """Whether what the bars are made of arrives at the terminal."""
+    """Return whether what the bars are made of arrives at the terminal."""
     try:
         "█░".encode(sys.stdout.encoding or "ascii")
     except (UnicodeEncodeError, LookupError):
@@ -100,7 +92,7 @@ def say_nothing_runs(why: str) -> NoReturn:
 
 
 def _running(where: Path) -> Path:
-    """The folder of the run that is meant, as far as it is not known to have ended."""
+    """Return the folder of the run that is meant, as far as it is not known to have ended."""
     from afspm.client.connect import find_run
     from afspm.errors import FileError
     from afspm.record.run_json import ENDED, read_run_json

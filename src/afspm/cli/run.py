@@ -7,56 +7,36 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from afspm.cli.arguments import FilesUnlessResumed, names_in
+from afspm.cli.arguments import RUNS, FilesUnlessResumed, Runs, names_in, opt
 
 if TYPE_CHECKING:
-    from afspm.experiment import Experiment, ProcessStart
+    from afspm.experiment import ProcessStart
 
 
 def run(
     files: FilesUnlessResumed = None,
     only: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--only",
-            metavar="NAME[,NAME…]",
-            help="Start these processes here, and no others.",
-            show_default=False,
-        ),
+        list[str] | None, opt("Start these processes here, and no others.", "--only", metavar="NAME[,NAME…]")
     ] = None,
     without: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--without", metavar="NAME[,NAME…]", help="Start all processes here but these.", show_default=False
-        ),
+        list[str] | None, opt("Start all processes here but these.", "--without", metavar="NAME[,NAME…]")
     ] = None,
-    runs: Annotated[Path, typer.Option("--runs", metavar="DIR", help="Where to make the run's folder.")] = Path("runs"),
+    runs: Runs = RUNS,
     speed: Annotated[
-        float | None,
-        typer.Option(
-            min=1e-6, help="Experiment seconds in a real second; simulated microscopes only.", show_default=False
-        ),
+        float | None, opt("Experiment seconds in a real second; simulated microscopes only.", min=1e-6)
     ] = None,
-    dashboard: Annotated[
-        bool,
-        typer.Option(
-            "--dashboard", help="Show it in the browser, too, if the file doesn't say so.", show_default=False
-        ),
-    ] = False,
+    dashboard: Annotated[bool, opt("Show it in the browser, too, if the file doesn't say so.", "--dashboard")] = False,
     resume: Annotated[
         Path | None,
-        typer.Option(
+        opt(
+            "Go on with a run that was killed or stopped, in its folder (of a folder of runs: the newest).",
             metavar="RUN",
-            help="Go on with a run that was killed or stopped, in its folder; the newest, of a folder of runs.",
-            show_default=False,
         ),
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check, say what would be started, and start nothing.")
     ] = False,
-    report: Annotated[
-        bool, typer.Option("--report/--no-report", help="Write report.html when it has ended.", show_default=False)
-    ] = True,
+    report: Annotated[bool, opt("Write report.html when it has ended.", "--report/--no-report")] = True,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell details too.")] = False,
 ) -> None:
     """Run an experiment.
@@ -69,6 +49,7 @@ def run(
     import sys
 
     from afspm.cli.dashboard import resumed_with_dashboard, with_dashboard
+    from afspm.cli.experiment_file import require_no_errors
     from afspm.experiment import load
     from afspm.supervisor import resume as resuming
     from afspm.supervisor import run as running
@@ -88,31 +69,18 @@ def run(
         found = resuming.find(resume)
         if dashboard:
             found = resumed_with_dashboard(found)
-        _check(found.experiment)
+        require_no_errors(found.experiment)
         raise typer.Exit(resuming.resume(found, options, terminal=sys.stdout).outcome.exit_code)
     if not files:
         raise typer.BadParameter("name an experiment file, or a run with --resume", param_hint="FILE")
     experiment = with_dashboard(files) if dashboard else load(*files)
-    _check(experiment)
+    require_no_errors(experiment)
     if dry_run:
         for start in running.dry_run(experiment, options):
             typer.echo(_told(start))
         return
     ended = running.run(experiment, options, terminal=sys.stdout)
     raise typer.Exit(ended.outcome.exit_code)
-
-
-def _check(experiment: Experiment) -> None:
-    """Show what is wrong or doubtful. Raises typer.Exit if something is wrong."""
-    from afspm.cli import check
-
-    findings = experiment.check()
-    if findings:
-        from rich.console import Console
-
-        check.show(findings, Console(stderr=True, highlight=False))
-    if any(finding.is_error for finding in findings):
-        raise typer.Exit(1)
 
 
 def _told(start: ProcessStart) -> str:

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from afspm.cli.joining import Where, acting, looking
+from afspm.cli.arguments import RUNS, Where
+from afspm.cli.joining import acting, looking
 
 if TYPE_CHECKING:
     from afspm.model import ControlMode
-
-RUNS = Path("runs")
 
 
 def pause(where: Where = RUNS) -> None:
@@ -77,7 +76,7 @@ def problems(
 
 
 def _list(where: Path) -> None:
-    from afspm.cli.telling import flagged
+    from afspm.cli.status_text import flagged
     from afspm.clock import NS_PER_S
     from afspm.formatting import duration_text
 

@@ -1,1 +1,1 @@
-"""What a component is and what runs it: the base class that users write, its loop, and `Scope`, the blocking handle."""
+"""Components and what runs them: the base class that users write, its loop, and `Scope`, the blocking handle."""

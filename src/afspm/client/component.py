@@ -1,4 +1,4 @@
-"""`Component`: what a scientist writes. A class with a handler for what it wants to hear of."""
+"""`Component`: the class that a scientist derives from, with a handler for each kind of message."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Component:
     """Envelopes, or how they begin, that it subscribes to where the experiment file doesn't say. None: all but what is
     told of processes, requests and logs; `("",)`: that too."""
     operates: ClassVar[bool] = False
-    """Whether a person commands the microscope by it in MANUAL mode, where the experiment file names nobody else."""
+    """A person commands the microscope by it in MANUAL mode, where the experiment file names nobody else."""
     needs_actions: tuple[str, ...] = ()
     """Actions that the microscope must have."""
     needs_parameters: tuple[str, ...] = ()

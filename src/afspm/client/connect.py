@@ -63,7 +63,7 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
 
 
 def guest_facts(launch: Launch) -> dict[str, Any]:
-    """What run.json says under "guest": the launch line of a component, without what is that component's own."""
+    """Return the guest of run.json: the launch line of a component, without what is that component's own."""
     sockets = Sockets(subscribe=launch.sockets.subscribe[:1], control=launch.sockets.control)
     guest = dataclasses.replace(launch, name=GUEST, class_="", settings={}, sockets=sockets, envelopes=None)
     facts: dict[str, Any] = json.loads(guest.to_json())
@@ -71,7 +71,7 @@ def guest_facts(launch: Launch) -> dict[str, Any]:
 
 
 def guest_of(folder: Path, name: str) -> Launch:
-    """The launch line of someone who joins the run in `folder`.
+    """Return the launch line of a guest that joins the run in `folder`.
 
     Raises:
         FileError: run.json can't be read.
@@ -93,7 +93,7 @@ def guest_of(folder: Path, name: str) -> Launch:
 
 
 def _keys_in(folder: Path) -> dict[str, Any]:
-    """The keys that were made for those who join this run; nothing if none were made."""
+    """Return the keys of this run's guests; nothing if none were made."""
     from afspm.transport.keys import require_private
 
     file = folder / STATE_DIR / GUEST_KEYS
@@ -110,7 +110,7 @@ def _keys_in(folder: Path) -> dict[str, Any]:
 
 
 def find_run(where: Path) -> Path:
-    """The folder of the run that is meant. Raises FileError if there is none."""
+    """Return the folder of the run that is meant. Raises FileError if there is none."""
     if where.suffix == ".toml":
         name = where.resolve().parent.name if where.stem == "experiment" else where.stem
         runs = (Path("runs"), where.resolve().parent / "runs")
@@ -127,14 +127,14 @@ def find_run(where: Path) -> Path:
 
 
 def _newest(runs: Path, name: str, file: Path) -> Path | None:
-    """The newest run of the experiment `name` in the folder `runs`."""
+    """Return the newest run of the experiment `name` in the folder `runs`."""
     name = _name_in(file) or name
     found = [run for run in runs.glob(f"*/{RUN_FILE}") if run_json_or_empty(run.parent).get("name") == name]
     return max(found, key=_started).parent if found else None
 
 
 def _started(run: Path) -> tuple[float, int]:
-    """By what the newest run is found: when its clock was set, else when its facts were written."""
+    """Return when a run was started: when its clock was set, else when run.json was written."""
     clock = run_json_or_empty(run.parent).get("clock") or {}
     return float(clock.get("origin_s", 0.0)), run.stat().st_mtime_ns
 

@@ -10,7 +10,7 @@ from afspm.model import ScopeState
 
 
 class CycleOutcome(Enum):
-    """How it ended."""
+    """The outcome of a cycle."""
 
     COMPLETED = auto()
     INTERRUPTED = auto()
@@ -18,7 +18,7 @@ class CycleOutcome(Enum):
     VANISHED = auto()
     """The microscope is free and there is nothing: it was started anew in the middle, say."""
     ANOTHER = auto()
-    """What was measured can't be what was asked for: a person at the panel has moved the frame, say."""
+    """The results can't be those asked for: a person at the panel has moved the frame, say."""
 
 
 class Cycle:

@@ -1,4 +1,4 @@
-"""Looking on at a running experiment: what is published, reduced to an `Overview`, and nothing asked for."""
+"""Follows a running experiment: what is published, reduced to an `Overview`, and nothing asked for."""
 
 from __future__ import annotations
 
@@ -83,15 +83,15 @@ class Follower:
             raise NoResponse("nobody is there", where=str(self.folder), hint=hint)
 
     def silent_s(self) -> float:
-        """Real seconds since anything came."""
+        """Return the real seconds since anything came."""
         return 0.0 if self.heard_s is None else self.clock.monotonic_s() - self.heard_s
 
     def cut_off(self) -> str:
-        """What to say if nobody runs it any more; empty if somebody does, or it has ended."""
+        """Return a message for a run that was cut off; empty if it runs, or has ended."""
         return cut_off_message(self.folder)
 
     def close(self) -> None:
-        """Look away."""
+        """Stop following."""
         self._port.close()
 
     def __enter__(self) -> Follower:

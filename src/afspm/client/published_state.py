@@ -1,4 +1,4 @@
-"""What is known to be in force: the newest of each state that the scheduler has published."""
+"""The newest of each state that the scheduler has published."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from afspm.model import ControlState, Feedback, ProbePosition, ScanParameters, S
 
 
 class PublishedState:
-    """The newest published states, and how often each was published, so that one can wait for the next."""
+    """The newest published states, and how often each was published, so that a caller can wait for the next."""
 
     def __init__(self) -> None:
         self._newest: dict[str, Any] = {}
@@ -27,7 +27,7 @@ class PublishedState:
             self.newest_ns = time_ns
 
     def count(self, message: str) -> int:
-        """How often `message` has been published."""
+        """Return how often `message` has been published."""
         return self._published[message]
 
     @property

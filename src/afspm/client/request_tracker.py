@@ -1,4 +1,4 @@
-"""What a component has asked of the scheduler, and which answer belongs to what."""
+"""Matches the scheduler's answers with the requests of a component."""
 
 from __future__ import annotations
 

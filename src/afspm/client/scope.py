@@ -4,36 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from numbers import Real
 from pathlib import Path
 
 from afspm import wire
 from afspm.client.command_retry import SETTLED_WITHIN_S, CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.events import Events, PublishedEvent
+from afspm.client.experiment_view import ExperimentView
 from afspm.client.keyed_results import KeyedResults, check_key
 from afspm.client.link import ExperimentLink
 from afspm.client.measurement import MeasurementRunner
 from afspm.client.parameter_values import Value, to_parameter, value_in
 from afspm.client.setup import MeasurementSetup
 from afspm.client.targets import ScanTarget, SpectrumTarget
-from afspm.errors import ExperimentEnded, InvalidValue
+from afspm.errors import ExperimentEnded
 from afspm.model import (
     ControlMode,
     ControlRequest,
     ControlResponse,
-    ControlState,
     Feedback,
     Frame,
     Parameter,
-    ProbePosition,
     Problem,
     ProblemNames,
     Progress,
     Region,
-    ScanParameters,
     ScanSet,
-    ScopeState,
     Spectrum,
 )
 
@@ -42,8 +38,8 @@ __all__ = ["Events", "PublishedEvent", "Scope"]
 ANSWER_S = 60.0  # by default; what waits for control or for a measurement has no limit by default
 
 
-class Scope:
-    """What an experiment asks of the microscope. A call returns when what it asks for is done.
+class Scope(ExperimentView):
+    """Asks the microscope for scans, spectra, settings and actions. A call returns when that is done.
 
     Control is asked for by itself and given back after each call; `with scope.control():` keeps it over several. Where
     it is refused or taken away, calls wait until it is back. Timeouts are in real seconds; None waits for ever.
@@ -69,25 +65,15 @@ class Scope:
         between: Callable[[], None] = lambda: None,
         frame: Frame = Frame.TIP,
     ) -> None:
-        self._link = link
-        self._between = between
+        super().__init__(link, problems or ProblemNames(), between)
         self._frame = frame
-        self._depth = 0
         self._begun: tuple[int, int] | None = None  # what was done when progress was first told, and when
         self._flagged: dict[int, int] = {}  # by us, and how many control states had been published before
-        self.problems = problems or ProblemNames()
         self._control = ControlHold(link, self.problems)
         self._commands = CommandRetry(link, self._control)
         self._setup = MeasurementSetup(link.view, self._commands)
         self._results = KeyedResults(state_dir, link.name)
         self._runner = MeasurementRunner(link, self._control, self._commands, self._setup, self._results)
-
-    def __repr__(self) -> str:
-        view = self._link.view
-        control = view.control or ControlState(ControlMode.UNDEFINED)
-        flagged = "".join(f", {self.problems.name(number)} is flagged" for number in control.problems)
-        holder = control.holder or "nobody"
-        return f"<Scope {self._link.name!r}: {view.state.name}, {control.mode.name}, {holder} is in control{flagged}>"
 
     # --- measuring ---
 
@@ -268,10 +254,6 @@ class Scope:
             self.clear(problem)
         return tuple(map(self.problems.name, flagged))
 
-    def is_flagged(self, problem: int | str) -> bool:
-        """Return whether a problem, by name or number, is flagged."""
-        return self.problems.number(problem) in self.control_state.problems
-
     def set_mode(self, mode: ControlMode) -> None:
         """Set MANUAL (nobody has control) or AUTOMATED."""
         self._tell(ControlRequest.SET_CONTROL_MODE, int(mode))
@@ -295,67 +277,6 @@ class Scope:
             left_s = (now_ns - begun_ns) * 1e-9 / (done - begun) * (of - done)
         self._link.tell(Progress(now_ns, self._link.name, done, of, left_s))
 
-    # --- looking ---
-
-    @property
-    def state(self) -> ScopeState:
-        """The state of the microscope."""
-        self._catch_up()
-        return self._link.view.state
-
-    @property
-    def control_state(self) -> ControlState:
-        """Mode, holder and problems."""
-        self._catch_up()
-        return self._link.view.control or ControlState(ControlMode.UNDEFINED)
-
-    @property
-    def mode(self) -> ControlMode:
-        """MANUAL or AUTOMATED."""
-        return self.control_state.mode
-
-    @property
-    def scan_parameters(self) -> ScanParameters | None:
-        """Region and shape of the next scan; None if the microscope has not said."""
-        self._catch_up()
-        return self._link.view.scan_parameters
-
-    @property
-    def feedback(self) -> Feedback | None:
-        """The z feedback; None if the microscope has not said."""
-        self._catch_up()
-        return self._link.view.feedback
-
-    @property
-    def probe_position(self) -> ProbePosition | None:
-        """The position of the probe; None if the microscope has not said."""
-        self._catch_up()
-        return self._link.view.probe_position
-
-    def events(self, *envelopes: str, timeout_s: float | None = None) -> Events:
-        """Iterate over what is published from now on, as `PublishedEvent(envelope, message, time_ns)`.
-
-        Args:
-            envelopes: prefixes of those wanted; none: all.
-            timeout_s: ends the iteration when nothing came for that long.
-        """
-        return Events(self._link, envelopes, timeout_s)
-
-    def wait_until(self, condition: Callable[[], bool], *, timeout_s: float | None = None) -> bool:
-        """Wait until `condition()`, tried whenever something was published; False when the time is up."""
-        with self._call():
-            return self._link.wait(condition, self._link.until(timeout_s))
-
-    def sleep(self, experiment_s: float) -> None:
-        """Let experiment time pass. Unlike `time.sleep` it follows the experiment's clock, and ends with it."""
-        if not (isinstance(experiment_s, Real) and experiment_s >= 0.0):
-            raise InvalidValue(f"can't wait for {experiment_s!r}", hint="a number of seconds, zero or more")
-        clock = self._link.clock
-        end_s = clock.now_s() + experiment_s
-        with self._call():
-            while (left_s := end_s - clock.now_s()) > 0.0:
-                self._link.wait(lambda: False, self._link.until(clock.real_s(left_s)))
-
     # --- leaving ---
 
     def close(self) -> None:
@@ -378,23 +299,6 @@ class Scope:
         """Never keep control that an earlier life of this component died with. Called by the component's loop."""
         self._control.gives_back_inherited = True
         self._control.release_inherited()
-
-    @contextmanager
-    def _call(self) -> Iterator[None]:
-        """Around each call of the user; when the outermost is done, what arrived meanwhile is handled."""
-        self._link.check()
-        self._depth += 1
-        try:
-            yield
-        finally:
-            self._depth -= 1
-        if self._depth == 0:
-            self._between()
-
-    def _catch_up(self) -> None:
-        """Take in what has arrived, so that what is told is not from before the last computation."""
-        self._link.wait_caught_up()
-        self._link.pump(0.0)
 
     def _tell(self, kind: ControlRequest, subject: int | None) -> None:
         """Ask the scheduler itself, which needs no control."""

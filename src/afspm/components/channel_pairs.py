@@ -1,12 +1,16 @@
-"""From the channels of a scan, which are published one by one, to what a `TipJudge` is given."""
+"""The channels of a scan, which are published one by one: pairs of two, and a warning for those that never come."""
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from afspm.components.tip_judge import TipJudge, Verdict
 from afspm.model import Scan
 from afspm.units import convert
+
+ENOUGH_SCANS = 3  # before a channel counts as missing; the channels of one scan come one by one
 
 
 @dataclass(frozen=True)
@@ -17,7 +21,7 @@ class HeightPair:
     retrace: Scan | None
 
     def judged_by(self, judge: TipJudge) -> Verdict:
-        """What it tells of the tip.
+        """Return what the pair tells of the tip.
 
         Raises:
             UnitError: the channels are no heights.
@@ -51,6 +55,34 @@ class ChannelPairing:
             return None
         self._seen.clear()
         return HeightPair(trace, retrace)
+
+
+class MissingChannels:
+    """Says once that scans come, and none has a channel that is wanted.
+
+    Args:
+        channels: their names; an empty one is not wanted.
+    """
+
+    def __init__(self, channels: Collection[str], log: logging.Logger) -> None:
+        self._missing = set(filter(None, channels))
+        self._others: dict[str, None] = {}
+        self._times: set[int | None] = set()
+        self._log = log
+
+    def see(self, scan: Scan) -> None:
+        """One more channel."""
+        self._missing.discard(scan.channel)
+        if not self._missing:
+            return
+        self._others[scan.channel] = None
+        self._times.add(scan.time_ns)
+        if len(self._times) >= ENOUGH_SCANS:
+            missing, there = " and ".join(sorted(self._missing)), ", ".join(self._others)
+            self._log.error(
+                "the scans have no channel %s, so nothing is judged. There are %s: set which", missing, there
+            )
+            self._missing.clear()
 
 
 def _belong_together(one: Scan, other: Scan) -> bool:

@@ -218,7 +218,7 @@ class DriftPictures(DriftTable):
         raise FileError(f"has no channel {self.channel!r}", where=told.file)
 
     def _told(self) -> list[TabledScan]:
-        """What the table says."""
+        """Return the scans of the table."""
         path = Path(self.run_dir) / self.file
         if not path.exists():
             return []

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from afspm import wire
-from afspm.components.channel_pairs import ChannelPairing
+from afspm.components.channel_pairs import ChannelPairing, MissingChannels
 from afspm.components.feedback_metrics import FeedbackError, FeedbackQuality
 from afspm.components.feedback_signal import FeedbackObserver
-from afspm.components.missing_channels import MissingChannels
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import ControlState, Feedback, Problem, Scan
 

@@ -1,4 +1,4 @@
-"""How well the z feedback follows, from its error signal and the height; and where better gains may be found."""
+"""Metrics of how well the z feedback follows, from its error signal and the height, and a search for gains."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SWING = 0.2  # of the error, that the height has to share for an oscillation
 
 
 class FeedbackQuality(Enum):
-    """How the feedback follows the sample."""
+    """The quality with which the feedback follows the sample."""
 
     WELL = "follows"
     BARELY = "barely follows"
@@ -62,7 +62,7 @@ class FeedbackError:
 
 @dataclass(frozen=True)
 class FeedbackLimits:
-    """What a feedback that follows may leave: a share of pixels beyond the threshold, and one of the relief."""
+    """Limits of a feedback that follows: a share of pixels beyond the threshold, and one of the relief."""
 
     pixels: float = 0.1
     relief: float = 0.2

@@ -32,7 +32,7 @@ class LineFile:
         self._told = OutageLog("lines wait to be written", _log)
 
     def lines(self) -> list[str]:
-        """What is there, the header not counted; without a last line that is not whole.
+        """Return the lines that are there, without the header and a last line that is not whole.
 
         Raises:
             FileError: it can't be read.

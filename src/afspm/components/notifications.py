@@ -1,4 +1,4 @@
-"""What people are told outside of the experiment: by a command that is run, by a webhook, tried again if that fails."""
+"""Notifications of people outside of the experiment, by a command or a webhook."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ Way = Literal["command", "webhook"]
 
 
 class NotDelivered(AfspmError):
-    """Nobody was told, for now."""
+    """A notification that could not be delivered, for now."""
 
 
 @dataclass(frozen=True)
 class Notification:
-    """Something that people are to be told.
+    """A notification for people.
 
     Attributes:
         what: one of OCCASIONS.
@@ -60,7 +60,7 @@ class Notification:
 
 @dataclass(frozen=True)
 class Targets:
-    """Who is told.
+    """The targets of notifications.
 
     Attributes:
         command: program and arguments; it gets the JSON on its standard input.
@@ -167,5 +167,5 @@ def _short(reason: Any) -> str:
 
 
 def delay_s(tries: int) -> float:
-    """How long to wait after so many tries that failed, in real time."""
+    """Return how long to wait after so many tries that failed, in real time."""
     return float(min(LONGEST_DELAY_S, FIRST_DELAY_S * 2 ** max(0, tries - 1)))

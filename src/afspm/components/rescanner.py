@@ -117,12 +117,12 @@ class Rescanner(Component):
             self.scope.set(names.SCAN_DIRECTION, names.UP if message.upwards else names.DOWN)
 
     def _note_before(self, name: str, value: Any) -> None:
-        """What was there before is kept until it is put back, also by one that is started after a kill."""
+        """Keep what was set before until it is put back, also by a life after a kill."""
         self.memory.setdefault(name, value)
         self.memory.save()
 
     def _put_back(self) -> None:
-        """What was changed to scan again: the next scan may take what it finds."""
+        """Undo what was changed to scan again: the next scan may take what it finds."""
         if (direction := self.memory.get(_BEFORE)) is not None:
             self.scope.set(names.SCAN_DIRECTION, direction)
             self.memory.pop(_BEFORE)
@@ -132,7 +132,7 @@ class Rescanner(Component):
         self.memory.save()
 
     def _put_back_at_last(self) -> None:
-        """The same where control was lost before that: somebody else has said that there is no drift."""
+        """Undo it where control was lost before that: another component has cleared the drift."""
         if _BEFORE not in self.memory and _FRAME_BEFORE not in self.memory:
             return
         try:
@@ -171,7 +171,7 @@ class Rescanner(Component):
             self.log.warning("the region of the scans before could not be set again: %s", refused.reason)
 
     def _is_as_asked(self, kind: int, told: Events) -> bool:
-        """Whether the scan was what it was taken for, by what was told of it right before it was published."""
+        """Return whether the scan succeeded, by the drift mapping that was published right before it."""
         mapping = None
         for event in told:
             mapping = event.message
@@ -183,7 +183,7 @@ class Rescanner(Component):
         return bool(mapping.matched and not mapping.lost and (kind == RescanKind.OPPOSITE or not mapping.rescan))
 
     def _forget(self, told: Events) -> None:
-        """What was told of earlier scans."""
+        """Drop the drift mappings of earlier scans."""
         for _ in told:
             pass
 

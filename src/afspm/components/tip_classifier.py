@@ -6,8 +6,7 @@ from typing import ClassVar
 
 from afspm.client.component import Component
 from afspm.components import tip_verdict
-from afspm.components.channel_pairs import ChannelPairing, HeightPair
-from afspm.components.missing_channels import MissingChannels
+from afspm.components.channel_pairs import ChannelPairing, HeightPair, MissingChannels
 from afspm.components.tip_judge import Opinion, TipJudge, TipTolerance, Verdict, VerdictCounter
 from afspm.errors import UnitError
 from afspm.model import ControlState, Scan

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
 from typing import ClassVar, Literal
 
-from afspm import wire
 from afspm.client.component import Component
 from afspm.client.events import Events
 from afspm.components import tip_verdict
 from afspm.components.channel_pairs import ChannelPairing
 from afspm.components.planned_scans import pair
 from afspm.components.tip_judge import Opinion, TipJudge
-from afspm.components.tip_treatments import XY, Pulse, Treatment, clearance_m, fresh_place, treatments
+from afspm.components.tip_treatments import treatments
 from afspm.components.tip_verdict import read_verdict
+from afspm.components.tip_workshop import DONE_ACTION, TipWorkshop, nm
 from afspm.errors import AfspmError, ConfigError, ControlLost, FileError, NoResponse, Refused
-from afspm.model import Problem, Region, Scan, ScanSet, ScopeState, names
+from afspm.model import Problem, Region, Scan, ScanSet, names
 from afspm.units import Duration, Length, Speed, Voltage
 
 VERDICT_WITHIN_S = 20.0  # real time: a classifier that says nothing for that long will not
-SETTLED_WITHIN_S = 2.0  # real time: a microscope that does not say that it is busy is taken to be ready then
-DONE_ACTION = "ActionMsg"
 
 
 class TipCorrector(Component):
@@ -81,7 +77,6 @@ class TipCorrector(Component):
     ) -> None:
         self.workshop_center = pair(workshop_center)
         self.test_center = None if test_center is None else pair(test_center)
-        self._frame: Region | None = None  # of our own, about a place
         self.allowed = treatments(pulse_voltages, pulse_duration, crash_depths, crash_speed)
         pulses = (names.PULSE,) if pulse_voltages else ()
         crashes = (names.CRASH,) if crash_depths else ()
@@ -94,6 +89,7 @@ class TipCorrector(Component):
         self.judge = TipJudge(reference_scans) if judge == "self" else None
 
     def run(self) -> None:
+        self._workshop = TipWorkshop(self, self.problem, self.workshop_center, self.place_spacing, self.keep_away)
         if self.judge is not None and "judge" in self.memory:
             self.judge.restore(self.memory["judge"])
         wanted = ("ControlState",) if self.judge is None else ("ControlState", "Scan2d")
@@ -138,7 +134,9 @@ class TipCorrector(Component):
                 if tried and self._is_cured(looks, shape, answers):  # a kill may have come between treatment and test
                     return
                 for number, treatment in enumerate(self.allowed[tried:], tried + 1):
-                    if self._treat(number, treatment, (region, test)) and self._is_cured(looks, shape, answers):
+                    if self._workshop.treat(number, treatment, (region, test)) and self._is_cured(
+                        looks, shape, answers
+                    ):
                         self.log.info("the tip is repaired")
                         return
                 why = f"all {len(self.allowed)} treatments that are allowed were tried"
@@ -161,103 +159,6 @@ class TipCorrector(Component):
         shape = self.memory["shape"]
         return Region((x, y), (width, height), angle), (shape[0], shape[1]) if shape else None
 
-    def _treat(self, number: int, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
-        """Whether the `number`-th treatment was done, at a place that the probe was moved to in the same tenure."""
-        while True:
-            place = self._fresh_place(number)
-            try:
-                with self.scope.control(unbroken=True):
-                    return self._treat_at(place, treatment, safe)
-            except Refused as refused:
-                self.log.warning("no %s, it was refused: %s", treatment, refused.reason)
-                return False
-            except ControlLost as lost:
-                if not self.scope.is_flagged(self.problem):
-                    raise
-                self.log.warning("no %s yet: %s; it is begun again at a fresh place", treatment, lost.what)
-
-    def _fresh_place(self, number: int) -> XY:
-        """Where the `number`-th treatment is to be tried. It is counted before: a kill must not make it happen twice.
-
-        Raises:
-            FileError: that can't be written down.
-        """
-        places = int(self.memory.get("places", 0))
-        self.memory["tried"], self.memory["places"] = number, places + 1
-        if not self.memory.save():
-            raise FileError("the disk is full: a treatment that can't be written down would be done again by a restart")
-        return fresh_place(self.workshop_center, self.place_spacing, places)
-
-    def _treat_at(self, place: XY, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
-        """Whether it was done. All of it in one tenure of control: whoever has it in between may move the probe."""
-        parameters = self.scope.scan_parameters  # a person may have chosen another region meanwhile
-        if parameters is not None and isinstance(parameters.region, Region) and parameters.region != self._frame:
-            safe = (*safe, parameters.region)
-        if (away := min(clearance_m(place, region) for region in safe)) < self.keep_away:
-            self.log.error("no %s: its place is only %.0f nm away from what is scanned", treatment, away * 1e9)
-            return False
-        action = names.PULSE if isinstance(treatment, Pulse) else names.CRASH
-        if not self.scope.supports(action):
-            self.log.warning("no %s: the microscope has no %s", treatment, action)
-            return False
-        self._go_to(place)
-        self._prepare(treatment)
-        if not self.scope.wait_until(
-            lambda: self._stands_at(place) or not self.scope.in_control, timeout_s=SETTLED_WITHIN_S
-        ):
-            self.log.error("no %s: the probe is %s, and not at %s", treatment, self._where(), _nm(place))
-            return False
-        where = self._where()
-        self._act(action)
-        self.log.info("%s %s", treatment, where)
-        self.publish(wire.message_type(DONE_ACTION)(action=action), f"{DONE_ACTION}_{self.name}")
-        return True
-
-    def _go_to(self, place: XY) -> None:
-        """Move the probe to a place; with the scan frame, where the microscope moves its tip in that alone."""
-        try:
-            self.scope.move_probe(place)
-        except Refused as refused:
-            parameters = self.scope.scan_parameters
-            if parameters is None or not isinstance(parameters.region, Region):
-                raise
-            self.log.debug("the frame goes along to %s: %s", _nm(place), refused.reason)
-            size_m = (self.place_spacing, self.place_spacing)
-            self._frame = replace(parameters.region, center_m=place, size_m=size_m)
-            self.scope.set_scan_region(self._frame)
-            self.scope.move_probe(place)
-
-    def _stands_at(self, place: XY) -> bool:
-        """Whether the probe is published to be so near to a place that no other one is nearer."""
-        position = self.scope.probe_position
-        return position is not None and math.dist(position.xy_m, place) <= self.place_spacing / 2
-
-    def _where(self) -> str:
-        position = self.scope.probe_position
-        return "nobody knows where" if position is None else f"at {_nm(position.xy_m)}"
-
-    def _act(self, action: str) -> None:
-        """Do it, and let it end: what is asked of a busy microscope it refuses."""
-        with self.scope.events("ScopeStateMsg", timeout_s=SETTLED_WITHIN_S) as states:
-            try:
-                self.scope.action(action)
-            except NoResponse as silent:
-                self.log.warning("%s: it counts as done, %s", silent.what, silent.hint)
-                return
-            was_busy = False
-            for event in states:
-                if event.message.state is ScopeState.FREE and was_busy:
-                    return
-                was_busy = True
-
-    def _prepare(self, treatment: Treatment) -> None:
-        if isinstance(treatment, Pulse):
-            self.scope.set(names.PULSE_VOLTAGE, treatment.voltage_v, "V")
-            self.scope.set(names.PULSE_DURATION, treatment.duration_s, "s")
-        else:
-            self.scope.set(names.CRASH_DEPTH, treatment.depth_m, "m")
-            self.scope.set(names.CRASH_SPEED, treatment.speed_m_per_s, "m/s")
-
     def _is_cured(self, looks: tuple[Region, ...], shape: tuple[int, int] | None, answers: Events) -> bool:
         """Test scans until it is known whether the tip is good.
 
@@ -269,7 +170,7 @@ class TipCorrector(Component):
             try:
                 scans = self.scope.scan(place, shape=shape)
             except (Refused, NoResponse) as error:
-                self.log.warning("no test scan at %s: %s", _nm(place.center_m), error.what)
+                self.log.warning("no test scan at %s: %s", nm(place.center_m), error.what)
                 refused.append(error.what)
                 if len(refused) == len(looks):
                     raise _Blind(f"no test scan can be taken: {error.what}") from error
@@ -344,7 +245,3 @@ class TipCorrector(Component):
 
 class _Blind(AfspmError):
     """Nobody can tell what the tip is like."""
-
-
-def _nm(place: XY) -> str:
-    return f"({place[0] * 1e9:.0f}, {place[1] * 1e9:.0f}) nm"

@@ -59,7 +59,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class TipTolerance:
-    """How far a tip may be from the reference and still be called good.
+    """The distance from the reference at which a tip is still called good.
 
     Attributes:
         detail: at a known place, the share of the fine detail that is left at least.
@@ -114,7 +114,7 @@ class KnownPlace:
 
 @dataclass
 class TipReference:
-    """What the scans of a good tip are like, all of the same size, angle and shape.
+    """The scans of a good tip, all of the same size, angle and shape.
 
     Attributes:
         size_m, angle_rad, shape: of those scans.
@@ -169,7 +169,7 @@ class TipReference:
 
 @dataclass
 class JudgeState:
-    """What survives a restart: the reference, those begun of scans of other sizes, and whether the tip is suspect."""
+    """State that survives a restart: the reference, those begun of scans of other sizes, and a suspicion."""
 
     reference: TipReference | None = None
     others: list[TipReference] = field(default_factory=list)

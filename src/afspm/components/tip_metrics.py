@@ -35,7 +35,7 @@ LEAST_CONTRAST = 0.1  # slopes common to trace and retrace against those of nois
 
 @dataclass(frozen=True)
 class TipMetrics:
-    """What one scan says about the tip.
+    """Metrics of the tip from one scan.
 
     Attributes:
         detail: short-wave against long-wave power of the slopes.

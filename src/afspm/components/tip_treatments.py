@@ -1,4 +1,4 @@
-"""What is tried to make a tip good again, in which order and where: pure, so that nothing surprising is ever done."""
+"""Treatments of a tip, their order and their places: pure, so that nothing surprising is ever done."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def treatments(
     crash_depths_m: Sequence[float],
     crash_speed_m_per_s: float,
 ) -> tuple[Treatment, ...]:
-    """The gentle ones first: pulses as listed, then crashes as listed. This is all that one repair may do.
+    """Return all that one repair may do, the gentle ones first: pulses as listed, then crashes as listed.
 
     Raises:
         ConfigError: nothing is listed, or a value that is no treatment.
@@ -60,14 +60,14 @@ def treatments(
 
 
 def fresh_place(center_m: XY, spacing_m: float, number: int) -> XY:
-    """The number-th place around a centre that no other lies within `spacing_m` of: sunflower seeds (Vogel 1979)."""
+    """Return the number-th place around a centre, `spacing_m` from all others: sunflower seeds (Vogel 1979)."""
     radius = 1.2 * spacing_m * math.sqrt(number)
     angle = number * math.pi * (3.0 - math.sqrt(5.0))
     return center_m[0] + radius * math.cos(angle), center_m[1] + radius * math.sin(angle)
 
 
 def clearance_m(place_m: XY, region: Region) -> float:
-    """How far a place lies outside of a region; 0 within."""
+    """Return how far a place lies outside of a region; 0 within."""
     cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
     dx, dy = place_m[0] - region.center_m[0], place_m[1] - region.center_m[1]
     u, v = dx * cos + dy * sin, -dx * sin + dy * cos

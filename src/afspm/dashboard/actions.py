@@ -1,18 +1,24 @@
-"""What a person can do to a running experiment. Everything is asked of the scheduler, which may say no."""
+"""Actions of a person on a running experiment: requests to the scheduler, which may refuse them."""
 
 from __future__ import annotations
 
+import logging
 import math
+import threading
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 from afspm import wire
 from afspm.client.link import ExperimentLink
 from afspm.client.parameter_values import from_parameter, to_parameter
+from afspm.clock import Clock
+from afspm.dashboard.access import Access, Visitor, check_name
 from afspm.dashboard.watch import Watch
-from afspm.dashboard.words import position
-from afspm.formatting import quantity
+from afspm.errors import AfspmError
+from afspm.formatting import quantity, typeset_position
+from afspm.launch import Launch
 from afspm.model import (
     RESTART_REQUEST,
     ControlMode,
@@ -26,17 +32,23 @@ from afspm.model import (
     ScopeState,
     names,
 )
+from afspm.model.events import PERSON
 from afspm.model.geometry import XY
+from afspm.process.context import new_session
 from afspm.record.overview import Overview
+from afspm.transport.network import Network
+from afspm.transport.port import ParentGone
+from afspm.transport.zmq_port import ZmqPort
 
 ANSWER_S = 20.0  # real time that an answer may take
 FREE_S = 60.0  # that the microscope may take to get to a place
 SETTLED_S = 2.0  # what was set is published by then, if it changed anything
+MOST_PERSONS = 32
 
 
 @dataclass(frozen=True)
 class ActionResult:
-    """What came of an action; `text` says it to the person, with the reason where it was refused."""
+    """The result of an action; `text` is for the person, with the reason of a refusal."""
 
     text: str
     ok: bool = True
@@ -117,7 +129,7 @@ class Actions:
             if not response.ok:
                 return _result(response, "")
             self._settle(lambda o: o.scan_parameters is not None and _fits(o.scan_parameters, wanted))
-        where = "" if region is None else f" at {position(region.center_m)}"
+        where = "" if region is None else f" at {typeset_position(region.center_m)}"
         return _result(self._when_free(names.START_SCAN), f"The scan{where} begins")
 
     def spectrum(self, at_m: XY | None = None) -> ActionResult:
@@ -127,12 +139,12 @@ class Actions:
             if not response.ok:
                 return _result(response, "")
             self._settle(lambda o: o.probe_position is not None and _near(o.probe_position.xy_m, at_m))
-        where = "" if at_m is None else f" at {position(at_m)}"
+        where = "" if at_m is None else f" at {typeset_position(at_m)}"
         return _result(self._when_free(names.START_SPEC), f"The spectrum{where} begins")
 
     # --- within ---
 
-    def _ask(self, kind: int, subject: Any = None) -> Response:
+    def _ask(self, kind: int, subject: object = None) -> Response:
         self._link.pump(0.0)  # what has come of the connection since we asked last
         return self._link.request(kind, subject, until_s=self._link.until(ANSWER_S))
 
@@ -191,3 +203,83 @@ def _fits(now: ScanParameters, wanted: ScanParameters) -> bool:
 
 def _near(a: XY, b: XY) -> bool:
     return math.dist(a, b) < 1e-3 * max(math.hypot(*b), 1e-9)
+
+
+Action = Callable[[Actions], ActionResult]
+
+
+@dataclass
+class _Person:
+    """A person's connection to the scheduler, used by one thread."""
+
+    thread: ThreadPoolExecutor
+    actions: Actions | None = None
+    port: ZmqPort | None = None
+
+    def close(self) -> None:
+        if self.port is not None:
+            self.port.wake_up(ParentGone())
+            self.thread.submit(self.port.close)
+        self.thread.shutdown(wait=False)
+
+
+class Steering:
+    """Carries out what persons ask for, each in the own name, one thing after the other for each.
+
+    Args:
+        launch: the line that the dashboard was started with; persons reach the scheduler as it does, with its keys.
+        access: knows who has signed in.
+    """
+
+    def __init__(self, launch: Launch, clock: Clock, watch: Watch, access: Access) -> None:
+        self._launch = launch
+        self._access = access
+        self._clock = clock
+        self._watch = watch
+        self._lock = threading.Lock()
+        self._persons: OrderedDict[str, _Person] = OrderedDict()
+        self._log = logging.getLogger("afspm.dashboard")
+
+    def do(self, visitor: Visitor, action: Action) -> Future[ActionResult]:
+        """Carry out an action in the name of a person, who must have one and not have signed out."""
+        person = check_name(visitor.person)
+        if not person or not self._access.is_signed_in(visitor):
+            done: Future[ActionResult] = Future()
+            done.set_result(ActionResult("Sign in first: what is done is in the record with a name.", ok=False))
+            return done
+        with self._lock:
+            one = self._persons.get(person)
+            if one is None:
+                while len(self._persons) >= MOST_PERSONS:
+                    self._persons.popitem(last=False)[1].close()
+                one = self._persons[person] = _Person(ThreadPoolExecutor(1, thread_name_prefix="person"))
+            self._persons.move_to_end(person)
+        return one.thread.submit(self._carry_out, person, one, action)
+
+    def close(self) -> None:
+        """End all connections; what is under way ends without an answer."""
+        with self._lock:
+            persons, self._persons = list(self._persons.values()), OrderedDict()
+        for one in persons:
+            one.close()
+
+    def _carry_out(self, person: str, one: _Person, action: Action) -> ActionResult:
+        try:
+            if one.actions is None:
+                one.port, one.actions = self._connect(person)
+            result = action(one.actions)
+        except AfspmError as error:
+            result = ActionResult(str(error), ok=False)
+        except Exception as error:
+            self._log.exception("an action of %s failed", person)
+            result = ActionResult(f"that failed: {type(error).__name__}: {error}", ok=False)
+        self._log.debug("%s: %s%s", person, result.text, "" if result.ok else " (not done)")
+        return result
+
+    def _connect(self, person: str) -> tuple[ZmqPort, Actions]:
+        launch = self._launch
+        name = f"{launch.name}{PERSON}{person}"
+        network = Network.from_launch(launch.name, launch.keys)
+        port = ZmqPort(network, name, self._clock, control=launch.sockets.control)
+        link = ExperimentLink.of_launch(launch, port, new_session(launch.run), name=name, log=self._log)
+        return port, Actions(link, self._watch)

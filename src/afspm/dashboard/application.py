@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import AsyncIterator, Callable
-from pathlib import Path
 
 from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
@@ -13,17 +12,14 @@ from nicegui import app as nicegui
 from nicegui import ui
 
 from afspm.dashboard.access import Access, Visitor, is_loopback
+from afspm.dashboard.actions import Steering
 from afspm.dashboard.archive import Archive
 from afspm.dashboard.content import Contents
 from afspm.dashboard.live import Live
-from afspm.dashboard.page import Page, Services
+from afspm.dashboard.page import ASSETS, Page, Services
 from afspm.dashboard.sign_in import VISITOR, AsgiApp, Guard, add_sign_in
-from afspm.dashboard.signals import Audience, Bell
-from afspm.dashboard.steering import Steering
-from afspm.dashboard.watch import Watch
+from afspm.dashboard.watch import Audience, Bell, Watch
 from afspm.model import Region
-
-ASSETS = Path(__file__).with_name("assets")
 
 
 def application(

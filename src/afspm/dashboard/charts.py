@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from afspm.dashboard.words import position
 from afspm.drawing.curves import Array, thinned
-from afspm.formatting import quantity, scale, time_of_day
+from afspm.formatting import quantity, scale, time_of_day, typeset_position
 from afspm.model import Spectrum
 from afspm.record.overview import DriftPoint
 
+Options = dict[str, Any]
 BEFORE = 6  # spectra that are shown faintly behind the newest
 MOST_DRIFT = 5_000
 _MARGINS = {"left": 8, "right": 16, "top": 30, "bottom": 28, "containLabel": True}
@@ -28,7 +28,7 @@ class Chart:
     """A chart and the HTML above it; `options` of None: nothing to draw."""
 
     words: str
-    options: dict[str, Any] | None = None
+    options: Options | None = None
 
 
 def drift_chart(points: Sequence[DriftPoint]) -> Chart:
@@ -57,7 +57,7 @@ def _drift_words(point: DriftPoint) -> str:
         return f'<p class="alarm">The sample is lost: {escape(point.reason) or "no scan fits"}</p>'
     how = "corrected" if point.correcting else "not corrected yet"
     word = "" if point.matched else f"; the last scan did not fit ({escape(point.reason)})"
-    return f"<p>{position(point.translation_m)}, moving at {quantity(speed, 'm')}/min, {how}{word}</p>"
+    return f"<p>{typeset_position(point.translation_m)}, moving at {quantity(speed, 'm')}/min, {how}{word}</p>"
 
 
 def spectrum_chart(spectra: Sequence[tuple[int, Spectrum]], variable: str) -> Chart:
@@ -79,7 +79,7 @@ def spectrum_chart(spectra: Sequence[tuple[int, Spectrum]], variable: str) -> Ch
     series = [_line(s.values[:, 0] * across, s[variable] * up, colour) for s, colour in drawn]
     for one in series[:-1]:
         one["lineStyle"]["opacity"] = 0.4
-    where = "" if last.position_m is None else f" at {position(last.position_m)}"
+    where = "" if last.position_m is None else f" at {typeset_position(last.position_m)}"
     words = f"<p>{escape(last.kind or 'Spectrum')}{where}, {time_of_day(time_ns)}</p>"
     axis = {"type": "value", "scale": True, "name": _named(last.names[0], unit_across)}
     return Chart(words, _options(series, axis, _named(variable, unit_up)))
@@ -93,7 +93,7 @@ def _named(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
-def _line(x: Array, y: Array, colour: str, name: str = "") -> dict[str, Any]:
+def _line(x: Array, y: Array, colour: str, name: str = "") -> Options:
     style = {"color": colour}
     return {
         "type": "line", "name": name, "data": _pairs(*thinned(x, y)), "showSymbol": False, "itemStyle": style,
@@ -107,7 +107,7 @@ def _pairs(x: Array, y: Array) -> list[list[float | None]]:
     return [[a if math.isfinite(a) else None, float(f"{b:.6g}") if math.isfinite(a + b) else None] for a, b in points]
 
 
-def _options(series: list[dict[str, Any]], x: dict[str, Any], y_name: str) -> dict[str, Any]:
+def _options(series: list[Options], x: Options, y_name: str) -> Options:
     axis = {
         "axisLabel": {"color": _QUIET},
         "axisLine": {"onZero": False, "lineStyle": {"color": _LINE}},

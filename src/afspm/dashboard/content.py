@@ -1,4 +1,4 @@
-"""What the page shows, as HTML made once for all who look at it."""
+"""The content of the page, as HTML made once for all viewers."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from afspm.clock import NS_PER_S
 from afspm.dashboard.charts import Chart, drift_chart
 from afspm.dashboard.sample_map import MapContent, map_html
 from afspm.dashboard.watch import Watch
-from afspm.dashboard.words import colour_class, position
-from afspm.drawing.timeline import TimelineRow, timeline_html
-from afspm.formatting import day_and_time, duration_text, time_of_day
+from afspm.drawing.timeline import TimelineRow, timeline_html, tint_class
+from afspm.formatting import day_and_time, duration_text, time_of_day, typeset_position
 from afspm.model import ControlMode, JournalEntry, LogLine, ProcessState, Region
 from afspm.record.overview import OVER, Overview
 from afspm.record.timeline import Span, Timeline
@@ -29,7 +28,7 @@ Flag = tuple[int, str, str]
 
 @dataclass(frozen=True)
 class SlowContent:
-    """What takes longer to make; `sample_map_near` is the part where something was measured."""
+    """The parts that take longer to make; `sample_map_near` shows only where something was measured."""
 
     sample_map: str = ""
     sample_map_near: str = ""
@@ -148,7 +147,7 @@ def trouble(watch: Watch) -> str:
 
 def rows_of(overview: Overview, silent: Mapping[str, int]) -> Iterator[TimelineRow]:
     """Yield the rows of the time line: control, mode, scope state, each problem, each process."""
-    yield TimelineRow("control", overview.controls.spans, colour_class)
+    yield TimelineRow("control", overview.controls.spans, tint_class)
     yield TimelineRow("mode", overview.modes.spans, lambda label: f"mode-{label}")
     yield TimelineRow("microscope", overview.states.spans, lambda label: f"state-{label.replace('_', '-')}")
     for number, lane in sorted(overview.problem_timelines.items()):
@@ -176,7 +175,7 @@ def status_html(watch: Watch, overview: Overview) -> str:
         "" if since_ns is None else f" since {time_of_day(since_ns)} ({duration_text((now_ns - since_ns) / NS_PER_S)})"
     )
     mode = control.mode.name
-    who = f'<b class="{colour_class(control.holder)}">{escape(control.holder)}</b>' if control.holder else "nobody"
+    who = f'<b class="{tint_class(control.holder)}">{escape(control.holder)}</b>' if control.holder else "nobody"
     parts = [
         _chip(mode, "mode", f"mode-{mode.lower()}"),
         _chip(f"{who} is in control<small>{since}</small>", "holder"),
@@ -204,7 +203,7 @@ def _microscope(overview: Overview, now_ns: int) -> Iterator[str]:
     far = "" if done is None else f" {100 * done[0]:.0f} %, {duration_text(done[1] / NS_PER_S)} left"
     yield _chip(f"microscope {state}{paused}{far}", "state", f"state-{state.replace(' ', '-')}")
     if overview.probe_position is not None:
-        yield _chip(f"probe {position(overview.probe_position.xy_m)}", "probe", "quiet")
+        yield _chip(f"probe {typeset_position(overview.probe_position.xy_m)}", "probe", "quiet")
     feedback = overview.feedback
     if feedback is not None and feedback.on is not None:
         at = "" if feedback.setpoint is None else f", setpoint {feedback.setpoint:.4g}"
@@ -223,7 +222,7 @@ def refusals_html(refusals: Iterable[JournalEntry], most: int = 40) -> str:
     if not newest:
         return '<p class="nothing">Nothing has been refused.</p>'
     rows = "".join(
-        f'<li><time>{time_of_day(one.time_ns)}</time> <b class="{colour_class(one.who)}">{escape(one.who)}</b> '
+        f'<li><time>{time_of_day(one.time_ns)}</time> <b class="{tint_class(one.who)}">{escape(one.who)}</b> '
         f"{escape(one.what)}<q>{escape(one.reason) or 'no reason was given'}</q></li>"
         for one in newest
     )

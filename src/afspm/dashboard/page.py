@@ -7,20 +7,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from html import escape
+from pathlib import Path
 
 from nicegui import ui
 
 from afspm.dashboard.access import Access, Visitor
+from afspm.dashboard.actions import Steering
 from afspm.dashboard.content import Content, Contents
 from afspm.dashboard.panels import ChartPanel, HealthPanel, LogPanel, SpectraPanel
 from afspm.dashboard.sign_in import SIGN_IN
-from afspm.dashboard.signals import Audience
-from afspm.dashboard.steering import Steering
 from afspm.dashboard.steering_panel import SteeringPanel
-from afspm.dashboard.watch import Watch
+from afspm.dashboard.watch import Audience, Watch
 from afspm.drawing import timeline
 from afspm.drawing.palette import PALETTES
 
+ASSETS = Path(__file__).with_name("assets")
 REFRESH_S = 0.5
 ANSWER_S = 5.0  # a browser that has not drawn the last for so long gets nothing more until it has
 THEMES = {"": None, "light": False, "dark": True}
@@ -31,7 +32,7 @@ SIMULATED = "SIMULATED: this is no real microscope"
 
 @dataclass(frozen=True)
 class Services:
-    """What the page is made from.
+    """The parts of the dashboard that every page uses.
 
     Attributes:
         title: the name of the experiment.
@@ -192,36 +193,7 @@ def _section(title: str, name: str) -> Iterator[None]:
         yield
 
 
-def _choice(part: str, label: str, options: dict[str, str]) -> str:
-    inner = "".join(f'<option value="{value}">{text}</option>' for value, text in options.items())
-    return f'<label>{label}<select data-part="{part}">{inner}</select></label>'
-
-
 def _image_html() -> str:
     """Return what assets/image.js brings to life."""
-    levelling = {"plane": "plane", "lines": "line by line", "none": "none"}
-    contrast = {"robust": "99 %", "full": "all values"}
-    tools = {"look": "Look", "profile": "Profile", "scan": "Scan here", "spectrum": "Spectrum here"}
-    buttons = "".join(
-        f'<button type="button" data-tool="{tool}" aria-pressed="{str(tool == "look").lower()}"'
-        f"{' class=measure' if tool in ('scan', 'spectrum') else ''}>{text}</button>"
-        for tool, text in tools.items()
-    )
-    zoom = {"1.5": ("+", "Zoom in"), "0.667": ("−", "Zoom out"), "0": ("all", "Show all of it")}
-    zooms = "".join(
-        f'<button type="button" data-zoom="{by}" aria-label="{label}">{text}</button>'
-        for by, (text, label) in zoom.items()
-    )
-    return (
-        '<div id="image" class="image"><div class="tools">'
-        f"{_choice('channel', 'Channel', {})}{_choice('levelling', 'Level', levelling)}"
-        f"{_choice('contrast', 'Colours for', contrast)}{_choice('palette', 'Map', {p: p for p in PALETTES})}</div>"
-        f'<div class="tools"><div class="group" role="group" aria-label="What the pointer does">{buttons}</div>'
-        f'<div class="group" role="group" aria-label="Zoom">{zooms}</div>'
-        '<button type="button" class="live" data-part="live">Back to the newest scan</button></div>'
-        '<canvas data-part="canvas" class="picture" tabindex="0" role="img" '
-        'aria-label="The scan. Arrow keys move the cross, plus and minus zoom, 0 shows all of it."></canvas>'
-        '<output class="readout" data-part="readout" aria-live="polite">Point at the scan to read its values.</output>'
-        '<canvas data-part="profile" class="profile" hidden role="img" aria-label="Profile along the line"></canvas>'
-        '<p class="caption"><span data-part="caption">No scan yet.</span> <small data-part="hint"></small></p></div>'
-    )
+    palettes = "".join(f'<option value="{name}">{name}</option>' for name in PALETTES)
+    return (ASSETS / "image.html").read_text(encoding="utf-8").replace("{palettes}", palettes)

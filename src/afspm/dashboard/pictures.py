@@ -1,29 +1,24 @@
-"""Frames as pictures for the browser, each made once however many look at it, and values along a line."""
+"""Frames as pictures for the browser, each made once however many look at it."""
 
 from __future__ import annotations
 
 import json
 import math
 import threading
-from collections import OrderedDict
 from dataclasses import dataclass
-
-import numpy as np
+from functools import lru_cache
 
 from afspm.dashboard.frames import ChannelFrame
 from afspm.drawing.levelling import Array, Levelling, levelled
 from afspm.drawing.palette import PALETTES
 from afspm.drawing.raster import Contrast, ValueRange, indices, png, value_range
-from afspm.model import Region
 
 KEPT = 8
-MOST_POINTS = 1024
-Pixel = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """How a viewer wants to see a scan."""
+    """Levelling, contrast and colours in which a viewer wants to see a scan."""
 
     levelling: Levelling = Levelling.PLANE
     contrast: Contrast = Contrast.ROBUST
@@ -41,8 +36,8 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
-    """A frame as it is seen.
+class RenderedFrame:
+    """A frame as a viewer sees it.
 
     Attributes:
         values: levelled, [y, x].
@@ -79,66 +74,24 @@ class Picture:
 
 
 class PictureCache:
-    """Draws, from any thread; keeps the newest few pictures."""
+    """Draws, from any thread; keeps the newest few pictures. A frame is known by its number."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._drawn: OrderedDict[tuple[int, Look], Picture] = OrderedDict()
+        self._drawn = lru_cache(KEPT)(_draw)
 
-    def draw(self, frame: ChannelFrame, look: Look) -> Picture:
+    def draw(self, frame: ChannelFrame, look: Look) -> RenderedFrame:
         """Return the picture of a frame."""
-        key = (frame.number, look)
         with self._lock:  # two that want the same wait for one; two that want others share a core anyway
-            drawn = self._drawn.get(key)
-            if drawn is None:
-                drawn = self._drawn[key] = _draw(frame, look)
-                while len(self._drawn) > KEPT:
-                    self._drawn.popitem(last=False)
-            else:
-                self._drawn.move_to_end(key)
-            return drawn
+            return self._drawn(frame, look)
 
 
-def _draw(frame: ChannelFrame, look: Look) -> Picture:
+def _draw(frame: ChannelFrame, look: Look) -> RenderedFrame:
     values = levelled(frame.values, look.levelling)
     span = value_range(values, look.contrast)
-    return Picture(frame, look, values, span, png(indices(values, span), look.palette))
+    return RenderedFrame(frame, look, values, span, png(indices(values, span), look.palette))
 
 
 def number_or_none(value: float) -> float | None:
     """Return a number as JSON has it, which knows no NaN."""
     return value if math.isfinite(value) else None
-
-
-def profile(values: Array, region: Region, begin: Pixel, end: Pixel) -> tuple[Array, Array]:
-    """Return (distances in m, values) along a line in the scan, linear between pixels, about one point a pixel.
-
-    Args:
-        values: [y, x], y ascending; NaN where nothing was measured.
-        begin, end: (column, row), fractions of pixels allowed; what lies outside is moved to the border.
-    """
-    ny, nx = values.shape
-    (x0, y0), (x1, y1) = ((min(max(x, 0.0), nx - 1.0), min(max(y, 0.0), ny - 1.0)) for x, y in (begin, end))
-    count = min(MOST_POINTS, max(2, round(math.hypot(x1 - x0, y1 - y0)) + 1))
-    column_m, row_m = region.size_m[0] / max(nx - 1, 1), region.size_m[1] / max(ny - 1, 1)
-    length_m = math.hypot((x1 - x0) * column_m, (y1 - y0) * row_m)
-    found = _interpolated(values, np.linspace(x0, x1, count), np.linspace(y0, y1, count))
-    return np.linspace(0.0, length_m, count), found
-
-
-def _interpolated(values: Array, x: Array, y: Array) -> Array:
-    ny, nx = values.shape
-    left = np.clip(np.floor(x).astype(int), 0, max(nx - 2, 0))
-    low = np.clip(np.floor(y).astype(int), 0, max(ny - 2, 0))
-    right, high = np.minimum(left + 1, nx - 1), np.minimum(low + 1, ny - 1)
-    u, v = x - left, y - low
-    total = np.zeros(x.shape)
-    # a neighbour of no weight must not spoil it with its NaN
-    for rows, columns, weights in (
-        (low, left, (1 - u) * (1 - v)),
-        (low, right, u * (1 - v)),
-        (high, left, (1 - u) * v),
-        (high, right, u * v),
-    ):
-        total += np.where(weights > 0.0, values[rows, columns] * weights, 0.0)
-    return total

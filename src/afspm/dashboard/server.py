@@ -98,10 +98,9 @@ class PageServer:
         self._socket = bound
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._run, name="page", daemon=True)
-        self._over = threading.Event()
 
     def start(self) -> None:
-        """Begin to serve; what comes before is answered then."""
+        """Begin to serve; requests that came before are answered then."""
         self._thread.start()
 
     def stop(self) -> None:
@@ -111,15 +110,8 @@ class PageServer:
         with contextlib.suppress(OSError):
             self._socket.close()
 
-    @property
-    def has_failed(self) -> bool:
-        """True if it ended without being told to."""
-        return self._over.is_set() and not self._server.should_exit
-
     def _run(self) -> None:
         try:
             self._server.run(sockets=[self._socket])
         except SystemExit:  # that is how it tells that it couldn't start
             logging.getLogger("afspm.dashboard").error("the page can't be served")
-        finally:
-            self._over.set()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import html
 from collections.abc import Awaitable, Callable, MutableMapping
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -38,19 +39,7 @@ _HEADERS = {
     "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
     "connect-src 'self' ws: wss:; frame-ancestors 'none'",
 }
-_PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Sign in: {title}</title><link rel="stylesheet" href="/assets/dashboard.css"></head>
-<body class="entrance"><main><h1>{title}</h1>
-<form method="post" action="/login">
-<p>What you do is in the record of the experiment with your name.</p>
-<label for="person">Your name</label>
-<input id="person" name="person" value="{person}" autocomplete="name" maxlength="40" autofocus>
-{password}
-{wrong}
-<button type="submit">Sign in</button>
-{look}
-</form>{hint}</main></body></html>"""
+_PAGE = Path(__file__).with_name("assets") / "sign_in.html"
 _PASSWORD = """<label for="password">Password</label>
 <input id="password" name="password" type="password" autocomplete="current-password">"""
 
@@ -137,7 +126,7 @@ def add_sign_in(app: FastAPI, access: Access, title: str, *, encrypted: bool, on
 
 
 def _page(access: Access, title: str, person: str, wrong: str, hint: str) -> str:
-    return _PAGE.format(
+    return _PAGE.read_text(encoding="utf-8").format(
         title=html.escape(title),
         person=html.escape(person),
         password="" if access.is_open else _PASSWORD,

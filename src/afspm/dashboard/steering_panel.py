@@ -11,12 +11,10 @@ from html import escape
 from nicegui import background_tasks, context, events, ui
 
 from afspm.dashboard.access import Visitor
-from afspm.dashboard.actions import ActionResult, Actions
+from afspm.dashboard.actions import Action, ActionResult, Actions, Steering
 from afspm.dashboard.content import Content
-from afspm.dashboard.steering import Action, Steering
 from afspm.dashboard.watch import Watch
-from afspm.dashboard.words import area, position
-from afspm.formatting import time_of_day
+from afspm.formatting import time_of_day, typeset_area, typeset_position
 from afspm.model import ControlMode, Region, names
 
 PARAMETERS = tuple(names.BASE_PARAMETERS)
@@ -154,13 +152,13 @@ class SteeringPanel:
         region = Region((float(place["x"]), float(place["y"])), size, float(place["angle"]))
         shape = _shape(int(place["rows"]), int(place["columns"]), size)
         angle = f", turned by {math.degrees(region.angle_rad):.3g}°" if region.angle_rad else ""
-        what = f"{area(size)} at {position(region.center_m)}{angle}, {shape[1]} × {shape[0]} px"
+        what = f"{typeset_area(size)} at {typeset_position(region.center_m)}{angle}, {shape[1]} × {shape[0]} px"
         if await _asked("Scan here?", what, "Scan"):
             self._do(lambda a: a.scan(region, shape))
 
     async def _ask_spectrum(self, event: events.GenericEventArguments) -> None:
         at_m = (float(event.args["x"]), float(event.args["y"]))
-        if await _asked("Spectrum here?", f"The probe moves to {position(at_m)}.", "Take it"):
+        if await _asked("Spectrum here?", f"The probe moves to {typeset_position(at_m)}.", "Take it"):
             self._do(lambda a: a.spectrum(at_m))
 
     # --- within ---

@@ -81,6 +81,11 @@ def timeline_html(rows: Iterable[TimelineRow], begin_ns: int | None, end_ns: int
     return f'<div class="lanes">{body}<div class="lane-axis"><b></b><div>{ticks}</div></div></div>'
 
 
+def tint_class(name: str) -> str:
+    """Return a class of the style sheet that is the same for a name wherever it is shown."""
+    return f"tint-{sum(ord(letter) * (i + 7) for i, letter in enumerate(name)) % 8}"
+
+
 def time_ticks(begin_s: float, end_s: float, about: int = 7) -> list[float]:
     """Return round times of day between two, seconds since the epoch; never many more than `about`."""
     step = next((s for s in _STEPS_S if (end_s - begin_s) / s <= about), None)

@@ -1,1 +1,1 @@
-"""What every process of an experiment shares: host, bond to the parent, loading of classes, failures, log, memory."""
+"""Shared by all processes of an experiment: host, bond to the parent, loading of classes, failures, log, memory."""

@@ -1,11 +1,11 @@
-"""What a process of an experiment is to the one that hosts it, and what it is given to run with."""
+"""A process of an experiment as its host sees it, and the context that it runs in."""
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
@@ -23,7 +23,7 @@ MEASURED_MESSAGES = frozenset({"Scan2d", "Spec1d"})
 
 
 class ProcessActivity:
-    """How long the current step has been running: what tells a busy process from a frozen one.
+    """The age of the current step, which tells a busy process from a frozen one.
 
     Written by the process, read by the thread that sends its heartbeats.
     """
@@ -33,68 +33,48 @@ class ProcessActivity:
         self.since_s: float | None = None
         self.longest_step_s = DEFAULT_LONGEST_STEP_S
 
-    def step(self) -> AbstractContextManager[None]:
+    @contextmanager
+    def step(self) -> Iterator[None]:
         """Something is being worked on in this block."""
-        return _Step(self, self._clock)
+        before, self.since_s = self.since_s, self._clock.monotonic_s()
+        try:
+            yield
+        finally:
+            self.since_s = before
 
-    def waiting(self) -> AbstractContextManager[None]:
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
         """Within a step: this block only waits. The step counts anew afterwards."""
-        return _Waiting(self, self._clock)
+        before, self.since_s = self.since_s, None
+        try:
+            yield
+        finally:
+            self.since_s = None if before is None else self._clock.monotonic_s()
 
     def age_s(self) -> float:
-        """Real seconds since the current step began; 0 when idle."""
+        """Return the real seconds since the current step began; 0 when idle."""
         since_s = self.since_s
         return 0.0 if since_s is None else max(0.0, self._clock.monotonic_s() - since_s)
 
 
-class _Block:
-    """Classes and no generators: these are around everything that a process does."""
-
-    __slots__ = ("_activity", "_before", "_clock")
-
-    def __init__(self, activity: ProcessActivity, clock: Clock) -> None:
-        self._activity = activity
-        self._clock = clock
-        self._before = activity.since_s
-
-
-class _Step(_Block):
-    __slots__ = ()
-
-    def __enter__(self) -> None:
-        self._activity.since_s = self._clock.monotonic_s()
-
-    def __exit__(self, *_: object) -> None:
-        self._activity.since_s = self._before
-
-
-class _Waiting(_Block):
-    __slots__ = ()
-
-    def __enter__(self) -> None:
-        self._activity.since_s = None
-
-    def __exit__(self, *_: object) -> None:
-        self._activity.since_s = None if self._before is None else self._clock.monotonic_s()
-
-
 def new_session(run: str) -> str:
-    """What tells this life of a process from all others, with the identity of its run (empty: none is known)."""
+    """Return an identity of this life of a process, with that of its run (empty: none is known)."""
     return "-".join(filter(None, [run, os.urandom(4).hex()]))
 
 
 def _never(_: Callable[[], object]) -> None:
-    """Nobody asks a process to stop that has no host."""
+    """Register nothing: nobody stops a process that has no host."""
 
 
 @dataclass
 class ProcessContext:
-    """What the host gives to a process.
+    """The context that the host gives to a process.
 
     Attributes:
         launch: the line that we were started with.
         clock: the experiment's.
-        open_port: connects to the experiment as a component does (scheduler and translators have sockets of their own).
+        open_port: connects to the experiment as a component does (scheduler and translators have sockets of their own);
+            with a tuple of envelopes, hears these instead of those of the launch line.
         log: records go to the supervisor, and to the log collector if there is one.
         activity: to be told of steps that take time.
         when_stopping: registers what is called, from another thread, when the parent has gone or wants us to stop
@@ -110,7 +90,7 @@ class ProcessContext:
 
     launch: Launch
     clock: Clock
-    open_port: Callable[[], Port]
+    open_port: Callable[..., Port]
     log: logging.Logger
     activity: ProcessActivity
     when_stopping: Callable[[Callable[[], None]], None] = _never
@@ -131,7 +111,7 @@ class ProcessContext:
 
 @runtime_checkable
 class ExperimentProcess(Protocol):
-    """What the host can run: a component, a scheduler, a translator. It is made with the settings as arguments."""
+    """A process that the host can run: a component, a scheduler, a translator, made with its settings as arguments."""
 
     def run_process(self, context: ProcessContext) -> int:
         """Run until done, ended or stopped; returns an `ExitCode`.

@@ -1,4 +1,4 @@
-"""What a person is told of an exception: what happened, and where in their own code."""
+"""An exception in words: what happened, and where in the user's own code."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ _BELOW_START = 2  # of `python -m`: what Python itself does first
 
 
 def describe(error: BaseException, name: str = "", package: Path = PACKAGE) -> str:
-    """An exception in words: its message on the first line, and below it the lines of code that led to it.
+    """Return the message of an exception, and below it the lines of code that led to it.
 
-    How we came to call somebody's component is left out; where we refused on purpose what it asked for, how we came to
-    do that as well. An error that comes from nobody's code but ours is told whole, unless it is one that we foresaw.
+    Our frames above the user's are left out; where we refused on purpose what the user's code asked for, those below it
+    as well. An error from our code alone is shown whole, unless it is one that we foresaw.
 
     Args:
-        name: of the component, which whoever reads this knows already.
+        name: of the component, which the reader knows already.
         package: the folder of the code that is ours.
     """
     trace = traceback.TracebackException.from_exception(error)
@@ -41,14 +41,14 @@ def describe(error: BaseException, name: str = "", package: Path = PACKAGE) -> s
 
 
 def where_now(thread_id: int, package: Path = PACKAGE) -> str:
-    """The lines of code that a thread is in just now, those of whoever wrote the component first."""
+    """Return the lines of code that a thread is in just now, from the user's own on."""
     frame = sys._current_frames().get(thread_id)
     stack = traceback.extract_stack(frame) if frame is not None else []
     return "".join(traceback.format_list(_kept(stack[_BELOW_START:], package, is_foreseen=False))).rstrip("\n")
 
 
 def _is_foreseen(error: BaseException, frames: Sequence[traceback.FrameSummary], package: Path) -> bool:
-    """Whether we raised it on purpose, for what was asked of us; then its message says all."""
+    """True if we raised it on purpose, for what was asked of us; then its message says all."""
     last = frames[-1] if frames else None
     return isinstance(error, AfspmError) or (
         last is not None and _is_ours(last, package) and (last.line or "").startswith("raise ")
@@ -79,5 +79,5 @@ def _is_ours(frame: traceback.FrameSummary, package: Path) -> bool:
 
 
 def _is_passage(frame: traceback.FrameSummary, package: Path) -> bool:
-    """Ours, or what Python does between two calls of ours."""
+    """True for ours, and for what Python does between two calls of ours."""
     return _is_ours(frame, package) or Path(frame.filename).name == "contextlib.py"

@@ -1,4 +1,4 @@
-"""`python -m afspm.process.foreign [--] command …`: runs a component of another language.
+"""`python -m afspm.process.foreign [--] command …` runs a component of another language.
 
 The command gets the launch line on its standard input, which stays open for as long as our parent holds ours open, and
 is ended when that is closed or the parent dies: terminated, then killed. Its exit code is ours.
@@ -22,10 +22,10 @@ _CHUNK = 1 << 16
 
 
 def main(arguments: list[str]) -> int:
-    """Run the command; returns its exit code (128 + n for the signal n, as shells do)."""
+    """Run the command and return its exit code (128 + n for the signal n, as shells do)."""
     command = arguments[1:] if arguments[:1] == ["--"] else arguments
     if not command:
-        sys.stderr.write("ERROR guard: no command given\n")
+        sys.stderr.write("ERROR foreign: no command given\n")
         return ExitCode.CONFIG
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # a terminal's or a supervisor's wish to end us must not leave the command behind, however early it comes
@@ -37,19 +37,19 @@ def main(arguments: list[str]) -> int:
     except (OSError, ValueError) as error:
         sys.stderr.write(f"ERROR {command[0]} can't be started: {error} (is it installed and executable?)\n")
         return ExitCode.CONFIG
-    guard = _Guard(child)
-    signal.signal(signal.SIGTERM, lambda *_: guard.end_soon())
+    program = _ForeignProgram(child)
+    signal.signal(signal.SIGTERM, lambda *_: program.end_soon())
     if wished.is_set():
-        guard.end_soon()
-    threading.Thread(target=guard.pass_on, name="stdin", daemon=True).start()
+        program.end_soon()
+    threading.Thread(target=program.pass_on, name="stdin", daemon=True).start()
     code = child.wait()
-    guard.sweep()
-    if guard.ending and code < 0:  # it did not end by itself: that it was stopped is what counts
+    program.sweep()
+    if program.ending and code < 0:  # it did not end by itself: that it was stopped is what counts
         return ExitCode.ORPHAN
     return 128 - code if code < 0 else code
 
 
-class _Guard:
+class _ForeignProgram:
     """Passes standard input on to the child, and ends it."""
 
     def __init__(self, child: subprocess.Popen[bytes]) -> None:

@@ -1,4 +1,4 @@
-"""`python -m afspm.process.host`: hosts one process of an experiment, as the line on its standard input says."""
+"""`python -m afspm.process.host` hosts one process of an experiment, as the line on its standard input says."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -34,12 +34,12 @@ from afspm.transport.port import ParentGone, Port
 from afspm.transport.zmq_port import open_port
 
 LOADED_WITHIN_S = 300.0  # a large library off a slow disk, the weights of a network
-FAREWELL_S = 1.0  # that exit handlers and threads of libraries have, once everything of ours is done
+EXIT_GRACE_S = 1.0  # for exit handlers and threads of libraries, once everything of ours is done
 MOST_FILES = 65_536  # more than anybody needs; some programs that are started by ours walk through all that may be
 
 
 def main() -> int:
-    """Returns the exit code, with which the caller is to end the process."""
+    """Run the process and return its exit code."""
     # Ctrl-C reaches the whole terminal; whether it ends us is the parent's decision
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -81,7 +81,7 @@ def _host(launch: Launch, logger: logging.Logger, parent: ParentWatch) -> int:
         context = ProcessContext(
             launch,
             clock,
-            open_port=lambda: _open_port(launch, clock, parent),
+            open_port=lambda heard=None: _open_port(launch, clock, parent, heard),
             log=logger,
             activity=activity,
             when_stopping=parent.when_gone,
@@ -100,7 +100,7 @@ def _beating(launch: Launch, activity: ProcessActivity, logger: logging.Logger) 
     sender = HeartbeatSender(
         launch.sockets.heartbeat,
         launch.beat_period_s,
-        _Watch(activity, logger).age_s,
+        _watched_age_s(activity, logger),
         lambda: activity.longest_step_s,
         launch.beat_token,
     )
@@ -108,29 +108,29 @@ def _beating(launch: Launch, activity: ProcessActivity, logger: logging.Logger) 
     sender.close()
 
 
-class _Watch:
-    """Says where a step hangs, before the beat that has the process killed for it."""
+def _watched_age_s(activity: ProcessActivity, logger: logging.Logger) -> Callable[[], float]:
+    """Return what tells the age of a step to the heartbeats' thread, and logs where one hangs, before it is killed."""
+    logged_since_s: float | None = None
 
-    def __init__(self, activity: ProcessActivity, logger: logging.Logger) -> None:
-        self._activity = activity
-        self._log = logger
-        self._told_since_s: float | None = None
-
-    def age_s(self) -> float:
-        """Called in the thread of the heartbeats."""
-        since_s, age_s = self._activity.since_s, self._activity.age_s()
-        if age_s > self._activity.longest_step_s and since_s != self._told_since_s:
-            self._told_since_s = since_s
+    def age_s() -> float:
+        nonlocal logged_since_s
+        since_s, age_s = activity.since_s, activity.age_s()
+        if age_s > activity.longest_step_s and since_s != logged_since_s:
+            logged_since_s = since_s
             where = failure.where_now(threading.main_thread().ident or 0)
-            longest = f"longer than longest_step_s = {self._activity.longest_step_s:g} s"
-            self._log.error("a step takes %s, and counts as frozen; it is at\n%s", longest, where)
+            longest = f"longer than longest_step_s = {activity.longest_step_s:g} s"
+            logger.error("a step takes %s, and counts as frozen; it is at\n%s", longest, where)
         return age_s
 
+    return age_s
 
-def _open_port(launch: Launch, clock: Clock, parent: ParentWatch) -> Port:
-    """The port of a component: hears, besides what it subscribed to, what `Scope` has to know."""
+
+def _open_port(launch: Launch, clock: Clock, parent: ParentWatch, heard: tuple[str, ...] | None) -> Port:
+    """Return the port of a component, which also hears what its `Scope` follows."""
     envelopes = wire.messages_of_the_experiment() if launch.envelopes is None else launch.envelopes
-    if launch.sockets.control is not None:
+    if heard is not None:
+        envelopes = heard
+    elif launch.sockets.control is not None:
         envelopes = tuple(sorted({*envelopes, *STATE_MESSAGES, *MEASURED_MESSAGES}))
     launch = replace(launch, envelopes=envelopes)
     port = open_port(launch, clock)
@@ -139,8 +139,7 @@ def _open_port(launch: Launch, clock: Clock, parent: ParentWatch) -> Port:
 
 
 def _allow_many_connections() -> None:
-    """As many open files as the system lets us have: by default a thousand, which strangers that connect use up; then
-    nothing could be written to disk any more."""
+    """Raise the limit of open files: strangers that connect use up a thousand, and then nothing can be written."""
     try:
         import resource
     except ImportError:  # Windows has no such limit
@@ -153,11 +152,11 @@ def _allow_many_connections() -> None:
 
 
 def _detach_stdin() -> None:
-    """What a component reads from sys.stdin is not what keeps us alive."""
+    """Give the component an empty sys.stdin: ours is the bond to the parent."""
     sys.stdin = Path(os.devnull).open(encoding="utf-8")  # noqa: SIM115 - as long as the process lives
 
 
 if __name__ == "__main__":
     exit_code = int(main())
-    end_within(FAREWELL_S, exit_code)
+    end_within(EXIT_GRACE_S, exit_code)
     sys.exit(exit_code)

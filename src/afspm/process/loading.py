@@ -1,4 +1,4 @@
-"""Makes the object of a launch line: imports its class, and calls it with the settings."""
+"""Loads the class that a launch line names, and calls it with the settings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from afspm.process.context import ExperimentProcess
 
 
 def load(launch: Launch) -> ExperimentProcess:
-    """The component, scheduler or translator of a launch line.
+    """Return the component, scheduler or translator of a launch line.
 
     Raises:
         ConfigError: there is no such class, or it can't be made with these settings. A restart would not help.
@@ -38,7 +38,7 @@ def load(launch: Launch) -> ExperimentProcess:
 
 
 def made_of(value: Any, where: str) -> Any:
-    """A setting; a table in it with a `class` (an intermediary class of the experiment file) as the object it means."""
+    """Return a setting, each table in it with a `class` as the object that this makes."""
     if isinstance(value, list | tuple):
         return [made_of(item, where) for item in value]
     if not isinstance(value, dict):
@@ -51,7 +51,7 @@ def made_of(value: Any, where: str) -> Any:
 
 
 def find_class(path: str, where: str) -> type[Any]:
-    """The class "package.module.Name". Raises ConfigError if there is none."""
+    """Return the class "package.module.Name". Raises ConfigError if there is none."""
     module_name, _, class_name = path.rpartition(".")
     if not module_name:
         raise ConfigError(f"{path!r} names no class", where=where, hint='write class = "module.Name"')
@@ -73,7 +73,7 @@ def find_class(path: str, where: str) -> type[Any]:
 
 
 def _check_settings(class_: type[Any], launch: Launch) -> None:
-    """So that a typo is told as one, and a TypeError from within a constructor is not taken for it."""
+    """Report a typo as one, and not as a TypeError from within a constructor."""
     try:
         signature = inspect.signature(class_)
         signature.bind(**launch.settings)

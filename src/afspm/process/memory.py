@@ -1,4 +1,4 @@
-"""What a component keeps on disk, so that it is there again after a crash or a kill."""
+"""A component's memory: a dict on disk that is there again after a crash or a kill."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from afspm.errors import InvalidValue
 from afspm.storage.atomic import CheckpointFile, OutageLog, load_checkpoint, write_atomic
 from afspm.storage.disk import DEADLINE_S, DiskThread
 
-SYNCED_WITHIN_S = 5.0
-"""So long a disk is waited for, whose every answer matters. One that hangs is full for all that one knows."""
+SYNCED_WITHIN_S = 5.0  # longest wait for the disk; one that hangs counts as full
 _log = logging.getLogger("afspm.memory")
 
 
@@ -22,9 +21,8 @@ class Memory(MutableMapping[str, Any]):
 
     Args:
         path: the file; None keeps nothing over a restart.
-        synced: whether saving waits for the disk, which takes ten milliseconds and more, so that all of it outlives a
-            power cut. If not, the disk is waited for a fifth of a second at most, and what was saved a moment before
-            a power cut outlives that. A kill, of any process, it outlives anyway.
+        synced: whether saving waits for the disk, ten milliseconds and more, so that all of it outlives a power cut. If
+            not, what was saved a moment before a power cut outlives that. A kill, of any process, it outlives anyway.
 
     Attributes:
         damage: what was wrong with the file, where the generation before was taken up in its place; "" else.
@@ -48,11 +46,11 @@ class Memory(MutableMapping[str, Any]):
     def save(self) -> bool:
         """Write everything to disk; when this returns it survives a kill, and, if synced, a power cut.
 
-        A disk that is full or hangs must not end the experiment: it is said, and the experiment goes on. Whoever does
-        something that must not happen twice looks at what is returned, and doesn't do it.
+        A disk that is full, away or hangs must not end the experiment: it is logged. A caller that does something that
+        must not happen twice looks at what is returned, and doesn't do it.
 
         Returns:
-            Whether it was written: False if the disk is full, or away, or hangs.
+            True if it was written.
 
         Raises:
             InvalidValue: a value is not of JSON's types.
@@ -104,7 +102,7 @@ class Memory(MutableMapping[str, Any]):
 
 
 def _number(value: Any) -> Any:
-    """A number of numpy as one of Python's."""
+    """Return a number of numpy as one of Python's."""
     if getattr(value, "shape", None) == ():
         return value.item()
     raise TypeError(f"it is of the type {type(value).__name__}")

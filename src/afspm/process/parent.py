@@ -16,7 +16,7 @@ _CHUNK = 1 << 16
 
 
 def read_launch_line() -> bytes:
-    """The first line of standard input; empty if it ends before one came.
+    """Return the first line of standard input; empty if it ends before one came.
 
     Read past Python's own buffering: a thread that waits in that one would block the end of the interpreter.
     """
@@ -34,10 +34,10 @@ class StopRequested(BaseException):
 
 
 class ParentWatch:
-    """Watches over the parent. What was registered is called, from another thread, when it has gone or lets us go.
+    """Watches the parent, and calls what was registered, from another thread, when it has gone or lets us go.
 
-    Should the process not have ended `END_WITHIN_S` later (a handler that computes, a library that hangs), it is ended
-    the hard way, with `code_if_late`; `TIP_WITHIN_S` later, if the tip is in danger then.
+    A process that has not ended `END_WITHIN_S` later (a handler that computes, a library that hangs) is ended the hard
+    way, with `code_if_late`; if the tip is in danger, `TIP_WITHIN_S` later.
     """
 
     def __init__(self, code_if_late: int) -> None:
@@ -64,7 +64,7 @@ class ParentWatch:
             callback()
 
     def tip_in_danger(self, whether: Callable[[], bool]) -> None:
-        """Register what says so; it is called once, from another thread."""
+        """Register what tells whether it is; it is called once, from another thread."""
         self._tip_in_danger = whether
 
     def let_go(self) -> None:

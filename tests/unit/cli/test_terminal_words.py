@@ -9,14 +9,13 @@ import pytest
 from rich.console import Console
 
 from afspm import model
-from afspm.cli import telling
-from afspm.cli.telling import About
+from afspm.cli.status_text import RunDescription, StatusText, bar
 from afspm.model import ControlMode, ControlState, ProcessCondition, ScopeState
 from afspm.record.overview import Overview
 
 S = 1_000_000_000
 START = 1_700_000_000 * S
-ABOUT = About("night", "runs/night-1", simulated=True, began_ns=START, speed=60.0)
+ABOUT = RunDescription("night", "runs/night-1", simulated=True, began_ns=START, speed=60.0)
 REGION = model.Region((0.0, 0.0), (1e-6, 1e-6))
 
 
@@ -42,7 +41,9 @@ def night() -> Overview:
         ))),
         (122, "JournalEntries", model.JournalEntries((
             model.JournalEntry(START + 122 * S, "request", "judge", "scan-speed = 1 m/s", 9, "at most 1e-5 m/s"),
-            model.JournalEntry(START + 123 * S, "control", "judge", "flagged tip-shape-changed"),
+            model.JournalEntry(
+                START + 123 * S, "control", "judge", "flagged", event=model.ControlEvent.PROBLEM_FLAGGED, problem=1
+            ),
         ))),
         (123, "ControlState", ControlState(ControlMode.AUTOMATED, "series", (1,))),
         (124, "LogLines", model.LogLines((model.LogLine(START + 124 * S, "judge", "ERROR", "lost the tip [/x]"),))),
@@ -51,9 +52,9 @@ def night() -> Overview:
     return overview
 
 
-def shown(overview: Overview, about: About = ABOUT, width: int = 140, silent_s: float = 0.0) -> str:
+def shown(overview: Overview, about: RunDescription = ABOUT, width: int = 140, silent_s: float = 0.0) -> str:
     console = Console(file=io.StringIO(), width=width, highlight=False, markup=False)
-    console.print(telling.screen(overview, about, START + 160 * S, silent_s=silent_s))
+    console.print(StatusText(overview, about, START + 160 * S).screen(silent_s=silent_s))
     text: str = console.file.getvalue()  # type: ignore[attr-defined]
     return text
 
@@ -95,7 +96,7 @@ def test_who_is_not_told_of_while_others_are_is_not_well(night: Overview) -> Non
         is_gone = "series not heard of for 7 min 00 s" in shown(night)
         assert is_gone is (after_s > 121)
     assert "scheduler not heard of" not in shown(night)
-    told = telling.as_json(night, ABOUT, START + 600 * S)["processes"]
+    told = StatusText(night, ABOUT, START + 600 * S).as_json()["processes"]
     assert {one["name"]: one["heard_of"] for one in told} == {
         "series": False, "judge": False, "grid": False, "scheduler": True,
     }  # fmt: skip
@@ -108,9 +109,9 @@ def test_nothing_is_cut_off_in_a_narrow_terminal(night: Overview) -> None:
 
 
 def test_without_block_characters_bars_are_plain(night: Overview) -> None:
-    about = About("night", "", fancy=False)
+    about = RunDescription("night", "", fancy=False)
     assert shown(night, about).isascii()
-    assert telling.bar(0.5, fancy=False, width=4) == "[##..]"
+    assert bar(0.5, fancy=False, width=4) == "[##..]"
 
 
 def test_what_is_refused_again_and_again_is_said_once(night: Overview) -> None:
@@ -137,7 +138,7 @@ def test_nothing_known_is_said_as_such() -> None:
 
 
 def test_json_says_the_same(night: Overview) -> None:
-    told = json.loads(json.dumps(telling.as_json(night, ABOUT, START + 160 * S)))
+    told = json.loads(json.dumps(StatusText(night, ABOUT, START + 160 * S).as_json()))
     assert (told["mode"], told["holder"], told["simulated"]) == ("AUTOMATED", "series", True)
     assert [(one["name"], one["by"]) for one in told["problems"]] == [("tip-shape-changed", "judge")]
     assert told["scan"] == {"part": 0.5, "remaining_s": 50.0}

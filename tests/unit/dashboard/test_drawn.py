@@ -18,8 +18,8 @@ from afspm.dashboard.content import refusals_html, rows_of, unheard
 from afspm.dashboard.panels import log_html, process_words
 from afspm.dashboard.sample_map import MapContent, map_html, places_of
 from afspm.dashboard.watch import Watch
-from afspm.dashboard.words import position
 from afspm.drawing.timeline import timeline_html
+from afspm.formatting import typeset_position
 from afspm.model import (
     ControlMode,
     ControlState,
@@ -287,5 +287,5 @@ def test_what_is_not_finite_in_a_spectrum_is_a_gap(gone: float) -> None:
 
 
 def test_positions_read_well() -> None:
-    assert position((1.2e-6, -5e-7)) == "(1.2, −0.5) µm"
-    assert position((0.0, 0.0)) == "(0, 0) nm"
+    assert typeset_position((1.2e-6, -5e-7)) == "(1.2, −0.5) µm"
+    assert typeset_position((0.0, 0.0)) == "(0, 0) nm"

@@ -8,9 +8,8 @@ import pytest
 
 from afspm.clock import ExperimentClock
 from afspm.dashboard.access import Access, Visitor
-from afspm.dashboard.actions import ActionResult
+from afspm.dashboard.actions import ActionResult, Steering
 from afspm.dashboard.sessions import Sessions
-from afspm.dashboard.steering import Steering
 from afspm.dashboard.watch import Watch
 from afspm.launch import Launch
 

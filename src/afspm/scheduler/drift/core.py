@@ -27,6 +27,7 @@ from afspm.logic.state import SavedState
 from afspm.model import (
     ControlRequest,
     Frame,
+    LoggedPacket,
     Packet,
     PacketHeader,
     Parameter,
@@ -158,10 +159,10 @@ class DriftCore(SchedulerCore):
             self._gate.restore(kept["scans"])
             self._channel = self._settings.channel or kept["channel"]
 
-    def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None:
+    def restore_cache(self, packets: Iterable[LoggedPacket]) -> None:
         entries = list(packets)
         super().restore_cache(entries)
-        for packet, source_ns in entries:
+        for packet, source_ns, _ in entries:
             if packet.envelope == "ScopeStateMsg":
                 self._note_state(packet.payload, packet.time_ns if source_ns is None else source_ns)
 

@@ -1,0 +1,233 @@
+"""`afspm new driver`, `test-translator` and `emulate`: for those who connect a microscope."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from afspm.cli.arguments import RUNS, Runs, names_in, opt
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from afspm.emulators.emulator import Emulator
+    from afspm.testing.translators import CheckOptions
+
+_ASK = """The probe will be moved, scans and spectra be taken, gains and bias changed by a few percent, the feedback
+switched off and on, all within the frame that is set now; everything is put back. Nothing is approached, pulsed or
+crashed. Is the tip so far from the sample that it can't reach it, whatever the feedback does?"""
+
+new = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Make something to begin with.")
+
+
+@new.callback()
+def _new() -> None:
+    """Make something to begin with."""
+
+
+@new.command("driver")
+def driver(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Of the package, e.g. my_scope.")],
+    into: Annotated[Path, typer.Option("--into", metavar="DIR", help="Where to make its folder.")] = Path(),
+) -> None:
+    """Make a package with a driver for a new controller.
+
+    As it is, it drives a controller that only pretends, and passes the checks of what it has.
+    """
+    from afspm.testing.skeletons import write_driver
+
+    folder = write_driver(name, into)
+    typer.echo(f"{folder}: replace its PretendController, and look how far it is with")
+    typer.echo(f"    cd {folder} && afspm test-translator experiment.toml")
+
+
+def check_translator(
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="FILE [OVERLAY…]",
+            help="An experiment file with a translator; a scheduler, too, unless the usual one will do.",
+            show_default=False,
+        ),
+    ] = None,
+    only: Annotated[
+        list[str] | None, opt("Only checks with this in their name.", "--only", "-k", metavar="PART")
+    ] = None,
+    without: Annotated[
+        list[str] | None,
+        opt("Processes that run already: joined by the addresses in the file.", "--without", metavar="NAME[,NAME…]"),
+    ] = None,
+    report: Annotated[Path | None, opt("Write the report here, too.", "--report", metavar="FILE")] = None,
+    runs: Runs = RUNS,
+    speed: Annotated[
+        float, typer.Option(min=1e-6, help="Experiment seconds in a real second; simulated microscopes only.")
+    ] = 20.0,
+    frame: Annotated[
+        str,
+        opt(
+            'Stay within a square of this side about the centre of the frame that is set, e.g. "500 nm". '
+            "Default: within the frame that is set.",
+            metavar="SIZE",
+        ),
+    ] = "",
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="The tip is withdrawn: don't ask.")] = False,
+    listed: Annotated[bool, typer.Option("--list", help="List the checks, and do none.")] = False,
+) -> None:
+    """Check each base operation of a translator from outside, with the tip withdrawn.
+
+    Starts translator and scheduler (and an emulated controller, if there is one), or joins running ones. What the
+    microscope does not support is skipped and listed. Ends with 0 if nothing was wrong.
+    """
+    import sys
+
+    from rich.console import Console
+
+    from afspm.testing.translators import CheckOptions
+    from afspm.units import si
+
+    if listed:
+        _list()
+        return
+    if not files:
+        raise typer.BadParameter("an experiment file is wanted", param_hint="FILE")
+    console = Console(file=sys.stdout, highlight=False)
+    options = CheckOptions(files, names_in(without), runs, speed, names_in(only), si(frame, "m") if frame else None)
+    if not yes and not _is_simulated(options):
+        typer.confirm(_ASK, abort=True)
+    _check(options, console, report)
+
+
+def _list() -> None:
+    from afspm.testing.translators.registry import all_checks
+
+    for check in all_checks():
+        typer.echo(f"{check.name:31}{check.title}")
+
+
+def _is_simulated(options: CheckOptions) -> bool:
+    from afspm.testing.translators.session import is_simulated, prepare
+
+    return is_simulated(prepare(options), options)
+
+
+def _check(options: CheckOptions, console: Console, copy: Path | None) -> None:
+    import signal
+
+    from afspm.testing.translators import CheckReport, run
+    from afspm.testing.translators.report import show_beginning, show_end, show_result
+
+    begun: list[CheckReport] = []
+
+    def begin(report: CheckReport) -> None:
+        begun.append(report)
+        show_beginning(report, console)
+
+    # whoever ends it has everything put back first
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        report = run(options, begin, done=lambda result: show_result(result, console))
+    except KeyboardInterrupt:
+        for report in begun:
+            show_end(report, console)
+        raise
+    show_end(report, console)
+    if copy is not None:
+        copy.write_text(report.to_json(), encoding="utf-8")
+    if not report.passed:
+        raise typer.Exit(1)
+
+
+def emulate(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The controller; without it: those that there are.")] = "",
+    settings: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="SETTING=VALUE…", help="Other settings, values as in TOML: surface=steps", show_default=False
+        ),
+    ] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one.")] = 0,
+    usual: Annotated[
+        bool, typer.Option("--usual", help="Listen where the vendor's own controller does, for clients that expect it.")
+    ] = False,
+    seed: Annotated[int, typer.Option(help="Everything left to chance follows from it.")] = 1,
+    speed: Annotated[float, typer.Option(min=1e-6, help="Experiment seconds in a real second.")] = 1.0,
+    fault: Annotated[
+        list[str] | None,
+        opt("What goes wrong, and when.", metavar="KIND[@SECONDS][,count=N][,duration=SECONDS]"),
+    ] = None,
+    folder: Annotated[
+        Path | None, opt("For its files. Default: emulated-NAME", "--folder", "-o", metavar="DIR")
+    ] = None,
+) -> None:
+    """Emulate a vendor's controller: its own protocol, simulated physics behind it.
+
+    Runs until Ctrl-C. It listens on this computer only, at a free port unless it is told another: whoever connects
+    to the vendor's usual port may expect a real controller there.
+    """
+    from afspm.emulators.registry import emulator, names
+
+    if not name:
+        for known in names():
+            typer.echo(_described(known, emulator(known)))
+        return
+    class_ = emulator(name)
+    given = {**(class_.usual if usual else {}), **({"port": port} if port else {}), **_settings(settings or [])}
+    made = class_(seed=seed, faults=fault or [], **given)
+    made.check()
+    _emulate(made, speed, folder or Path(f"emulated-{class_.vendor.lower()}"))
+
+
+def _emulate(emulator: Emulator, speed: float, folder: Path) -> None:
+    import signal
+
+    from afspm.clock import ExperimentClock
+    from afspm.emulators.emulator import Crashed
+    from afspm.process.log import set_up
+
+    log = set_up("emulate", "INFO")
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: emulator.stop())
+
+    def listening(address: str) -> None:
+        where = f"listening at {address}, files in {folder.resolve()}" if address else "does not listen for now"
+        typer.echo(f"SIMULATED {emulator.vendor} controller: {where}")
+
+    try:
+        emulator.run(ExperimentClock.starting_now(speed=speed), folder.resolve(), log, listening)
+    except Crashed as crash:
+        typer.echo(f"SIMULATED crash: {crash}", err=True)
+        raise typer.Exit(1) from None
+
+
+def _described(name: str, class_: type[Emulator]) -> str:
+    faults = "".join(f"\n    {kind:20} {does}" for kind, does in class_.fault_kinds.items())
+    return f"{name}: {class_.vendor}{faults}"
+
+
+def _settings(given: list[str]) -> dict[str, Any]:
+    """`a=1`, `a.b="x"`, `a=word`: as in TOML, but that a word needs no quotes.
+
+    Raises:
+        ConfigError: not of that form.
+    """
+    import tomllib
+
+    from afspm.errors import ConfigError
+
+    lines = []
+    for one in given:
+        key, found, value = one.partition("=")
+        try:
+            tomllib.loads(f"value = {value}")
+        except tomllib.TOMLDecodeError:
+            quoted = value.replace("\\", "\\\\").replace('"', '\\"')
+            value = f'"{quoted}"'
+        if not found:
+            raise ConfigError(f"{one!r} is no setting", hint="SETTING=VALUE")
+        lines.append(f"{key} = {value}")
+    try:
+        return tomllib.loads("\n".join(lines))
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{' '.join(given)}: {error}", hint="SETTING=VALUE, names separated by dots") from error

@@ -1,0 +1,137 @@
+"""`afspm check`, `graph` and `keys`: what is done with an experiment file before anything starts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from afspm.cli.arguments import Files, opt
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from afspm.experiment import Experiment, Finding
+
+
+def check(
+    files: Files,
+    expanded: Annotated[bool, typer.Option("--expanded", help="Print the whole file as it is in force.")] = False,
+    explain: Annotated[
+        bool,
+        typer.Option(
+            "--explain",
+            help="Print the short form of a file of the published implementation, and say what each line has become.",
+        ),
+    ] = False,
+) -> None:
+    """Find every error of an experiment file, before anything starts.
+
+    Says file, line, what is wrong and what would be right. Ends with 1 if there are errors; warnings are only told.
+    """
+    from rich.console import Console
+
+    from afspm.experiment import load
+
+    experiment = load(*files)
+    findings = experiment.check()
+    console = Console(stderr=expanded or explain, highlight=False)
+    if explain:
+        _explain(experiment, console)
+    show(findings, console)
+    if expanded:
+        typer.echo(experiment.expanded(), nl=False)
+    console.print(_summary(experiment, findings), markup=False, soft_wrap=True)
+    if any(finding.is_error for finding in findings):
+        raise typer.Exit(1)
+
+
+def _explain(experiment: Experiment, console: Console) -> None:
+    """Print the short form, and to the console what has become of each line."""
+    from afspm.experiment.short_form import explained, short
+
+    for place, line, became in explained(experiment):
+        console.print(f"{place}: {line}: {became}", markup=False, emoji=False, soft_wrap=True)
+    typer.echo(short(experiment), nl=False)
+
+
+def show(findings: Sequence[Finding], console: Console) -> None:
+    """Print findings, one a paragraph, coloured where the terminal can."""
+    from rich.text import Text
+
+    for finding in findings:
+        colour = "bold red" if finding.is_error else "yellow"
+        line = Text.assemble((str(finding.place), "bold"), ": ", (f"{finding.level.value}: ", colour), finding.what)
+        if finding.hint:
+            line.append(f"\n    {finding.hint}", "dim")
+        console.print(line, soft_wrap=True)  # a wrapped line could not be clicked or searched
+
+
+def require_no_errors(experiment: Experiment) -> None:
+    """Show what is wrong or doubtful. Raises typer.Exit if something is wrong."""
+    findings = experiment.check()
+    if findings:
+        from rich.console import Console
+
+        show(findings, Console(stderr=True, highlight=False))
+    if any(finding.is_error for finding in findings):
+        raise typer.Exit(1)
+
+
+def _summary(experiment: Experiment, findings: Sequence[Finding]) -> str:
+    errors = sum(finding.is_error for finding in findings)
+    warnings = len(findings) - errors
+    count = len(experiment.component_names)
+    told = [f"{n} {word}{'s' if n != 1 else ''}" for n, word in ((errors, "error"), (warnings, "warning")) if n]
+    return f"{experiment.name}: {count} process{'es' if count != 1 else ''}, {', '.join(told) or 'nothing wrong'}"
+
+
+def graph(
+    files: Files,
+    output: Annotated[Path | None, opt("The SVG file to write. Default: named as the experiment.", "--output", "-o")]
+    = None,
+) -> None:  # fmt: skip
+    """Draw the components, sockets and envelopes of an experiment as SVG."""
+    from afspm.errors import FileError
+    from afspm.experiment import load
+    from afspm.experiment.graph import draw
+
+    experiment = load(*files)
+    experiment.require_valid()
+    target = output or Path(f"{experiment.name}.svg")
+    try:
+        target.write_text(draw(experiment), encoding="utf-8")
+    except OSError as error:
+        raise FileError(f"the picture can't be written: {error.strerror or error}", where=str(target)) from error
+    typer.echo(target)
+
+
+def keys(
+    files: Files,
+    folder: Annotated[
+        Path | None, opt("Where to put them. Default: [security] keys of the file, else keys/ beside it.", "--folder")
+    ] = None,
+    also: Annotated[
+        list[str] | None, opt("A person who is to have a key. Repeatable.", "--also", metavar="NAME")
+    ] = None,
+) -> None:
+    """Make a key pair for each process of an experiment, for the supervisors, and for the people named.
+
+    Keys that are there already are left as they are. Copy public/ to every computer, and of private/ only the keys of
+    what runs there.
+    """
+    from afspm.experiment import load
+    from afspm.logic.supervisor_registry import SUPERVISOR
+    from afspm.transport.keys import generate
+
+    experiment = load(*files)
+    target = folder or experiment.keys_folder or experiment.folder / "keys"
+    written = generate(target, [*experiment.component_names, SUPERVISOR, *(also or ())])
+    for file in written:
+        typer.echo(file)
+    if not written:
+        typer.echo(f"all keys are there already, in {target}")
+    if experiment.keys_folder is None:
+        typer.echo(f'to use them: [security] keys = "{target.name}"')

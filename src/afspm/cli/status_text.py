@@ -1,0 +1,268 @@
+"""A running experiment in words, for a terminal of any width, and as JSON. What is told comes from an `Overview`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from afspm.clock import NS_PER_S
+from afspm.formatting import area_text, day_and_time, duration_text, time_of_day
+from afspm.model import LogLine, ProcessCondition, ProcessState, Region, ScopeState
+from afspm.record.overview import OLD_S, OVER, Overview
+from afspm.record.timeline import Span
+
+if TYPE_CHECKING:
+    from rich.console import Group
+    from rich.text import Text
+
+BAR = 24
+WELL = (ProcessCondition.ALIVE, ProcessCondition.BUSY)
+BAD = (ProcessCondition.SILENT, ProcessCondition.GIVEN_UP, ProcessCondition.RESTARTING)
+LEVELS = {"WARNING": "yellow", "ERROR": "bold red", "CRITICAL": "bold red"}
+_PROCESS = ("name", "role", "step_age_s", "starts", "pid", "last_exit")
+
+
+@dataclass(frozen=True, slots=True)
+class RunDescription:
+    """Facts of a run besides what it publishes.
+
+    Attributes:
+        began_ns: experiment time at its start; None if it is not known.
+        speed: experiment seconds in a real second.
+        fancy: True if the terminal can show block characters.
+    """
+
+    name: str
+    folder: str
+    simulated: bool = False
+    began_ns: int | None = None
+    speed: float = 1.0
+    fancy: bool = True
+
+
+def bar(part: float, *, fancy: bool = True, width: int = BAR) -> str:
+    """Return a part of a whole (0 to 1) as a bar."""
+    full = min(width, max(0, round(part * width)))
+    return ("█" * full + "░" * (width - full)) if fancy else "[" + "#" * full + "." * (width - full) + "]"
+
+
+def flagged(seen: Overview) -> Iterator[tuple[int, str, Span | None]]:
+    """Yield (number, name, since when and by whom) of each problem that is flagged."""
+    for number in seen.control.problems if seen.control else ():
+        yield number, seen.problems.name(number), seen.problem_timelines[number].now
+
+
+def log_line(line: LogLine) -> Text:
+    """Return what a process said, coloured by how bad it is."""
+    from rich.text import Text
+
+    text = Text.assemble((f"{time_of_day(line.time_ns)} ", "dim"), (f"{line.name} ", "cyan"))
+    return text.append(line.text, LEVELS.get(line.level, ""))
+
+
+class StatusText:
+    """The words on a run at a moment, in experiment time."""
+
+    def __init__(self, seen: Overview, run: RunDescription, now_ns: int) -> None:
+        self._seen = seen
+        self._run = run
+        self._now_ns = now_ns
+
+    def screen(self, *, silent_s: float = 0.0, log_lines: int = 8) -> Group:
+        """Return all that there is to see."""
+        from rich.console import Group
+        from rich.text import Text
+
+        lines = [self._head()]
+        if silent_s > OLD_S:
+            told = f"no news for {duration_text(silent_s)}: the scheduler is being started again, or can't be reached"
+            lines.append(Text(told, "bold yellow"))
+        lines += [self._control(), *self._problems(), self._scanning(), *self._progress(), *self._processes()]
+        lines += self._refusals()
+        lines += map(log_line, list(self._seen.log)[-log_lines:] if log_lines > 0 else ())
+        for line in lines:
+            line.no_wrap, line.overflow = False, "fold"
+        return Group(*lines)
+
+    def summary(self) -> str:
+        """Return the most important in one line."""
+        return "; ".join(
+            " ".join(line.plain.split()) for line in (self._control(), *self._problems(), self._microscope())
+        )
+
+    def _head(self) -> Text:
+        from rich.text import Text
+
+        run = self._run
+        line = Text.assemble((run.name, "bold")).append("  SIMULATED" if run.simulated else "", "bold red")
+        line.append(f"  {day_and_time(self._now_ns)}")
+        if run.began_ns is not None:
+            line.append(f", running{self._since(run.began_ns)}")
+        return line.append(f", {run.speed:g} x real time" if run.speed != 1.0 else "")
+
+    def _since(self, since_ns: int | None) -> str:
+        return "" if since_ns is None else f" for {duration_text((self._now_ns - since_ns) / NS_PER_S)}"
+
+    def _control(self) -> Text:
+        line, seen = _label("control"), self._seen
+        if seen.control is None:
+            return line.append("not known yet")
+        mode = seen.control.mode.name
+        line.append(mode, "bold yellow" if mode == "MANUAL" else "")
+        if mode == "MANUAL":
+            return line.append(self._since(seen.modes.changed_ns))
+        return line.append(f", {seen.control.holder or 'nobody'} is in control{self._since(seen.control_since_ns)}")
+
+    def _problems(self) -> Iterator[Text]:
+        for _, name, span in flagged(self._seen):
+            line = _label("problem").append(name, "bold red")
+            if span is not None:
+                line.append(f"{self._since(span.start_ns)}{f', flagged by {span.by}' if span.by else ''}")
+            yield line
+
+    def _microscope(self) -> Text:
+        line, status = _label("microscope"), self._seen.status
+        if status is None:
+            return line.append("has not been heard of yet")
+        now = self._seen.states.now
+        line.append(status.state.name.lower().replace("_", " ")).append(", paused" if status.paused else "", "yellow")
+        return line.append(self._since(now.start_ns if now else None))
+
+    def _scanning(self) -> Text:
+        """Return what the microscope does, and how far it is with a scan."""
+        line, seen = self._microscope(), self._seen
+        if seen.status is None or seen.status.state is not ScopeState.SCANNING:
+            return line
+        if (progress := seen.scan_progress(self._now_ns)) is not None:
+            line.append(f"  {self._bar(progress[0])} {self._left(progress[1])}")
+        parameters = seen.scan_parameters
+        if parameters is None or not isinstance(parameters.region, Region):
+            return line
+        pixels = f", {parameters.shape[1]} x {parameters.shape[0]}" if isinstance(parameters.shape, tuple) else ""
+        return line.append(f"  {area_text(parameters.region.size_m)}{pixels}", "dim")
+
+    def _bar(self, part: float) -> str:
+        return f"{bar(part, fancy=self._run.fancy)} {100 * part:3.0f} %"
+
+    def _left(self, left_ns: int | None) -> str:
+        if left_ns is None:
+            return ""
+        speed = self._run.speed
+        real = f" ({duration_text(left_ns / speed / NS_PER_S)} real)" if speed != 1.0 else ""
+        return f"{duration_text(left_ns / NS_PER_S)} left{real}"
+
+    def _progress(self) -> Iterator[Text]:
+        for told in self._seen.told_progress.values():
+            if told.of <= 0:
+                continue
+            left_ns = told.remaining_ns(self._now_ns)
+            left = "longer than expected" if left_ns == 0 else self._left(left_ns)
+            said = f"{told.name}: {told.done} of {told.of}  {self._bar(told.done / told.of)} "
+            yield _label("progress").append(said + ("done" if told.done >= told.of else left))
+
+    def _processes(self) -> Iterator[Text]:
+        """Yield those that are well in one line; each of the others in its own."""
+        seen, states = self._seen, self._seen.processes.values()
+        running = [state.name for state in states if state.condition not in OVER]
+        unheard = {name: ns for name in running if (ns := seen.unheard_ns(name, self._run.speed)) is not None}
+        well = [_well(state) for state in states if state.condition in WELL and state.name not in unheard]
+        if well:
+            yield _label("processes").append(", ".join(well))
+        for state in states:
+            line = _label("process").append(f"{state.name} ")
+            if state.name in unheard:
+                gone = duration_text(unheard[state.name] / NS_PER_S)
+                line.append("not heard of", "bold red")
+                yield line.append(f" for {gone}: whoever started it is gone, or can't be reached")
+            elif state.condition not in WELL:
+                condition = state.condition.name.lower().replace("_", " ")
+                line.append(condition, "bold red" if state.condition in BAD else "yellow").append(self._lately(state))
+                yield line.append(f" ({state.last_exit})" if state.last_exit else "")
+
+    def _lately(self, state: ProcessState) -> str:
+        """Return since when it is so; of what is over, when that was."""
+        if state.condition is ProcessCondition.ENDED:
+            return f" {duration_text((self._now_ns - state.since_ns) / NS_PER_S)} ago"
+        return self._since(state.since_ns)
+
+    def _refusals(self, most: int = 3) -> Iterator[Text]:
+        """Yield the last; what was refused again and again in the same way, once."""
+        last: dict[tuple[str, str, str], tuple[int, int]] = {}
+        for entry in self._seen.refusals:
+            key = (entry.who, entry.what, entry.reason)
+            last[key] = (last.pop(key, (0, 0))[0] + 1, entry.time_ns)
+        for (who, what, reason), (count, time_ns) in list(last.items())[-most:]:
+            again = f" ({count} times)" if count > 1 else ""
+            line = _label("refused").append(f"{time_of_day(time_ns)} {who}: {what}{again}")
+            yield line.append(f": {reason}" if reason else "", "yellow")
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the same for programs. Times as ISO 8601 in UTC, durations in experiment seconds."""
+        seen, run = self._seen, self._run
+        control, running = seen.control, seen.scan_progress(self._now_ns)
+        return {
+            "experiment": run.name,
+            "folder": run.folder,
+            "simulated": run.simulated,
+            "time": _iso(self._now_ns),
+            "mode": control.mode.name if control else None,
+            "holder": control.holder if control else None,
+            "since": _iso(seen.control_since_ns),
+            "problems": [
+                {
+                    "number": number,
+                    "name": name,
+                    "since": _iso(span.start_ns if span else None),
+                    "by": span.by if span else "",
+                }
+                for number, name, span in flagged(seen)
+            ],
+            "state": seen.status.state.name if seen.status else None,
+            "scan": None if running is None else {"part": round(running[0], 4), "remaining_s": _seconds(running[1])},
+            "progress": {
+                name: {"done": told.done, "of": told.of, "remaining_s": _seconds(told.remaining_ns(self._now_ns))}
+                for name, told in seen.told_progress.items()
+            },
+            "processes": [self._process_json(state) for state in seen.processes.values()],
+            "refusals": [
+                {"time": _iso(one.time_ns), "who": one.who, "what": one.what, "reason": one.reason}
+                for one in seen.refusals
+            ],
+            "log": [
+                {"time": _iso(line.time_ns), "name": line.name, "level": line.level, "text": line.text}
+                for line in seen.log
+            ],
+        }
+
+    def _process_json(self, state: ProcessState) -> dict[str, Any]:
+        return {
+            **{name: getattr(state, name) for name in _PROCESS},
+            "condition": state.condition.name,
+            "since": _iso(state.since_ns),
+            "heard_of": self._seen.unheard_ns(state.name, self._run.speed) is None,
+        }
+
+
+def _label(name: str) -> Text:
+    from rich.text import Text
+
+    return Text.assemble((f"{name:11}", "dim"))
+
+
+def _well(state: ProcessState) -> str:
+    told = []
+    if state.condition is ProcessCondition.BUSY and state.step_age_s >= 1.0:
+        told.append(f"busy for {duration_text(state.step_age_s)}")
+    if state.starts > 1:
+        told.append(f"started {state.starts} times")
+    return f"{state.name} ({', '.join(told)})" if told else state.name
+
+
+def _seconds(ns: int | None) -> float | None:
+    return None if ns is None else ns / NS_PER_S
+
+
+def _iso(time_ns: int | None) -> str | None:
+    return None if time_ns is None else datetime.fromtimestamp(time_ns / NS_PER_S, UTC).isoformat()

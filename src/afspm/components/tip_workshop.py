@@ -1,0 +1,132 @@
+"""The workshop: fresh places on the sample, where treatments of the tip are done."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from afspm import wire
+from afspm.client.component import Component
+from afspm.components.tip_treatments import XY, Pulse, Treatment, clearance_m, fresh_place
+from afspm.errors import ControlLost, FileError, NoResponse, Refused
+from afspm.model import Region, ScopeState, names
+
+SETTLED_WITHIN_S = 2.0  # real time: a microscope that does not say that it is busy is taken to be ready then
+DONE_ACTION = "ActionMsg"
+
+
+class TipWorkshop:
+    """Treats the tip for a component, which has control around every call.
+
+    Args:
+        center: about which the places are.
+        spacing: between the places of two treatments, in m.
+        keep_away: least distance of a treatment from what is scanned, in m.
+    """
+
+    def __init__(self, component: Component, problem: str, center: XY, spacing: float, keep_away: float) -> None:
+        self._component = component
+        self._scope, self._log, self._memory = component.scope, component.log, component.memory
+        self._problem = problem
+        self._center = center
+        self._spacing, self._keep_away = spacing, keep_away
+        self._frame: Region | None = None  # of our own, about a place
+
+    def treat(self, number: int, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
+        """Do the `number`-th treatment at a fresh place, in one tenure of control with the move there.
+
+        Returns whether it was done. Raises FileError: it can't be written down.
+        """
+        while True:
+            place = self._fresh_place(number)
+            try:
+                with self._scope.control(unbroken=True):
+                    return self._treat_at(place, treatment, safe)
+            except Refused as refused:
+                self._log.warning("no %s, it was refused: %s", treatment, refused.reason)
+                return False
+            except ControlLost as lost:
+                if not self._scope.is_flagged(self._problem):
+                    raise
+                self._log.warning("no %s yet: %s; it is begun again at a fresh place", treatment, lost.what)
+
+    def _fresh_place(self, number: int) -> XY:
+        """Return where to try the `number`-th treatment. It is counted before: a kill must not make it happen twice."""
+        places = int(self._memory.get("places", 0))
+        self._memory["tried"], self._memory["places"] = number, places + 1
+        if not self._memory.save():
+            raise FileError("the disk is full: a treatment that can't be written down would be done again by a restart")
+        return fresh_place(self._center, self._spacing, places)
+
+    def _treat_at(self, place: XY, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
+        parameters = self._scope.scan_parameters  # a person may have chosen another region meanwhile
+        if parameters is not None and isinstance(parameters.region, Region) and parameters.region != self._frame:
+            safe = (*safe, parameters.region)
+        if (away := min(clearance_m(place, region) for region in safe)) < self._keep_away:
+            self._log.error("no %s: its place is only %.0f nm away from what is scanned", treatment, away * 1e9)
+            return False
+        action = names.PULSE if isinstance(treatment, Pulse) else names.CRASH
+        if not self._scope.supports(action):
+            self._log.warning("no %s: the microscope has no %s", treatment, action)
+            return False
+        self._go_to(place)
+        self._prepare(treatment)
+        if not self._scope.wait_until(
+            lambda: self._stands_at(place) or not self._scope.in_control, timeout_s=SETTLED_WITHIN_S
+        ):
+            self._log.error("no %s: the probe is %s, and not at %s", treatment, self._where(), nm(place))
+            return False
+        where = self._where()
+        self._act(action)
+        self._log.info("%s %s", treatment, where)
+        self._component.publish(wire.message_type(DONE_ACTION)(action=action), f"{DONE_ACTION}_{self._component.name}")
+        return True
+
+    def _go_to(self, place: XY) -> None:
+        """Move the probe to a place; with the scan frame, where the microscope moves its tip in that alone."""
+        try:
+            self._scope.move_probe(place)
+        except Refused as refused:
+            parameters = self._scope.scan_parameters
+            if parameters is None or not isinstance(parameters.region, Region):
+                raise
+            self._log.debug("the frame goes along to %s: %s", nm(place), refused.reason)
+            size_m = (self._spacing, self._spacing)
+            self._frame = replace(parameters.region, center_m=place, size_m=size_m)
+            self._scope.set_scan_region(self._frame)
+            self._scope.move_probe(place)
+
+    def _stands_at(self, place: XY) -> bool:
+        """Return whether the probe is published to be nearer to this place than to any other."""
+        position = self._scope.probe_position
+        return position is not None and math.dist(position.xy_m, place) <= self._spacing / 2
+
+    def _where(self) -> str:
+        position = self._scope.probe_position
+        return "nobody knows where" if position is None else f"at {nm(position.xy_m)}"
+
+    def _act(self, action: str) -> None:
+        """Do it, and let it end: what is asked of a busy microscope it refuses."""
+        with self._scope.events("ScopeStateMsg", timeout_s=SETTLED_WITHIN_S) as states:
+            try:
+                self._scope.action(action)
+            except NoResponse as silent:
+                self._log.warning("%s: it counts as done, %s", silent.what, silent.hint)
+                return
+            was_busy = False
+            for event in states:
+                if event.message.state is ScopeState.FREE and was_busy:
+                    return
+                was_busy = True
+
+    def _prepare(self, treatment: Treatment) -> None:
+        if isinstance(treatment, Pulse):
+            self._scope.set(names.PULSE_VOLTAGE, treatment.voltage_v, "V")
+            self._scope.set(names.PULSE_DURATION, treatment.duration_s, "s")
+        else:
+            self._scope.set(names.CRASH_DEPTH, treatment.depth_m, "m")
+            self._scope.set(names.CRASH_SPEED, treatment.speed_m_per_s, "m/s")
+
+
+def nm(place: XY) -> str:
+    return f"({place[0] * 1e9:.0f}, {place[1] * 1e9:.0f}) nm"
