@@ -13,7 +13,7 @@ from typing import Any
 
 from afspm.clock import ExperimentClock
 from afspm.launch import Launch, Sockets
-from afspm.record.ahead import expect_record
+from afspm.storage.packet_log import expect_recorder, log_folder
 from afspm.supervisor.ports import FreePorts
 
 CLOCK = ExperimentClock.real()
@@ -54,7 +54,7 @@ class Roles(ExitStack):
         self.run_folder = Path(folder)
         publish, serve = PORTS.address(), PORTS.address()
         if recorded:
-            expect_record(Path(folder))
+            expect_recorder(log_folder(Path(folder)))
             sockets = Sockets(subscribe=(publish,), control=serve)
             recorder = "afspm.components.recorder.Recorder"
             line = Launch("recorder", recorder, sockets=sockets, run_dir=folder, state_dir=folder, log_level="ERROR")

@@ -19,10 +19,11 @@ import numpy as np
 import afspm
 from afspm import wire
 from afspm.model import ControlMode, ControlState, Packet, Region, Scan, ScopeState, ScopeStatus
-from afspm.record import ahead, journal
+from afspm.record import journal
 from afspm.record.journal import SCHEDULER
 from afspm.record.measured_files import write_synced
 from afspm.record.store import RecordSettings, RecordStore
+from afspm.storage.packet_log import START, LogReader, committed, log_folder
 from benchmarks.codec import scan
 from benchmarks.control import Client
 from benchmarks.processes import roles
@@ -127,9 +128,9 @@ class RecordedLine(FreshLine):
 
     def wait_until_sure(self) -> None:
         """Until what was written ahead may be written over."""
-        said, newest = self._folder / ahead.RECORDED_FILE, "SELECT max(time_ns) FROM packets"
         self.wait_until_recorded()
-        self._wait(lambda asked: ahead.recorded_until(said) >= asked(newest))
+        log = log_folder(self._folder)
+        self._wait(lambda asked: not LogReader(log, committed(log) or START).read(1))
 
     def _wait(self, is_so: Callable[[Callable[[str], int]], bool]) -> None:
         deadline = perf_counter() + RECORDED_WITHIN_S

@@ -16,13 +16,13 @@ _ADDRESS = re.compile(r"(tcp://(\[[0-9A-Fa-f:.%]+\]|[^:/\s]+):(\d+|\*)|ipc://\S+
 
 
 def is_address(text: str) -> bool:
-    """Whether this is an address as ZeroMQ writes it."""
+    """Return whether this is an address as ZeroMQ writes it."""
     match = _ADDRESS.fullmatch(text)
     return match is not None and _has_port(match)
 
 
 def hint_on(text: str) -> str:
-    """What to do about a text that is no address but for its port; empty: it does not even look like one."""
+    """Return what to do about a text that is no address but for its port; empty: it does not even look like one."""
     match = _ADDRESS.fullmatch(text)
     return f"a port is {HIGHEST_PORT} at most" if match and not _has_port(match) else ""
 
@@ -32,7 +32,7 @@ def _has_port(match: re.Match[str]) -> bool:
 
 
 def reaches(connect: str, bind: str) -> bool:
-    """Whether a connection to one address ends at what is bound at the other (a wildcard means any host)."""
+    """Return whether a connection to one address ends at what is bound at the other (a wildcard means any host)."""
     if connect == bind:
         return True
     a, b = _ADDRESS.fullmatch(connect), _ADDRESS.fullmatch(bind)
@@ -43,7 +43,7 @@ def reaches(connect: str, bind: str) -> bool:
 
 
 def connectable(bind: str) -> str:
-    """How a peer on the same computer connects to what is bound: a wildcard is no address to connect to."""
+    """Return how a peer on the same computer connects to what is bound: a wildcard is no address to connect to."""
     return re.sub(r"^tcp://(\*|0\.0\.0\.0)(?=:)", f"tcp://{LOOPBACK}", bind)
 
 
@@ -75,7 +75,7 @@ class Listens:
         return value
 
     def address(self, value: Any, settings: Mapping[str, Any]) -> str | None:
-        """Where the component listens, as ZeroMQ would write it; None: that is left to itself, or no address at all.
+        """Return where the component listens, as ZeroMQ writes it; None: it decides itself, or this is none.
 
         Args:
             value: of the setting.

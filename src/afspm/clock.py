@@ -27,7 +27,7 @@ NS_PER_S = 1_000_000_000
 
 
 def iso_utc(time_ns: int | None) -> str:
-    """A time, ns since the Unix epoch, as ISO 8601 in UTC, to the microsecond; empty for none."""
+    """Return a time, ns since the Unix epoch, as ISO 8601 in UTC, to the microsecond; empty for none."""
     if time_ns is None:
         return ""
     seconds, rest_ns = divmod(time_ns, NS_PER_S)
@@ -35,7 +35,7 @@ def iso_utc(time_ns: int | None) -> str:
 
 
 class Clock(Protocol):
-    """What tells the time."""
+    """A source of time."""
 
     def now_ns(self) -> int:
         """Experiment time, ns since the Unix epoch."""
@@ -50,7 +50,7 @@ class Clock(Protocol):
         ...
 
     def real_s(self, experiment_s: float) -> float:
-        """How long `experiment_s` of the experiment last in real time, in s."""
+        """Return how long `experiment_s` of the experiment last in real time, in s."""
         ...
 
     def late(self) -> AbstractContextManager[None]:
@@ -68,7 +68,7 @@ _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 @cache
 def monotonic_id() -> str:
-    """What tells apart computers, boots of one computer, and clocks of one boot, by which time.monotonic() goes.
+    """Return what tells apart computers, boots of one computer, and clocks of one boot, by which time.monotonic() goes.
 
     In one boot all processes count from one zero: the function is "system-wide" by Python's documentation (since 3.5;
     on macOS since 3.10), but which of Windows' clocks it reads depends on the version of Python. Elsewhere than on
@@ -182,18 +182,18 @@ class ExperimentClock:
 
     @classmethod
     def real(cls) -> ExperimentClock:
-        """The clock on the wall."""
+        """Return the clock on the wall."""
         return cls()
 
     @classmethod
     def starting_now(cls, start_s: float | None = None, speed: float = 1.0) -> ExperimentClock:
-        """A clock that shows `start_s` (default: the real time) now and goes at `speed` from here."""
+        """Return a clock that shows `start_s` (default: the real time) now and goes at `speed` from here."""
         origin_s = time.time()
         return cls(origin_s, origin_s if start_s is None else start_s, speed)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> ExperimentClock:
-        """The clock that `as_dict` told of; of nothing, the one on the wall."""
+        """Return the clock that `as_dict` told of; of nothing, the one on the wall."""
         if not values:
             return cls.real()
         told = (float(values["origin_s"]), float(values["start_s"]), float(values["speed"]))
@@ -257,7 +257,7 @@ class ExperimentClock:
 
     @cached_property
     def _since_origin_ns(self) -> int:
-        """How long the run had lasted at the zero of time.monotonic()."""
+        """The age of the run at the zero of time.monotonic()."""
         return int(self._wall_at_zero_s * NS_PER_S) - int(self.origin_s * NS_PER_S)
 
     @cached_property

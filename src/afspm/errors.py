@@ -80,7 +80,7 @@ class ErrorCollector:
 
 
 def individual_errors(error: AfspmError) -> tuple[AfspmError, ...]:
-    """The errors that one stands for: those that it gathers, or itself."""
+    """Return the errors that one stands for: those that it gathers, or itself."""
     return error.errors if isinstance(error, ConfigErrors) else (error,)
 
 

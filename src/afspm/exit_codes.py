@@ -1,4 +1,4 @@
-"""How a process of an experiment ends, told to its supervisor by the exit code."""
+"""Exit codes, by which a process tells its supervisor why it ends."""
 
 from __future__ import annotations
 

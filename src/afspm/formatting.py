@@ -15,7 +15,7 @@ _LENGTHS = ((1e-3, "mm"), (1e-6, "um"), (1e-9, "nm"), (1e-12, "pm"))
 
 
 def duration_text(seconds: float) -> str:
-    """A duration, as exactly as it matters.
+    """Return a duration, as exactly as it matters.
 
     >>> [lasting(s) for s in (8.2, 200, 725, 7500, 300_000)]
     ['8 s', '3 min 20 s', '12 min', '2 h 05 min', '3 d 11 h']
@@ -65,7 +65,7 @@ def position_text(xy_m: tuple[float, float]) -> str:
 
 
 def typeset(told: str) -> str:
-    """What `lengths`, `area` and `place` give, for pages.
+    """Return what `lengths`, `area` and `place` give, for pages.
 
     >>> typeset("2 x 1 um at (1.2, -0.5) um")
     '2 × 1 µm at (1.2, −0.5) µm'

@@ -70,7 +70,7 @@ class Unit:
         return core_schema.no_info_before_validator_function(self.read, handler(source))
 
     def read(self, value: Any) -> float:
-        """A quantity of the experiment file in this SI unit; a plain number is in it already.
+        """Return a quantity of the experiment file in this SI unit; a plain number is in it already.
 
         Raises:
             UnitError: not a finite number, an unknown unit, or one of another kind.
@@ -125,7 +125,7 @@ def parse_quantity(text: str) -> tuple[float, str]:
 
 
 def si(value: str | float, unit: str) -> float:
-    """A quantity as text ("2.5 um") or a plain number (SI already) as a float in the SI unit `unit`.
+    """Return a quantity as text ("2.5 um") or a plain number (SI already) as a float in the SI unit `unit`.
 
     Raises:
         UnitError: not a number, an unknown unit, or one of another kind than `unit`.
@@ -139,7 +139,7 @@ def si(value: str | float, unit: str) -> float:
 
 
 def si_unit(unit: str) -> str:
-    """The SI unit of the same kind: "nm" -> "m", "um/s" -> "m/s", "deg" -> "rad".
+    """Return the SI unit of the same kind: "nm" -> "m", "um/s" -> "m/s", "deg" -> "rad".
 
     Raises:
         UnitError: an unknown unit.
@@ -148,7 +148,7 @@ def si_unit(unit: str) -> str:
 
 
 def same_kind(unit_a: str, unit_b: str) -> bool:
-    """Whether one unit can be converted to the other; False for unknown ones."""
+    """Return whether one unit can be converted to the other; False for unknown ones."""
     try:
         return _base_and_factor(unit_a)[0] == _base_and_factor(unit_b)[0]
     except UnitError:
@@ -169,7 +169,7 @@ def _ratio(unit_from: str, unit_to: str) -> Fraction:
 
 @lru_cache(maxsize=1000)
 def _base_and_factor(unit: str) -> tuple[str, Fraction]:
-    """A unit as its kind, written in base units, and the factor to them."""
+    """Return a unit as its kind, written in base units, and the factor to them."""
     unit = unit.strip()
     simple = _simple(unit)
     if simple is not None:

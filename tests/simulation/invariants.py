@@ -283,7 +283,7 @@ class Invariants:
     def _replayed(self, host: SchedulerHost, event: ReplayRequested, effects: Sequence[Effect]) -> None:
         """Exactly what is cached and it has not had, oldest first over all envelopes."""
         replay = next(effect for effect in effects if isinstance(effect, Replay))
-        cached = [packet for packet, _ in host.core.cached()]
+        cached = [packet for packet, *_ in host.core.cached()]
         wanted = [p for p in cached if (p.time_ns or 0) > event.since_ns and p.envelope.startswith(event.prefixes)]
         self._must(list(replay.packets) == wanted, f"a replay of {len(replay.packets)} instead of {len(wanted)}")
         times = [packet.time_ns or 0 for packet in replay.packets]

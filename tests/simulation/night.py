@@ -350,7 +350,7 @@ class Night:
         """In calm weather the experiment goes on, and everybody has what the cache holds."""
         if not self.keeper.given_up and scans == 0:
             self.invariants.fail(f"nothing was scanned in the calm; control: {self.scheduler.core.control}")
-        cached = [packet for packet, _ in self.scheduler.core.cached()]
+        cached = [packet for packet, *_ in self.scheduler.core.cached()]
         self.timeline.run_until(self.timeline.monotonic_s() + 1.0)
         for client in self.components.values():
             settled = self.timeline.monotonic_s() - max(client.since_s, self.scheduler.since_s) > _SETTLED_S

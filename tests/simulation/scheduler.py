@@ -37,6 +37,7 @@ from afspm.model import (
     HAS_ENDED,
     RELAY_REQUEST,
     ControlResponse,
+    LoggedPacket,
     Packet,
     PacketHeader,
     Request,
@@ -47,8 +48,6 @@ from afspm.model.snapshot import restored, snapshot
 from tests.simulation.network import ControlLine, ControlServer, Feed, Publisher, Weather
 from tests.simulation.process import Alarm, Process
 from tests.simulation.timeline import Timeline
-
-Entry = tuple[Packet, int | None]
 
 
 @dataclass
@@ -62,7 +61,7 @@ class Disk:
     """
 
     state: SavedState | None = None
-    journal: tuple[Entry, ...] = ()
+    journal: tuple[LoggedPacket, ...] = ()
     full: bool = False
     stale: bool = False
 
@@ -71,12 +70,12 @@ class Disk:
         if not self.full:
             self.state = state
 
-    def keep(self, packet: Packet, source_ns: int | None) -> None:
+    def keep(self, entry: LoggedPacket) -> None:
         """A packet, before it is published."""
         if self.full:
             self.stale = True
             return
-        self.journal = (*self.journal, (packet, source_ns))
+        self.journal = (*self.journal, entry)
 
     def saved(self) -> SavedState | None:
         """As it comes out of a JSON file; None if nothing was saved."""
@@ -273,11 +272,11 @@ class SchedulerHost(Process):
         elif isinstance(effect, Forward):
             self._link.ask(effect.request, effect.number)
         elif isinstance(effect, Publish):
-            if effect.cached and (effect.source_ns is None or self.writes_ahead):
-                self.disk.keep(effect.packet, effect.source_ns)
+            if effect.history and (effect.source_ns is None or self.writes_ahead):
+                self.disk.keep(LoggedPacket(effect.packet, effect.source_ns, effect.history))
             for feed in list(self._feeds):
                 feed.publish(effect.packet)
-            if effect.cached and not self._journal_due:
+            if effect.history and not self._journal_due:
                 self._journal_due = True
                 self.later(self.journal_s * self.timeline.random.random(), self._write_journal)
         elif isinstance(effect, Replay):

@@ -119,7 +119,7 @@ class Written:
         self._derived = _Derived.of(host.core.control, self._names)
         self._published_s = -1.0
         if self._newest is not None and self.is_certain:
-            kept = [packet for packet, _ in host.core.cached() if packet.time_ns == self._newest.time_ns]
+            kept = [packet for packet, *_ in host.core.cached() if packet.time_ns == self._newest.time_ns]
             self._must(kept == [self._newest], "what was written last is not there any more after a restart")
 
     def _reply(self, reply: Reply) -> None:

@@ -152,7 +152,7 @@ def test_a_spectrum_is_taken_by_a_click_and_shown(night: Night, page: Any, keep:
     night.until(lambda: len(night.follower.overview.spectra) > before)
     taken = night.follower.overview.spectra[-1]
     assert taken.position_m == pytest.approx(centre, abs=2e-9)
-    page.wait_for_selector(".spectra .chart path")
+    page.wait_for_selector(".spectra .chart path[stroke='var(--t0)']")
     page.wait_for_selector(".map path.spectrum", state="attached")
     keep(page, "spectrum")
 

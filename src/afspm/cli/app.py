@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
 
+from afspm import plugins
 from afspm.cli import dashboard, drift, drivers, experiment_file, recorded, run, status, steer
+from afspm.errors import ConfigError
 
 app = typer.Typer(
     name="afspm",
@@ -35,7 +38,8 @@ def _afspm(
     """Automate scanning probe microscopes: run experiments of several components that share one microscope."""
 
 
-BEFORE, MEANWHILE, AFTERWARDS, MICROSCOPES = "Before", "While it runs", "Afterwards", "Microscopes"
+BEFORE, MEANWHILE, AFTERWARDS = "Before", "While it runs", "Afterwards"
+MICROSCOPES, PLUGINS = "Microscopes", "Plug-ins"
 
 app.command("run")(run.run)
 app.command("check", rich_help_panel=BEFORE)(experiment_file.check)
@@ -55,3 +59,27 @@ app.add_typer(drift.app, name="drift", rich_help_panel=AFTERWARDS)
 app.add_typer(drivers.new, name="new", rich_help_panel=MICROSCOPES)
 app.command("test-translator", rich_help_panel=MICROSCOPES)(drivers.check_translator)
 app.command("emulate", rich_help_panel=MICROSCOPES)(drivers.emulate)
+
+
+def _add_plugins() -> None:
+    """Add the commands of installed packages: one that can't be loaded says so when it is called."""
+    for name in plugins.names(plugins.COMMANDS):
+        try:
+            command = plugins.load(plugins.COMMANDS, name)
+        except ConfigError as error:
+            command = _unloadable(error)
+        if isinstance(command, typer.Typer):
+            app.add_typer(command, name=name, rich_help_panel=PLUGINS)
+        else:
+            app.command(name, rich_help_panel=PLUGINS)(command)
+
+
+def _unloadable(error: ConfigError) -> Callable[[], None]:
+    def command() -> None:
+        """Not available: its package can't be loaded."""
+        raise error
+
+    return command
+
+
+_add_plugins()

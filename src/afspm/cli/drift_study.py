@@ -33,7 +33,7 @@ refused, again: scans that could not be registered, and that were taken again.""
 
 
 def metrics_of(settings: NightSettings, seed: int) -> Mapping[str, float]:
-    """What a worker does, and all that it sends back."""
+    """Simulate a night, in a worker, and return its metrics."""
     return night(settings, seed).metrics()
 
 

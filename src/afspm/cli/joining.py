@@ -1,4 +1,4 @@
-"""How the commands of the terminal find a running experiment, and in whose name they speak there."""
+"""Connections of the terminal's commands to a running experiment, in the name of the user."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def person() -> str:
 
 @contextmanager
 def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
-    """Look on at the run that is meant; ends the command where nothing runs.
+    """Follow the run that is meant; end the command where nothing runs.
 
     Args:
         lines: also of scans that are being taken.
@@ -50,7 +50,7 @@ def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
 
 @contextmanager
 def acting(where: Path) -> Iterator[Scope]:
-    """A handle on the run that is meant, in the name of whoever sits here; ends the command where nothing runs."""
+    """Connect to the run that is meant, in the name of the user; end the command where nothing runs."""
     from afspm.client.connect import connect
 
     folder = _running(where)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 REFRESH_S = 0.25
 LOOK_S = 2.0
-"""So often it is looked whether it still goes on, where nothing is said."""
+"""Interval of checks whether the run still goes on, where nothing is published."""
 UNBROKEN = 10_000  # columns: what programs and files get has a line for a line
 
 

@@ -26,7 +26,7 @@ _PROCESS = ("name", "role", "step_age_s", "starts", "pid", "last_exit")
 
 @dataclass(frozen=True, slots=True)
 class RunDescription:
-    """What is known of a run besides what it publishes.
+    """Facts of a run besides what it publishes.
 
     Attributes:
         began_ns: experiment time at its start; None if it is not known.
@@ -63,7 +63,7 @@ def log_line(line: LogLine) -> Text:
 
 
 class StatusText:
-    """What is to be said of a run at a moment, in experiment time."""
+    """The words on a run at a moment, in experiment time."""
 
     def __init__(self, seen: Overview, run: RunDescription, now_ns: int) -> None:
         self._seen = seen

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import re
-import struct
 import zlib
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,12 +13,13 @@ from typing import Any
 
 from afspm import wire
 from afspm.errors import FileError, InvalidValue, WireError
+from afspm.model import LoggedPacket, Packet
 from afspm.process.memory import Memory
 from afspm.storage.atomic import OutageLog, write_atomic
+from afspm.storage.segment import head_of, read_packet
 
 _log = logging.getLogger("afspm.memory")
-_MAGIC = b"afspm-result-1\n"
-_LENGTH = struct.Struct("<Q")
+_HEAD = "result"
 LONGEST_KEY = 100
 
 
@@ -76,13 +76,13 @@ class KeyedResults:
         """Keep the result; the intent is fulfilled. Where the disk is full, another life measures it again."""
         path = self._path(key)
         if path is not None:
-            head = {"key": key, "plan": plan, "interruptions": result.interruptions}
-            parts: list[bytes] = [json.dumps(head).encode()]
-            for thing in result.things:
-                message, payload = wire.encode(thing)
-                parts += [message.encode(), payload]
+            things = [wire.encode(thing) for thing in result.things]
+            head = {"key": key, "plan": plan, "interruptions": result.interruptions, "things": len(things)}
+            parts: list[bytes | memoryview] = []
+            for name, payload in [(_HEAD, json.dumps(head).encode()), *things]:
+                parts += [head_of(LoggedPacket(Packet(name, payload), None, 0)), payload]
             with self._outage.trying():
-                write_atomic(path, [_MAGIC, *(piece for part in parts for piece in (_LENGTH.pack(len(part)), part))])
+                write_atomic(path, parts)
         self._memory.pop("pending", None)
         self._memory.save()
 
@@ -110,16 +110,13 @@ def check_key(key: str) -> str:
 
 def _read(path: Path) -> tuple[dict[str, Any], list[Any]]:
     try:
-        data = memoryview(path.read_bytes())
-        if bytes(data[: len(_MAGIC)]) != _MAGIC:
+        with path.open("rb") as file:
+            packets = [entry.packet for entry in iter(lambda: read_packet(file), None)]
+        if not packets or packets[0].envelope != _HEAD:
             raise ValueError("not a result")
-        parts, at = [], len(_MAGIC)
-        while at < len(data):
-            begin = at + _LENGTH.size
-            at = begin + _LENGTH.unpack_from(data, at)[0]
-            parts.append(data[begin:at])
-        names, payloads = parts[1::2], parts[2::2]
-        things = [wire.decode(str(name, "utf-8"), part) for name, part in zip(names, payloads, strict=True)]
-        return json.loads(bytes(parts[0])), things
-    except (OSError, ValueError, struct.error, WireError, IndexError) as error:
+        head = json.loads(bytes(packets[0].payload))
+        if len(packets) != 1 + head["things"]:
+            raise ValueError("not all of it is there")
+        return head, [wire.decode(packet.envelope, packet.payload) for packet in packets[1:]]
+    except (OSError, ValueError, WireError) as error:
         raise FileError(f"can't be read: {error}", where=str(path), hint="remove it to measure anew") from error

@@ -13,7 +13,9 @@ from afspm.exit_codes import ExitCode
 from afspm.model import Frame
 from afspm.process.priority import step_back
 from afspm.record.run_json import EXPERIMENT_FILE, experiment_name
-from afspm.transport.port import CaughtUp, Killed, PacketReceived, ParentGone
+from afspm.storage.packet_log import log_folder
+from afspm.storage.segment import segments
+from afspm.transport.port import Killed, PacketReceived, ParentGone
 
 if TYPE_CHECKING:
     from afspm.process.context import ProcessContext
@@ -21,15 +23,17 @@ if TYPE_CHECKING:
 
 REST_S = 0.5
 """Real: for what is said of the end after it."""
+SIGNS_OF_LIFE = ("ControlState",)
+"""What a recorder hears of a scheduler whose log it follows."""
 
 
 class Recorder(Component):
     """Writes `journal.sqlite`, and every scan and spectrum as an HDF5 file, into the folder of the run.
 
-    It only listens, and lets all others have the processor first. Whatever is killed, also everything at once, nothing
-    that was published is missing in the record of a run that is resumed, and nothing is there twice. A disk that is
-    full is told; the experiment goes on, and what was missed is recorded once there is room, as far as it is still
-    kept then.
+    It follows the scheduler's packet log, and lets all others have the processor first. Whatever is killed, also
+    everything at once, nothing that was published is missing in the record of a run that is resumed, and nothing is
+    there twice. A disk that is full is logged; the experiment goes on, and what was missed is recorded once there is
+    room, as far as it is still kept then.
 
     Args:
         scans: whether scans and spectra are kept; else only the journal is.
@@ -44,17 +48,21 @@ class Recorder(Component):
 
     def run_process(self, context: ProcessContext) -> int:
         from afspm.components.recording import RecordWriter
+        from afspm.record.journal import SCHEDULER
 
         step_back()
         launch = context.launch
         run_dir = Path(launch.run_dir or ".")
         context.activity.longest_step_s = self.longest_step_s
         logging.getLogger("h5py").setLevel(logging.WARNING)  # else it tells of every number that it converts
-        port = context.open_port()
+        # one that keeps a log need not send us everything, too
+        heard = SIGNS_OF_LIFE if len(launch.sockets.subscribe) == 1 else None
+        port = context.open_port(heard)
         source = launch.sockets.subscribe[0] if launch.sockets.subscribe else ""
+        log = log_folder(Path(launch.state_dir or run_dir))
         writer = RecordWriter(
             run_dir,
-            Path(launch.state_dir) if launch.state_dir else None,
+            log,
             _about(context, run_dir, scans=self.scans),
             context.clock,
             context.log,
@@ -62,24 +70,27 @@ class Recorder(Component):
             wake=lambda: port.wake_up(),  # of whichever is open then
         )
         writer.start()
-        until_s = math.inf
+        until_s, is_to_ask_again = math.inf, False
         try:
             while (left_s := until_s - context.clock.monotonic_s()) > 0.0:
                 for incoming in port.poll(None if left_s == math.inf else left_s):
                     match incoming:
-                        case PacketReceived():
-                            writer.put(incoming.packet, "" if incoming.source == source else incoming.source)
-                        case CaughtUp() if incoming.source == source:
-                            writer.caught_up()
+                        case PacketReceived() if incoming.source != source:
+                            writer.put(incoming.packet, incoming.source)
+                        case PacketReceived() if heard is None and not segments(log):
+                            writer.put(incoming.packet, SCHEDULER)
+                        case PacketReceived() if not segments(log):  # a scheduler of version 1 keeps no log
+                            heard, is_to_ask_again = None, True
                         case Killed():
                             until_s = min(until_s, context.clock.monotonic_s() + REST_S)
                         case ParentGone():
                             writer.finish(ended=until_s < math.inf)
                             return ExitCode.ORPHAN
                 writer.check()
-                if writer.wants_replay():
+                if writer.wants_replay() or is_to_ask_again:
+                    is_to_ask_again = False
                     port.close()
-                    port = context.open_port()
+                    port = context.open_port(heard)
             writer.finish(ended=True)
             return ExitCode.ENDED
         finally:

@@ -1,4 +1,4 @@
-"""Who may look and who may steer: names and passwords."""
+"""Access to the dashboard: names and passwords of those who may look or steer."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Visitor:
 
 
 class Access:
-    """Decides who comes in, and who may steer.
+    """Decides whom the dashboard lets look, and whom it lets steer.
 
     On loopback without passwords everybody may look, and any name may steer. Where there is a common password, only
     those who know it may look. Where there are persons, only they may steer, each with a password of the own.
@@ -140,7 +140,8 @@ class Access:
 
     def by_password(self, person: str, password: str, address: str) -> Visitor | None:
         """Return who shows a name and a password with a request; None if that is wrong, or was wrong too often."""
-        return Visitor(person) if not self.wait_s(address) and self._proves(person, password, address) else None
+        is_proved = not self.wait_s(address) and self._proves(person, password, address)
+        return Visitor(person) if is_proved else None
 
     def wait_s(self, address: str) -> float:
         """Return how long an address that was wrong too often has to wait; 0 if it needn't."""

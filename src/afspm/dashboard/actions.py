@@ -1,4 +1,4 @@
-"""What a person can do to a running experiment. Everything is asked of the scheduler, which may say no."""
+"""Actions of a person on a running experiment: requests to the scheduler, which may refuse them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 from afspm import wire
 from afspm.client.link import ExperimentLink
@@ -49,7 +48,7 @@ MOST_PERSONS = 32
 
 @dataclass(frozen=True)
 class ActionResult:
-    """What came of an action; `text` says it to the person, with the reason where it was refused."""
+    """The result of an action; `text` is for the person, with the reason of a refusal."""
 
     text: str
     ok: bool = True
@@ -145,7 +144,7 @@ class Actions:
 
     # --- within ---
 
-    def _ask(self, kind: int, subject: Any = None) -> Response:
+    def _ask(self, kind: int, subject: object = None) -> Response:
         self._link.pump(0.0)  # what has come of the connection since we asked last
         return self._link.request(kind, subject, until_s=self._link.until(ANSWER_S))
 

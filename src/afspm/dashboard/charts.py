@@ -15,6 +15,7 @@ from afspm.formatting import quantity, scale, time_of_day, typeset_position
 from afspm.model import Spectrum
 from afspm.record.overview import DriftPoint
 
+Options = dict[str, Any]
 BEFORE = 6  # spectra that are shown faintly behind the newest
 MOST_DRIFT = 5_000
 _MARGINS = {"left": 8, "right": 16, "top": 30, "bottom": 28, "containLabel": True}
@@ -27,7 +28,7 @@ class Chart:
     """A chart and the HTML above it; `options` of None: nothing to draw."""
 
     words: str
-    options: dict[str, Any] | None = None
+    options: Options | None = None
 
 
 def drift_chart(points: Sequence[DriftPoint]) -> Chart:
@@ -92,7 +93,7 @@ def _named(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
-def _line(x: Array, y: Array, colour: str, name: str = "") -> dict[str, Any]:
+def _line(x: Array, y: Array, colour: str, name: str = "") -> Options:
     style = {"color": colour}
     return {
         "type": "line", "name": name, "data": _pairs(*thinned(x, y)), "showSymbol": False, "itemStyle": style,
@@ -106,7 +107,7 @@ def _pairs(x: Array, y: Array) -> list[list[float | None]]:
     return [[a if math.isfinite(a) else None, float(f"{b:.6g}") if math.isfinite(a + b) else None] for a, b in points]
 
 
-def _options(series: list[dict[str, Any]], x: dict[str, Any], y_name: str) -> dict[str, Any]:
+def _options(series: list[Options], x: Options, y_name: str) -> Options:
     axis = {
         "axisLabel": {"color": _QUIET},
         "axisLine": {"onZero": False, "lineStyle": {"color": _LINE}},

@@ -1,4 +1,4 @@
-"""What the page shows, as HTML made once for all who look at it."""
+"""The content of the page, as HTML made once for all viewers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Flag = tuple[int, str, str]
 
 @dataclass(frozen=True)
 class SlowContent:
-    """What takes longer to make; `sample_map_near` is the part where something was measured."""
+    """The parts that take longer to make; `sample_map_near` shows only where something was measured."""
 
     sample_map: str = ""
     sample_map_near: str = ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from afspm.addresses import Listens
 from afspm.client.component import Component
@@ -96,7 +96,7 @@ class Dashboard(Component):
         self._server.start()
         self._say_where(bound.getsockname()[1])
 
-    def on_message(self, envelope: str, message: Any) -> None:
+    def on_message(self, envelope: str, message: object) -> None:
         time_ns = self.packet.time_ns if self.packet and self.packet.time_ns is not None else self.clock.now_ns()
         self._watch.take(envelope.partition("_")[0], message, time_ns, envelope)
 

@@ -43,9 +43,15 @@ class ChannelFrame:
     def complete(self) -> bool:
         return self.time_ns is not None
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ChannelFrame) and self.number == other.number
+
+    def __hash__(self) -> int:
+        return self.number
+
 
 class FrameStore:
-    """What pictures are made of. Not for several threads at once.
+    """Keeps frames, of which pictures are made. Not for several threads at once.
 
     Args:
         memory_bytes: of finished frames that are kept, beside the newest of each channel; of growing ones, too.

@@ -1,4 +1,4 @@
-"""What the page fetches by itself: pictures as they come, values, profiles.
+"""Requests of the browser's scripts: pictures as they come, values, profiles.
 
 The browser asks for the next picture when it has drawn the last, and gets the newest: what it was too slow for is left
 out, and nothing waits for it here.
@@ -15,7 +15,7 @@ from fastapi import Depends, FastAPI, Response
 from fastapi.responses import PlainTextResponse
 
 from afspm.dashboard.archive import Archive
-from afspm.dashboard.pictures import Look, Picture, PictureCache, number_or_none
+from afspm.dashboard.pictures import Look, PictureCache, RenderedFrame, number_or_none
 from afspm.dashboard.watch import Bell, Watch
 from afspm.drawing.palette import LEVELS, PALETTES
 from afspm.drawing.profile import profile
@@ -41,7 +41,7 @@ Asked = Annotated[PictureRequest, Depends()]
 
 
 class Live:
-    """The answers to what the page fetches.
+    """Answers the requests of the browser's scripts.
 
     Args:
         archive: where scans are that are not in memory any more.
@@ -131,7 +131,7 @@ class Live:
         with self._watch.reading():
             return self._watch.frames.newest_number(channel or None)
 
-    def _drawn(self, asked: PictureRequest) -> Picture | None:
+    def _drawn(self, asked: PictureRequest) -> RenderedFrame | None:
         with self._watch.reading():
             frames = self._watch.frames
             frame = frames.kept(asked.time, asked.channel) if asked.time else frames.newest(asked.channel or None)

@@ -32,7 +32,7 @@ SIMULATED = "SIMULATED: this is no real microscope"
 
 @dataclass(frozen=True)
 class Services:
-    """What the page is made from.
+    """The parts of the dashboard that every page uses.
 
     Attributes:
         title: the name of the experiment.

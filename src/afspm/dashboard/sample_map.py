@@ -20,7 +20,7 @@ _SAME = 200.0  # places that differ by less than this part of their size are one
 
 @dataclass(frozen=True)
 class MapContent:
-    """What is on the map, in the coordinates of components (of the sample, where drift is corrected).
+    """The content of the map, in the coordinates of components (of the sample, where drift is corrected).
 
     Attributes:
         current: the region that is set.
@@ -40,40 +40,59 @@ class MapContent:
 
 
 def map_html(content: MapContent, *, whole: bool = True) -> str:
-    """The map as HTML; scans have their time and channel as data-time and data-channel, spectra their time.
+    """Return the map; scans have their time and channel as data-time and data-channel, spectra their time.
 
     Args:
         whole: all of what the limits allow; else the part where something was measured, and what is set now.
     """
     places, left_out = places_of(content.scans)
     spectra = [one for one in content.spectra if one.position_m is not None][-MOST_PLACES:]
-    frame = _frame(content, places, spectra, whole=whole)
-    if frame is None:
+    corners = [one.region.corners_m() for one, _ in places] + [np.array([one.position_m]) for one in spectra]
+    if content.current is not None:
+        corners.append(content.current.corners_m())
+    limits = None if content.limits is None else _over_the_sample(content.limits, content.tip_to_sample)
+    if limits is not None and (whole or not corners):
+        corners.append(limits)
+    if content.probe_m is not None and (whole or not corners):
+        corners.append(np.array([content.probe_m]))
+    if not corners:
         return '<p class="nothing">No place is known yet.</p>'
+    view = MapView.around(np.concatenate(corners))
     shapes = [
-        "" if content.limits is None else _polygon(frame, _limits(content), "limits"),
-        *(_scan(frame, one, count, content.shown_ns) for one, count in places),
-        "" if content.current is None else _polygon(frame, content.current.corners_m(), "current"),
-        *(_spectrum(frame, one) for one in spectra),
-        "" if content.probe_m is None else _probe(frame, content.probe_m),
+        "" if limits is None else view.polygon(limits, "limits"),
+        *(_scan(view, one, count, content.shown_ns) for one, count in places),
+        "" if content.current is None else view.polygon(content.current.corners_m(), "current"),
+        *(_spectrum(view, one) for one in spectra),
     ]
-    ticks = _ticks(frame)
+    if content.probe_m is not None:
+        x, y = view.at(content.probe_m)
+        cross = f"M{x - 14:.2f} {y:.2f}h28M{x:.2f} {y - 14:.2f}v28"
+        shapes.append(f'<path class="probe" d="{cross}"><title>the probe</title></path>')
+    keys = {
+        "scan": ("scans; click one to see it", bool(content.scans)),
+        "current": ("set now", content.current is not None),
+        "spectrum": ("spectra", bool(spectra)),
+        "limits": ("limits", limits is not None and whole),
+    }
+    shown = "".join(f'<span class="key-{name}">{text}</span>' for name, (text, is_there) in keys.items() if is_there)
     more = f"<p>{left_out} older places are not drawn.</p>" if left_out else ""
     words = f"{len(places)} places with scans and {len(spectra)} spectra"
     return (
         f'<figure class="map" role="img" aria-label="Map of the sample: {words}">'
-        f'<div class="map-area" style="aspect-ratio:{frame.width:.6g}/{frame.height:.6g}">'
-        f'<svg viewBox="0 0 {frame.width:.6g} {frame.height:.6g}">{"".join(shapes)}</svg>{ticks}</div>'
-        f"{_keys(content, spectra, whole=whole)}{_drift_words(content)}{more}</figure>"
+        f'<div class="map-area" style="aspect-ratio:{view.width:.6g}/{view.height:.6g}">'
+        f'<svg viewBox="0 0 {view.width:.6g} {view.height:.6g}">{"".join(shapes)}</svg>{_ticks(view)}</div>'
+        f'<div class="map-keys">{shown}</div>{_drift_words(content.tip_to_sample)}{more}</figure>'
     )
 
 
 def places_of(scans: Sequence[ScanSummary]) -> tuple[list[tuple[ScanSummary, int]], int]:
-    """([(newest scan, how many there are) for each place], how many older places are left out); large ones first."""
+    """Return ([(newest scan, how many) for each place], how many older places are left out); large ones first."""
     found: dict[tuple[int, ...], tuple[ScanSummary, int]] = {}
     seen: dict[tuple[int, ...], int] = {}
     for scan in scans:
-        key = _place(scan.region)
+        (x, y), (width, height) = scan.region.center_m, scan.region.size_m
+        step = max(width, height) / _SAME
+        key = (*(round(v / step) for v in (x, y, width, height)), round(scan.region.angle_rad * 500))
         if seen.get(key) != scan.time_ns:
             seen[key] = scan.time_ns
             count = found.pop(key, (scan, 0))[1]
@@ -83,14 +102,8 @@ def places_of(scans: Sequence[ScanSummary]) -> tuple[list[tuple[ScanSummary, int
     return newest, len(found) - len(newest)
 
 
-def _place(region: Region) -> tuple[int, ...]:
-    step = max(region.size_m) / _SAME
-    (x, y), (width, height) = region.center_m, region.size_m
-    return (round(x / step), round(y / step), round(width / step), round(height / step), round(region.angle_rad * 500))
-
-
 @dataclass(frozen=True)
-class _MapFrame:
+class MapView:
     """The part of the plane that is shown, in a unit that makes handy numbers. y is upwards, unlike on the screen."""
 
     left_m: float
@@ -99,81 +112,54 @@ class _MapFrame:
     height: float
     per_m: float
 
+    @classmethod
+    def around(cls, points_m: Array) -> MapView:
+        """Return the view that has all points in it, with a margin."""
+        low, high = points_m.min(axis=0), points_m.max(axis=0)
+        side = max(*(high - low), 1e-10)
+        low, high = low - _MARGIN * side, high + _MARGIN * side
+        # never narrower than two to three, which nobody could click in
+        lacking = np.maximum(0.67 * (high - low).max() - (high - low), 0.0)
+        low, high = low - lacking / 2, high + lacking / 2
+        per_m = 1000.0 / float((high - low).max())
+        width, height = (float(v) * per_m for v in high - low)
+        return cls(float(low[0]), float(low[1]), width, height, per_m)
+
     def at(self, xy_m: Sequence[float] | Array) -> tuple[float, float]:
         x, y = (float(xy_m[0]) - self.left_m) * self.per_m, (float(xy_m[1]) - self.low_m) * self.per_m
         return x, self.height - y
 
-
-def _frame(
-    content: MapContent,
-    places: Sequence[tuple[ScanSummary, int]],
-    spectra: Sequence[SpectrumSummary],
-    *,
-    whole: bool,
-) -> _MapFrame | None:
-    points = [one.region.corners_m() for one, _ in places]
-    points += [np.array([one.position_m]) for one in spectra]
-    if content.current is not None:
-        points.append(content.current.corners_m())
-    if content.limits is not None and (whole or not points):
-        points.append(_limits(content))
-    if content.probe_m is not None and (whole or not points):
-        points.append(np.array([content.probe_m]))
-    if not points:
-        return None
-    every = np.concatenate(points)
-    low, high = every.min(axis=0), every.max(axis=0)
-    side = max(*(high - low), 1e-10)
-    low, high = low - _MARGIN * side, high + _MARGIN * side
-    # never narrower than two to three, which nobody could click in
-    for axis in (0, 1):
-        lacking = 0.67 * (high - low).max() - (high - low)[axis]
-        if lacking > 0.0:
-            low[axis], high[axis] = low[axis] - lacking / 2, high[axis] + lacking / 2
-    per_m = 1000.0 / float((high - low).max())
-    width, height = (float(v) * per_m for v in high - low)
-    return _MapFrame(float(low[0]), float(low[1]), width, height, per_m)
+    def polygon(self, corners_m: Array, style: str, inside: str = "", data: str = "") -> str:
+        points = " ".join("{:.2f},{:.2f}".format(*self.at(corner)) for corner in corners_m)
+        return f'<polygon class="{style}" points="{points}"{data}>{inside}</polygon>'
 
 
-def _limits(content: MapContent) -> Array:
-    """The corners of what is allowed, moved along with the tip under a sample that drifts."""
-    assert content.limits is not None
-    corners = content.limits.corners_m()
-    if content.tip_to_sample is None:
-        return corners
-    return np.asarray(corners @ content.tip_to_sample[:, :2].T + content.tip_to_sample[:, 2])
+def _over_the_sample(limits: Region, tip_to_sample: Array | None) -> Array:
+    """Return the corners of what is allowed, moved along with the tip over a sample that drifts."""
+    corners = limits.corners_m()
+    return corners if tip_to_sample is None else np.asarray(corners @ tip_to_sample[:, :2].T + tip_to_sample[:, 2])
 
 
-def _polygon(frame: _MapFrame, corners_m: Array, style: str, inside: str = "", data: str = "") -> str:
-    points = " ".join("{:.2f},{:.2f}".format(*frame.at(corner)) for corner in corners_m)
-    return f'<polygon class="{style}" points="{points}"{data}>{inside}</polygon>'
-
-
-def _scan(frame: _MapFrame, one: ScanSummary, count: int, shown_ns: int | None) -> str:
+def _scan(view: MapView, one: ScanSummary, count: int, shown_ns: int | None) -> str:
     often = f", {count} scans" if count > 1 else ""
     cut = ", interrupted" if one.interrupted else ""
     who = f" by {one.holder}" if one.holder else ""
     title = f"{typeset_area(one.region.size_m)} at {time_of_day(one.time_ns)}{who}{often}{cut}"
     style = "scan" + (" cut" if one.interrupted else "") + (" shown" if shown_ns == one.time_ns else "")
     data = f' data-time="{one.time_ns}" data-channel="{escape(one.channel)}"'
-    return _polygon(frame, one.region.corners_m(), style, f"<title>{escape(title)}</title>", data)
+    return view.polygon(one.region.corners_m(), style, f"<title>{escape(title)}</title>", data)
 
 
-def _spectrum(frame: _MapFrame, one: SpectrumSummary) -> str:
+def _spectrum(view: MapView, one: SpectrumSummary) -> str:
     assert one.position_m is not None
-    x, y = frame.at(one.position_m)
+    x, y = view.at(one.position_m)
     title = escape(f"{one.kind or 'spectrum'} at {time_of_day(one.time_ns)}")
     return f'<path class="spectrum" d="M{x:.2f} {y:.2f}h0" data-spectrum="{one.time_ns}"><title>{title}</title></path>'
 
 
-def _probe(frame: _MapFrame, xy_m: tuple[float, float]) -> str:
-    x, y = frame.at(xy_m)
-    return f'<path class="probe" d="M{x - 14:.2f} {y:.2f}h28M{x:.2f} {y - 14:.2f}v28"><title>the probe</title></path>'
-
-
-def _ticks(frame: _MapFrame) -> str:
-    low = np.array([frame.left_m, frame.low_m])
-    high = low + np.array([frame.width, frame.height]) / frame.per_m
+def _ticks(view: MapView) -> str:
+    low = np.array([view.left_m, view.low_m])
+    high = low + np.array([view.width, view.height]) / view.per_m
     factor, unit = scale(float(np.abs(np.concatenate([low, high])).max()), "m")
     parts = []
     for axis, side in ((0, "left"), (1, "bottom")):
@@ -185,21 +171,10 @@ def _ticks(frame: _MapFrame) -> str:
     return f'{"".join(parts)}<span class="map-unit">{unit}</span>'
 
 
-def _keys(content: MapContent, spectra: Sequence[SpectrumSummary], *, whole: bool) -> str:
-    keys = {
-        "scan": ("scans; click one to see it", bool(content.scans)),
-        "current": ("set now", content.current is not None),
-        "spectrum": ("spectra", bool(spectra)),
-        "limits": ("limits", content.limits is not None and whole),
-    }
-    shown = "".join(f'<span class="key-{name}">{text}</span>' for name, (text, is_there) in keys.items() if is_there)
-    return f'<div class="map-keys">{shown}</div>'
-
-
-def _drift_words(content: MapContent) -> str:
-    if content.tip_to_sample is None:
+def _drift_words(tip_to_sample: Array | None) -> str:
+    if tip_to_sample is None:
         return ""
-    x, y = content.tip_to_sample[:, 2]
+    x, y = tip_to_sample[:, 2]
     factor, unit = scale(max(abs(x), abs(y)), "m")
     return (
         f'<p class="map-drift">Sample coordinates; the sample has moved by ({-x * factor:.3g}, {-y * factor:.3g}) '

@@ -100,7 +100,7 @@ class PageServer:
         self._thread = threading.Thread(target=self._run, name="page", daemon=True)
 
     def start(self) -> None:
-        """Begin to serve; what comes before is answered then."""
+        """Begin to serve; requests that came before are answered then."""
         self._thread.start()
 
     def stop(self) -> None:

@@ -24,7 +24,7 @@ MOST_ENDED = 1000
 
 @dataclass(frozen=True)
 class Session:
-    """What a cookie says.
+    """The content of a cookie.
 
     Attributes:
         person: empty for one who only looks.

@@ -1,4 +1,4 @@
-"""What the dashboard knows: written by the component's thread, read by the page's."""
+"""The state that the component's thread writes and the page's thread reads."""
 
 from __future__ import annotations
 

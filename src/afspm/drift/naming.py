@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from afspm import plugins
 from afspm.errors import AfspmError, ConfigError
 
 
@@ -73,6 +74,8 @@ def _imported(what: str, name: str) -> type[Any]:
 
 def _ready_made(what: str, name: str, ready_made: Mapping[str, ReadyMade]) -> type[Any]:
     if name not in ready_made:
+        if isinstance(plugin := plugins.load(f"afspm.{what}s", name), type):
+            return plugin
         known = ", ".join(ready_made)
         hint = _near(name.casefold(), ready_made) or f"there are {known}; write one of your own as module.Name"
         raise ConfigError(f"there is no {what} {name!r}", hint=hint)

@@ -15,17 +15,17 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field
 
 from afspm.errors import AfspmError
 from afspm.experiment import class_loader
 from afspm.experiment.document import Document
-from afspm.experiment.findings import Findings
 from afspm.experiment.known import WiringClass
 from afspm.experiment.published import length_m, wire_of
 from afspm.experiment.sections import Section, parse
+from afspm.experiment.toml_lines import Settings, Table
 from afspm.logic.envelopes import CacheRule, Envelopes
 from afspm.model import PacketHeader
 from afspm.units import Length
@@ -61,7 +61,7 @@ class CacheSection(Section):
 
 @dataclass(frozen=True)
 class CacheSettings:
-    """What the scheduler is told of the cache."""
+    """The settings of the scheduler's cache."""
 
     rules: tuple[CacheRule, ...] = ()
     mapping: str | None = None
@@ -69,24 +69,22 @@ class CacheSettings:
 
     @property
     def envelopes(self) -> tuple[str, ...]:
-        """How the envelopes of the rules begin, as far as that is fixed."""
+        """The beginnings of the rules' envelopes, as far as they are fixed."""
         return tuple(re.split(r"[{}]", rule.envelope)[0] for rule in self.rules if rule.envelope)
 
-    def to_settings(self) -> dict[str, Any]:
+    def to_settings(self) -> Settings:
         """In JSON's types; `CacheRule` by its fields."""
         rules = [{k: v for k, v in vars(rule).items() if v is not None} for rule in self.rules]
         return {"rules": rules, "mapping": self.mapping, "history": dict(self.history)}
 
 
-def read(
-    table: Mapping[str, Any], logic: Mapping[str, Any] | None, document: Document, findings: Findings
-) -> CacheSettings:
-    """The section, with what the paper's form says of the cache where the section says nothing.
+def read(table: Table, logic: Table | None, document: Document) -> CacheSettings:
+    """Return the section, with what the paper's form says of the cache where the section says nothing.
 
     Args:
         logic: the table that the scheduler's cache refers to in the paper's form.
     """
-    section = parse(CacheSection, "cache", dict(table), document, findings)
+    section = parse(CacheSection, "cache", dict(table), document)
     rules = []
     for i, rule in enumerate(section.rules):
         try:
@@ -94,9 +92,9 @@ def read(
                 CacheRule(rule.message, rule.channel, rule.kind, rule.above, rule.up_to, rule.envelope, rule.history)
             )
         except AfspmError as error:
-            findings.error(f"[cache] rules[{i}]: {error.what}", document.place("cache", "rules", i), error.hint)
+            document.error(f"[cache] rules[{i}]: {error.what}", "cache", "rules", i, hint=error.hint)
     if section.mapping is not None:
-        _check_mapping(section.mapping, document, findings)
+        _check_mapping(section.mapping, document)
     history = dict(section.history)
     if logic is not None and wire_of(logic) is WiringClass.CACHE_LOGIC:
         history = _published_history(logic) | history
@@ -104,30 +102,29 @@ def read(
     return CacheSettings(tuple(rules), section.mapping, history)
 
 
-def _check_mapping(name: str, document: Document, findings: Findings) -> None:
-    place = document.place("cache", "mapping")
+def _check_mapping(name: str, document: Document) -> None:
     try:
         function = class_loader.load(name)
     except class_loader.Unloadable as error:
-        findings.error(f"[cache] mapping: {error.what}", place, error.hint)
+        document.error(f"[cache] mapping: {error.what}", "cache", "mapping", hint=error.hint)
         return
     if not callable(function):
-        findings.error(f"[cache] mapping: {name} is no function", place)
+        document.error(f"[cache] mapping: {name} is no function", "cache", "mapping")
         return
     for header in _EXAMPLES:  # else its packets would be missing, in the middle of the night
         try:
             Envelopes(mapping=function).of(header)
         except AfspmError as error:
-            findings.error(f"[cache] mapping: {error.what}", place, error.hint)
+            document.error(f"[cache] mapping: {error.what}", "cache", "mapping", hint=error.hint)
             return
 
 
-def _published_history(logic: Mapping[str, Any]) -> dict[str, int]:
+def _published_history(logic: Table) -> dict[str, int]:
     count = logic.get("default_scan_history")
     return {"Scan2d": count} if isinstance(count, int) and count > 0 else {}
 
 
-def _published_rules(logic: Mapping[str, Any]) -> list[CacheRule]:
+def _published_rules(logic: Table) -> list[CacheRule]:
     """Histories by size, [[width, height], count]; a number is in nm, as in the envelopes' names."""
     histories = logic.get("proto_with_history_list")
     if wire_of(histories) is not WiringClass.HISTORIES or not isinstance(histories, Mapping):

@@ -1,4 +1,4 @@
-"""What a microscope can do, as far as its class tells before it runs."""
+"""The capabilities of a microscope, as far as its class tells before it runs."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from afspm.errors import AfspmError
+from afspm.experiment.toml_lines import Table
 from afspm.model import Parameter, names
 
 if TYPE_CHECKING:
@@ -26,8 +27,8 @@ class MicroscopeCapabilities:
     sets: Mapping[str, tuple[Parameter, ...]]
 
 
-def of_class(microscope: type, settings: Mapping[str, Any]) -> MicroscopeCapabilities | None:
-    """The abilities of a `Driver` class with these settings; None where the class does not tell."""
+def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None:
+    """Return the abilities of a `Driver` class with these settings; None where the class does not tell."""
     from afspm.translator.driver import Driver
 
     if not issubclass(microscope, Driver):
@@ -44,14 +45,14 @@ def of_class(microscope: type, settings: Mapping[str, Any]) -> MicroscopeCapabil
 
 
 def _set_by(action: Any, table: ParameterTable) -> tuple[Parameter, ...]:
-    """What an action of the experiment file sets, in SI."""
+    """Return what an action of the experiment file sets, in SI."""
     given = action.get("set") if isinstance(action, Mapping) else None
     values = table.written(given, where="actions") if isinstance(given, Mapping) else {}
     return tuple(Parameter(name, str(value), table[name].si_unit or None) for name, value in values.items())
 
 
 def base() -> dict[str, str | None]:
-    """The base parameters and the extensions of ours with their SI units, where nothing better is known."""
+    """Return the base parameters and the extensions of ours with their SI units, where nothing better is known."""
     ours = {
         names.PULSE_VOLTAGE: "V",
         names.PULSE_DURATION: "s",

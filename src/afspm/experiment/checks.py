@@ -1,4 +1,4 @@
-"""What must hold between the parts of an experiment: who is there, who talks to whom, who solves what."""
+"""Checks between the parts of an experiment: its processes, their connections, the problems they solve."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _MISSING = {
 
 
 def check(resolved: ResolvedExperiment) -> None:
-    """Run every check; what is found goes to `resolved.findings`."""
+    """Run every check; what is found goes to the findings of its document."""
     for one in CHECKS:
         one(resolved)
 
@@ -58,16 +58,16 @@ def check_roles(resolved: ResolvedExperiment) -> None:
     for role, hint in _MISSING.items():
         having = resolved.with_role(role)
         if not having and all_loaded and len(resolved.processes) == len(resolved.parts.components):
-            resolved.error(f"there is no {role.value}", hint=hint)
+            resolved.document.error(f"there is no {role.value}", hint=hint)
         for extra in having[1:]:
             what = f"[{extra.name}] is a second {role.value} beside [{having[0].name}]"
-            resolved.error(what, extra.name, hint="one is enough")
+            resolved.document.error(what, extra.name, hint="one is enough")
     seen: dict[str, str] = {}
     for name in resolved.processes:
         other = seen.setdefault(name.casefold(), name)
         if other != name:
             what = f"[{name}] and [{other}] are the same name but for upper and lower case"
-            resolved.error(what, name, hint="their files would be the same on some computers")
+            resolved.document.error(what, name, hint="their files would be the same on some computers")
 
 
 def check_names(resolved: ResolvedExperiment) -> None:
@@ -75,7 +75,7 @@ def check_names(resolved: ResolvedExperiment) -> None:
     for name in resolved.processes:
         if not is_process_name(name):
             hint = f"letters, digits, _, - and spaces, at most {LONGEST_PROCESS_NAME} bytes, as in [tip_corrector]"
-            resolved.error(f"[{name}] can't be the name of a component", name, hint=hint)
+            resolved.document.error(f"[{name}] can't be the name of a component", name, hint=hint)
 
 
 def check_commands(resolved: ResolvedExperiment) -> None:
@@ -83,7 +83,7 @@ def check_commands(resolved: ResolvedExperiment) -> None:
     for part in resolved.parts.components:
         if part.command and not is_program(part.command[0], resolved.document.folders[0]):
             what = f"[{part.name}] there is no program {part.command[0]!r}"
-            resolved.error(what, part.name, "command", hint="give its path, or install it")
+            resolved.document.error(what, part.name, "command", hint="give its path, or install it")
 
 
 def check_intermediaries(resolved: ResolvedExperiment) -> None:
@@ -96,16 +96,16 @@ def check_intermediaries(resolved: ResolvedExperiment) -> None:
         for key, value in table.items():
             if key != "class" and key not in WIRE_SETTINGS[kind]:
                 what = f"[{name}] a {kind.value} has no setting {key!r}"
-                resolved.error(what, name, key, hint=nearest(key, WIRE_SETTINGS[kind]))
+                resolved.document.error(what, name, key, hint=nearest(key, WIRE_SETTINGS[kind]))
             elif key in ("request_timeout_ms", "request_retries") and not isinstance(value, int | float):
                 hint = "is it in a second file, to be laid over this one?"
-                resolved.error(f"[{name}] {key} = {value!r} is no number", name, key, hint=hint)
+                resolved.document.error(f"[{name}] {key} = {value!r} is no number", name, key, hint=hint)
             elif key.endswith("url"):
                 for url in value if isinstance(value, list) else [value]:
                     if not isinstance(url, str) or not is_address(url):
                         near = closest(str(url), names, 0.7)
                         hint = f"did you mean {near!r}?" if near else hint_on(str(url)) or EXAMPLE
-                        resolved.error(f"[{name}] {key} = {url!r} is not an address", name, key, hint=hint)
+                        resolved.document.error(f"[{name}] {key} = {url!r} is not an address", name, key, hint=hint)
 
 
 def check_addresses(resolved: ResolvedExperiment) -> None:
@@ -119,10 +119,10 @@ def check_addresses(resolved: ResolvedExperiment) -> None:
         for address, other in bound.items():
             if reaches(slot.address, address) or reaches(address, slot.address):
                 what = f"[{slot.owner}] and [{other.owner}] both bind {slot.address} ({slot.use}, {other.use})"
-                resolved.findings.error(what, slot.place)
+                resolved.document.findings.error(what, slot.place)
         bound[slot.address] = slot
         if slot.keyed and is_address(slot.address) and not is_local(slot.address) and not secure:
-            resolved.findings.error(
+            resolved.document.findings.error(
                 f"[{slot.owner}] binds {slot.address}, which other computers can reach, without keys",
                 slot.place,
                 'make keys with `afspm keys` and set [security] keys = "keys"; or say [security] insecure = true',
@@ -135,7 +135,7 @@ def check_addresses(resolved: ResolvedExperiment) -> None:
                 continue
             if not any(reaches(target, b) for b in bound):
                 what = f"[{name}] connects to {target}, which nobody binds"
-                resolved.error(what, name, hint=nearest(target, bound, 0.8))
+                resolved.document.error(what, name, hint=nearest(target, bound, 0.8))
 
 
 def check_self_subscription(resolved: ResolvedExperiment) -> None:
@@ -146,7 +146,7 @@ def check_self_subscription(resolved: ResolvedExperiment) -> None:
             continue
         key = f"{own.owner}/{own.use}"
         if key in links.subscribe or (own.address and any(reaches(s, own.address) for s in links.subscribe)):
-            resolved.error(f"[{name}] subscribes to itself", name, "subscriber")
+            resolved.document.error(f"[{name}] subscribes to itself", name, "subscriber")
 
 
 def check_listens_to(resolved: ResolvedExperiment) -> None:
@@ -157,12 +157,12 @@ def check_listens_to(resolved: ResolvedExperiment) -> None:
         for i, other in enumerate(wanted if isinstance(wanted, list) else [wanted]):
             path = (name, "listens_to", i)
             if other == name:
-                resolved.error(f"[{name}] subscribes to itself", *path)
+                resolved.document.error(f"[{name}] subscribes to itself", *path)
             elif other not in resolved.processes:
                 what = f"[{name}] listens_to: there is no component {other!r}"
-                resolved.error(what, *path, hint=nearest(str(other), publishers))
+                resolved.document.error(what, *path, hint=nearest(str(other), publishers))
             elif other not in publishers:
-                resolved.error(f"[{name}] listens to [{other}], which publishes nothing", *path)
+                resolved.document.error(f"[{name}] listens to [{other}], which publishes nothing", *path)
 
 
 def check_problems(resolved: ResolvedExperiment) -> None:
@@ -176,15 +176,15 @@ def check_problems(resolved: ResolvedExperiment) -> None:
                 number = _number(resolved, problem)
                 if number is None:
                     hint = nearest(problem, resolved.problems) + ", or name it under [problems]"
-                    resolved.error(f"[{name}] {verb} {problem!r}, which is no problem", name, hint=hint)
+                    resolved.document.error(f"[{name}] {verb} {problem!r}, which is no problem", name, hint=hint)
                 elif verb == "flags" and number not in solved:
                     what = f"[{name}] flags {problem!r}, which nobody solves: the experiment would stand still"
                     hint = "add a component that solves it, or [control] solved_by_hand"
-                    resolved.error(what, name, hint=hint)
+                    resolved.document.error(what, name, hint=hint)
     for i, problem in enumerate(by_hand):
         if _number(resolved, problem) is None:
             hint = nearest(problem, resolved.problems)
-            resolved.error(f"{problem!r} is no problem", "control", "solved_by_hand", i, hint=hint)
+            resolved.document.error(f"{problem!r} is no problem", "control", "solved_by_hand", i, hint=hint)
 
 
 def _number(resolved: ResolvedExperiment, problem: str) -> int | None:
@@ -210,9 +210,9 @@ def check_envelopes(resolved: ResolvedExperiment) -> None:
             hint = 'give the microscope live_lines_s = "1 s"' if live else nearest(prefix, published)
             what = f"[{name}] subscribes to {prefix!r}, which nobody publishes"
             if resolved.caching.mapping is not None:
-                resolved.warning(f"{what}, unless the mapping of [cache] makes it", *path, hint=hint)
+                resolved.document.warning(f"{what}, unless the mapping of [cache] makes it", *path, hint=hint)
             else:
-                resolved.error(what, *path, hint=hint)
+                resolved.document.error(what, *path, hint=hint)
 
 
 def _is_published(prefix: str, published: set[str], made: Collection[str]) -> bool:
@@ -226,13 +226,13 @@ def check_controller(resolved: ResolvedExperiment) -> None:
     """One emulated controller at most, and no other address for its translator."""
     for name in resolved.emulators[1:]:
         what = f"[{name}] is a second emulated controller beside [{resolved.emulators[0]}]"
-        resolved.error(what, name, hint="one is enough")
+        resolved.document.error(what, name, hint="one is enough")
     for translator in resolved.with_role(Role.TRANSLATOR):
         controller = resolved.controller_of(translator.name, resolved.processes)
         if controller and ADDRESS in translator.part.settings:
             what = f"[{translator.name}] {ADDRESS} is not used: it talks to [{controller}], which is emulated"
             hint = f"[{controller}] component = false, for the controller at this address"
-            resolved.warning(what, translator.name, ADDRESS, hint=hint)
+            resolved.document.warning(what, translator.name, ADDRESS, hint=hint)
 
 
 def check_clock(resolved: ResolvedExperiment) -> None:
@@ -242,9 +242,9 @@ def check_clock(resolved: ResolvedExperiment) -> None:
     if (speed := resolved.sections.clock.speed) != 1.0:
         hint = "time can't be made faster there: leave it out, or set it to 1 in the file for this microscope"
         what = f"[clock] speed = {speed:g} on a microscope that is not simulated"
-        resolved.error(what, "clock", "speed", hint=hint)
+        resolved.document.error(what, "clock", "speed", hint=hint)
     if "start" in resolved.parts.sections.get("clock", {}):
-        resolved.error("[clock] start on a microscope that is not simulated", "clock", "start")
+        resolved.document.error("[clock] start on a microscope that is not simulated", "clock", "start")
 
 
 def check_names_of_people(resolved: ResolvedExperiment) -> None:
@@ -258,18 +258,18 @@ def check_names_of_people(resolved: ResolvedExperiment) -> None:
             any_role, path = True, ("control", "roles", role, i)
             if not {member, component_of(member)} & names:
                 what = f"[control.roles] {role}: there is no {member!r} among components and keys"
-                resolved.error(what, *path, hint=nearest(member, names))
+                resolved.document.error(what, *path, hint=nearest(member, names))
             elif not _has_password(resolved, member):
                 what = f"[control.roles] {role}: {member!r} has no password, whoever types the name has the role"
                 hint = f"`afspm dashboard --make-password` makes a line of people for [{component_of(member)}]"
-                resolved.warning(what, *path, hint=hint)
+                resolved.document.warning(what, *path, hint=hint)
     if any_role and (security.plain or security.insecure):
         hint = "leave [security] plain away, or make keys with `afspm keys` and set [security] keys"
         what = "[control.roles] without keys: whoever takes the name has the role"
-        resolved.warning(what, "control", "roles", hint=hint)
+        resolved.document.warning(what, "control", "roles", hint=hint)
     if keys is not None and not keys.is_dir():
         what = f"[security] keys: there is no folder {str(keys)!r}"
-        resolved.error(what, "security", "keys", hint="`afspm keys` makes it")
+        resolved.document.error(what, "security", "keys", hint="`afspm keys` makes it")
 
 
 def _has_password(resolved: ResolvedExperiment, member: str) -> bool:
@@ -289,7 +289,7 @@ def check_likely_typos(resolved: ResolvedExperiment) -> None:
             near = closest(text, names, 0.85) if _WORD.fullmatch(text) and len(text) > 3 else None
             if near:
                 what = f"[{part.name}] {path[1]} = {text!r} is nearly the name of a variable"
-                resolved.warning(what, *path, hint=f"did you mean {near!r}?")
+                resolved.document.warning(what, *path, hint=f"did you mean {near!r}?")
 
 
 def _texts(value: Any, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], str]]:
@@ -314,7 +314,7 @@ def check_needs(resolved: ResolvedExperiment) -> None:
             ):
                 for one in [one for one in needed if one not in offered]:
                     what = f"[{name}] needs the {kind} {one!r}, which [{translator.name}] does not have"
-                    resolved.error(what, name, hint=nearest(one, offered))
+                    resolved.document.error(what, name, hint=nearest(one, offered))
 
 
 CHECKS: Final[tuple[Callable[[ResolvedExperiment], None], ...]] = (

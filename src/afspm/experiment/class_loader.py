@@ -8,15 +8,17 @@ import importlib.util
 import inspect
 import sys
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from afspm import plugins
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.known import SHORT_NAME_PACKAGES
 from afspm.experiment.parts import DECLARED_KEYS
 from afspm.experiment.published import GUIDE
+from afspm.experiment.toml_lines import Table
 from afspm.model import Role
 
 # By where they come from: a class of the user is recognised by what it is derived from.
@@ -29,7 +31,7 @@ _ROLE_BY_BASE = (
 
 @dataclass(frozen=True)
 class ComponentDeclaration:
-    """What a component says about itself in attributes of its class (a command: in its table)."""
+    """Declarations of a component in attributes of its class (a command: in its table)."""
 
     solves: tuple[str, ...] = ()
     flags: tuple[str, ...] = ()
@@ -45,7 +47,7 @@ class ComponentDeclaration:
         )
 
     @classmethod
-    def of_table(cls, table: Mapping[str, Any]) -> ComponentDeclaration:
+    def of_table(cls, table: Table) -> ComponentDeclaration:
         return cls(**{key: names for key in DECLARED_KEYS if (names := _names(table.get(key))) is not None})
 
 
@@ -79,7 +81,7 @@ def importing_from(folders: Sequence[Path]) -> Iterator[None]:
 
 
 def _is_from(folder: Path, name: str) -> bool:
-    """Whether a module was imported from a folder, and not from an environment (.venv) that lies in it."""
+    """Return whether a module was imported from a folder, and not from an environment (.venv) that lies in it."""
     file = getattr(sys.modules[name], "__file__", None)
     if not file:
         return False
@@ -88,10 +90,10 @@ def _is_from(folder: Path, name: str) -> bool:
 
 
 def full_path(name: str) -> str:
-    """A name without a module as the full path of our class of that name; a path with a module as it is.
+    """Return a name without a module as the full path of the class, of ours or of a plug-in; other paths as they are.
 
     Raises:
-        Unloadable: none of ours is called that.
+        Unloadable: there is no such class.
     """
     if "." in name:
         return name
@@ -105,11 +107,15 @@ def full_path(name: str) -> str:
             found = _attribute(module, name)
             return f"{found.__module__}.{found.__qualname__}"
         known += [n for n in offered if n[:1].isupper()]
+    for group in (plugins.COMPONENTS, plugins.DRIVERS):
+        if (path := plugins.class_path(group, name)) is not None:
+            return path
+        known += plugins.names(group)
     raise Unloadable(f"there is no ready-made class {name!r}", nearest(name, known) or 'write it as "module.Name"')
 
 
 def load(path: str) -> Any:
-    """The object `module.Name`.
+    """Return the object `module.Name`.
 
     Raises:
         Unloadable: no such module or name, or the module fails when it is imported.
@@ -145,7 +151,7 @@ def role_of(component: type) -> Role | None:
 
 
 def _attribute(module: Any, name: str) -> Any:
-    """A name of a module, which a package may only import when it is asked for."""
+    """Return a name of a module, which a package may only import when it is asked for."""
     try:
         return getattr(module, name)
     except AttributeError:
@@ -158,7 +164,7 @@ def _attribute(module: Any, name: str) -> Any:
 
 
 def _hidden(module: Any) -> str:
-    """What to do where a file of the user's has the name of a module that Python has already; "" where none has."""
+    """Return what to do where a file of the user's has the name of a module of Python's; empty where none has."""
     for folder in sys.path:
         file = Path(folder, f"{module.__name__}.py")
         if file.exists():
@@ -204,7 +210,7 @@ def _search_paths(parent: str) -> list[str]:
 
 
 def _where(error: BaseException) -> str:
-    """The last line of a traceback with file and line, in one line."""
+    """Return the last line of a traceback with file and line, in one line."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
     said = str(error)
@@ -222,7 +228,7 @@ def _own_classes(module: Any) -> list[str]:
 
 
 def _names(value: Any) -> tuple[str, ...] | None:
-    """A text or texts as a tuple of texts; enum members by their name. None for what is not declared."""
+    """Return a text or texts as a tuple of texts; enum members by their name. None for what is not declared."""
     if value is None or isinstance(value, property):
         return None
     if isinstance(value, str):

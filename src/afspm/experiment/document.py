@@ -8,10 +8,10 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from afspm.experiment import toml_lines
 from afspm.experiment.findings import Findings, SourceLocation
+from afspm.experiment.toml_lines import Settings
 
 
 @dataclass
@@ -22,16 +22,26 @@ class Document:
         homes: the folders that relative file names are meant from, and where modules are found; empty: those of the
             files. (An expanded file is in the folder of its run, and speaks of files beside the one it was made of.)
         is_whole: whether all files could be read.
+        findings: what is wrong or doubtful in them.
     """
 
     files: tuple[Path, ...]
-    data: dict[str, Any] = field(default_factory=dict)
+    data: Settings = field(default_factory=dict)
     places: dict[toml_lines.Path, SourceLocation] = field(default_factory=dict)
     homes: tuple[Path, ...] = ()
     is_whole: bool = True
+    findings: Findings = field(default_factory=Findings)
+
+    def error(self, what: str, *path: str | int, hint: str = "") -> None:
+        """Report an error at the line where `path` is set."""
+        self.findings.error(what, self.place(*path), hint)
+
+    def warning(self, what: str, *path: str | int, hint: str = "") -> None:
+        """Report a warning at the line where `path` is set."""
+        self.findings.warning(what, self.place(*path), hint)
 
     def place(self, *path: str | int) -> SourceLocation:
-        """Where `path` was set: its own line, or that of the nearest thing around it."""
+        """Return where `path` was set: its own line, or that of the nearest thing around it."""
         for depth in range(len(path), 0, -1):
             found = self.places.get(path[:depth])
             if found is not None:
@@ -39,7 +49,7 @@ class Document:
         return SourceLocation(str(self.files[0]))
 
     def folder_of(self, *path: str | int) -> Path:
-        """The folder of the file that set `path`; relative file names in it are meant from there."""
+        """Return the folder of the file that set `path`; relative file names in it are meant from there."""
         return self.homes[0] if self.homes else Path(self.place(*path).file).resolve().parent
 
     @property
@@ -48,12 +58,12 @@ class Document:
         return list(self.homes or dict.fromkeys(file.resolve().parent for file in self.files))
 
 
-def read(files: Sequence[Path], findings: Findings, homes: Sequence[Path] = ()) -> Document:
+def read(files: Sequence[Path], homes: Sequence[Path] = ()) -> Document:
     """Read the files and lay each over those before it: tables merge, of anything else the later wins."""
     document = Document(tuple(files), homes=tuple(homes))
     for file in files:
-        text = _text(file, findings)
-        data = None if text is None else _parse(text, file, findings)
+        text = _text(file, document.findings)
+        data = None if text is None else _parse(text, file, document.findings)
         if text is None or data is None:
             document.is_whole = False
             continue
@@ -72,7 +82,7 @@ def _text(file: Path, findings: Findings) -> str | None:
     return None
 
 
-def _parse(text: str, file: Path, findings: Findings) -> dict[str, Any] | None:
+def _parse(text: str, file: Path, findings: Findings) -> Settings | None:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -110,17 +120,17 @@ _HABITS = (
 
 
 def _habit(what: str, written: str) -> str:
-    """What to write instead of a line that would be right elsewhere."""
+    """Return what to write instead of a line that would be right elsewhere."""
     return next((hint for said, line, hint in _HABITS if what.startswith(said) and re.search(line, written)), "")
 
 
-def _lay_over(document: Document, data: dict[str, Any], where: dict[toml_lines.Path, SourceLocation]) -> None:
+def _lay_over(document: Document, data: Settings, where: dict[toml_lines.Path, SourceLocation]) -> None:
     _merge(document.data, data, (), document.places)
     document.places.update(where)
 
 
 def _merge(
-    below: dict[str, Any], above: dict[str, Any], path: toml_lines.Path, places: dict[toml_lines.Path, SourceLocation]
+    below: Settings, above: Settings, path: toml_lines.Path, places: dict[toml_lines.Path, SourceLocation]
 ) -> None:
     for key, value in above.items():
         here = (*path, key)

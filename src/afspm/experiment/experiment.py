@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import document as documents
 from afspm.experiment import parts as sorting
-from afspm.experiment.findings import Finding, Findings
+from afspm.experiment.findings import Finding
 from afspm.experiment.implied_parts import RECORDS
+from afspm.experiment.toml_lines import Table
 from afspm.launch import Launch
 from afspm.model import Role
 
@@ -46,12 +47,11 @@ class ProcessStart:
 
 
 class Experiment:
-    """What the files say. Made by `load`."""
+    """An experiment as its files say it. Made by `load`."""
 
-    def __init__(self, document: documents.Document, found: Findings) -> None:
+    def __init__(self, document: documents.Document) -> None:
         self._document = document
-        self._found = found
-        self.parts = sorting.sort(document, found)
+        self.parts = sorting.sort(document)
 
     @property
     def name(self) -> str:
@@ -96,7 +96,7 @@ class Experiment:
     def check(self) -> list[Finding]:
         """Everything that is wrong or doubtful; nothing is started. Errors first, then by line."""
         self.resolved  # noqa: B018  (finds what there is to find)
-        return self._found.ordered()
+        return self._document.findings.ordered()
 
     @cached_property
     def resolved(self) -> ResolvedExperiment:
@@ -104,7 +104,7 @@ class Experiment:
         from afspm.experiment import checks
         from afspm.experiment.resolution import resolve
 
-        resolved = resolve(self.parts, self._document, self._found)
+        resolved = resolve(self.parts, self._document)
         if self._document.is_whole:  # what is missing may be in a file that can't be read, which has been reported
             checks.check(resolved)
         return resolved
@@ -121,14 +121,14 @@ class Experiment:
         take_address: Callable[[], str],
         only: Collection[str] = (),
         without: Collection[str] = (),
-        clock: Mapping[str, Any] | None = None,
+        clock: Table | None = None,
         run: str = "",
         simulated: bool = False,
         run_dir: str = "",
         state_dir: str = "",
         log_level: str = "INFO",
     ) -> list[ProcessStart]:
-        """What is to be started: translator and scheduler first.
+        """Return what is to be started: translator and scheduler first.
 
         Args:
             take_address: gives a free loopback address for each that the file leaves open.
@@ -143,7 +143,7 @@ class Experiment:
         from afspm.experiment import process_starts
 
         self.require_valid()
-        starts = process_starts.starts(self, take_address, only, without)
+        starts = process_starts.starts(self.resolved, take_address, only, without)
         knowing = process_starts.knowing_the_run(self.resolved)
         return [
             replace(
@@ -165,16 +165,16 @@ class Experiment:
         """True if the microscope is simulated for certain, where these parts are started on this computer."""
         from afspm.experiment import process_starts
 
-        return process_starts.simulated(self, only, without)
+        return self.resolved.simulated_with(process_starts.chosen_names(self.resolved, only, without))
 
     def asking(self, names: Collection[str]) -> Launch | None:
         """A launch line by which those of `names` ask the scheduler where it is started elsewhere; None: nobody can."""
         from afspm.experiment import process_starts
 
-        return process_starts.asking(self, names)
+        return process_starts.asking(self.resolved, names)
 
     def policy(self) -> ChildPolicy:
-        """How processes are watched and started again, from [restart]."""
+        """Return how processes are watched and started again, from [restart]."""
         from afspm.logic.supervision.child import ChildPolicy
         from afspm.logic.supervision.liveness import LivenessPolicy
         from afspm.logic.supervision.restart import RestartPolicy
@@ -191,7 +191,7 @@ class Experiment:
         return ExperimentClock.starting_now(settings.start.timestamp() if settings.start else None, settings.speed)
 
     def expanded(self, *, secrets: bool = True) -> str:
-        """The whole experiment as one TOML text: references replaced, defaults filled in; see `expanded.to_toml`."""
+        """Return the whole experiment as one TOML text: references replaced, defaults filled in."""
         from afspm.experiment.toml_writer import to_toml
 
         return to_toml(self, secrets=secrets)
@@ -203,8 +203,7 @@ def load_expanded(path: Path, homes: Sequence[Path], *overlays: Path) -> Experim
     Args:
         homes: the folders of the files that it was made of (`Experiment.folders`).
     """
-    found = Findings()
-    return Experiment(documents.read([path, *overlays], found, homes), found)
+    return Experiment(documents.read([path, *overlays], homes))
 
 
 def load(path: str | Path, *overlays: str | Path) -> Experiment:
@@ -212,6 +211,4 @@ def load(path: str | Path, *overlays: str | Path) -> Experiment:
 
     Nothing is raised for what is wrong in the files: `Experiment.check` tells it all at once.
     """
-    found = Findings()
-    document = documents.read([Path(path), *map(Path, overlays)], found)
-    return Experiment(document, found)
+    return Experiment(documents.read([Path(path), *map(Path, overlays)]))

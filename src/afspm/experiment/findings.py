@@ -1,4 +1,4 @@
-"""What a check finds: said with file, line, and what would put it right."""
+"""Findings of a check, each with file, line, and what would put it right."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Findings:
 
     @property
     def errors(self) -> int:
-        """How many errors there are so far."""
+        """The number of errors so far."""
         return sum(finding.is_error for finding in self.found)
 
     def ordered(self) -> list[Finding]:
@@ -71,7 +71,7 @@ class Findings:
 
 
 def nearest(name: str, valid: Iterable[str], cutoff: float = 0.6) -> str:
-    """A hint that names the valid name nearest to `name`, or, where none is near, a few of them."""
+    """Return a hint that names the valid name nearest to `name`, or, where none is near, a few of them."""
     names = sorted(set(valid))
     close = closest(name, names, cutoff)
     if close:
@@ -83,7 +83,7 @@ def nearest(name: str, valid: Iterable[str], cutoff: float = 0.6) -> str:
 
 
 def closest(name: str, valid: Iterable[str], cutoff: float = 0.6) -> str | None:
-    """The valid name nearest to `name` (upper and lower case alike), or None where none is near."""
+    """Return the valid name nearest to `name` (upper and lower case alike), or None where none is near."""
     by_fold = {v.casefold(): v for v in valid}
     match = difflib.get_close_matches(name.casefold(), list(by_fold), n=1, cutoff=cutoff)
     return by_fold[match[0]] if match else None

@@ -75,7 +75,7 @@ class ProcessBox:
 
 @dataclass(frozen=True)
 class PublisherLane:
-    """What one component publishes to others."""
+    """The publications of one component to others."""
 
     publisher: ProcessBox
     listeners: tuple[ProcessBox, ...]
@@ -83,7 +83,7 @@ class PublisherLane:
 
 
 def draw(experiment: Experiment) -> str:
-    """The picture as the text of an SVG file."""
+    """Return the picture as the text of an SVG file."""
     return _Drawing(experiment.resolved, experiment.name).document()
 
 
@@ -129,7 +129,7 @@ class _Drawing:
         return ProcessBox(part, lines, labels, asks=not written)
 
     def _from_scheduler(self, part: ExperimentPart) -> list[str]:
-        """What it hears from the scheduler: not what only other components publish; at least that it is over."""
+        """Return what it hears from the scheduler: not what only other components publish; at least that it is over."""
         prefixes = self.resolved.processes[part.name].envelopes
         if prefixes is None or "" in prefixes:
             return ["all envelopes"]
@@ -156,7 +156,7 @@ class _Drawing:
     # --- where it goes --------------------------------------------------------------------------------------------
 
     def _top(self) -> float:
-        """The y of the components' upper edge."""
+        """Return the y of the components' upper edge."""
         return MARGIN + 34 + LANE * len(self.lanes)
 
     def _place(self) -> None:
@@ -226,7 +226,7 @@ class _Drawing:
         self.svg.text(middle, y - 6, lane.label, size=LABEL_SIZE, fill=ENVELOPES, halo=True)
 
     def _entry(self, lane: PublisherLane, box: ProcessBox) -> float:
-        """Where a lane comes down to a listener: each at a place of its own, left of where the box's own goes up."""
+        """Return where a lane comes down to a listener: each at a place of its own, left of the box's own."""
         arriving = [other for other in self.lanes if box in other.listeners]
         return box.x - box.width / 4 + arriving.index(lane) * min(14.0, box.width / 2 / (len(arriving) + 1))
 
@@ -251,7 +251,7 @@ class _Drawing:
                 self.svg.text(x, y + LINE, _at(slot.address), size=TEXT_SIZE, fill=GREY, anchor=anchor)
 
     def _translator(self, box: ProcessBox) -> float:
-        """The translator below the bar and its microscope below it; returns where that ends."""
+        """Return the translator below the bar and its microscope below it; returns where that ends."""
         middle = self.bar_x + self.bar_width / 2
         top = self.bar_y + BAR_HEIGHT
         name = box.part.name

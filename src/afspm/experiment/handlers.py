@@ -18,7 +18,7 @@ _CALLED = ("run", *(name for name in vars(Component) if name.startswith("on_")))
 
 
 def check_handlers(resolved: ResolvedExperiment) -> None:
-    """What looks like a handler is called by that name, with what it takes."""
+    """Methods that look like handlers are called by that name, with what they take."""
     for process in resolved.with_role(Role.COMPONENT):
         component = process.component
         if component is None or not issubclass(component, Component):
@@ -26,11 +26,11 @@ def check_handlers(resolved: ResolvedExperiment) -> None:
         for name, method in _methods(component):
             shown, path = f"[{process.name}] {component.__name__}.{name}", (process.name, "class")
             if hint := _hint_on_name(name, resolved):
-                resolved.warning(f"{shown} is never called: there is no such handler", *path, hint=hint)
+                resolved.document.warning(f"{shown} is never called: there is no such handler", *path, hint=hint)
             wanted = _arguments(name)
             if wrong := _wrong_signature(method, wanted):
                 hint = f"write `def {name}({', '.join(wanted)})`"
-                resolved.error(f"{shown} can't be called as it will be: {wrong}", *path, hint=hint)
+                resolved.document.error(f"{shown} can't be called as it will be: {wrong}", *path, hint=hint)
 
 
 def _methods(component: type[Component]) -> Iterator[tuple[str, Callable[..., Any]]]:
@@ -45,7 +45,7 @@ def _methods(component: type[Component]) -> Iterator[tuple[str, Callable[..., An
 
 
 def _hint_on_name(name: str, resolved: ResolvedExperiment) -> str:
-    """What to do about a handler that is never called; empty: it is."""
+    """Return what to do about a handler that is never called; empty: it is."""
     valid = {*_CALLED, *(f"on_{snake_case(message)}" for message in wire.known_messages() if message not in HANDLERS)}
     near = closest(name, valid, _NEARLY)
     if name in valid or (near is None and resolved.messages):  # a handler of a message of the user's own

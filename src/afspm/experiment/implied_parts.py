@@ -6,11 +6,12 @@ import importlib.util
 import shutil
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from afspm.components.notifications import END, OCCASIONS, Targets, address
 from afspm.errors import ConfigError
 from afspm.experiment.parts import ExperimentPart
+from afspm.experiment.toml_lines import Settings
 from afspm.model import Role
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ def recorder(resolved: ResolvedExperiment) -> ExperimentPart | None:
     scans = section.scans
     if scans and importlib.util.find_spec("h5py") is None:
         scans = False
-        resolved.warning(
+        resolved.document.warning(
             "scans and spectra are not recorded: h5py is not installed",
             "record",
             hint='pip install "afspm[record]"; or say [record] scans = false',
@@ -46,13 +47,13 @@ def notifier(resolved: ResolvedExperiment) -> ExperimentPart | None:
     if not is_wanted or resolved.saying(NOTIFIES) or not resolved.with_role(Role.SCHEDULER):
         return None
     wanted = targets(section, resolved.document.folders[0])
-    settings: dict[str, Any] = {"program": list(wanted.command)} if wanted.command else {}
+    settings: Settings = {"program": list(wanted.command)} if wanted.command else {}
     settings |= {"webhook": wanted.webhook} if wanted.webhook else {}
     settings |= {"on": list(section.on), "unsolved_after": section.unsolved_after, "folder": wanted.folder}
     return _implied(resolved, NOTIFIER, settings, "notify")
 
 
-def _implied(resolved: ResolvedExperiment, name: str, settings: dict[str, Any], section: str) -> ExperimentPart:
+def _implied(resolved: ResolvedExperiment, name: str, settings: Settings, section: str) -> ExperimentPart:
     free_name, place = resolved.parts.free_name(name), resolved.document.place(section)
     return ExperimentPart(free_name, name.capitalize(), (), settings, {}, place, implied=True)
 
@@ -69,19 +70,19 @@ def check_notify(resolved: ResolvedExperiment) -> None:
     """[notify] names a way to tell people, and it works."""
     section = resolved.sections.notify
     if "notify" in resolved.parts.sections and not (section.command or section.webhook):
-        resolved.error("[notify] nobody is told of anything", "notify", hint="give a `command` or a `webhook`")
+        resolved.document.error("[notify] nobody is told of anything", "notify", hint="give a `command` or a `webhook`")
     if section.command and not is_program(section.command[0], resolved.document.folders[0]):
         what = f"[notify] there is no program {section.command[0]!r}"
-        resolved.error(what, "notify", "command", hint="give its path, or install it")
+        resolved.document.error(what, "notify", "command", hint="give its path, or install it")
     if section.webhook:
         try:
             address(section.webhook)
         except ConfigError as error:
             # the environment may be that of another computer, where the scheduler is started
-            report = resolved.warning if section.webhook.startswith("$") else resolved.error
+            report = resolved.document.warning if section.webhook.startswith("$") else resolved.document.error
             report(f"[notify] webhook: {error.what}", "notify", "webhook", hint=error.hint)
 
 
 def is_program(name: str, folder: Path) -> bool:
-    """Whether a command may begin with this: "python", which is ours, a program that is found, a file in a folder."""
+    """Return whether a command may begin with this: "python", which is ours, a program, a file in a folder."""
     return name == "python" or shutil.which(name) is not None or (folder / name).is_file()

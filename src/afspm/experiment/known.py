@@ -50,36 +50,25 @@ SHORT_WIRE_CLASSES: Final[dict[str, WiringClass]] = {
     "Client": WiringClass.CLIENT,
 }
 
+_REQUESTS = {"request_timeout_ms", "request_retries"}
+_CACHED = {
+    "sub_url",
+    "topics_to_sub",
+    "sub_extract_proto",
+    "update_cache",
+    "extract_proto_kwargs",
+    "update_cache_kwargs",
+}
 # What each kind understands. Settings of the published classes that only say how Python is to decode or to name
 # packets are accepted and have no meaning here: decoding is the wire's, naming is the [cache] section's.
 WIRE_SETTINGS: Final[dict[WiringClass, frozenset[str]]] = {
     WiringClass.PUBLISHER: frozenset({"url", "get_envelope_for_proto"}),
-    WiringClass.SUBSCRIBER: frozenset(
-        {
-            "sub_url",
-            "topics_to_sub",
-            "sub_extract_proto",
-            "update_cache",
-            "extract_proto_kwargs",
-            "update_cache_kwargs",
-        }
-    ),
+    WiringClass.SUBSCRIBER: frozenset(_CACHED),
     WiringClass.COMBINED: frozenset({"subs"}),
-    WiringClass.CACHE: frozenset(
-        {
-            "url",
-            "sub_url",
-            "sub_extract_proto",
-            "pub_get_envelope_for_proto",
-            "update_cache",
-            "extract_proto_kwargs",
-            "update_cache_kwargs",
-            "topics_to_sub",
-        }
-    ),
+    WiringClass.CACHE: frozenset({"url", "pub_get_envelope_for_proto", *_CACHED}),
     WiringClass.SERVER: frozenset({"url"}),
-    WiringClass.ROUTER: frozenset({"server_url", "router_url", "request_timeout_ms", "request_retries"}),
-    WiringClass.CLIENT: frozenset({"url", "request_timeout_ms", "request_retries", "uuid"}),
+    WiringClass.ROUTER: frozenset({"server_url", "router_url", *_REQUESTS}),
+    WiringClass.CLIENT: frozenset({"url", "uuid", *_REQUESTS}),
     WiringClass.CACHE_LOGIC: frozenset({"default_scan_history", "proto_with_history_list"}),
     WiringClass.ENVELOPE: frozenset({"size", "channel"}),
     WiringClass.SPECTRA: frozenset({"type"}),

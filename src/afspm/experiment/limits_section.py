@@ -18,19 +18,20 @@ every = "10 min"
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Mapping
-from dataclasses import asdict
-from typing import Annotated, Any, Final
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any, Final, TypeVar
 
 import pydantic
 from pydantic import Field
 
 from afspm.errors import AfspmError
 from afspm.experiment.document import Document
-from afspm.experiment.findings import Findings, nearest
-from afspm.experiment.sections import S, Section, parse, report
-from afspm.experiment.toml_lines import Path
+from afspm.experiment.findings import nearest
+from afspm.experiment.sections import Section, parse, report
+from afspm.experiment.toml_lines import Settings, Table
 from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.model import Parameter, Region, names
 from afspm.units import Angle, Duration, Length, parse_quantity, si
@@ -72,197 +73,158 @@ class LimitsSection(Section):
     most_pixels: Annotated[int, Field(gt=0)] = 8192 * 8192
 
 
+L = TypeVar("L", bound=ActionLimit)
 LARGEST_REGION_M: Final = 0.01  # no scanner reaches as far
 _OWN: Final = (*LimitsSection.model_fields, "actions")
 
 
+@dataclass(frozen=True)
 class LimitsReader:
     """Reads the section, given what the microscope has.
 
     Args:
         parameters: the generic names that exist with their SI units (None: it depends on the operating mode).
         actions: those that exist; None: not known before it runs.
-        certain: whether these are all parameters, or only those that any microscope may have.
         sets: by name of an action, the parameters that it sets.
+        certain: whether these are all parameters, or only those that any microscope may have.
     """
 
-    def __init__(
-        self,
-        document: Document,
-        findings: Findings,
-        components: tuple[str, ...],
-        parameters: Mapping[str, str | None],
-        actions: frozenset[str] | None,
-        *,
-        certain: bool,
-        sets: Mapping[str, tuple[Parameter, ...]],
-    ) -> None:
-        self._document = document
-        self._findings = findings
-        self._components = components
-        self._parameters = parameters
-        self._actions = actions
-        self._known_actions = frozenset((*names.BASE_ACTIONS, *names.EXTENSION_ACTIONS)) if actions is None else actions
-        self._certain = certain
-        self._sets = sets
+    document: Document
+    components: Collection[str]
+    parameters: Mapping[str, str | None]
+    actions: frozenset[str] | None
+    sets: Mapping[str, tuple[Parameter, ...]]
+    certain: bool
 
-    def read(self, table: Mapping[str, Any]) -> ExperimentLimits:
-        """The limits; what is wrong is reported and left out."""
-        whole = parse(
-            LimitsSection,
-            "limits",
-            {k: v for k, v in table.items() if k in LimitsSection.model_fields},
-            self._document,
-            self._findings,
-        )
-        parameters = {k: v for k, v in table.items() if k not in _OWN}
+    @property
+    def _known_actions(self) -> frozenset[str]:
+        return frozenset((*names.BASE_ACTIONS, *names.EXTENSION_ACTIONS)) if self.actions is None else self.actions
+
+    def read(self, table: Table) -> ExperimentLimits:
+        """Return the limits; what is wrong is reported and left out."""
+        own = {key: value for key, value in table.items() if key in LimitsSection.model_fields}
+        whole = parse(LimitsSection, "limits", own, self.document)
+        parameters = {key: value for key, value in table.items() if key not in _OWN}
         actions = table.get("actions", {})
         if not isinstance(actions, Mapping):
-            self._findings.error("[limits] actions is no table", self._document.place("limits", "actions"))
+            self.document.error("[limits] actions is no table", "limits", "actions")
             actions = {}
         limits = ExperimentLimits(
             parameters={name: limit for name, one in parameters.items() if (limit := self._parameter(name, one))},
             actions={name: limit for name, one in actions.items() if (limit := self._action(name, one))},
             region=None if whole.region is None else self._region(whole.region),
-            region_source=str(self._document.place("limits", "region")),
+            region_source=str(self.document.place("limits", "region")),
             most_pixels=whole.most_pixels,
-            sets={name: one for name, one in self._sets.items() if one},
+            sets={name: one for name, one in self.sets.items() if one},
         )
         self._check_sizes(limits)
         return limits
 
     def _parameter(self, name: str, table: Any) -> Limit | None:
-        path: Path = ("limits", name)
-        if name not in self._parameters:
-            hint = nearest(name, [*self._parameters, *_OWN])
-            if name in self._known_actions:
-                hint = f"it is an action: [limits.actions.{name}]"
-            if self._certain or not name.startswith("x-"):
-                self._findings.error(f"[limits] there is no parameter {name!r}", self._document.place(*path), hint)
-                return None
+        if name not in self.parameters and (self.certain or not name.startswith("x-")):
+            is_action = name in self._known_actions
+            near = nearest(name, [*self.parameters, *_OWN])
+            hint = f"it is an action: [limits.actions.{name}]" if is_action else near
+            self.document.error(f"[limits] there is no parameter {name!r}", "limits", name, hint=hint)
+            return None
+        path = ("limits", name)
         read = self._validated(ParameterLimit, table, path)
         if read is None:
             return None
-        self._check_who(read.only, path)
-        unit = self._unit(name, read)
-        low, high = (self._in(read, key, unit, path) for key in ("min", "max"))
-        step, rate = self._in(read, "step", unit, path), self._in(read, "rate", unit, path, per_s=True)
-        if low is not None and high is not None and low > high:
-            self._findings.error(
-                f"[limits.{name}] min = {read.min!r} is above max = {read.max!r}",
-                self._document.place(*path, "min"),
-                "nothing would be allowed",
-            )
+        unit = self.parameters.get(name) or _unit_of(read)
+        low, high, step, rate = (self._in(read, key, unit, path) for key in ("min", "max", "step", "rate"))
         for key, value in (("step", step), ("rate", rate)):
             if value is not None and value <= 0:
-                self._findings.error(f"[limits.{name}] {key} is not above zero", self._document.place(*path, key))
-        if low is not None and high is not None and step is not None and step > high - low >= 0:
-            self._findings.warning(
-                f"[limits.{name}] step is larger than the whole range", self._document.place(*path, "step")
-            )
-        source = str(self._document.place(*path))
-        return Limit(low, high, step, rate, read.every, read.only, unit, source)
+                self.document.error(f"[limits.{name}] {key} is not above zero", *path, key)
+        if low is not None and high is not None:
+            if low > high:
+                what = f"[limits.{name}] min = {read.min!r} is above max = {read.max!r}"
+                self.document.error(what, *path, "min", hint="nothing would be allowed")
+            elif step is not None and step > high - low:
+                self.document.warning(f"[limits.{name}] step is larger than the whole range", *path, "step")
+        return Limit(low, high, step, rate, read.every, read.only, unit, str(self.document.place(*path)))
 
     def _action(self, name: str, table: Any) -> Limit | None:
-        path: Path = ("limits", "actions", name)
-        known = self._known_actions
-        if name not in known and (self._actions is not None or not name.startswith("x-")):
-            hint = nearest(name, known)
-            self._findings.error(f"[limits.actions] there is no action {name!r}", self._document.place(*path), hint)
+        path = ("limits", "actions", name)
+        if name not in self._known_actions and (self.actions is not None or not name.startswith("x-")):
+            hint = nearest(name, self._known_actions)
+            self.document.error(f"[limits.actions] there is no action {name!r}", *path, hint=hint)
         read = self._validated(ActionLimit, table, path)
         if read is None:
             return None
-        self._check_who(read.only, path)
-        return Limit(interval_s=read.every, only=read.only, source=str(self._document.place(*path)))
+        return Limit(interval_s=read.every, only=read.only, source=str(self.document.place(*path)))
 
-    def _validated(self, model: type[S], table: Any, path: Path) -> S | None:
+    def _validated(self, model: type[L], table: Any, path: tuple[str, ...]) -> L | None:
         try:
-            return model.model_validate(table)
+            read = model.model_validate(table)
         except pydantic.ValidationError as error:
             for one in error.errors(include_url=False):
-                report(one, path, self._document, self._findings, known=tuple(model.model_fields))
+                report(one, path, self.document, known=tuple(model.model_fields))
             return None
+        for i, who in enumerate(read.only or ()):
+            if who not in self.components:
+                what = f"[{'.'.join(path)}] only: there is no component {who!r}"
+                self.document.error(what, *path, "only", i, hint=nearest(who, self.components))
+        return read
 
-    def _check_who(self, only: tuple[str, ...] | None, path: Path) -> None:
-        for i, who in enumerate(only or ()):
-            if who not in self._components:
-                place = self._document.place(*path, "only", i)
-                self._findings.error(
-                    f"[{'.'.join(map(str, path))}] only: there is no component {who!r}",
-                    place,
-                    nearest(who, self._components),
-                )
-
-    def _unit(self, name: str, read: ParameterLimit) -> str | None:
-        """The parameter's SI unit; where that depends on the operating mode, the unit of the first value given."""
-        known = self._parameters.get(name)
-        if known is not None:
-            return known
-        for value in (read.min, read.max, read.step):
-            if isinstance(value, str):
-                try:
-                    return parse_quantity(value)[1] or None
-                except AfspmError:
-                    continue
-        return None
-
-    def _in(self, read: ParameterLimit, key: str, unit: str | None, path: Path, *, per_s: bool = False) -> float | None:
+    def _in(self, read: ParameterLimit, key: str, unit: str | None, path: tuple[str, ...]) -> float | None:
+        """Return a quantity of a limit in the unit of its parameter; a rate in that per second."""
         value = getattr(read, key)
         if value is None:
             return None
-        where = f"[{'.'.join(map(str, path))}] {key} = {value!r}"
+        where = f"[{'.'.join(path)}] {key} = {value!r}"
         try:
-            number = _rate(value, unit or "") if per_s else si(value, unit or "")
+            number = _rate(value, unit or "") if key == "rate" else si(value, unit or "")
         except AfspmError as error:
-            hint = f'a change in a time, as in "1 {unit or ""}/s"' if per_s else error.hint
-            self._findings.error(f"{where}: {error.what}", self._document.place(*path, key), hint)
+            hint = f'a change in a time, as in "1 {unit or ""}/s"' if key == "rate" else error.hint
+            self.document.error(f"{where}: {error.what}", *path, key, hint=hint)
             return None
         if not math.isfinite(number):
-            self._findings.error(f"{where} is not a finite number", self._document.place(*path, key))
+            self.document.error(f"{where} is not a finite number", *path, key)
             return None
         return number
 
     def _region(self, box: RegionSection) -> Region | None:
-        place = self._document.place("limits", "region")
-        spans, rectangle = (box.x is not None, box.y is not None), (box.center is not None, box.size is not None)
-        if any(spans) == any(rectangle) or not (all(spans) or all(rectangle)):
-            self._findings.error("[limits] region needs either x and y, or center and size", place)
-            return None
-        if box.x is not None and box.y is not None:
-            size = (box.x[1] - box.x[0], box.y[1] - box.y[0])
-            center = (box.x[0] + size[0] / 2, box.y[0] + size[1] / 2)
-        else:
-            assert box.center is not None
-            assert box.size is not None
-            size, center = box.size, box.center
-        if size[0] <= 0 or size[1] <= 0:
-            self._findings.error("[limits] region is empty", place, "from the smaller to the larger value")
+        path = ("limits", "region")
+        match box.x, box.y, box.center, box.size:
+            case (left, right), (low, high), None, None:
+                center, size = ((left + right) / 2, (low + high) / 2), (right - left, high - low)
+            case None, None, (_, _) as center, (_, _) as size:
+                pass
+            case _:
+                self.document.error("[limits] region needs either x and y, or center and size", *path)
+                return None
+        if min(size) <= 0:
+            self.document.error("[limits] region is empty", *path, hint="from the smaller to the larger value")
             return None
         if max(size) > LARGEST_REGION_M:
-            self._findings.warning(
-                f"[limits] region is {size[0]:g} m x {size[1]:g} m: it keeps nothing safe", place,
-                'a plain number is in m: write e.g. "3 um"',
-            )  # fmt: skip
+            what = f"[limits] region is {size[0]:g} m x {size[1]:g} m: it keeps nothing safe"
+            self.document.warning(what, *path, hint='a plain number is in m: write e.g. "3 um"')
         return Region(center, size, box.angle)
 
     def _check_sizes(self, limits: ExperimentLimits) -> None:
         """The smallest scan allowed must fit into the region allowed."""
-        region = limits.region
-        if region is None:
+        if limits.region is None:
             return
-        longest_m = math.hypot(*region.size_m)
+        longest_m = math.hypot(*limits.region.size_m)
         for name in (names.SCAN_SIZE_X, names.SCAN_SIZE_Y):
             limit = limits.parameters.get(name)
             if limit is not None and limit.low is not None and limit.low > longest_m:
-                self._findings.error(
-                    f"[limits.{name}] min does not fit into [limits] region",
-                    self._document.place("limits", name, "min"),
-                    "no scan would be allowed",
-                )
+                what = f"[limits.{name}] min does not fit into [limits] region"
+                self.document.error(what, "limits", name, "min", hint="no scan would be allowed")
+
+
+def _unit_of(read: ParameterLimit) -> str | None:
+    """Return the unit of the first value given: the operating mode of the microscope decides what it is."""
+    for value in (read.min, read.max, read.step):
+        if isinstance(value, str):
+            with contextlib.suppress(AfspmError):
+                return parse_quantity(value)[1] or None
+    return None
 
 
 def _rate(value: Quantity, unit: str) -> float:
-    """A change per second, in `unit` per second: "1 V/s", "0.1 V/min"."""
+    """Return a change per second, in `unit` per second: "1 V/s", "0.1 V/min"."""
     if not isinstance(value, str):
         return float(value)
     number, given = parse_quantity(value)
@@ -272,14 +234,14 @@ def _rate(value: Quantity, unit: str) -> float:
     return si(f"{number} {over}", unit) / si(f"1 {under}", "s")
 
 
-def to_settings(limits: ExperimentLimits) -> dict[str, Any]:
+def to_settings(limits: ExperimentLimits) -> Settings:
     """As the scheduler process gets them, in JSON's types; `Limit` and `Region` by their fields."""
 
-    def plain(limit: Limit) -> dict[str, Any]:
+    def plain(limit: Limit) -> Settings:
         fields = {key: value for key, value in asdict(limit).items() if value is not None}
         return fields | ({"only": sorted(limit.only)} if limit.only is not None else {})
 
-    settings: dict[str, Any] = {
+    settings: Settings = {
         "parameters": {name: plain(limit) for name, limit in limits.parameters.items()},
         "actions": {name: plain(limit) for name, limit in limits.actions.items()},
         "most_pixels": limits.most_pixels,

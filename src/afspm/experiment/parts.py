@@ -10,12 +10,11 @@ from typing import Any, Final
 from afspm.errors import AfspmError
 from afspm.experiment import published
 from afspm.experiment.document import Document
-from afspm.experiment.findings import Findings, SourceLocation, closest, nearest
+from afspm.experiment.findings import SourceLocation, closest, nearest
 from afspm.experiment.known import WIRE_KEYS
 from afspm.experiment.published import PublishedSetting, wire_of
-from afspm.experiment.toml_lines import Path
+from afspm.experiment.toml_lines import Path, Settings, Table
 from afspm.experiment.toml_writer import value as toml
-from afspm.experiment.variable_references import VariableReferences
 
 SECTIONS: Final = ("clock", "control", "limits", "problems", "cache", "security", "restart", "record", "notify")
 
@@ -45,8 +44,8 @@ class ExperimentPart:
     name: str
     class_path: str
     command: tuple[str, ...]
-    settings: Mapping[str, Any]
-    own: Mapping[str, Any]
+    settings: Table
+    own: Table
     place: SourceLocation
     implied: bool = False
 
@@ -55,13 +54,13 @@ class ExperimentPart:
 class ExperimentParts:
     """The sorted and expanded file."""
 
-    variables: dict[str, Any] = field(default_factory=dict)
-    sections: dict[str, dict[str, Any]] = field(default_factory=dict)
-    intermediaries: dict[str, dict[str, Any]] = field(default_factory=dict)
+    variables: Settings = field(default_factory=dict)
+    sections: dict[str, Settings] = field(default_factory=dict)
+    intermediaries: dict[str, Settings] = field(default_factory=dict)
     components: list[ExperimentPart] = field(default_factory=list)
     became: dict[Path, str] = field(default_factory=dict)
     """Of each line of the published form, where it is ours under another name or is no more."""
-    instead: dict[str, dict[str, Any]] = field(default_factory=dict)
+    instead: dict[str, Settings] = field(default_factory=dict)
     """Tables of components that have no counterpart, by their names, as they are in the file."""
 
     def free_name(self, wanted: str) -> str:
@@ -72,61 +71,60 @@ class ExperimentParts:
         return next(name for name in names if name not in taken)
 
 
-def sort(document: Document, findings: Findings) -> ExperimentParts:
+def sort(document: Document) -> ExperimentParts:
     """Sort and expand; report what can't be part of an experiment."""
     parts = ExperimentParts()
-    raw_components: dict[str, dict[str, Any]] = {}
+    raw_components: dict[str, Settings] = {}
     for key, value in document.data.items():
         if not isinstance(value, dict):
             parts.variables[key] = value
-        elif _is_component(key, value, document, findings):
+        elif _is_component(key, value, document):
             raw_components[key] = value
         elif key in SECTIONS and "class" not in value:
             parts.sections[key] = value
         else:
             parts.intermediaries[key] = value
-    references = VariableReferences(document, {**parts.variables, **parts.intermediaries}, findings)
+    references = VariableReferences(document, {**parts.variables, **parts.intermediaries})
     parts.variables = {k: references.expand(v, (k,)) for k, v in parts.variables.items()}
     parts.sections = {k: references.expand(v, (k,)) for k, v in parts.sections.items()}
     parts.intermediaries = {k: references.expand(v, (k,)) for k, v in parts.intermediaries.items()}
     tables = {name: references.expand(table, (name,)) for name, table in raw_components.items()}
     channels = published.renamed_channels(tables)
-    ours = _FromPublished(channels, parts, document, findings)
+    ours = _FromPublished(channels, parts, document)
     for name, table in parts.intermediaries.items():
         renamed = published.with_channels(table, channels)
         parts.intermediaries[name] = {k: published.evaluated(v, channels) for k, v in renamed.items()}
     for name, table in tables.items():
-        part = _component(name, published.evaluated(table, channels), document, findings)
+        part = _component(name, published.evaluated(table, channels), document)
         if part is not None and (part := ours.translated(part)) is not None:
             parts.components.append(part)
-    _report_unused(parts, references.used, document, findings)
+    _report_unused(parts, references.used, document)
     return parts
 
 
-def _is_component(name: str, table: dict[str, Any], document: Document, findings: Findings) -> bool:
+def _is_component(name: str, table: Settings, document: Document) -> bool:
     marked = table.get("component", False)
     if not isinstance(marked, bool):
-        findings.error(f"`component` of [{name}] is {marked!r}, not true or false", document.place(name, "component"))
+        document.error(f"`component` of [{name}] is {marked!r}, not true or false", name, "component")
     return marked is True
 
 
-def _component(name: str, table: dict[str, Any], document: Document, findings: Findings) -> ExperimentPart | None:
-    place = document.place(name)
+def _component(name: str, table: Settings, document: Document) -> ExperimentPart | None:
     class_path, command = table.get("class", ""), table.get("command", ())
     if not isinstance(class_path, str):
-        findings.error(f"`class` of [{name}] is not text", document.place(name, "class"), 'class = "module.Name"')
+        document.error(f"`class` of [{name}] is not text", name, "class", hint='class = "module.Name"')
         return None
     if isinstance(command, str):
         command = [command]
     if not isinstance(command, list | tuple) or not all(isinstance(word, str) for word in command):
-        findings.error(
-            f"`command` of [{name}] is not a list of texts", document.place(name, "command"), 'command = ["program", …]'
+        document.error(
+            f"`command` of [{name}] is not a list of texts", name, "command", hint='command = ["program", …]'
         )
         return None
     if bool(class_path) == bool(command):
         both = "both `class` and `command`" if class_path else "neither `class` nor `command`"
         near = "" if class_path else _misspelt(table, ("class", "command"))
-        findings.error(f"component [{name}] has {both}", place, near or "one of them says what to run")
+        document.error(f"component [{name}] has {both}", name, hint=near or "one of them says what to run")
         return None
     own_keys = OWN_KEYS if class_path else OWN_KEYS | {SIMULATED, *DECLARED_KEYS}
     return ExperimentPart(
@@ -135,7 +133,7 @@ def _component(name: str, table: dict[str, Any], document: Document, findings: F
         command=tuple(command),
         settings={k: v for k, v in table.items() if k not in own_keys},
         own={k: v for k, v in table.items() if k in own_keys},
-        place=place,
+        place=document.place(name),
     )
 
 
@@ -146,7 +144,6 @@ class _FromPublished:
     channels: Mapping[str, str]
     parts: ExperimentParts
     document: Document
-    findings: Findings
 
     def translated(self, part: ExperimentPart) -> ExperimentPart | None:
         """Return the component as ours; None: it has no process of its own here."""
@@ -156,7 +153,7 @@ class _FromPublished:
             self.parts.instead[part.name] = table
             self.parts.became[here] = instead
             what = f"[{part.name}] {published.last(table)} calls code that is written for the published implementation"
-            self.findings.error(what, self.document.place(*here), f"{instead}; {published.GUIDE}")
+            self.document.error(what, *here, hint=f"{instead}; {published.GUIDE}")
             return None
         ours = published.class_of(table)
         if ours is None:
@@ -172,9 +169,7 @@ class _FromPublished:
             self._put(settings, ours.settings[key], (part.name, key), table)
         return replace(part, class_path=ours.ours, settings=settings)
 
-    def _put(
-        self, settings: dict[str, Any], setting: PublishedSetting, here: tuple[str, str], table: Mapping[str, Any]
-    ) -> None:
+    def _put(self, settings: Settings, setting: PublishedSetting, here: tuple[str, str], table: Table) -> None:
         value = table[here[1]]
         try:
             becomes = setting.becomes(self.channels.get(value, value) if here[1] == "channel_id" else value, table)
@@ -182,12 +177,12 @@ class _FromPublished:
                 published.put(settings, name, one)
         except (AfspmError, TypeError, ValueError) as error:
             what, hint = (error.what, error.hint) if isinstance(error, AfspmError) else (str(error), "")
-            self.findings.error(f"[{here[0]}] {here[1]} = {value!r}: {what}", self.document.place(*here), hint)
+            self.document.error(f"[{here[0]}] {here[1]} = {value!r}: {what}", *here, hint=hint)
             return
         self.parts.became[here] = ", ".join(f"{name} = {toml(one)}" for name, one in becomes.items()) or setting.why
 
 
-def _misspelt(table: Mapping[str, Any], wanted: tuple[str, ...]) -> str:
+def _misspelt(table: Table, wanted: tuple[str, ...]) -> str:
     for key in table:
         near = closest(key, wanted, 0.7)
         if near:
@@ -195,23 +190,62 @@ def _misspelt(table: Mapping[str, Any], wanted: tuple[str, ...]) -> str:
     return ""
 
 
-def _report_unused(parts: ExperimentParts, used: set[str], document: Document, findings: Findings) -> None:
+def _report_unused(parts: ExperimentParts, used: set[str], document: Document) -> None:
     for name, table in parts.intermediaries.items():
         if name in used:
             continue
         section = closest(name, SECTIONS, 0.75)
         if section and "class" not in table:
-            findings.error(f"there is no section [{name}]", document.place(name), f"did you mean [{section}]?")
+            document.error(f"there is no section [{name}]", name, hint=f"did you mean [{section}]?")
         elif within := [key for key, value in table.items() if isinstance(value, dict) and value.get("component")]:
             whole = f"{name}.{within[0]}"
             hint = f'a name with a dot is written in quotes: ["{whole}"]'
-            findings.error(f"[{whole}] is within a table [{name}], and no component", document.place(name), hint)
+            document.error(f"[{whole}] is within a table [{name}], and no component", name, hint=hint)
         elif "component" in table:
             continue  # switched off: component = false
         elif "class" in table or "command" in table:
             hint = "does it lack `component = true`?" if wire_of(table) is None else ""
-            findings.warning(f"nothing refers to [{name}]", document.place(name), hint)
+            document.warning(f"nothing refers to [{name}]", name, hint=hint)
         else:
-            findings.warning(
-                f"[{name}] is neither a section nor a component", document.place(name), nearest(name, SECTIONS)
-            )
+            document.warning(f"[{name}] is neither a section nor a component", name, hint=nearest(name, SECTIONS))
+
+
+class VariableReferences:
+    """Replaces references in values: a text that equals a top-level key stands for that key's value, as in the paper.
+
+    Only whole texts count, and only keys that hold a variable or an intermediary table: components and the sections
+    are no values, so that a component may be named (in a role, in a limit) without being pasted in.
+
+    Attributes:
+        used: the keys that were referred to.
+    """
+
+    def __init__(self, document: Document, variables: Table) -> None:
+        self._document = document
+        self._variables = variables
+        self.used: set[str] = set()
+
+    def expand(self, value: Any, path: Path) -> Any:
+        """`value`, which stands at `path`, with every reference in it replaced, again and again."""
+        return self._expand(value, path, ())
+
+    def _expand(self, value: Any, path: Path, through: tuple[str, ...]) -> Any:
+        if isinstance(value, dict):
+            return {key: self._expand(item, (*path, key), through) for key, item in value.items()}
+        if isinstance(value, list):
+            return [self._expand(item, (*path, i), through) for i, item in enumerate(value)]
+        if not isinstance(value, str) or value not in self._variables:
+            return value
+        if value in through:
+            self._report_cycle((*through[through.index(value) :], value))
+            return value
+        self.used.add(value)
+        return self._expand(self._variables[value], (value,), (*through, value))
+
+    def _report_cycle(self, around: tuple[str, ...]) -> None:
+        # the same ring is met from each of its keys: begin it at its smallest name, so that it is reported once
+        ring = around[:-1]
+        start = ring.index(min(ring))
+        ring = ring[start:] + ring[:start]
+        what = " -> ".join((*ring, ring[0]))
+        self._document.error(f"the references go in a circle: {what}", ring[0])

@@ -1,11 +1,10 @@
-"""What a ready-made component will do, as far as that is fixed before it runs: made once, never started."""
+"""The plan of a ready-made component, as far as it is fixed before it runs: made once, never started."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
+from afspm.experiment.toml_lines import Table
 from afspm.logic.limit_checker import LimitChecker
 from afspm.logic.limits import ExperimentLimits
 from afspm.model import ControlRequest, ProbePosition, Region, Request, ScanParameters
@@ -30,8 +29,8 @@ class PlannedMeasurements:
     needs_parameters: tuple[str, ...] = ()
 
 
-def plan_of(component: type, settings: Mapping[str, Any]) -> PlannedMeasurements | None:
-    """The plan of a component with these settings; None where it has none, or none that can be known.
+def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
+    """Return the plan of a component with these settings; None where it has none, or none that can be known.
 
     Raises:
         AfspmError: the component refuses its settings.
@@ -49,7 +48,7 @@ def plan_of(component: type, settings: Mapping[str, Any]) -> PlannedMeasurements
 
 
 def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[str]:
-    """Why the limits would refuse what is planned; each reason once."""
+    """Return why the limits would refuse what is planned; each reason once."""
     # steps and rates depend on what is in force by then
     guard = LimitChecker(_without_changes(limits))
     wanted: list[tuple[ControlRequest, object]] = [

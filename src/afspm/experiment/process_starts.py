@@ -1,4 +1,4 @@
-"""What is to be started, as launch lines."""
+"""Launch lines of the processes to start."""
 
 from __future__ import annotations
 
@@ -9,100 +9,88 @@ from typing import TYPE_CHECKING, Any
 
 from afspm.addresses import connectable, reaches
 from afspm.errors import ConfigError
-from afspm.experiment import limits_section, wiring
+from afspm.experiment import limits_section
 from afspm.experiment.experiment import ProcessStart
 from afspm.experiment.findings import nearest
 from afspm.experiment.known import DASHBOARD, DASHBOARD_PASSWORD
-from afspm.experiment.parts import ExperimentPart
+from afspm.experiment.toml_lines import Settings
 from afspm.experiment.toml_writer import SECRET
+from afspm.experiment.wiring import ProcessSockets
 from afspm.launch import Launch, Sockets
 from afspm.logic.microscope_status import FEEDBACK_OFF
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import Frame, Role
 
 if TYPE_CHECKING:
-    from afspm.experiment.experiment import Experiment
     from afspm.experiment.resolution import ResolvedExperiment, ResolvedProcess
 
 _ORDER = (Role.TRANSLATOR, Role.SCHEDULER, Role.COMPONENT)
 
 
 def starts(
-    experiment: Experiment, take_address: Callable[[], str], only: Collection[str], without: Collection[str]
+    resolved: ResolvedExperiment, take_address: Callable[[], str], only: Collection[str], without: Collection[str]
 ) -> list[ProcessStart]:
-    """The processes chosen, translator and scheduler first; clock and folders are still to be added."""
-    resolved = experiment.resolved
-    chosen = _with_implied(_chosen(experiment.component_names, only, without), resolved, set(only), set(without))
-    links = {name: _without_gone(resolved.net.links[name], resolved, set(without)) for name in chosen}
-    for part in resolved.parts.components:
-        if part.implied and part.name in chosen:
-            links[part.name] = _reachable(links[part.name], resolved, chosen)
-    _require_addresses(resolved, links, chosen, piecemeal=bool(only))
+    """Return the processes chosen, translator and scheduler first; clock and folders are still to be added."""
+    implied = {name for name, process in resolved.processes.items() if process.part.implied}
+    chosen = chosen_names(resolved, only, without)
+    if any(scheduler.name in chosen for scheduler in resolved.with_role(Role.SCHEDULER)):
+        chosen |= implied - set(only) - set(without)  # what is not in the file is started where the scheduler is
+    else:
+        chosen -= implied - set(only)
+    links = {name: _subscribing(resolved, name, chosen, set(without)) for name in chosen}
+    # those that are not chosen run elsewhere; without `only` they may just have been left out
+    _require_addresses(resolved, {**resolved.net.links, **links} if only else links, chosen, implied)
     addresses = resolved.net.addresses(take_address)
     processes = [process for role in _ORDER for process in resolved.with_role(role) if process.name in chosen]
-    return [_start(process, experiment, links[process.name], addresses, chosen) for process in processes]
+    return [_start(process, resolved, links[process.name], addresses, chosen) for process in processes]
 
 
 def knowing_the_run(resolved: ResolvedExperiment) -> set[str]:
-    """The processes that are told the identity of the run: all, unless the scheduler is of another language."""
+    """Return who is told the identity of the run: all, unless the scheduler is of another language."""
     if all(not scheduler.part.command for scheduler in resolved.with_role(Role.SCHEDULER)):
         return set(resolved.processes)
     return {*resolved.emulators, *(translator.name for translator in resolved.with_role(Role.TRANSLATOR))}
 
 
-def simulated(experiment: Experiment, only: Collection[str], without: Collection[str]) -> bool:
-    """True if the microscope is simulated for certain, where these parts are started on this computer."""
-    resolved = experiment.resolved
-    return resolved.simulated_with(_chosen(experiment.component_names, only, without))
+def chosen_names(resolved: ResolvedExperiment, only: Collection[str], without: Collection[str]) -> set[str]:
+    """Return the names that are chosen to be started here.
 
-
-def _chosen(names: list[str], only: Collection[str], without: Collection[str]) -> set[str]:
+    Raises:
+        ConfigError: there is no such component.
+    """
+    names = list(resolved.processes)
     for name in [*only, *without]:
         if name not in names:
             raise ConfigError(f"there is no component {name!r}", hint=nearest(name, names))
     return {name for name in names if (not only or name in only) and name not in without}
 
 
-def _with_implied(chosen: set[str], resolved: ResolvedExperiment, only: set[str], without: set[str]) -> set[str]:
-    """What is not in the file is started where the scheduler is."""
-    here = any(part.name in chosen for part in resolved.with_role(Role.SCHEDULER))
-    implied = {part.name for part in resolved.parts.components if part.implied} - only
-    return chosen | (implied - without) if here else chosen - implied
+def _subscribing(resolved: ResolvedExperiment, name: str, chosen: set[str], without: set[str]) -> ProcessSockets:
+    """Return the sockets of a process, without those that nobody can know of.
 
-
-def _without_gone(
-    links: wiring.ProcessSockets, resolved: ResolvedExperiment, without: set[str]
-) -> wiring.ProcessSockets:
-    """A component left out, of no address that anybody could know, is not there: nobody listens to it."""
-    gone = {
+    A component that is left out, and has no address, is not there. And nobody has to write down an address for the
+    sake of what is not in the file.
+    """
+    links, is_implied = resolved.net.links[name], resolved.processes[name].part.implied
+    unknown = {
         key
         for key, slot in resolved.net.slots.items()
-        if slot.owner in without and slot.address is None and resolved.processes[slot.owner].role is Role.COMPONENT
+        if slot.address is None
+        and (
+            (slot.owner in without and resolved.processes[slot.owner].role is Role.COMPONENT)
+            or (is_implied and slot.owner not in chosen)
+        )
     }
-    return replace(links, subscribe=tuple(source for source in links.subscribe if source not in gone))
-
-
-def _reachable(links: wiring.ProcessSockets, resolved: ResolvedExperiment, chosen: set[str]) -> wiring.ProcessSockets:
-    """Nobody has to write down an address for the sake of what is not in the file."""
-    slots = resolved.net.slots
-    unknown = {key for key, slot in slots.items() if slot.address is None and slot.owner not in chosen}
     return replace(links, subscribe=tuple(source for source in links.subscribe if source not in unknown))
 
 
 def _require_addresses(
-    resolved: ResolvedExperiment, links: Mapping[str, wiring.ProcessSockets], chosen: set[str], *, piecemeal: bool
+    resolved: ResolvedExperiment, links: Mapping[str, ProcessSockets], chosen: set[str], implied: set[str]
 ) -> None:
-    """Between a process started here and one started elsewhere the address must be written down.
-
-    Args:
-        piecemeal: those that are not chosen run elsewhere; else they may just have been left out.
-    """
+    """Between a process started here and one started elsewhere the address must be written down."""
     missing: dict[str, set[str]] = {}
-    implied = {part.name for part in resolved.parts.components if part.implied}
-    for name, link in resolved.net.links.items() if piecemeal else links.items():
-        if name in implied:
-            continue
-        for key in (link.control, *links.get(name, link).subscribe):
+    for name in links.keys() - implied:
+        for key in (links[name].control, *links[name].subscribe):
             slot = resolved.net.slots.get(key or "")
             if slot is not None and slot.address is None and (slot.owner in chosen) != (name in chosen):
                 missing.setdefault(f"[{slot.owner}] {slot.key}", set()).add(name)
@@ -117,12 +105,13 @@ def _require_addresses(
 
 def _start(
     process: ResolvedProcess,
-    experiment: Experiment,
-    links: wiring.ProcessSockets,
+    resolved: ResolvedExperiment,
+    links: ProcessSockets,
     addresses: Mapping[str, str],
     chosen: Collection[str],
 ) -> ProcessStart:
-    resolved, part, role, wires = experiment.resolved, process.part, process.role, process.wires
+    name, command, role, wires = process.name, process.part.command, process.role, process.wires
+    control = resolved.sections.control
 
     def bound(key: str | None) -> str | None:
         return None if key is None else addresses.get(key, key)
@@ -131,12 +120,9 @@ def _start(
         return connectable(addresses.get(key, key))
 
     launch = Launch(
-        name=part.name,
+        name=name,
         class_=process.class_path,
-        settings={
-            **resolved.processes[part.name].settings,
-            **(_for_scheduler(resolved) if role is Role.SCHEDULER else {}),
-        },
+        settings={**process.settings, **(_for_scheduler(resolved) if role is Role.SCHEDULER else {})},
         sockets=Sockets(
             publish=bound(links.publish),
             subscribe=tuple(met(source) for source in links.subscribe),
@@ -145,69 +131,63 @@ def _start(
         ),
         envelopes=process.envelopes,
         problems=resolved.named_problems,
-        request_timeout_s=wires.request_timeout_s or resolved.sections.control.request_timeout,
-        request_retries=_first(wires.request_retries, resolved.sections.control.request_retries),
+        request_timeout_s=wires.request_timeout_s or control.request_timeout,
+        request_retries=control.request_retries if wires.request_retries is None else wires.request_retries,
         keys=_keys(resolved, links, addresses),
         messages=resolved.messages,
         beat_period_s=resolved.sections.restart.beat_period,
         simulated=resolved.simulated_with(chosen),
-        controller=resolved.controller_of(part.name, chosen) if role is Role.TRANSLATOR else "",
+        controller=resolved.controller_of(name, chosen) if role is Role.TRANSLATOR else "",
         sample_coordinates=role is Role.COMPONENT and _in_sample_coordinates(resolved),
         retracts=role is Role.TRANSLATOR and _retracts(resolved),
     )
-    folders = tuple(str(folder) for folder in resolved.document.folders)
-    beats = part.own.get("heartbeats") is not False
-    return ProcessStart(launch, role, _command(part), experiment.folder, folders, beats, _hidden(resolved, part.name))
+    if command[:1] == ("python",):  # the one that runs us, wherever that is
+        command = (sys.executable, *command[1:])
+    folders = resolved.document.folders
+    beats = process.part.own.get("heartbeats") is not False
+    return ProcessStart(launch, role, command, folders[0], tuple(map(str, folders)), beats, _hidden(resolved, process))
 
 
-def _hidden(resolved: ResolvedExperiment, name: str) -> tuple[str, ...]:
-    """Environment variables that hold secrets, but for those of the component `name`."""
-    webhook = str(resolved.sections.notify.webhook)
-    every = {DASHBOARD_PASSWORD, *([webhook[1:]] if webhook.startswith("$") else [])}
-    every.update(*(_secrets(resolved, part.name) for part in resolved.parts.components))
-    return tuple(sorted(every - _secrets(resolved, name)))
+def _hidden(resolved: ResolvedExperiment, process: ResolvedProcess) -> tuple[str, ...]:
+    """Environment variables that hold secrets of others."""
+    every = {DASHBOARD_PASSWORD, *_variable(resolved.sections.notify.webhook)}
+    every.update(*map(_secrets, resolved.processes.values()))
+    return tuple(sorted(every - _secrets(process)))
 
 
-def _secrets(resolved: ResolvedExperiment, name: str) -> set[str]:
-    """Environment variables of which a component has to know the value."""
-    webhook = str(resolved.processes[name].settings.get(SECRET, ""))
-    operates = resolved.processes[name].says("operates")
-    return {*([webhook[1:]] if webhook.startswith("$") else []), *([DASHBOARD_PASSWORD] if operates else [])}
+def _secrets(process: ResolvedProcess) -> set[str]:
+    return {*_variable(process.settings.get(SECRET)), *([DASHBOARD_PASSWORD] if process.says("operates") else [])}
 
 
-def _command(part: ExperimentPart) -> tuple[str, ...]:
-    """The command; "python" is the one that runs us, wherever that is."""
-    return (sys.executable, *part.command[1:]) if part.command[:1] == ("python",) else part.command
+def _variable(secret: Any) -> list[str]:
+    """The environment variable that is named instead of a secret."""
+    return [secret[1:]] if isinstance(secret, str) and secret.startswith("$") else []
 
 
-def asking(experiment: Experiment, names: Collection[str]) -> Launch | None:
-    """A launch line by which to ask the scheduler, which runs elsewhere, in the name of the first of `names`.
+def asking(resolved: ResolvedExperiment, names: Collection[str]) -> Launch | None:
+    """Return a launch line by which to ask a scheduler elsewhere, in the name of the first of `names`.
 
     None where it is not said where it is, or it is of another language and perhaps knows nothing of our requests.
     """
-    resolved = experiment.resolved
     scheduler = next(iter(resolved.with_role(Role.SCHEDULER)), None)
     if scheduler is None or scheduler.part.command:
         return None
     # as those that are started here reach it; a translator, which asks nobody, by what the scheduler binds
     known = [*(resolved.net.links[name].control for name in names), f"{scheduler.name}/serve"]
-    addresses = {key: slot.address for key, slot in resolved.net.slots.items()}
-    address = next((found for key in known if key and (found := addresses.get(key, key)) is not None), None)
+    slots = resolved.net.slots.items()
+    addresses = {key: slot.address for key, slot in slots if slot.address is not None}
+    opened = {key for key, slot in slots if slot.address is None}
+    address = next((addresses.get(key, key) for key in known if key and key not in opened), None)
     if address is None:
         return None
-    target = connectable(address)
-    keys = _keys(
-        resolved, wiring.ProcessSockets(), {key: found for key, found in addresses.items() if found is not None}
-    )
+    target, keys = connectable(address), _keys(resolved, ProcessSockets(), addresses)
     if keys is not None and "folder" in keys:
         keys = {**keys, target: scheduler.name}
     return Launch(next(iter(names)), sockets=Sockets(control=target), keys=keys)
 
 
-def _keys(
-    resolved: ResolvedExperiment, links: wiring.ProcessSockets, addresses: Mapping[str, str]
-) -> dict[str, str] | None:
-    """The folder of the keys, and whose key to expect at each address; see `transport.network.Network.from_launch`."""
+def _keys(resolved: ResolvedExperiment, links: ProcessSockets, addresses: Mapping[str, str]) -> dict[str, str] | None:
+    """Return the folder of the keys, and whose key to expect at each address; see `Network.from_launch`."""
     if resolved.keys_folder is None:
         return {"insecure": "true"} if resolved.sections.security.insecure else None
     slots = resolved.net.slots.items()
@@ -226,54 +206,32 @@ def _keys(
 
 
 def _in_sample_coordinates(resolved: ResolvedExperiment) -> bool:
-    """Whether the scheduler maps places, as its class says."""
+    """Return whether the scheduler maps places, as its class says."""
     schedulers = resolved.with_role(Role.SCHEDULER)
     return any(getattr(scheduler.component, "frame", None) is Frame.SAMPLE for scheduler in schedulers)
 
 
 def _retracts(resolved: ResolvedExperiment) -> bool:
-    """Whether a tip without feedback is to be retracted when nobody is in control any more."""
+    """Return whether a tip without feedback is to be retracted when nobody is in control any more."""
     control = resolved.sections.control
     dangerous = WatchdogSettings().dangerous if control.dangerous is None else control.dangerous
     return control.retract and FEEDBACK_OFF in dangerous
 
 
-def _first(a: int | None, b: int) -> int:
-    return b if a is None else a
+_OF_OTHERS = {"request_timeout", "request_retries", "solved_by_hand"}
+_IN_SECONDS = ("lease", "grace", "malfunction_after")
 
 
-def _operators(resolved: ResolvedExperiment) -> list[str]:
-    """Components by which a person may command the microscope in MANUAL mode, as their classes say.
-
-    And a dashboard that joins the run later, which is under no other's name.
-    """
-    operators = resolved.saying("operates")
-    return operators if DASHBOARD in resolved.processes else [*operators, DASHBOARD]
-
-
-def _for_scheduler(resolved: ResolvedExperiment) -> dict[str, Any]:
-    """The sections that the scheduler enforces, as arguments of its constructor. Times in s, lengths in m.
-
-    control: lease_s, grace_s, malfunction_after_s, stop_scan_on_problem, stop_scan_on_manual, retract, dangerous,
-        spectra_by_variable, roles (name of the role -> names; None: everyone).
-    limits: see `limits.to_settings`; cache: see `caching.Caching.to_settings`.
-    """
-    control = resolved.sections.control
+def _for_scheduler(resolved: ResolvedExperiment) -> Settings:
+    """Return the sections that the scheduler enforces, as arguments of its constructor. Times in s, lengths in m."""
+    dumped = resolved.sections.control.model_dump(mode="json", exclude=_OF_OTHERS)
+    control = {f"{key}_s" if key in _IN_SECONDS else key: value for key, value in dumped.items()}
+    if control["roles"]["operate"] is None:
+        # components by which a person may command, and a dashboard that joins later, which is under no other's name
+        operators = resolved.saying("operates")
+        control["roles"]["operate"] = operators if DASHBOARD in resolved.processes else [*operators, DASHBOARD]
     return {
-        "control": {
-            "lease_s": control.lease,
-            "grace_s": control.grace,
-            "malfunction_after_s": control.malfunction_after,
-            "stop_scan_on_problem": control.stop_scan_on_problem,
-            "stop_scan_on_manual": control.stop_scan_on_manual,
-            "retract": control.retract,
-            "spectra_by_variable": control.spectra_by_variable,
-            "dangerous": None if control.dangerous is None else list(control.dangerous),
-            "roles": {
-                **{role: None if who is None else list(who) for role, who in control.roles},
-                "operate": _operators(resolved) if control.roles.operate is None else list(control.roles.operate),
-            },
-        },
+        "control": control,
         "limits": limits_section.to_settings(resolved.limits),
         "cache": resolved.caching.to_settings(),
     }

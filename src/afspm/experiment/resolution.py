@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,10 @@ from afspm.experiment.cache_section import CacheSettings
 from afspm.experiment.capabilities import MicroscopeCapabilities
 from afspm.experiment.class_loader import ComponentDeclaration
 from afspm.experiment.document import Document
-from afspm.experiment.findings import Findings, nearest
+from afspm.experiment.findings import nearest
 from afspm.experiment.parts import EMULATED, SIMULATED, ExperimentPart, ExperimentParts
 from afspm.experiment.sections import ExperimentSections, read_sections
+from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.wiring import BoundSocket, Wiring, WiringKeys
 from afspm.logic.limits import ExperimentLimits
 from afspm.model import ProblemNames, Role
@@ -50,7 +51,7 @@ class ResolvedProcess:
     wires: WiringKeys
     role: Role = Role.COMPONENT
     declared: ComponentDeclaration = field(default_factory=ComponentDeclaration)
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: Settings = field(default_factory=dict)
     component: type | None = None
     class_path: str = ""
     wrong: frozenset[str] | None = None
@@ -60,12 +61,12 @@ class ResolvedProcess:
         return self.part.name
 
     def says(self, attribute: str) -> bool:
-        """Whether its class has an attribute that is true."""
+        """Return whether its class has an attribute that is true."""
         return getattr(self.component, attribute, False) is True
 
     @property
     def is_microscope(self) -> bool:
-        """Whether it is a simulated microscope, as its class (a command: its table) says."""
+        """True for a simulated microscope, as its class (a command: its table) says."""
         return self.part.own.get(SIMULATED) is True if self.part.command else self.says(SIMULATED)
 
     @property
@@ -92,7 +93,6 @@ class ResolvedExperiment:
 
     parts: ExperimentParts
     document: Document
-    findings: Findings
     sections: ExperimentSections
     messages: tuple[str, ...]
     named_problems: dict[str, int]
@@ -108,11 +108,11 @@ class ResolvedExperiment:
 
     def error(self, what: str, *path: str | int, hint: str = "") -> None:
         """Report an error at the line where `path` is set."""
-        self.findings.error(what, self.document.place(*path), hint)
+        self.document.error(what, *path, hint=hint)
 
     def warning(self, what: str, *path: str | int, hint: str = "") -> None:
         """Report a warning at the line where `path` is set."""
-        self.findings.warning(what, self.document.place(*path), hint)
+        self.document.warning(what, *path, hint=hint)
 
     def with_role(self, role: Role) -> list[ResolvedProcess]:
         return [process for process in self.processes.values() if process.role is role]
@@ -158,15 +158,14 @@ class ResolvedExperiment:
         return self.saying(EMULATED)
 
 
-def resolve(parts: ExperimentParts, document: Document, findings: Findings) -> ResolvedExperiment:
+def resolve(parts: ExperimentParts, document: Document) -> ResolvedExperiment:
     """Resolve all that can be; what can't is reported and left out."""
     resolved = ResolvedExperiment(
         parts=parts,
         document=document,
-        findings=findings,
-        sections=read_sections(parts.sections, document, findings),
-        messages=_messages(parts.variables.get("messages", []), document, findings),
-        named_problems=_problems(parts.sections.get("problems", {}), document, findings),
+        sections=read_sections(parts.sections, document),
+        messages=_messages(parts.variables.get("messages", []), document),
+        named_problems=_problems(parts.sections.get("problems", {}), document),
     )
     with class_loader.importing_from(document.folders):
         for part in parts.components:
@@ -175,13 +174,13 @@ def resolve(parts: ExperimentParts, document: Document, findings: Findings) -> R
             parts.components.append(added)
             _add(added, resolved)
         _resolve_sections(resolved)
-    resolved.net = wiring.connect(resolved.processes, document.place)
+    resolved.net = wiring.connect(resolved.processes, document)
     return resolved
 
 
 def _add(part: ExperimentPart, resolved: ResolvedExperiment) -> None:
-    name, document, findings = part.name, resolved.document, resolved.findings
-    process = ResolvedProcess(part, wiring.read_wires(part, document.place, findings))
+    name, document = part.name, resolved.document
+    process = ResolvedProcess(part, wiring.read_wires(part, document))
     resolved.processes[name] = process
     process.declared = ComponentDeclaration.of_table(part.own)
     process.role = _written_role(part, resolved)
@@ -192,26 +191,28 @@ def _add(part: ExperimentPart, resolved: ResolvedExperiment) -> None:
         path = class_loader.full_path(part.class_path)
         component = class_loader.load(path)
     except class_loader.Unloadable as error:
-        resolved.error(f"[{name}] class: {error.what}", name, "class", hint=error.hint)
+        resolved.document.error(f"[{name}] class: {error.what}", name, "class", hint=error.hint)
         return
     role = class_loader.role_of(component) if isinstance(component, type) else None
     if role is None:
-        resolved.error(f"[{name}] {path} is not a component", name, "class", hint="derive it from afspm.Component")
+        resolved.document.error(
+            f"[{name}] {path} is not a component", name, "class", hint="derive it from afspm.Component"
+        )
         return
     process.component, process.class_path, process.role = component, path, role
     process.declared = _declared(component, part)
-    errors = findings.errors
+    errors = document.findings.errors
     given = FROM_SECTIONS if role is Role.SCHEDULER else ()
     wrong: set[str] = set()
-    process.settings = settings.check(component, part.settings, (name,), document, findings, given, wrong)
-    if findings.errors > errors:
+    process.settings = settings.check(component, part.settings, (name,), document, given, wrong)
+    if document.findings.errors > errors:
         process.wrong = frozenset(wrong)
     for setting, address, keyed in settings.listening(component, process.settings):
         resolved.listening.append(BoundSocket(name, setting, address, setting, document.place(name, setting), keyed))
 
 
 def _declared(component: type, part: ExperimentPart) -> ComponentDeclaration:
-    """What the class says; a setting `problem` takes the place of its default there."""
+    """Return what the class says; a setting `problem` takes the place of its default there."""
     said = ComponentDeclaration.of_class(component)
     default, given = settings.default_of(component, "problem"), part.settings.get("problem")
     if not isinstance(given, str) or not isinstance(default, str):
@@ -225,26 +226,25 @@ def _declared(component: type, part: ExperimentPart) -> ComponentDeclaration:
 
 def _resolve_sections(resolved: ResolvedExperiment) -> None:
     """The sections whose meaning depends on the components: what is kept, what is allowed, what is planned."""
-    parts, document, findings = resolved.parts, resolved.document, resolved.findings
+    parts, document = resolved.parts, resolved.document
     processes = resolved.processes.values()
     logic = next((process.wires.cache_logic for process in processes if process.wires.cache_logic), None)
-    resolved.caching = cache_section.read(parts.sections.get("cache", {}), logic, document, findings)
+    resolved.caching = cache_section.read(parts.sections.get("cache", {}), logic, document)
     translators = resolved.with_role(Role.TRANSLATOR)
     has = next((has for translator in translators if (has := translator.capabilities())), None)
     reader = limits_section.LimitsReader(
         document,
-        findings,
-        components=tuple(part.name for part in parts.components),
+        components=resolved.processes.keys(),
         parameters=capabilities.base() if has is None else {**capabilities.base(), **has.parameters},
         actions=None if has is None else has.actions,
-        certain=has is not None,
         sets={} if has is None else has.sets,
+        certain=has is not None,
     )
     resolved.limits = reader.read(parts.sections.get("limits", {}))
     for translator in translators:
         for action, reason in planned_measurements.refused_actions(resolved.limits):
             what = f"[{translator.name}] actions: the limits would always refuse {reason}"
-            resolved.error(what, translator.name, "actions", action)
+            resolved.document.error(what, translator.name, "actions", action)
     for process in processes:
         if process.component is None:
             continue
@@ -274,11 +274,11 @@ def _look_inside(process: ResolvedProcess, component: type, resolved: ResolvedEx
 def _report(name: str, error: AfspmError, resolved: ResolvedExperiment) -> None:
     inside = _inside(error)
     said = f"{sections.name_of((name, *inside))}{':' if inside else ''} {error.what}"
-    resolved.error(said, name, *inside, hint=error.hint)
+    resolved.document.error(said, name, *inside, hint=error.hint)
 
 
 def _inside(error: AfspmError) -> tuple[str | int, ...]:
-    """Where in a component's table an error says that it is: "panel[1].set" as ("panel", 1, "set")."""
+    """Return where in a component's table an error says that it is: "panel[1].set" as ("panel", 1, "set")."""
     where = error.where.removeprefix("simulation.").removeprefix("the experiment file, ")
     return tuple(int(index) if index else key for key, index in _STEP.findall(where))
 
@@ -293,7 +293,7 @@ def _resolve_plan(process: ResolvedProcess, component: type, resolved: ResolvedE
             _report(name, one, resolved)
         return
     except Exception as error:
-        resolved.error(f"[{name}] refuses its settings: {type(error).__name__}: {error}", name)
+        resolved.document.error(f"[{name}] refuses its settings: {type(error).__name__}: {error}", name)
         return
     if plan is None:
         return
@@ -301,7 +301,7 @@ def _resolve_plan(process: ResolvedProcess, component: type, resolved: ResolvedE
         process.declared, needs_actions=plan.needs_actions, needs_parameters=plan.needs_parameters
     )
     for reason in planned_measurements.refusals(name, plan, resolved.limits):
-        resolved.error(f"[{name}] plans what its limits refuse: {reason}", name)
+        resolved.document.error(f"[{name}] plans what its limits refuse: {reason}", name)
 
 
 def _written_role(part: ExperimentPart, resolved: ResolvedExperiment) -> Role:
@@ -311,44 +311,43 @@ def _written_role(part: ExperimentPart, resolved: ResolvedExperiment) -> Role:
         if written in [role.value for role in Role]:
             return Role(written)
         hint = nearest(str(written), [role.value for role in Role])
-        resolved.error(f"[{part.name}] has no role {written!r}", part.name, "role", hint=hint)
+        resolved.document.error(f"[{part.name}] has no role {written!r}", part.name, "role", hint=hint)
     if "control_server" in part.own:
         return Role.TRANSLATOR
     return Role.SCHEDULER if {"router", "pubsubcache"} & part.own.keys() else Role.COMPONENT
 
 
-def _messages(given: Any, document: Document, findings: Findings) -> tuple[str, ...]:
+def _messages(given: Any, document: Document) -> tuple[str, ...]:
     """`messages`: .proto files, absolute, and modules with messages of the user."""
     if not isinstance(given, list) or not all(isinstance(one, str) for one in given):
-        findings.error("`messages` is not a list of texts", document.place("messages"), 'messages = ["my.proto"]')
+        document.error("`messages` is not a list of texts", "messages", hint='messages = ["my.proto"]')
         return ()
     found = []
     for i, one in enumerate(given):
-        place = document.place("messages", i)
         if not one.endswith(".proto"):
             found.append(one)
             if class_loader.find_module(one, document.folders) is None:
-                findings.error(f"messages: there is no module {one!r}", place, "or give a .proto file")
+                document.error(f"messages: there is no module {one!r}", "messages", i, hint="or give a .proto file")
             continue
         file = document.folder_of("messages") / one
         found.append(str(file))
         if not file.is_file():
-            findings.error(f"messages: there is no file {one!r}", place, "it is looked for beside the experiment file")
+            hint = "it is looked for beside the experiment file"
+            document.error(f"messages: there is no file {one!r}", "messages", i, hint=hint)
     return tuple(found)
 
 
-def _problems(table: Mapping[str, Any], document: Document, findings: Findings) -> dict[str, int]:
+def _problems(table: Table, document: Document) -> dict[str, int]:
     """[problems]: each name with its number; a wrong one is reported and left out."""
     named: dict[str, int] = {}
     for name, number in table.items():
-        place = document.place("problems", name)
         if not isinstance(number, int) or isinstance(number, bool):
-            findings.error(f"[problems] {name} = {number!r} is not a whole number", place)
+            document.error(f"[problems] {name} = {number!r} is not a whole number", "problems", name)
             continue
         try:
             ProblemNames({**named, name: number})
         except InvalidValue as error:
-            findings.error(error.what, place, error.hint)
+            document.error(error.what, "problems", name, hint=error.hint)
         else:
             named[name] = number
     return named

@@ -11,7 +11,8 @@ from pydantic import Field
 
 from afspm.errors import AfspmError
 from afspm.experiment.document import Document
-from afspm.experiment.findings import Findings, nearest
+from afspm.experiment.findings import nearest
+from afspm.experiment.toml_lines import Settings
 from afspm.units import Duration
 
 
@@ -121,11 +122,11 @@ class ExperimentSections(Section):
     notify: NotifySection = NotifySection()
 
 
-def read_sections(tables: Mapping[str, dict[str, Any]], document: Document, findings: Findings) -> ExperimentSections:
+def read_sections(tables: Mapping[str, Settings], document: Document) -> ExperimentSections:
     """Read them all; what is wrong with one is reported, and its defaults taken."""
     return ExperimentSections.model_construct(
         **{
-            name: parse(type(field.default), name, tables.get(name, {}), document, findings)
+            name: parse(type(field.default), name, tables.get(name, {}), document)
             for name, field in ExperimentSections.model_fields.items()
         }
     )
@@ -134,43 +135,53 @@ def read_sections(tables: Mapping[str, dict[str, Any]], document: Document, find
 S = TypeVar("S", bound=Section)
 
 
-def parse(model: type[S], name: str, table: dict[str, Any], document: Document, findings: Findings) -> S:
-    """The section `[name]`; what is wrong with it is reported, and its defaults returned."""
+def parse(model: type[S], name: str, table: Settings, document: Document) -> S:
+    """Return the section `[name]`; what is wrong with it is reported, and its defaults returned."""
     try:
         return model.model_validate(table)
     except pydantic.ValidationError as error:
         for one in error.errors(include_url=False):
-            report(one, (name,), document, findings, known=_fields_at(model, one["loc"]))
+            report(one, (name,), document, known=_fields_at(model, one["loc"]))
         return model()
 
 
-def report(
-    error: Any, path: tuple[str | int, ...], document: Document, findings: Findings, known: tuple[str, ...] = ()
-) -> None:
-    """One error of pydantic in the words of the experiment file."""
+_WANTED = {
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "a whole number"),
+    **dict.fromkeys(("float_type", "float_parsing"), "a number"),
+    **dict.fromkeys(("bool_type", "bool_parsing"), "true or false"),
+    **dict.fromkeys(("tuple_type", "list_type"), "a list of values in brackets"),
+    **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "a table of keys and values"),
+    **dict.fromkeys(("enum", "literal_error"), "{expected}"),
+    "finite_number": "a finite number",
+    "string_type": "a text in quotes",
+    "greater_than": "above {gt:g}",
+    "greater_than_equal": "at least {ge:g}",
+    "less_than": "below {lt:g}",
+    "less_than_equal": "at most {le:g}",
+}
+"""What was wanted, by pydantic's types of errors."""
+
+
+def report(error: Any, path: tuple[str | int, ...], document: Document, known: tuple[str, ...] = ()) -> None:
+    """Report one error of pydantic in the words of the experiment file."""
     location = tuple(part for part in error["loc"] if isinstance(part, int) or not part.startswith("function-"))
     full = (*path, *location)
-    place = document.place(*full)
-    shown = name_of(full)
-    if error["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        findings.error(f"{shown} is not a setting", place, nearest(str(location[-1]), known))
-    elif error["type"] == "missing":
-        findings.error(f"{shown} is missing", place)
-    elif error["type"] in ("tuple_type", "list_type"):
-        findings.error(f"{shown} is a list of values in brackets, not {error['input']!r}", place)
-    elif error["type"] in ("model_type", "dict_type"):
-        findings.error(f"{shown} is a table of keys and values, not {error['input']!r}", place)
-    elif error["type"] == "too_long":
-        most, given = error["ctx"]["max_length"], error["ctx"]["actual_length"]
-        findings.error(f"{shown} has {given} values, and takes {most} at most", place)
-    elif isinstance(cause := error.get("ctx", {}).get("error"), AfspmError):
-        findings.error(f"{shown} = {error['input']!r}: {cause.what}", place, cause.hint)
+    shown, kind, given = name_of(full), error["type"], error.get("input")
+    context, hint = error.get("ctx", {}), ""
+    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
+        said, hint = f"{shown} is not a setting", nearest(str(location[-1]), known)
+    elif kind == "missing":
+        said = f"{shown} is missing"
+    elif kind == "too_long":
+        said = f"{shown} has {context['actual_length']} values, and takes {context['max_length']} at most"
+    elif isinstance(cause := context.get("error"), AfspmError):
+        said, hint = f"{shown} = {given!r}: {cause.what}", cause.hint
+    elif kind in _WANTED:
+        said = f"{shown} is {_WANTED[kind].format(**context)}, not {given!r}"
     else:
-        said = error["msg"].removeprefix("Value error, ").replace("Input should be", "it should be")
-        said = said[:1].lower() + said[1:]
-        given = error.get("input")
-        tail = f", not {given!r}" if not isinstance(given, dict) and repr(given) not in said else ""
-        findings.error(f"{shown}: {said}{tail}", place)
+        told = error["msg"].removeprefix("Value error, ").replace("Input should be", "it should be")
+        said = f"{shown}: {told[:1].lower()}{told[1:]}, not {given!r}"
+    document.error(said, *full, hint=hint)
 
 
 def name_of(path: tuple[str | int, ...]) -> str:
@@ -191,7 +202,7 @@ def _fields_at(model: type[pydantic.BaseModel], location: tuple[str | int, ...])
 
 
 def _sections_in(annotation: Any) -> Iterator[type[pydantic.BaseModel]]:
-    """The sections that an annotation speaks of: itself, or within a union or a tuple."""
+    """Return the sections that an annotation speaks of: itself, or within a union or a tuple."""
     if isinstance(annotation, type) and issubclass(annotation, pydantic.BaseModel):
         yield annotation
     for inner in get_args(annotation):

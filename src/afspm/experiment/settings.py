@@ -20,8 +20,9 @@ from afspm.addresses import Listens
 from afspm.errors import UnitError
 from afspm.experiment import class_loader
 from afspm.experiment.document import Document
-from afspm.experiment.findings import Findings, closest, nearest
+from afspm.experiment.findings import closest, nearest
 from afspm.experiment.sections import report
+from afspm.experiment.toml_lines import Settings, Table
 
 _ANNOTATED = ("m", "s", "rad", "V", "A", "m/s", "Hz")
 _KINDS_WITHOUT_NAME = {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
@@ -30,14 +31,13 @@ _TYPES = pydantic.ConfigDict(arbitrary_types_allowed=True)
 
 def check(
     component: type,
-    settings: Mapping[str, Any],
+    settings: Table,
     path: tuple[str, ...],
     document: Document,
-    findings: Findings,
     given: Collection[str] = (),
     wrong: set[str] | None = None,
-) -> dict[str, Any]:
-    """The settings as the process gets them: validated, in SI units, of JSON's types. Reports what is wrong.
+) -> Settings:
+    """Return the settings as the process gets them: validated, in SI units, of JSON's types. Reports what is wrong.
 
     Args:
         given: parameters that are not for the table to set.
@@ -47,34 +47,32 @@ def check(
     parameters = {name: p for name, p in everything.items() if p.kind not in _KINDS_WITHOUT_NAME and name not in given}
     takes_any = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in everything.values())
     kinds = _annotations(component)
-    checked: dict[str, Any] = {}
+    checked: Settings = {}
     unknown: list[str] = []
     for name, value in settings.items():
         if name in parameters:
             annotation = kinds.get(name, Any)
             if name not in kinds and _is_quantity(value):
-                findings.warning(
-                    f"[{'.'.join(path)}] {name} = {value!r} stays a text: the argument does not say what it is",
-                    document.place(*path, name),
-                    f"e.g. `def __init__(self, {name}: Length)`, with Length from afspm.units",
-                )
-            errors = findings.errors
-            checked[name] = _value(annotation, value, (*path, name), document, findings)
-            if wrong is not None and findings.errors > errors:
+                what = f"[{'.'.join(path)}] {name} = {value!r} stays a text: the argument does not say what it is"
+                hint = f"e.g. `def __init__(self, {name}: Length)`, with Length from afspm.units"
+                document.warning(what, *path, name, hint=hint)
+            errors = document.findings.errors
+            checked[name] = _value(annotation, value, (*path, name), document)
+            if wrong is not None and document.findings.errors > errors:
                 wrong.add(name)
         elif takes_any:
             checked[name] = jsonable(value, document.folder_of(*path, name))
         else:
             unknown.append(name)
-            place = document.place(*path, name)
             replaced = "" if closest(name, parameters) else _replaced(path, name, document)
-            findings.error(f"[{'.'.join(path)}] has no setting {name!r}", place, replaced or nearest(name, parameters))
-    _report_missing(parameters, settings, unknown, path, document, findings)
+            what = f"[{'.'.join(path)}] has no setting {name!r}"
+            document.error(what, *path, name, hint=replaced or nearest(name, parameters))
+    _report_missing(parameters, settings, unknown, path, document)
     return checked
 
 
 def _replaced(path: tuple[str, ...], name: str, document: Document) -> str:
-    """What to do about a setting of a class that a later file has replaced; empty: none has."""
+    """Return what to do about a setting of a class that a later file has replaced; empty: none has."""
     of_class, of_setting = document.place(*path, "class").file, document.place(*path, name).file
     if document.files.index(Path(of_class)) <= document.files.index(Path(of_setting)):
         return ""
@@ -82,12 +80,12 @@ def _replaced(path: tuple[str, ...], name: str, document: Document) -> str:
 
 
 def default_of(component: type, name: str) -> Any:
-    """The default of a setting; None where it has none."""
+    """Return the default of a setting; None where it has none."""
     parameter = _parameters(component).get(name)
     return None if parameter is None or parameter.default is inspect.Parameter.empty else parameter.default
 
 
-def listening(component: type, settings: Mapping[str, Any]) -> Iterator[tuple[str, str, bool]]:
+def listening(component: type, settings: Table) -> Iterator[tuple[str, str, bool]]:
     """(setting, address, whether keys guard it) of each place at which the component will listen by its settings."""
     everything = {**{name: default_of(component, name) for name in _parameters(component)}, **settings}
     for name, annotation in _annotations(component).items():
@@ -117,12 +115,12 @@ def jsonable(value: Any, folder: Path) -> Any:
     return value
 
 
-def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Document, findings: Findings) -> Any:
+def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Document) -> Any:
     folder = document.folder_of(*path)
     if _is_object(value):
-        return _object(value, path, document, findings)
+        return _object(value, path, document)
     if isinstance(value, list) and any(map(_is_object, value)):
-        return [_value(Any, item, path, document, findings) for item in value]
+        return [_value(Any, item, path, document) for item in value]
     try:
         adapter = pydantic.TypeAdapter(annotation, config=None if _has_own_config(annotation) else _TYPES)
     except pydantic.PydanticUndefinedAnnotation:
@@ -131,27 +129,26 @@ def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Documen
         return jsonable(adapter.validate_python(value), folder)
     except pydantic.ValidationError as error:
         for one in error.errors(include_url=False):
-            report(one, path, document, findings)
+            report(one, path, document)
         return jsonable(value, folder)
 
 
-def _object(value: dict[str, Any], path: tuple[str, ...], document: Document, findings: Findings) -> dict[str, Any]:
-    """An intermediary class of the user's own: checked here, made by the process."""
+def _object(value: Settings, path: tuple[str, ...], document: Document) -> Settings:
+    """Return an intermediary class of the user's own: checked here, made by the process."""
     settings = {key: item for key, item in value.items() if key != "class"}
-    place = document.place(*path)
     try:
         wanted = class_loader.load(value["class"])
     except class_loader.Unloadable as error:
-        findings.error(f"[{path[0]}] {'.'.join(path[1:])} class: {error.what}", place, error.hint)
+        document.error(f"[{path[0]}] {'.'.join(path[1:])} class: {error.what}", *path, hint=error.hint)
         return {"class": value["class"]}
     if not isinstance(wanted, type):
-        findings.error(f"[{path[0]}] {'.'.join(path[1:])}: {value['class']} is not a class", place)
+        document.error(f"[{path[0]}] {'.'.join(path[1:])}: {value['class']} is not a class", *path)
         return {"class": value["class"]}
-    return {"class": value["class"], **check(wanted, settings, path, document, findings)}
+    return {"class": value["class"], **check(wanted, settings, path, document)}
 
 
 def _is_quantity(value: Any) -> bool:
-    """Whether a text is a number with a unit for which there is an annotation."""
+    """Return whether a text is a number with a unit for which there is an annotation."""
     if not isinstance(value, str):
         return False
     for unit in _ANNOTATED:
@@ -174,7 +171,7 @@ def _has_own_config(annotation: Any) -> bool:
 
 @cache
 def _parameters(component: type) -> Mapping[str, inspect.Parameter]:
-    """The parameters of the constructor; where it hands **settings on to its base class, those of that as well."""
+    """Return the parameters of the constructor, and those of its base classes that it hands **settings on to."""
     found: dict[str, inspect.Parameter] = {}
     for init in _constructors(component):
         own = list(inspect.signature(init).parameters.values())[1:]  # without self
@@ -198,9 +195,9 @@ def _constructors(component: type) -> Sequence[Callable[..., Any]]:
 
 
 @cache
-def _annotations(component: type) -> Mapping[str, Any]:
+def _annotations(component: type) -> Table:
     """Of every parameter, resolved; those that can't be (imported for typing only) are left out."""
-    kinds: dict[str, Any] = {}
+    kinds: Settings = {}
     for init in reversed(_constructors(component)):
         try:
             kinds |= typing.get_type_hints(init, include_extras=True)
@@ -211,15 +208,14 @@ def _annotations(component: type) -> Mapping[str, Any]:
 
 def _report_missing(
     parameters: Mapping[str, inspect.Parameter],
-    settings: Mapping[str, Any],
+    settings: Table,
     unknown: list[str],
     path: tuple[str, ...],
     document: Document,
-    findings: Findings,
 ) -> None:
     for name, parameter in parameters.items():
         if parameter.default is not inspect.Parameter.empty or name in settings:
             continue
         if closest(name, unknown, 0.7):
             continue  # the misspelt key has been reported with this name as the hint
-        findings.error(f"[{'.'.join(path)}] lacks its setting {name!r}", document.place(*path))
+        document.error(f"[{'.'.join(path)}] lacks its setting {name!r}", *path)

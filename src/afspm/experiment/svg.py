@@ -84,7 +84,7 @@ class Svg:
         )
 
     def document(self, width: float, height: float, title: str, colours: Iterable[str]) -> str:
-        """The whole picture, on white."""
+        """Return the whole picture, on white."""
         heads = "".join(
             f'<marker id="head-{c[1:]}" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="7" markerHeight="7" '
             f'orient="auto-start-reverse"><path d="M0 0.8 L10 5 L0 9.2 z" fill="{c}"/></marker>'
@@ -100,7 +100,7 @@ class Svg:
 
 
 def _rounded(points: Sequence[tuple[float, float]], radius: float = 8) -> str:
-    """A path with right angles rounded off."""
+    """Return a path with right angles rounded off."""
     x, y = points[0]
     path = [f"M{x:.1f} {y:.1f}"]
     for (ax, ay), (bx, by), (cx, cy) in zip(points, points[1:], points[2:], strict=False):

@@ -1,4 +1,4 @@
-"""Who binds and who connects where: what the file says, and free addresses for what it leaves open.
+"""The sockets that each process binds or connects to; the file may leave addresses open.
 
 Translator and scheduler each bind a publisher and a control server. The scheduler connects to the translator's,
 every component to the scheduler's; a component that publishes has an address of its own, to which those connect that
@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from afspm.addresses import hint_on, is_address
-from afspm.experiment.findings import Findings, SourceLocation
+from afspm.experiment.document import Document
+from afspm.experiment.findings import SourceLocation
 from afspm.experiment.known import WIRE_KEYS, WiringClass
 from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.published import wire_of
+from afspm.experiment.toml_lines import Settings, Table
 from afspm.model import Role
 
 if TYPE_CHECKING:
@@ -37,7 +39,7 @@ class BoundSocket:
 
 @dataclass
 class WiringKeys:
-    """What the wiring keys of one component say, as plain addresses."""
+    """The wiring keys of one component, as plain addresses."""
 
     publish: str | None = None
     subscribe: list[str] | None = None
@@ -48,7 +50,7 @@ class WiringKeys:
     cache_out: str | None = None
     request_timeout_s: float | None = None
     request_retries: int | None = None
-    cache_logic: dict[str, Any] | None = None
+    cache_logic: Settings | None = None
 
 
 @dataclass(frozen=True)
@@ -69,34 +71,28 @@ class Wiring:
     links: dict[str, ProcessSockets] = field(default_factory=dict)
 
     def addresses(self, take: Callable[[], str]) -> dict[str, str]:
-        """Every slot's key with the address bound there, open ones filled by `take()`."""
+        """Return every slot's key with the address bound there, open ones filled by `take()`."""
         return {key: slot.address or take() for key, slot in self.slots.items()}
 
 
-def read_wires(part: ExperimentPart, placed: Callable[..., SourceLocation], findings: Findings) -> WiringKeys:
-    """What the wiring keys of a component mean; reports what doesn't fit them."""
+def read_wires(part: ExperimentPart, document: Document) -> WiringKeys:
+    """Return what the wiring keys of a component mean; reports what doesn't fit them."""
     wires = WiringKeys()
     for key, kinds in WIRE_KEYS.items():
         if key not in part.own:
             continue
-        value, place = part.own[key], placed(part.name, key)
+        value, path = part.own[key], (part.name, key)
         if isinstance(value, str) and is_address(value):
             _apply_address(wires, key, value)
-        elif wire_of(value) in kinds:
+        elif (kind := wire_of(value)) in kinds:
             _apply_table(wires, value)
         elif isinstance(value, str):
             what = f"[{part.name}] {key} = {value!r} is neither an address nor one of the tables above"
-            findings.error(what, place, hint_on(value))
-        elif wire_of(value) is not None:
-            findings.error(f"[{part.name}] {key} is a {_kind(value)}, not a {kinds[0].value}", place)
+            document.error(what, *path, hint=hint_on(value))
         else:
-            findings.error(f"[{part.name}] {key} is {value!r}, not a {kinds[0].value}", place)
+            given = repr(value) if kind is None else f"a {kind.value}"
+            document.error(f"[{part.name}] {key} is {given}, not a {kinds[0].value}", *path)
     return wires
-
-
-def _kind(table: Any) -> str:
-    wire = wire_of(table)
-    return wire.value if wire else "table"
 
 
 def _apply_address(wires: WiringKeys, key: str, address: str) -> None:
@@ -113,7 +109,7 @@ def _apply_address(wires: WiringKeys, key: str, address: str) -> None:
             wires.cache_out = address
 
 
-def _apply_table(wires: WiringKeys, table: Mapping[str, Any]) -> None:
+def _apply_table(wires: WiringKeys, table: Table) -> None:
     match wire_of(table):
         case WiringClass.PUBLISHER:
             wires.publish = table.get("url")
@@ -137,7 +133,7 @@ def _apply_table(wires: WiringKeys, table: Mapping[str, Any]) -> None:
             wires.cache_logic = logic.get("cache_logic") if isinstance(logic, dict) else None
 
 
-def _add_subscriber(wires: WiringKeys, table: Mapping[str, Any]) -> None:
+def _add_subscriber(wires: WiringKeys, table: Table) -> None:
     urls = table.get("sub_url", ())
     wires.subscribe = [*(wires.subscribe or ()), *([urls] if isinstance(urls, str) else urls)]
     topics = table.get("topics_to_sub")
@@ -145,7 +141,7 @@ def _add_subscriber(wires: WiringKeys, table: Mapping[str, Any]) -> None:
         wires.envelopes = [*(wires.envelopes or ()), *([topics] if isinstance(topics, str) else topics)]
 
 
-def _apply_timeouts(wires: WiringKeys, table: Mapping[str, Any]) -> None:
+def _apply_timeouts(wires: WiringKeys, table: Table) -> None:
     timeout_ms, retries = table.get("request_timeout_ms"), table.get("request_retries")
     if isinstance(timeout_ms, int | float):
         wires.request_timeout_s = timeout_ms / 1000
@@ -153,7 +149,7 @@ def _apply_timeouts(wires: WiringKeys, table: Mapping[str, Any]) -> None:
         wires.request_retries = retries
 
 
-def connect(processes: Mapping[str, ResolvedProcess], placed: Callable[..., SourceLocation]) -> Wiring:
+def connect(processes: Mapping[str, ResolvedProcess], document: Document) -> Wiring:
     """Fill in what the wiring keys leave out."""
     net = Wiring()
     scheduler = next((p for p in processes.values() if p.role is Role.SCHEDULER), None)
@@ -161,7 +157,7 @@ def connect(processes: Mapping[str, ResolvedProcess], placed: Callable[..., Sour
     above = scheduler.wires if scheduler else WiringKeys()
 
     def slot(owner: str, use: str, address: str | None, key: str) -> str:
-        net.slots[f"{owner}/{use}"] = BoundSocket(owner, use, address, key, placed(owner, key))
+        net.slots[f"{owner}/{use}"] = BoundSocket(owner, use, address, key, document.place(owner, key))
         return f"{owner}/{use}"
 
     source, target = above.cache_in, above.control
@@ -192,7 +188,7 @@ def connect(processes: Mapping[str, ResolvedProcess], placed: Callable[..., Sour
 def _sources(
     process: ResolvedProcess, scheduler: ResolvedProcess | None, processes: Mapping[str, ResolvedProcess], net: Wiring
 ) -> tuple[str, ...]:
-    """Where a component subscribes: as said, else at the scheduler and at those who publish what it listens to."""
+    """Return where it subscribes: as said, else at the scheduler and at publishers of what it listens to."""
     own = process.wires
     published = f"{scheduler.name}/publish" if scheduler else ""
     if own.subscribe is not None:
@@ -213,5 +209,5 @@ def _sources(
 
 
 def _overlap(published: Collection[str], prefixes: Collection[str] | None) -> bool:
-    """Whether any envelope of the one is wanted by the other; no prefixes means all are."""
+    """Return whether any envelope of the one is wanted by the other; no prefixes means all are."""
     return prefixes is None or any(e.startswith(p) or p.startswith(e) for e in published for p in prefixes)

@@ -8,6 +8,7 @@ from datetime import tzinfo
 from importlib import import_module
 from pathlib import Path
 
+from afspm import plugins
 from afspm.errors import FileError
 from afspm.files.content import FileContent
 
@@ -39,15 +40,13 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     path = Path(path)
     if not path.is_file():
         raise FileError("no such file", where=str(path))
-    name = FORMATS.get(path.suffix.lower())
-    if name is None:
+    reader = _reader(path.suffix.lower())
+    if reader is None:
         raise FileError(
             f"no reader for {path.suffix or 'a file without a suffix'}",
             where=str(path),
-            hint=f"read: {' '.join(FORMATS)}",
+            hint=f"read: {' '.join((*FORMATS, *(f'.{name}' for name in plugins.names(plugins.READERS))))}",
         )
-    module, _, function = name.partition(":")
-    reader: Reader = getattr(import_module(f"afspm.files.{module}"), function)
     try:
         return _told_apart(reader(path, zone))
     except FileError as error:
@@ -57,6 +56,17 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     except Exception as error:  # a reader may stumble in any way over a broken file
         why = f"{type(error).__name__}: {error}"
         raise FileError(f"is not readable as {path.suffix}: {why}", where=str(path)) from error
+
+
+def _reader(suffix: str) -> Reader | None:
+    """Return the reader of a suffix, of ours or of an installed package; None if there is none."""
+    reader: Reader | None
+    if suffix in FORMATS:
+        module, _, function = FORMATS[suffix].partition(":")
+        reader = getattr(import_module(f"afspm.files.{module}"), function)
+    else:
+        reader = plugins.load(plugins.READERS, suffix.removeprefix("."))
+    return reader
 
 
 def _told_apart(content: FileContent) -> FileContent:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import islice
 
 from afspm.logic.envelopes import Envelopes
-from afspm.model import Packet, PacketHeader
+from afspm.model import LoggedPacket, Packet, PacketHeader
 
 TIME_STEP_NS = 1_000
 """The least time between two packets: peers that reckon in microseconds must see them in order."""
@@ -24,11 +24,14 @@ _FUTURE_NS = 3600 * 10**9  # a translator's clock further ahead of ours than tha
 
 @dataclass(slots=True)
 class Kept:
-    """A packet in the cache; `source_ns` is the time that the translator gave it."""
+    """A packet in the cache, with its size in bytes."""
 
-    packet: Packet
-    source_ns: int | None
+    logged: LoggedPacket
     size: int
+
+    @property
+    def packet(self) -> Packet:
+        return self.logged.packet
 
 
 class PacketCache:
@@ -67,8 +70,8 @@ class PacketCache:
         """Bytes."""
         return self._bytes
 
-    def take(self, packet: Packet, header: PacketHeader, now_ns: int) -> tuple[Packet, bool] | None:
-        """A packet of the translator's, as it is to be published, and whether it is kept.
+    def take(self, packet: Packet, header: PacketHeader, now_ns: int) -> tuple[Packet, int] | None:
+        """A packet of the translator's as it is to be published, and how many of its envelope are kept (0: not this).
 
         Its time is the translator's, or later where that would not be after what was published before (a clock that
         was set back or is far ahead, a peer that says no time). None: we have had it.
@@ -109,25 +112,22 @@ class PacketCache:
         written down any more, they keep their first times, by which subscribers know that they have had them."""
         self._first_times = {source_ns: first_ns for source_ns, first_ns in recent if source_ns not in self._sources}
 
-    def stamp(self, envelope: str, payload: bytes, now_ns: int) -> tuple[Packet, bool]:
+    def stamp(self, envelope: str, payload: bytes, now_ns: int) -> tuple[Packet, int]:
         """A packet of the scheduler's own, kept under its envelope."""
         out = Packet(envelope, payload, self._next_ns(now_ns))
         return out, self._keep(out, None, self._envelopes.history(envelope))
 
-    def restore(self, packets: Iterable[tuple[Packet, int | None]]) -> None:
-        """Take up what was kept before a restart, oldest first.
-
-        How many are kept of an envelope is known again with its next packet; until then all of them are.
-        """
+    def restore(self, packets: Iterable[LoggedPacket]) -> None:
+        """Take up what was kept before a restart, oldest first."""
         newest_ns = next(reversed(self._kept), 0)
-        for packet, source_ns in packets:
+        for packet, source_ns, history in packets:
             if packet.time_ns is None or packet.time_ns <= newest_ns:
                 continue
             newest_ns = packet.time_ns
             self.not_before(newest_ns)
             if source_ns is not None:
                 self._saw(source_ns)
-            self._keep(packet, source_ns, _TIMES_REMEMBERED)
+            self._keep(packet, source_ns, history)
 
     def holds(self, envelope: str, payload: bytes) -> bool:
         """Whether one of the newest packets of an envelope is just this."""
@@ -147,7 +147,7 @@ class PacketCache:
             if time_ns > since_ns and kept.packet.envelope.startswith(starts)
         )
 
-    def _again(self, packet: Packet, source_ns: int, history: int) -> tuple[Packet, bool]:
+    def _again(self, packet: Packet, source_ns: int, history: int) -> tuple[Packet, int]:
         assert packet.time_ns is not None
         self._recent.append((source_ns, packet.time_ns))
         kept = self._keep(packet, source_ns, history)
@@ -156,8 +156,8 @@ class PacketCache:
             self._times[envelope] = deque(sorted(times))
         return packet, kept
 
-    def __iter__(self) -> Iterator[tuple[Packet, int | None]]:
-        return iter([(kept.packet, kept.source_ns) for kept in self._kept.values()])
+    def __iter__(self) -> Iterator[LoggedPacket]:
+        return iter([kept.logged for kept in self._kept.values()])
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -172,13 +172,13 @@ class PacketCache:
         if len(self._sources) > _TIMES_REMEMBERED:
             self._sources.popitem(last=False)
 
-    def _keep(self, packet: Packet, source_ns: int | None, history: int) -> bool:
+    def _keep(self, packet: Packet, source_ns: int | None, history: int) -> int:
         payload = packet.payload
         size = (payload.nbytes if isinstance(payload, memoryview) else len(payload)) + _OVERHEAD_BYTES
         if size > self._max_bytes or not history:
-            return False
+            return 0
         assert packet.time_ns is not None
-        self._kept[packet.time_ns] = Kept(packet, source_ns, size)
+        self._kept[packet.time_ns] = Kept(LoggedPacket(packet, source_ns, history), size)
         self._bytes += size
         times = self._times.setdefault(packet.envelope, deque())
         times.append(packet.time_ns)
@@ -187,7 +187,7 @@ class PacketCache:
             self._drop(times[0])
         while self._bytes > self._max_bytes:
             self._drop(self._least_needed())
-        return True
+        return history
 
     def _least_needed(self) -> int:
         """The oldest packet that its envelope has a newer one of; else the oldest."""

@@ -206,12 +206,12 @@ class Publish:
 
     Attributes:
         source_ns: the translator's own time of it; None for what comes from the scheduler.
-        cached: whether it is in the cache now, so that it should be kept over a restart.
+        history: how many of its envelope the cache keeps over a restart; 0: this one is not in it.
     """
 
     packet: Packet
     source_ns: int | None = None
-    cached: bool = True
+    history: int = 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,8 @@ CONTROL_STATE = "ControlState"
 
 def publish(draft: StateDraft, envelope: str, payload: bytes, time_ns: int | None = None) -> None:
     """Publish a packet of the scheduler's own; its time is saved before."""
-    packet, cached = draft.env.cache.stamp(envelope, payload, draft.now_ns if time_ns is None else time_ns)
-    draft.effects.append(Publish(packet, None, cached))
+    packet, history = draft.env.cache.stamp(envelope, payload, draft.now_ns if time_ns is None else time_ns)
+    draft.effects.append(Publish(packet, None, history))
     draft.save()
 
 

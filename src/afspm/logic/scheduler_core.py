@@ -38,7 +38,7 @@ from afspm.logic.events import (
 from afspm.logic.microscope_status import STOPS
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.state import Environment, SavedState, SchedulerState, StateDraft, restored_state, saved_state
-from afspm.model import ControlMode, ControlState, Packet, Problem, Request, Response, component_of
+from afspm.model import ControlMode, ControlState, LoggedPacket, Problem, Request, Response, component_of
 
 _MALFUNCTION = Problem.DEVICE_MALFUNCTION
 _AT_ONCE_S = 0.0  # in real monotonic time: always past
@@ -145,11 +145,11 @@ class SchedulerCore:
         if self._env.frame is not None and saved.frame is not None:
             self._env.frame.restore(json.loads(saved.frame))
 
-    def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None:
+    def restore_cache(self, packets: Iterable[LoggedPacket]) -> None:
         """Take up packets that were published (with their `source_ns`), oldest first, before `start`."""
         self._env.cache.restore(packets)
 
-    def cached(self) -> Iterable[tuple[Packet, int | None]]:
+    def cached(self) -> Iterable[LoggedPacket]:
         """Return what is cached now (with `source_ns`), oldest first."""
         return self._env.cache
 

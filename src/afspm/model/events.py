@@ -1,4 +1,4 @@
-"""What happens beside what is measured: who asked for what, who runs, what was said."""
+"""Events beside the measurements: requests, states of processes, log lines, progress."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 
-from afspm.model.enums import ControlMode
+from afspm.model.state import ControlMode
 
 PERSON = ":"
 """Between a component and the person that it acts for: "dashboard:Ada"."""
@@ -26,7 +26,7 @@ def component_of(who: str) -> str:
 
 
 class Role(Enum):
-    """What a process is in the experiment."""
+    """The role of a process in the experiment."""
 
     TRANSLATOR = "translator"
     SCHEDULER = "scheduler"
@@ -34,7 +34,7 @@ class Role(Enum):
 
 
 class ProcessCondition(IntEnum):
-    """How it is with a process; the numbers of the wire."""
+    """The condition of a process; the numbers of the wire."""
 
     UNDEFINED = 0
     STARTING = 1
@@ -96,13 +96,13 @@ class JournalEntry:
 
     @property
     def refused(self) -> bool:
-        """Whether it was asked for and not done."""
+        """True if it was asked for and not done."""
         return bool(self.response)
 
 
 @dataclass(frozen=True, slots=True)
 class ProcessState:
-    """How it is with one process.
+    """The state of one process.
 
     Attributes:
         role: "scheduler", "translator", "component" …
@@ -158,7 +158,7 @@ class LogLines:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far the component `name` is with what it set out to do.
+    """The progress of the component `name` with what it set out to do.
 
     Attributes:
         done, of: how many of how many, of whatever it counts.
@@ -172,13 +172,13 @@ class Progress:
     left_s: float | None = None
 
     def remaining_ns(self, now_ns: int) -> int | None:
-        """How long it will still take, told now; None if it does not say."""
+        """Return how long it will still take, told now; None if it does not say."""
         return None if self.left_s is None else max(0, round(self.left_s * 1e9) - max(0, now_ns - self.time_ns))
 
 
 @dataclass(frozen=True, slots=True)
 class RelayedMessage:
-    """What the scheduler publishes for others: ProcessStates and LogLines of a supervisor, Progress of a component.
+    """A message that the scheduler publishes for others: ProcessStates and LogLines of a supervisor, Progress.
 
     Its envelope is the message's name, for ProcessStates and Progress followed by "_" and whose it is.
     """

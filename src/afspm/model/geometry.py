@@ -82,14 +82,14 @@ class Region:
         return (self.center_m[0] - self.size_m[0] / 2, self.center_m[1] - self.size_m[1] / 2)
 
     def corners_m(self) -> NDArray[np.float64]:
-        """The four corners as turned, shape (4, 2), counter-clockwise from that of smallest x and y."""
+        """Return the four corners as turned, shape (4, 2), counter-clockwise from that of smallest x and y."""
         import numpy as np
 
         half = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * np.asarray(self.size_m)
         return np.stack(self._in_space(half[:, 0], half[:, 1]), axis=-1)
 
     def contains(self, xy_m: XY) -> bool:
-        """Whether a point, in the same frame, lies inside or on the border."""
+        """Return whether a point, in the same frame, lies inside or on the border."""
         x, y = xy_m[0] - self.center_m[0], xy_m[1] - self.center_m[1]
         cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
         return bool(abs(cos * x + sin * y) <= self.size_m[0] / 2 and abs(cos * y - sin * x) <= self.size_m[1] / 2)
@@ -105,7 +105,7 @@ class Region:
         return self._in_space(u_m, v_m)
 
     def moved_to(self, center_m: XY) -> Region:
-        """The same size and angle about another centre."""
+        """Return the same size and angle about another centre."""
         return replace(self, center_m=center_m)
 
     def _in_space(self, u_m: Floats, v_m: Floats) -> tuple[Floats, Floats]:

@@ -1,8 +1,9 @@
-"""What is published: a packet, and what can be known of it without reading its values."""
+"""A published packet, and its header, which is known without reading its values."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 
 @dataclass(slots=True)
@@ -20,9 +21,22 @@ class Packet:
     time_ns: int | None = None
 
 
+class LoggedPacket(NamedTuple):
+    """A packet as it stands in the packet log.
+
+    Attributes:
+        source_ns: the time that the translator gave it; None: it is the scheduler's own.
+        history: how many packets of its envelope the scheduler's cache keeps; 0: this one is not cached.
+    """
+
+    packet: Packet
+    source_ns: int | None
+    history: int
+
+
 @dataclass(frozen=True, slots=True)
 class PacketHeader:
-    """What the envelope of a packet may depend on.
+    """The header of a packet, on which its envelope may depend.
 
     Attributes:
         message: the name of the message, e.g. "Scan2d".

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator, Mapping
+from enum import IntEnum
 
 from afspm.errors import InvalidValue
-from afspm.model.enums import Problem
 
 HIGHEST_PROBLEM = 255  # a problem travels as one byte
+
+
+class Problem(IntEnum):
+    """Problems of an experiment. Experiment files name more of them, with numbers above these."""
+
+    NONE = 0
+    TIP_SHAPE_CHANGED = 1
+    DEVICE_MALFUNCTION = 2
+    FEEDBACK_NON_OPTIMAL = 3
+    THERMAL_DRIFT = 4
 
 
 class ProblemNames(Mapping[str, int]):
@@ -39,7 +49,7 @@ class ProblemNames(Mapping[str, int]):
         return f"ProblemNames({self._numbers})"
 
     def number(self, problem: str | int) -> int:
-        """The number of a problem given by number or by name ("tip-shape-changed", "EP_TIP_SHAPE_CHANGED").
+        """Return the number of a problem given by number or by name ("tip-shape-changed", "EP_TIP_SHAPE_CHANGED").
 
         Raises:
             InvalidValue: no such problem.
@@ -58,7 +68,7 @@ class ProblemNames(Mapping[str, int]):
         return int(problem)
 
     def name(self, number: int) -> str:
-        """The name of a problem; a number that nobody named is told as such."""
+        """Return the name of a problem; a number that nobody named is told as such."""
         return self._names.get(number, f"problem {number}")
 
     def __getitem__(self, name: str) -> int:

@@ -70,7 +70,7 @@ class ScanParameters:
         object.__setattr__(self, "shape", (rows, columns))
 
     def onto(self, current: ScanParameters) -> ScanParameters:
-        """What is in force after these were asked for while `current` were.
+        """Return what is in force after these were asked for while `current` were.
 
         Raises:
             InvalidValue: a part of a region is asked for where there is no region yet, or the result is none.
@@ -127,7 +127,7 @@ class Scan:
 
     @property
     def parameters(self) -> ScanParameters:
-        """What it was taken with; without a shape where that is not known."""
+        """The parameters that it was taken with; without a shape where that is not known."""
         return ScanParameters(self.region, self.shape if all(self.shape) else None, self.unit)
 
     @property
@@ -137,7 +137,7 @@ class Scan:
 
     @property
     def lines_missing(self) -> int:
-        """How many lines have no value at all: it was broken off. All of them where no values came."""
+        """The number of lines without any value: it was broken off. All of them where no values came."""
         if not self.values.size:
             return self.shape[0]
         import numpy as np
@@ -295,7 +295,7 @@ class ScanSet(Mapping[str, Scan]):
         return f"<ScanSet {', '.join(self)}: {nx} x {ny} px, {width:g} x {height:g} nm, {self.time}>"
 
     def to_xarray(self) -> xarray.Dataset:
-        """All channels as an xarray Dataset (needs the extra `xarray`)."""
+        """Return all channels as an xarray Dataset (needs the extra `xarray`)."""
         import xarray
 
         return xarray.Dataset({channel: scan.to_xarray() for channel, scan in self.items()})

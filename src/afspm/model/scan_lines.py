@@ -43,7 +43,7 @@ class ScanLines:
             )
 
     def into(self, picture: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """A picture of the whole scan with these lines in it; rows that are not there yet are NaN.
+        """Return a picture of the whole scan with these lines in it; rows that are not there yet are NaN.
 
         Args:
             picture: [y, x] with the lines before, which is changed; None: these are the first.

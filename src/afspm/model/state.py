@@ -1,16 +1,37 @@
-"""What the microscope and the experiment are in."""
+"""States of the microscope and of the experiment."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
-from afspm.model.enums import ControlMode, ScopeState
 from afspm.model.geometry import XY
+
+
+class ScopeState(IntEnum):
+    """The states of a microscope."""
+
+    UNDEFINED = 0
+    MOVING = 1
+    SCANNING = 2
+    FREE = 3
+    INTERRUPTED = 4
+    COARSE_MOTOR = 5
+    BUSY_PARAM = 6
+    SPEC = 7
+
+
+class ControlMode(IntEnum):
+    """Components control the microscope (AUTOMATED), or only the person at it (MANUAL)."""
+
+    UNDEFINED = 0
+    MANUAL = 1
+    AUTOMATED = 2
 
 
 @dataclass(frozen=True)
 class ScopeStatus:
-    """What the microscope is doing.
+    """The activity of the microscope.
 
     Attributes:
         paused: a scan is running but stands still; None if the microscope does not say.
@@ -52,7 +73,7 @@ class PositionChange:
 
 @dataclass(frozen=True)
 class ControlState:
-    """Who is in control, and what stands in the way.
+    """The holder of control, and the problems that stand in the way.
 
     Attributes:
         mode: automated or manual.

@@ -73,7 +73,8 @@ class ProcessContext:
     Attributes:
         launch: the line that we were started with.
         clock: the experiment's.
-        open_port: connects to the experiment as a component does (scheduler and translators have sockets of their own).
+        open_port: connects to the experiment as a component does (scheduler and translators have sockets of their own);
+            with a tuple of envelopes, hears these instead of those of the launch line.
         log: records go to the supervisor, and to the log collector if there is one.
         activity: to be told of steps that take time.
         when_stopping: registers what is called, from another thread, when the parent has gone or wants us to stop
@@ -89,7 +90,7 @@ class ProcessContext:
 
     launch: Launch
     clock: Clock
-    open_port: Callable[[], Port]
+    open_port: Callable[..., Port]
     log: logging.Logger
     activity: ProcessActivity
     when_stopping: Callable[[Callable[[], None]], None] = _never

@@ -81,7 +81,7 @@ def _host(launch: Launch, logger: logging.Logger, parent: ParentWatch) -> int:
         context = ProcessContext(
             launch,
             clock,
-            open_port=lambda: _open_port(launch, clock, parent),
+            open_port=lambda heard=None: _open_port(launch, clock, parent, heard),
             log=logger,
             activity=activity,
             when_stopping=parent.when_gone,
@@ -125,10 +125,12 @@ def _watched_age_s(activity: ProcessActivity, logger: logging.Logger) -> Callabl
     return age_s
 
 
-def _open_port(launch: Launch, clock: Clock, parent: ParentWatch) -> Port:
+def _open_port(launch: Launch, clock: Clock, parent: ParentWatch, heard: tuple[str, ...] | None) -> Port:
     """Return the port of a component, which also hears what its `Scope` follows."""
     envelopes = wire.messages_of_the_experiment() if launch.envelopes is None else launch.envelopes
-    if launch.sockets.control is not None:
+    if heard is not None:
+        envelopes = heard
+    elif launch.sockets.control is not None:
         envelopes = tuple(sorted({*envelopes, *STATE_MESSAGES, *MEASURED_MESSAGES}))
     launch = replace(launch, envelopes=envelopes)
     port = open_port(launch, clock)

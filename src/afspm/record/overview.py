@@ -13,7 +13,9 @@ import numpy as np
 from afspm.clock import NS_PER_S
 from afspm.drift.record import drift_at
 from afspm.model import (
+    ControlEvent,
     ControlMode,
+    ControlRequest,
     ControlState,
     Feedback,
     Frame,
@@ -298,13 +300,9 @@ class Overview:
         for entry in reversed(self.entries):
             if entry.time_ns < time_ns - SOON_NS:
                 break
-            if not entry.refused and self._flags(entry, number):
+            if not entry.refused and _flags(entry, number):
                 return entry.who
         return ""
-
-    def _flags(self, entry: JournalEntry, number: int) -> bool:
-        words = entry.what.split()
-        return len(words) >= 2 and words[0] in ("flags", "flagged") and words[1] == self.problems.name(number)
 
     def _take_entries(self, entries: JournalEntries, time_ns: int) -> None:
         for entry in entries.entries:
@@ -317,21 +315,22 @@ class Overview:
             for number, lane in self.problem_timelines.items():
                 # the batch comes a moment after the control state that it explains
                 is_near = bool(lane.spans) and abs(lane.spans[-1].start_ns - entry.time_ns) <= SOON_NS
-                if is_near and self._flags(entry, number):
+                if is_near and _flags(entry, number):
                     lane.name_last(entry.who)
 
     def _take_change(self, entry: JournalEntry) -> None:
         """Control, mode or problems changed: who comes late was not there when it did, and has it from the journal."""
-        verb, _, rest = entry.what.partition(" ")
-        if entry.what.startswith("in control"):
-            self.controls.change(entry.who, entry.time_ns)
-        elif entry.what.startswith("no longer in control"):
-            self.controls.change(None, entry.time_ns)
-        elif verb == "mode":
-            self.modes.change(rest.lower(), entry.time_ns)
-        elif verb in ("flagged", "cleared") and rest in self.problems:
-            label = self.problems.name(self.problems[rest]) if verb == "flagged" else None
-            self.problem_timelines[self.problems[rest]].change(label, entry.time_ns, by=entry.who)
+        match entry.event:
+            case ControlEvent.CONTROL_GAINED:
+                self.controls.change(entry.who, entry.time_ns)
+            case ControlEvent.CONTROL_LOST:
+                self.controls.change(None, entry.time_ns)
+            case ControlEvent.MODE_CHANGED if entry.mode is not None:
+                self.modes.change(entry.mode.name.lower(), entry.time_ns)
+            case ControlEvent.PROBLEM_FLAGGED | ControlEvent.PROBLEM_CLEARED if entry.problem is not None:
+                is_flagged = entry.event is ControlEvent.PROBLEM_FLAGGED
+                label = self.problems.name(entry.problem) if is_flagged else None
+                self.problem_timelines[entry.problem].change(label, entry.time_ns, by=entry.who)
 
     def _take_processes(self, states: ProcessStates, time_ns: int) -> None:
         for state in states.processes:
@@ -371,6 +370,11 @@ class Overview:
 
     def _take_position(self, position: ProbePosition, time_ns: int) -> None:
         self.probe_position = position
+
+
+def _flags(entry: JournalEntry, number: int) -> bool:
+    is_flag = entry.event is ControlEvent.PROBLEM_FLAGGED or entry.request == ControlRequest.ADD_EXP_PRBLM
+    return is_flag and entry.problem == number
 
 
 def _keep(kept: dict[Any, Any], key: object, thing: object) -> None:

@@ -89,10 +89,9 @@ class RecordStore:
         for name, value in about.facts.items():
             self.note(name, value)
 
-    @property
-    def recorded_ns(self) -> int:
-        """Up to this time everything is recorded that the scheduler published and that was given."""
-        return min((packet.time_ns or 0 for packet in self._gathering.waiting()), default=self._newest_ns + 1) - 1
+    def waiting(self) -> list[Packet]:
+        """Return the packets that are recorded once others of their scan have come."""
+        return list(self._gathering.waiting())
 
     def take(self, packets: Iterable[tuple[Packet, str]]) -> None:
         """Record packets, each with its source, in the order in which they were published.
@@ -106,7 +105,7 @@ class RecordStore:
 
     def flush(self) -> None:
         """No more channels come to the scan that came last. Raises as `take`."""
-        if not any(True for _ in self._gathering.waiting()):
+        if not self.waiting():
             return
         with self._all_or_nothing():
             self._write(self._gathering.flush())

@@ -13,33 +13,19 @@ from typing import Any, Protocol
 from afspm.clock import Clock
 from afspm.errors import FileError
 from afspm.exit_codes import ExitCode
+from afspm.launch import Launch
 from afspm.logic.fencing import Epoch
 from afspm.logic.scheduler_core import SchedulerCore
 from afspm.logic.settings import SchedulerSettings
 from afspm.model import ProblemNames
-from afspm.scheduler.journal import Journal
 from afspm.scheduler.settings import scheduler_settings
 from afspm.scheduler.shell import Core, SchedulerShell
 from afspm.scheduler.state_file import StateFile
 from afspm.scheduler.wire_codec import WireCodec
-from afspm.transport.port import LaunchedProcess
+from afspm.scheduler.write_ahead import WriteAhead
+from afspm.storage.packet_log import PacketLog, cached_packets, log_folder
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.scheduler_sockets import SchedulerSockets
-
-
-class SchedulerLaunch(LaunchedProcess, Protocol):
-    """The part of `afspm.launch.Launch` that is needed here."""
-
-    @property
-    def clock(self) -> Mapping[str, Any]: ...
-    @property
-    def run(self) -> str: ...
-    @property
-    def simulated(self) -> bool: ...
-    @property
-    def state_dir(self) -> str: ...
-    @property
-    def request_timeout_s(self) -> float: ...
 
 
 class SchedulerActivity(Protocol):
@@ -52,7 +38,7 @@ class SchedulerContext(Protocol):
     """The part of `process.context.ProcessContext` that is needed here."""
 
     @property
-    def launch(self) -> SchedulerLaunch: ...
+    def launch(self) -> Launch: ...
     @property
     def clock(self) -> Clock: ...
     @property
@@ -68,8 +54,8 @@ class SchedulerContext(Protocol):
 class Scheduler:
     """Lets one component at a time command the microscope, and gives everybody what was published.
 
-    Killed and restarted it goes on where it was: mode, holder and problems are on disk before anybody is told of them,
-    and the cache is a moment later.
+    Killed and restarted it goes on where it was: mode, holder and problems, and everything that it publishes, are on
+    disk before anybody is told of them.
 
     Args:
         control: the section [control] of the experiment file, durations in s.
@@ -96,9 +82,9 @@ class Scheduler:
         launch, clock, log = context.launch, context.clock, context.log
         folder = Path(launch.state_dir) if launch.state_dir else None
         state = StateFile(folder and folder / f"{launch.name}.json", log)
-        journal = Journal(folder and folder / f"{launch.name}.cache", clock, log)
         core = self._core(context)
-        _restore(core, state, journal)
+        _restore(core, state, log_folder(folder) if folder else None)
+        write_ahead = WriteAhead(state, PacketLog(log_folder(folder)) if folder else None, core.cached, log)
         warnings = RateLimitedLog(log, clock)
         sockets = SchedulerSockets(launch, warnings, since_ns=core.newest_source_ns, epoch=_epoch(context))
         stopping = threading.Event()
@@ -108,7 +94,7 @@ class Scheduler:
             sockets.wake_up()
 
         context.when_stopping(stop)
-        shell = self._shell(core, sockets, clock, state, journal, warnings, log)
+        shell = self._shell(core, sockets, clock, write_ahead, warnings, log)
         try:
             shell.start()
             while not (shell.over or stopping.is_set()):
@@ -142,7 +128,7 @@ def _epoch(context: SchedulerContext) -> bytes:
     return Epoch(launch.run, context.clock.now_ns(), launch.simulated).encode() if launch.run else b""
 
 
-def _restore(core: Core, state: StateFile, journal: Journal) -> None:
+def _restore(core: Core, state: StateFile, log: Path | None) -> None:
     """What was in force before a restart."""
     try:
         if (saved := state.load()) is not None:
@@ -153,4 +139,5 @@ def _restore(core: Core, state: StateFile, journal: Journal) -> None:
             where=str(state.path),
             hint="delete the file to begin with nobody in control",
         ) from error
-    core.restore_cache(journal.load())
+    if log is not None:
+        core.restore_cache(cached_packets(log))

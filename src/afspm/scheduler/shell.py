@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
 from collections.abc import Hashable, Iterable
@@ -16,17 +15,16 @@ from afspm.model import (
     RELAY_REQUEST,
     ControlRequest,
     ControlResponse,
+    LoggedPacket,
     Packet,
     Request,
     Response,
     ResponseDetail,
 )
-from afspm.storage.atomic import OutageLog
-from afspm.storage.disk import DEADLINE_S, SYNCER, DiskThread
-from afspm.transport.hold_back import STATE, HoldBack
 from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
+from afspm.transport.state_delay import StateDelay
 from afspm.transport.translator_link import LinkReply, LinkUp
 from afspm.wire.protocol import LONGEST_ID
 
@@ -34,8 +32,7 @@ if TYPE_CHECKING:
     from afspm.clock import Clock
     from afspm.logic.arbitration import ArbitrationState
     from afspm.logic.state import SavedState
-    from afspm.scheduler.journal import Journal
-    from afspm.scheduler.state_file import StateFile
+    from afspm.scheduler.write_ahead import WriteAhead
     from afspm.transport.rate_limited_log import RateLimitedLog
     from afspm.transport.scheduler_sockets import SchedulerSockets, Source
 
@@ -43,7 +40,6 @@ _LEVELS = logging.getLevelNamesMapping()
 _LATE_S = 0.005
 """How late a deadline may be noticed while messages come: to ask for the next one after each takes as long as some of
 them do."""
-_CLOSED_WITHIN_S = 5.0
 _TELL = bytes([RELAY_REQUEST])
 
 
@@ -55,8 +51,8 @@ class Core(Protocol):
     def deadline_s(self) -> float | None: ...
     def deadline_ns(self) -> int | None: ...
     def restore(self, saved: SavedState) -> None: ...
-    def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None: ...
-    def cached(self) -> Iterable[tuple[Packet, int | None]]: ...
+    def restore_cache(self, packets: Iterable[LoggedPacket]) -> None: ...
+    def cached(self) -> Iterable[LoggedPacket]: ...
     @property
     def control(self) -> ArbitrationState: ...
     @property
@@ -73,23 +69,18 @@ class SchedulerShell:
         core: Core,
         sockets: SchedulerSockets,
         clock: Clock,
-        state: StateFile,
-        journal: Journal,
+        write_ahead: WriteAhead,
         warnings: RateLimitedLog,
         log: logging.Logger,
     ) -> None:
         self._core = core
         self._sockets = sockets
         self._clock = clock
-        self._state = state
-        self._journal = journal
-        self._disk = DiskThread()
-        self._told = OutageLog("what is told now would be lost in a crash", log)
-        self._problems: frozenset[int] = frozenset()
+        self._write_ahead = write_ahead
         self._warnings = warnings
         self._log = log
         self._replay: tuple[Packet, ...] = ()
-        self._hold_back = HoldBack()
+        self._state_delay = StateDelay()
         self._look_at_s = 0.0  # at the deadlines, in real monotonic time
         self.ended = False
         self._tip_is_safe = True
@@ -184,13 +175,8 @@ class SchedulerShell:
             self._take(events.Stopped())
 
     def close(self) -> None:
-        """Write down what is cached, unless the experiment is over, and make sure of what was saved."""
-        if not self.ended:
-            self._journal.follow(self._core.cached())
-        with contextlib.suppress(OSError):
-            self._disk.run(lambda: self._journal.close(ended=self.ended))
-            self._disk.run(self._state.close)
-        self._disk.close(_CLOSED_WITHIN_S)
+        """Make sure of what was written."""
+        self._write_ahead.close()
 
     # --- what comes in ---
 
@@ -249,14 +235,10 @@ class SchedulerShell:
     def _deadlines(self, now_s: float) -> None:
         """See to those that have come, and find the next."""
         self._release(now_s)
-        due_s = self._journal.due_s
-        if due_s is not None and now_s >= due_s:
-            self._journal.follow(self._core.cached())
         if self._core_due_s() <= now_s:
             self._take(events.Tick())
-        due_s = self._journal.due_s
-        dues_s = (due_s, self._hold_back.due_s, self._core_due_s())
-        self._look_at_s = min(one_s for one_s in dues_s if one_s is not None)
+        held_s = self._state_delay.due_s
+        self._look_at_s = self._core_due_s() if held_s is None else min(held_s, self._core_due_s())
 
     def _core_due_s(self) -> float:
         """When, in real monotonic time, the core is due."""
@@ -299,46 +281,29 @@ class SchedulerShell:
 
     def _publish(self, packet: Packet) -> None:
         publisher, now_s = self._sockets.publisher, self._clock.monotonic_s()
-        for one in self._hold_back.take(packet, now_s, wanted=publisher.has_plain_subscriber(STATE)):
+        for one in self._state_delay.take(packet, now_s, wanted=publisher.has_plain_subscriber(wire.Topic.SCOPE_STATE)):
             publisher.publish(one)
-        if self._hold_back.due_s is not None:
-            self._look_at_s = min(self._look_at_s, self._hold_back.due_s)
+        if self._state_delay.due_s is not None:
+            self._look_at_s = min(self._look_at_s, self._state_delay.due_s)
 
     def _release(self, now_s: float = math.inf) -> None:
-        for packet in self._hold_back.release(now_s):
+        for packet in self._state_delay.release(now_s):
             self._sockets.publisher.publish(packet)
 
     def _write_down(self, effects: list[events.Effect]) -> None:
-        """Write what must outlive a crash before anybody is told; problems that are flagged outlive a power cut, too.
-
-        A disk that is full or hangs must not end the experiment, nor hold it up: that is said, and it goes on.
-        """
-        notes: list[events.Publish] = []
-        saved: events.SaveState | None = None
+        """Write what must outlive a crash before anybody is told."""
+        entries: list[LoggedPacket] = []
+        state: SavedState | None = None
+        over = self.ended
         for effect in effects:
             if isinstance(effect, events.SaveState):
-                saved = effect
-            elif isinstance(effect, events.Publish) and not self.ended:
-                notes.append(effect)
+                state = effect.state
+            elif isinstance(effect, events.Publish):
+                # last words are recorded; a scheduler that is started again must not find the end in its cache
+                entries.append(LoggedPacket(effect.packet, effect.source_ns, 0 if over else effect.history))
             elif isinstance(effect, events.Kill):
-                break  # what is said afterwards is of no use to a run that is resumed
-        if saved is None and not notes:
-            return
-
-        def write() -> None:
-            if saved is not None:
-                self._state.save(saved.state)
-            for note in notes:
-                self._journal.note(note.packet, note.source_ns, cached=note.cached)
-
-        with self._told.trying():
-            self._disk.run(write, sum(len(note.packet.payload) for note in notes))
-            if saved is not None and self._has_new_problems(saved.state):
-                SYNCER.now(DEADLINE_S)
-
-    def _has_new_problems(self, state: SavedState) -> bool:
-        before, self._problems = self._problems, frozenset(state.control.problems)
-        return not self._problems <= before
+                over = True
+        self._write_ahead.write(state, entries)
 
 
 def _id_of(asked: PeerAsked) -> str:

@@ -34,6 +34,10 @@ class DiskTimeout(OSError):
         super().__init__(f"the disk has not answered within {within_s:g} s")
 
 
+class DiskBacklogFull(DiskTimeout):
+    """So much waits for the disk that this is never written."""
+
+
 class _Task:
     """Something to do; `done` is held until it is."""
 
@@ -70,20 +74,23 @@ class DiskThread:
             size: bytes that it keeps in memory until then.
 
         Raises:
-            DiskTimeout: not in time; it is done later, or if too much waits, never.
+            DiskTimeout: not in time; it is done later.
+            DiskBacklogFull: too much waits; it is never done.
             Exception: what `work` raises.
         """
-        task = self._put(work, size)
-        if task is None or not task.done.acquire(timeout=0.0 if self.hangs else self._deadline_s):
+        task = self.submit(work, size)
+        if not task.done.acquire(timeout=0.0 if self.hangs else self._deadline_s):
             self.hangs = True
             raise DiskTimeout(self._deadline_s)
         if task.error is not None:
             raise task.error
 
-    def _put(self, work: Callable[[], object], size: int) -> _Task | None:
+    def submit(self, work: Callable[[], object], size: int = 0) -> _Task:
+        """Have something done, and wait for nothing. Raises DiskBacklogFull."""
         with self._lock:
             if self._count and (self._bytes + size > self._most_bytes or self._count >= MOST_TASKS):
-                return None
+                self.hangs = True
+                raise DiskBacklogFull(self._deadline_s)
             self._bytes += size
             self._count += 1
         if self._thread is None:

@@ -1,4 +1,4 @@
-"""Whether a process that does not beat stands still: a look from outside, by what its operating system says of it.
+"""A look from outside at a process that does not beat: the operating system tells whether it works.
 
 Beats come from a thread of Python. Code that holds Python's lock for long, such as a call into a library, or the
 loading of a large one off a slow disk, lets none through, and yet it works.
@@ -24,7 +24,7 @@ LOOKS = 10
 
 @dataclass(frozen=True, slots=True)
 class ActivitySample:
-    """What is seen of a process at one time.
+    """A process as it is seen at one time.
 
     Attributes:
         processor_s: the processor time that it has used in its life.
@@ -63,7 +63,7 @@ class ActivityMonitor:
         self.again_s = -math.inf
 
     def work(self, now_s: float) -> bool | None:
-        """Whether it works, in real monotonic time; None: that can't be told, or not yet."""
+        """Return whether it works, in real monotonic time; None: that can't be told, or not yet."""
         if now_s >= self.again_s:
             self.again_s = now_s + self._lately_s / LOOKS
             self._works = self._judge(self._look(self._pid), now_s)

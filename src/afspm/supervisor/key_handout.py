@@ -25,7 +25,7 @@ WRITTEN_WITHIN_S = 5.0
 
 @dataclass(frozen=True)
 class KeyHandout:
-    """What is started, with its keys.
+    """The processes to start, with their keys.
 
     Attributes:
         guest, supervisor: the keys of those who join the run, and of who reports to its scheduler, as launch lines
@@ -69,14 +69,14 @@ def _scheduler(experiment: Experiment) -> str:
 
 
 def _with(start: ProcessStart, own: Keys | None, scheduler: str) -> ProcessStart:
-    """A start with its keys; `scheduler`: whom alone a translator obeys."""
+    """Return a start with its keys; `scheduler`: whom alone a translator obeys."""
     if own is None:
         return start
     return replace(start, launch=replace(start.launch, keys={**own.as_launch(), "scheduler": scheduler}))
 
 
 def _of_file(experiment: Experiment, start: ProcessStart) -> Keys | None:
-    """The keys of a process out of the folder, with those of others only where it has to know them."""
+    """Return the keys of a process out of the folder, with those of others only where it has to know them."""
     launch = start.launch
     own = keys.from_launch(launch.name, launch.keys)
     if own is None or launch.sockets.publish or launch.sockets.serve or start.command:
@@ -86,7 +86,7 @@ def _of_file(experiment: Experiment, start: ProcessStart) -> Keys | None:
 
 
 def _guarded(experiment: Experiment, starts: Sequence[ProcessStart]) -> dict[str, str]:
-    """Whose requests are to be proved, by the address that they come to: all who may send them are started here."""
+    """Return the servers that demand proof, by address: all who may ask them are started here."""
     slots = experiment.resolved.net.slots
     here = {start.launch.name for start in starts}
     complete = here >= set(experiment.component_names)

@@ -45,7 +45,7 @@ class LineReader:
         """The first line of the last error."""
 
     def read(self, stream: Literal["stdout", "stderr"], line: str) -> tuple[int, str]:
-        """The level (that of `logging`) and the text of a line."""
+        """Return the level (that of `logging`) and the text of a line."""
         if stream == "stdout":
             return logging.INFO, line
         match = _LEVELLED.match(line)
@@ -101,7 +101,7 @@ class RunLog:
             self._shown.add(time_of_day(wall_ns), f"{name:{self._widest}}", level, text)
 
     def _experiment_time(self) -> str:
-        """The time in the experiment, where it is another than the one on the wall."""
+        """Return the time in the experiment, where it is another than the one on the wall."""
         now_ns = self._clock.now_ns()
         if abs(now_ns - self._wall.now_ns()) < NS_PER_S:
             return ""
@@ -114,7 +114,7 @@ class RunLog:
 
 
 def colour_of(name: str) -> str:
-    """The colour of a component's name: the same in every run and on every computer."""
+    """Return the colour of a component's name: the same in every run and on every computer."""
     return COLOURS[zlib.crc32(name.encode()) % len(COLOURS)]
 
 

@@ -55,7 +55,7 @@ class FreePorts:
         raise OSError(f"no free port between {LOWEST} and {HIGHEST} on {self._host}")
 
     def address(self) -> str:
-        """A free address for a socket, as ZeroMQ writes it."""
+        """Return a free address for a socket, as ZeroMQ writes it."""
         return f"tcp://{self._host}:{self.take()}"
 
 
@@ -92,7 +92,7 @@ def _can_be_bound(host: str, port: int) -> bool:
 
 
 def _is_free(host: str, port: int) -> bool:
-    """Whether nobody has bound it; if so it is held from now on, where that can be."""
+    """Return whether nobody has bound it; if so it is held from now on, where that can be."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         try:
             probe.bind((host, port))

@@ -73,7 +73,7 @@ def follow(
 
 
 def summary(outcome: RunOutcome, folder: Path) -> list[str]:
-    """The summary: why it ended, what ran, what had to be restarted or was given up, where everything is."""
+    """Return the summary: why it ended, what ran, what had to be restarted or was given up, where everything is."""
     told = [f"{outcome.text}, after {duration_text(outcome.duration_s)}"]
     told.append(f"ran: {', '.join(report.name for report in outcome.reports if report.starts)}")
     for report in outcome.reports:
@@ -94,7 +94,7 @@ def summary(outcome: RunOutcome, folder: Path) -> list[str]:
 
 
 def _recorded(folder: Path) -> list[str]:
-    """What the record counts, where there is one."""
+    """Return what the record counts, where there is one."""
     try:
         with open_run(folder) as run:
             whole = sum(not row.interrupted for row in run.scans)
@@ -105,7 +105,7 @@ def _recorded(folder: Path) -> list[str]:
 
 
 def _tabled(table: Path) -> list[str]:
-    """What the table of measurements counts, where the experiment kept one; a scan's channels are one scan."""
+    """Return what the table of measurements counts, where the experiment kept one; a scan's channels are one scan."""
     try:
         with table.open(encoding="utf-8", newline="") as file:
             rows = {(row.get("measurement"), row.get("time")) for row in csv.DictReader(file)}

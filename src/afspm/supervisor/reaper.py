@@ -51,7 +51,7 @@ class Reaper:
         self._tell(f"{pid} 0")
 
     def close(self) -> None:
-        """What is left now, the supervisor leaves behind."""
+        """Close its input: it ends what is left now."""
         if self._popen is not None and self._popen.stdin is not None:
             with contextlib.suppress(OSError):
                 self._popen.stdin.close()

@@ -35,7 +35,7 @@ BEFORE_S = 1.0
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """How to replay a run.
+    """Options of a replay.
 
     Attributes:
         speed: experiment seconds in a real second; None: as it was recorded.
@@ -113,7 +113,7 @@ def _addresses(run: Run, options: ReplayOptions) -> tuple[str, str]:
 
 
 def _said(run: Run) -> tuple[str | None, str | None]:
-    """Where the scheduler was, as far as the experiment file says so."""
+    """Return where the scheduler was, as far as the experiment file says so."""
     try:
         tables = [table for table in run.experiment.values() if isinstance(table, dict)]
     except (FileError, tomllib.TOMLDecodeError):
@@ -126,7 +126,7 @@ def _said(run: Run) -> tuple[str | None, str | None]:
 
 
 def _guest(run: Run) -> Launch:
-    """The launch line of whoever joins."""
+    """Return the launch line of whoever joins."""
     recorded = run.facts.get(GUEST)
     guest = Launch.from_json(json.dumps(recorded)) if isinstance(recorded, dict) else Launch("guest")
     return replace(guest, keys=None, run="", simulated=run.simulated, sample_coordinates=run.frame is Frame.SAMPLE)

@@ -19,11 +19,11 @@ from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
 from afspm.experiment import Experiment, load, load_expanded
 from afspm.logic.supervision.run_end import EndReason
-from afspm.record import ahead
 from afspm.record.journal import open_to_read
 from afspm.record.run_json import EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, read_run_json
 from afspm.record.run_lock import lock_run, quoted, resume_command
 from afspm.storage.atomic import load_checkpoint
+from afspm.storage.packet_log import log_folder, logged_packets
 from afspm.supervisor import run as running
 from afspm.supervisor.ports import require_free
 from afspm.supervisor.run import FILES, HOMES, HOW, ONLY, RUN, WITHOUT, FinishedRun, RunOptions
@@ -55,7 +55,7 @@ class ResumableRun:
     added: tuple[str, ...] = ()
 
     def with_overlay(self, file: Path) -> ResumableRun:
-        """The same run, which goes on with what the file adds."""
+        """Return the same run, which goes on with what the file adds."""
         experiment = load_expanded(self.folder / EXPERIMENT_FILE, self.homes, file)
         before = self.experiment.component_names
         added = [name for name in experiment.component_names if name not in before]
@@ -125,8 +125,7 @@ def last_seen_ns(folder: Path) -> int:
     """The last time in the experiment that anything of the run's folder knows of; 0 if nothing does."""
     seen = [0]
     state = folder / STATE_DIR
-    for written in ahead.folders(state):
-        seen += [one.packet.time_ns or 0 for one in ahead.written_ahead(written)]
+    seen += [entry.packet.time_ns or 0 for entry in logged_packets(log_folder(state))]
     for file in state.glob("*.json"):
         try:
             kept, _ = load_checkpoint(file, json.loads)
@@ -145,7 +144,7 @@ def last_seen_ns(folder: Path) -> int:
 
 
 def _wait_until_gone(facts: dict[str, Any], folder: Path) -> None:
-    """Whoever lost his parent ends within a moment; two of one name must not be at work in one folder.
+    """Wait until processes that lost their parent have ended: two of one name must not share a folder.
 
     Raises:
         FileError: somebody stays.
@@ -167,7 +166,7 @@ def _wait_until_gone(facts: dict[str, Any], folder: Path) -> None:
 
 
 def _is_gone(port: int, until_s: float) -> bool:
-    """Whether nobody listens on a port any more; a connection that is closed says that it is so, or soon will be."""
+    """Return whether nobody listens on a port any more; a connection that is closed says so."""
     clock = ExperimentClock.real()
     while (left_s := until_s - clock.monotonic_s()) > 0.0:
         try:
@@ -205,13 +204,13 @@ def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> Non
 
 
 def _whole(experiment: Experiment) -> dict[str, Any]:
-    """What is in force, defaults too, whoever wrote it down."""
+    """Return what is in force, defaults too, whoever wrote it down."""
     experiment.resolved  # noqa: B018  (adds what the file leaves open)
     return tomllib.loads(experiment.expanded(secrets=False))
 
 
 def differing(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Where two experiments differ: each section with its keys."""
+    """Return where two experiments differ: each section with its keys."""
     found = []
     for name in {**before, **now}:
         then, later = before.get(name), now.get(name)

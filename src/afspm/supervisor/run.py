@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -16,10 +17,10 @@ from afspm.errors import ConfigError
 from afspm.experiment import Experiment, ProcessStart, Role
 from afspm.launch import Launch, Sockets
 from afspm.logic.supervisor_registry import LOGGED_AS
-from afspm.record import ahead
 from afspm.record.run_json import ENDED, STATE_DIR, run_json_or_empty
 from afspm.record.run_lock import lock_run
 from afspm.storage.disk import run_bounded
+from afspm.storage.packet_log import discard_if_recorded, expect_recorder, log_folder
 from afspm.supervisor import key_handout, post_run, run_folder, run_identity
 from afspm.supervisor.log import RunLog
 from afspm.supervisor.ports import FreePorts, require_free
@@ -41,7 +42,7 @@ CLOCK_FILE = "clock"
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How to run an experiment here and now, as far as the experiment file is not about it.
+    """Options of a run that the experiment file is not about.
 
     Attributes:
         runs: the folder of run folders.
@@ -61,7 +62,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What came of a run."""
+    """A run that is over."""
 
     folder: Path
     outcome: RunOutcome
@@ -112,7 +113,7 @@ def go(
         facts = {**run_facts(name, starts, common), **facts_to_resume(experiment, starts, options), FILES: files}
         run_folder.write_run(folder, facts)
         if {start.launch.name for start in starts} & set(experiment.recorders):
-            ahead.expect_record(folder / STATE_DIR)
+            expect_recorder(log_folder(folder / STATE_DIR))
         log.write(LOGGED_AS, logging.INFO, f"{name}: {len(starts)} processes, into {folder}")
         handed = key_handout.hand_over(experiment, starts)
         reporter = reporter_of(experiment, starts, clock, common.run, handed.supervisor)
@@ -125,6 +126,9 @@ def go(
             run_bounded(lambda: run_folder.write_run(folder, ending), WRITTEN_WITHIN_S)
         except OSError as error:  # a full disk must not keep people from being told of the end
             log.write(LOGGED_AS, logging.ERROR, f"how it ended is not in run.json: {error}")
+        if outcome.why.is_final:
+            with suppress(OSError):  # what stays is only space
+                run_bounded(lambda: discard_if_recorded(log_folder(folder / STATE_DIR)), WRITTEN_WITHIN_S)
         ended = EndedRun(name, folder, outcome, common.simulated)
         post_run.follow(experiment, ended, starts, clock, log, with_report=options.report)
     finally:
@@ -143,7 +147,7 @@ def addresses_of(starts: Sequence[ProcessStart]) -> dict[str, str]:
 
 
 def facts_to_resume(experiment: Experiment, starts: Sequence[ProcessStart], options: RunOptions) -> dict[str, object]:
-    """What else run.json says, so that the run can be resumed with that file alone.
+    """Return what else run.json says, so that the run can be resumed with that file alone.
 
     There the recorder and others that go where the scheduler is are named like all the rest, and so are chosen by name.
     """
@@ -157,13 +161,13 @@ def facts_to_resume(experiment: Experiment, starts: Sequence[ProcessStart], opti
 
 
 def dry_run(experiment: Experiment, options: RunOptions = RunOptions()) -> list[ProcessStart]:
-    """What `run` would start, and nothing else. Raises as `run` does."""
+    """Return what `run` would start, and nothing else. Raises as `run` does."""
     experiment.require_valid()
     return _starts(experiment, options, _own(experiment, options), FreePorts())
 
 
 def run_facts(name: str, starts: Sequence[ProcessStart], common: RunIdentity) -> dict[str, object]:
-    """What run.json says: who is where, and with what launch line a script can join (`afspm.connect`)."""
+    """Return what run.json says: who is where, and with what launch line a script can join (`afspm.connect`)."""
     facts: dict[str, object] = {
         "name": name,
         RUN: common.run,
@@ -216,7 +220,7 @@ def _starts(
 
 
 def _own(experiment: Experiment, options: RunOptions) -> RunIdentity:
-    """What this part of the experiment would have by itself."""
+    """Return what this part of the experiment would have by itself."""
     simulated = experiment.simulated(options.only, options.without)
     clock, speed = experiment.clock(), options.speed
     if speed is not None and not experiment.resolved.simulated:
@@ -233,7 +237,7 @@ def _common(
     options: RunOptions,
     terminal: TextIO | None,
 ) -> RunIdentity:
-    """What the whole experiment has, of which perhaps only a part is started here: it is the scheduler's.
+    """Return what the whole experiment has, of which perhaps only a part is started here: it is the scheduler's.
 
     Raises:
         ConfigError: the file's time is a simulation's, and here it is not certain that the microscope is simulated.

@@ -20,7 +20,7 @@ MOST_RUNS_A_SECOND = 1000
 
 
 def create(runs: Path, experiment: str, started: datetime) -> Path:
-    """A new, empty run folder `runs/<experiment>-<time>/`, absolute; `runs/latest` then names it.
+    """Return a new, empty run folder `runs/<experiment>-<time>/`, absolute; `runs/latest` then names it.
 
     Raises:
         FileError: the folder can't be made.

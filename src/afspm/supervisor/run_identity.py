@@ -1,4 +1,4 @@
-"""What all parts of an experiment have in common: a part that is started without the scheduler asks that for it."""
+"""The clock and identity that all parts of a run share; a part without the scheduler asks that for them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SAME_S = 1e-3  # two processes of one computer agree on real time to that
 
 @dataclass(frozen=True)
 class RunIdentity:
-    """What is the same in all processes of a run, on all of its computers.
+    """The identity and clock of a run, the same on all of its computers.
 
     Attributes:
         run: the identity of the run, random; empty: it is not known here.
@@ -71,7 +71,7 @@ def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
 
 
 def _read(response: Response, asked_s: float, answered_s: float, where: str) -> RunIdentity:
-    """What was told between two moments of real time, with the clock as it is to be read on this computer."""
+    """Return what was told between two moments of real time, with the clock as it is to be read on this computer."""
     if not response.ok:
         raise ConfigError(f"the scheduler does not tell the time: {response.reason}", where=where)
     try:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from afspm.model import ControlMode, ControlRequest, Problem
-from afspm.record.ahead import expect_record, written_ahead
+from afspm.storage.packet_log import log_folder, logged_packets
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="what a descriptor is open on is found in /proc")
 HOOK = Path(__file__).parents[2] / "support" / "hanging_disk"
@@ -21,7 +21,6 @@ def switch(rig: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterato
     """While this file is there, the disk hangs."""
     state = tmp_path / "state"
     state.mkdir()
-    expect_record(state)
     monkeypatch.setenv("PYTHONPATH", str(HOOK))
     monkeypatch.setenv("HANGING_FOLDER", str(state))
     file = tmp_path / "state.hangs"
@@ -41,8 +40,8 @@ def test_requests_flags_and_packets_do_not_wait_for_a_disk_that_hangs(rig: Any, 
         rig.publish_packet("FeedbackAnalysis", b"")
         rig.until(lambda number=number: len(holder.packets("FeedbackAnalysis")) == number)
     switch.unlink()
-    log = tmp_path / "state" / "scheduler.ahead"
-    rig.until(lambda: [written.packet.envelope for written in written_ahead(log)].count("FeedbackAnalysis") == 2)
+    log = log_folder(tmp_path / "state")
+    rig.until(lambda: [entry.packet.envelope for entry in logged_packets(log)].count("FeedbackAnalysis") == 2)
     rig.kill()
     rig.start()
     late = rig.component("Late")

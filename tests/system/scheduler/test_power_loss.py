@@ -11,7 +11,6 @@ import pytest
 
 from afspm import wire
 from afspm.model import ControlRequest, Problem
-from afspm.record.ahead import expect_record
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="what a descriptor is open on is found in /proc")
 LOSSY = Path(__file__).parents[2] / "support" / "lossy_disk"
@@ -23,7 +22,6 @@ def test_a_problem_that_was_told_stands_after_a_power_cut(
 ) -> None:
     state = tmp_path / "state"
     state.mkdir()
-    expect_record(state)
     monkeypatch.setenv("PYTHONPATH", str(LOSSY))
     monkeypatch.setenv("LOSSY_FOLDER", str(state))
     shadow = runpy.run_path(str(LOSSY / "sitecustomize.py"))["Shadow"](str(state))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,8 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
+from afspm.storage.packet_log import log_folder, logged_packets
+from afspm.storage.segment import path_of, segments
 from afspm.transport.port import CaughtUp, ControlConnected, Killed, PacketReceived
 
 REQUEST, RELEASE = ControlRequest.REQUEST_CTRL, ControlRequest.RELEASE_CTRL
@@ -163,23 +164,24 @@ def test_a_damaged_state_is_not_taken_for_an_empty_one(rig: Any, tmp_path: Any) 
     assert rig.process.wait(timeout=10) not in (0, 80, 81)
 
 
-def test_damaged_packets_of_the_cache_are_left_out(rig: Any, tmp_path: Any) -> None:
+def test_a_packet_at_the_end_of_the_log_that_is_damaged_is_left_out(rig: Any, tmp_path: Any) -> None:
     rig.start()
     component = rig.component("Component")
     for number in range(3):
         rig.publish_packet("Scan2d", scan(number))
-    cache = tmp_path / "state" / "scheduler.cache"
+    log = log_folder(tmp_path / "state")
 
-    def scans_on_disk() -> list[Path]:
-        return [file for file in sorted(cache.glob("*.packet")) if b'"Scan2d' in file.read_bytes()[:100]]
+    def scans_on_disk() -> int:
+        return sum(entry.packet.envelope.startswith("Scan2d") for entry in logged_packets(log))
 
-    rig.until(lambda: cache.exists() and len(scans_on_disk()) == 3)
+    rig.until(lambda: scans_on_disk() == 3)
     rig.kill()
     rig.translator.close()
     rig.translator = rig.make_translator(*rig.source)  # which has forgotten them
-    files = scans_on_disk()
-    files[1].write_bytes(files[1].read_bytes()[:-5])
-    (cache / "00000000000000000001.packet").write_bytes(b"nonsense")
+    (segment,) = segments(log)
+    while scans_on_disk() == 3:
+        segment.write_bytes(segment.read_bytes()[:-5])
+    path_of(log, 99).write_bytes(b"nonsense")
     rig.start()
     late = rig.component("Late", ["Scan2d"])
     rig.until(lambda: any(isinstance(i, CaughtUp) for i in late.found))

@@ -41,7 +41,9 @@ def night() -> Overview:
         ))),
         (122, "JournalEntries", model.JournalEntries((
             model.JournalEntry(START + 122 * S, "request", "judge", "scan-speed = 1 m/s", 9, "at most 1e-5 m/s"),
-            model.JournalEntry(START + 123 * S, "control", "judge", "flagged tip-shape-changed"),
+            model.JournalEntry(
+                START + 123 * S, "control", "judge", "flagged", event=model.ControlEvent.PROBLEM_FLAGGED, problem=1
+            ),
         ))),
         (123, "ControlState", ControlState(ControlMode.AUTOMATED, "series", (1,))),
         (124, "LogLines", model.LogLines((model.LogLine(START + 124 * S, "judge", "ERROR", "lost the tip [/x]"),))),

@@ -9,10 +9,11 @@ import os
 import runpy
 import sqlite3
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import afspm
@@ -23,12 +24,11 @@ from afspm.components.recording import RecordWriter
 from afspm.errors import FileError
 from afspm.exit_codes import ExitCode
 from afspm.launch import Launch
-from afspm.model import ControlMode, ControlState, Packet
+from afspm.model import ControlMode, ControlState, LoggedPacket, Packet, Region, ScanLines
 from afspm.process.context import ProcessActivity, ProcessContext
-from afspm.record import ahead
-from afspm.record.ahead import Ahead, expect_record, recorded_until
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.store import RecordSettings, RecordStore
+from afspm.storage.packet_log import LogReader, PacketLog, committed, expect_recorder
 from afspm.transport.port import Incoming, ParentGone
 
 DEADLINE_S = 20.0
@@ -44,16 +44,17 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.state = folder / "state"
-        self.state.mkdir()
-        expect_record(self.state)
+        self.packets = folder / "state" / "packets"
+        self.packets.parent.mkdir()
+        expect_recorder(self.packets)
+        self.log = PacketLog(self.packets)
         self.woken = threading.Event()
         self.writers: list[RecordWriter] = []
 
     def writer(self) -> RecordWriter:
         writer = RecordWriter(
             self.folder,
-            self.state,
+            self.packets,
             RecordSettings(),
             ExperimentClock.real(),
             logging.getLogger("recorder"),
@@ -64,6 +65,17 @@ class Bench:
         writer.start()
         return writer
 
+    def publish(self, *packets: Packet) -> None:
+        """As the scheduler does."""
+        for packet in packets:
+            self.log.append(LoggedPacket(packet, None, 1))
+
+    @property
+    def is_committed(self) -> bool:
+        """All of the log is said to be recorded."""
+        position = committed(self.packets)
+        return position is not None and not LogReader(self.packets, position).read(1)
+
     def times(self) -> list[int | None]:
         """Of what is recorded; none before the record has begun."""
         with contextlib.suppress(FileError), afspm.open_run(self.folder) as run:
@@ -72,43 +84,71 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
-    monkeypatch.setattr(recording, "AGAIN_S", 0.02)
-    monkeypatch.setattr(recording, "QUIET_S", 0.02)
-    return Bench(tmp_path)
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    for name in ("AGAIN_S", "QUIET_S", "LOOK_S", "COMMIT_S"):
+        monkeypatch.setattr(recording, name, 0.02)
+    made = Bench(tmp_path)
+    yield made
+    made.log.close()
 
 
-def test_what_was_written_ahead_and_what_is_sent_again_is_recorded_once_in_order(bench: Bench) -> None:
-    noted = Ahead(bench.state / f"scheduler{ahead.FOLDER_SUFFIX}", bench.state / ahead.RECORDED_FILE)
-    for time_ns in (1, 2, 3, 4):
-        noted.note(control(time_ns), None, cached=True)
-    noted.close(ended=False)
+def test_the_log_and_what_others_send_are_recorded_once_in_order(bench: Bench) -> None:
+    bench.publish(*map(control, (1, 2, 3)))
     writer = bench.writer()
-    for time_ns in (2, 4, 5):
-        writer.put(control(time_ns), "")
-    writer.caught_up()
-    writer.put(control(6), "")
+    bench.publish(*map(control, (3, 4, 5)))
+    _until(lambda: bench.times() == [1, 2, 3, 4, 5])
+    writer.put(control(6), "tcp://another")
+    bench.publish(control(7))
     writer.finish(ended=True)
-    assert bench.times() == [1, 2, 3, 4, 5, 6]
-    assert recorded_until(bench.state / ahead.RECORDED_FILE) == 6
+    assert bench.times() == [1, 2, 3, 4, 5, 7]
+    assert afspm.open_run(bench.folder)._query("SELECT source FROM packets WHERE time_ns = 6") == [("tcp://another",)]
+    assert bench.is_committed
+
+
+def test_another_life_goes_on_where_the_last_had_committed(bench: Bench) -> None:
+    bench.publish(*map(control, range(1, 6)))
+    bench.writer().finish(ended=False)
+    position = committed(bench.packets)
+    assert bench.is_committed
+    bench.publish(*map(control, range(6, 9)))
+    assert committed(bench.packets) == position
+    bench.writer().finish(ended=False)
+    assert bench.times() == list(range(1, 9))
+    assert bench.is_committed
+
+
+def test_lines_of_a_scan_that_is_not_over_are_read_again_by_another_life(bench: Bench) -> None:
+    region = Region((0.0, 0.0), (1e-6, 1e-6))
+
+    def lines(number: int) -> Packet:
+        made = ScanLines(region, (4, 4), "Height", "m", number, np.full((1, 4), float(number)))
+        return Packet("ScanLines", wire.encode(made)[1], 100 + number)
+
+    bench.publish(control(1), lines(0))
+    bench.writer().finish(ended=False)
+    bench.publish(lines(1), control(200))
+    bench.writer().finish(ended=False)
+    assert not bench.is_committed, "they are recorded with the rest of the scan"
+    bench.writer().finish(ended=True)
+    (row,) = afspm.open_run(bench.folder).scans
+    assert row.interrupted
+    assert np.isfinite(afspm.open_run(bench.folder).scan(row).first.values).sum() == 8
+    assert bench.is_committed
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="what a descriptor is open on is found in /proc")
 def test_what_is_said_to_be_recorded_is_on_the_disk(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    monkeypatch.setattr(recording, "SURE_S", 0.01)
     lossy = runpy.run_path(str(LOSSY / "sitecustomize.py"))
     for name in ("fsync", "fdatasync", "unlink", "remove", "replace", "rename"):
         monkeypatch.setattr(os, name, getattr(os, name))  # to be as they were after the test
     shadow = lossy["Shadow"](str(bench.folder))
     lossy["watch"](shadow)
-    said = lambda: recorded_until(bench.state / ahead.RECORDED_FILE)  # noqa: E731
     writer = bench.writer()
-    writer.caught_up()
     for time_ns in range(1, 6):
-        writer.put(control(time_ns), "")
-        _until(lambda time_ns=time_ns: said() >= time_ns)
+        bench.publish(control(time_ns))
+        _until(lambda: bench.is_committed)
         after = tmp_path_factory.mktemp("after")
         shadow.copy(after)
         with afspm.open_run(after) as run:
@@ -116,29 +156,18 @@ def test_what_is_said_to_be_recorded_is_on_the_disk(
     writer.finish(ended=True)
 
 
-def test_a_scheduler_that_does_not_say_when_all_has_come_is_not_waited_for(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recording, "CAUGHT_UP_WITHIN_S", 0.05)
-    writer = bench.writer()
-    writer.put(control(1), "")
-    _until(lambda: bench.times() == [1])
-    writer.finish(ended=False)
-
-
 def test_a_full_disk_is_told_once_and_all_is_recorded_when_there_is_room(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     disk = _Disk(monkeypatch)
     writer = bench.writer()
-    writer.caught_up()
     _until(lambda: (bench.folder / JOURNAL_FILE).exists())
     disk.is_full = True
     for time_ns in (1, 2):
-        writer.put(control(time_ns), "")
+        bench.publish(control(time_ns))
     _until(lambda: disk.refused > 3)
     disk.is_full = False
-    writer.put(control(3), "")
+    bench.publish(control(3))
     writer.finish(ended=True)
     assert bench.times() == [1, 2, 3]
     assert [r.levelname for r in caplog.records if "can be recorded" in r.message] == ["CRITICAL"]
@@ -152,28 +181,25 @@ def test_what_did_not_fit_while_the_disk_was_full_is_asked_for_again(
     disk = _Disk(monkeypatch)
     disk.is_full = True
     writer = bench.writer()
-    writer.caught_up()
-    writer.put(control(1), "")
+    writer.put(control(1), "tcp://another")
     _until(lambda: disk.refused > 0)
     packets = [control(time_ns) for time_ns in range(1, 30)]
     for packet in packets:
-        writer.put(packet, "")
+        writer.put(packet, "tcp://another")
     disk.is_full = False
     assert bench.woken.wait(DEADLINE_S)
     assert writer.wants_replay()
     assert not writer.wants_replay(), "once"
-    for packet in packets:  # the scheduler sends again what it has kept
-        writer.put(packet, "")
-    writer.caught_up()
+    for packet in packets:  # the publisher sends again what it has kept
+        writer.put(packet, "tcp://another")
     writer.finish(ended=True)
-    assert bench.times() == [packet.time_ns for packet in packets]
+    assert _all_times(bench) == [packet.time_ns for packet in packets]
 
 
 def test_a_damaged_journal_is_put_aside_and_told(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
     (bench.folder / JOURNAL_FILE).write_bytes(b"SQLite format 3\0" + b"nonsense" * 1000)
     writer = bench.writer()
-    writer.caught_up()
-    writer.put(control(1), "")
+    bench.publish(control(1))
     writer.finish(ended=True)
     assert bench.times() == [1]
     assert (bench.folder / f"{JOURNAL_FILE}.damaged-1").exists()
@@ -185,9 +211,8 @@ def test_a_journal_that_is_damaged_further_in_is_put_aside_too(
     bench: Bench, caplog: pytest.LogCaptureFixture, table: str
 ) -> None:
     writer = bench.writer()
-    writer.caught_up()
     for number in range(1, 400):
-        writer.put(control(number), "")
+        bench.publish(control(number))
     writer.finish(ended=False)
     journal = bench.folder / JOURNAL_FILE
     with contextlib.closing(sqlite3.connect(journal)) as opened:
@@ -197,12 +222,12 @@ def test_a_journal_that_is_damaged_further_in_is_put_aside_too(
     content[(page - 1) * size : page * size] = b"\xff" * size
     journal.write_bytes(content)
     again = bench.writer()
-    again.caught_up()
-    again.put(control(1000), "")
+    bench.publish(control(1000))
     again.finish(ended=True)
     assert (bench.folder / f"{JOURNAL_FILE}.damaged-1").exists()
     assert any("put aside" in record.message for record in caplog.records)
-    assert again.wants_replay or bench.times() == [1000], "what was lost with it is asked for again"
+    assert bench.times() == [*range(1, 400), 1000], "the log still has what was lost with it"
+    assert again.wants_replay()
 
 
 def test_what_ends_the_writing_is_raised_where_it_is_noticed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -211,8 +236,7 @@ def test_what_ends_the_writing_is_raised_where_it_is_noticed(bench: Bench, monke
 
     monkeypatch.setattr(RecordStore, "take", broken)
     writer = bench.writer()
-    writer.caught_up()
-    writer.put(control(1), "")
+    bench.publish(control(1))
     assert bench.woken.wait(DEADLINE_S)
     with pytest.raises(RuntimeError, match="mistake of ours"):
         writer.check()
@@ -220,7 +244,6 @@ def test_what_ends_the_writing_is_raised_where_it_is_noticed(bench: Bench, monke
 
 def test_a_packet_without_a_time_gets_that_of_now(bench: Bench) -> None:
     writer = bench.writer()
-    writer.caught_up()
     writer.put(Packet("ControlState", control(1).payload), "tcp://another")
     writer.finish(ended=True)
     row = afspm.open_run(bench.folder)._query("SELECT source, time_ns > 0 FROM packets")
@@ -234,7 +257,7 @@ def test_what_wakes_the_recorder_is_the_port_that_is_open_now(tmp_path: Path, mo
     class _Port:
         """Brings the end, to who has been woken up often enough."""
 
-        def __init__(self) -> None:
+        def __init__(self, heard: tuple[str, ...] | None) -> None:
             self.woken = 0
             ports.append(self)
 
@@ -285,6 +308,11 @@ class _Disk:
             take(store, packets)
 
         monkeypatch.setattr(RecordStore, "take", taken)
+
+
+def _all_times(bench: Bench) -> list[int]:
+    """Of what is recorded, whoever published it."""
+    return [row[0] for row in afspm.open_run(bench.folder)._query("SELECT time_ns FROM packets ORDER BY time_ns")]
 
 
 def _until(condition: Callable[[], bool]) -> None:

@@ -51,7 +51,7 @@ def test_python_is_the_one_that_runs_us(write: Write) -> None:
         ('[notify]\ncommand = ["no-such-program"]\n', "there is no program 'no-such-program'"),
         ('[notify]\nwebhook = "chat.example.org"\n', "it is not an address"),
         (HOOK + 'on = ["dawn"]\n', "'dawn'"),
-        (HOOK + "unsolved_after = 0\n", "greater than 0"),
+        (HOOK + "unsolved_after = 0\n", "above 0"),
         (HOOK + 'weebhook = "x"\n', "weebhook is not a setting"),
     ],
 )

@@ -169,7 +169,7 @@ def test_what_was_published_is_replayed_to_who_comes_late(lab: Lab) -> None:
     for n in range(5):
         lab.take_control(f"series-{n}")
         lab.entries()
-    assert sum(packet.envelope == "JournalEntries" for packet, _ in lab.core.cached()) == 6
+    assert sum(packet.envelope == "JournalEntries" for packet, *_ in lab.core.cached()) == 6
 
 
 def test_it_is_saved_before_it_is_published_so_that_its_time_is_not_given_twice(lab: Lab) -> None:

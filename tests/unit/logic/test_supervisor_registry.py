@@ -60,7 +60,7 @@ def order(lab: Lab, process: str, who: str = "dashboard:Ada") -> Response:
 
 
 def cached(lab: Lab) -> list[str]:
-    return [packet.envelope for packet, _ in lab.core.cached()]
+    return [packet.envelope for packet, *_ in lab.core.cached()]
 
 
 def test_what_a_supervisor_tells_is_published_cached_and_not_forwarded(lab: Lab) -> None:

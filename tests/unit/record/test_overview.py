@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from afspm import model, wire
-from afspm.model import ControlMode, ControlState, ProcessCondition, ScopeState
+from afspm.model import ControlEvent, ControlMode, ControlRequest, ControlState, ProcessCondition, ScopeState
 from afspm.record.overview import MOST_LINES, Overview
 
 S = 1_000_000_000
@@ -34,8 +36,11 @@ def process(condition: ProcessCondition, since_s: int, starts: int = 1, last_exi
     return model.ProcessState("series", "component", condition, since_s * S, starts=starts, last_exit=last_exit)
 
 
-def entry(time_s: float, what: str, response: int | None = 0, who: str = "classifier", reason: str = "") -> object:
-    return model.JournalEntries((model.JournalEntry(round(time_s * S), "request", who, what, response, reason),))
+def entry(
+    time_s: float, what: str, response: int | None = 0, who: str = "classifier", reason: str = "", **codes: Any
+) -> object:
+    made = model.JournalEntry(round(time_s * S), "request", who, what, response, reason, **codes)
+    return model.JournalEntries((made,))
 
 
 NIGHT: list[tuple[str, object, int]] = [
@@ -49,7 +54,7 @@ NIGHT: list[tuple[str, object, int]] = [
     ("ScopeStateMsg", status(ScopeState.SCANNING), 20),
     ("ScanLines", lines(0, 1, began_s=20), 21),
     ("ControlState", control(None, TIP), 22),
-    ("JournalEntries", entry(22, "flags tip-shape-changed"), 23),
+    ("JournalEntries", entry(22, "flags a problem", request=ControlRequest.ADD_EXP_PRBLM, problem=TIP), 23),
     ("ScopeStateMsg", status(ScopeState.INTERRUPTED), 24),
     ("ScopeStateMsg", status(ScopeState.FREE), 25),
     ("ControlState", control("corrector", TIP), 26),
@@ -231,19 +236,19 @@ def test_what_remains_gets_less_while_nothing_new_is_told() -> None:
     assert model.Progress(20 * S, "series", 2, 10).remaining_ns(20 * S) is None
 
 
-def change(time_s: int, who: str, what: str) -> tuple[str, object, int]:
-    entry = model.JournalEntry(time_s * S, "control", who, what)
+def change(time_s: int, who: str, event: ControlEvent, **codes: Any) -> tuple[str, object, int]:
+    entry = model.JournalEntry(time_s * S, "control", who, "in words", event=event, **codes)
     return "JournalEntries", model.JournalEntries((entry,)), time_s
 
 
 STORY = [
-    change(2, "series", "in control"),
-    change(22, "classifier", "flagged tip-shape-changed"),
-    change(23, "series", "no longer in control"),
-    change(26, "corrector", "in control to solve tip-shape-changed"),
-    change(35, "corrector", "cleared tip-shape-changed"),
-    change(36, "corrector", "no longer in control"),
-    change(40, "terminal:ada", "mode MANUAL"),
+    change(2, "series", ControlEvent.CONTROL_GAINED),
+    change(22, "classifier", ControlEvent.PROBLEM_FLAGGED, problem=TIP),
+    change(23, "series", ControlEvent.CONTROL_LOST),
+    change(26, "corrector", ControlEvent.CONTROL_GAINED, problem=TIP),
+    change(35, "corrector", ControlEvent.PROBLEM_CLEARED, problem=TIP),
+    change(36, "corrector", ControlEvent.CONTROL_LOST),
+    change(40, "terminal:ada", ControlEvent.MODE_CHANGED, mode=ControlMode.MANUAL),
 ]
 
 

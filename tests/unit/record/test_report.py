@@ -7,6 +7,7 @@ import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,8 +31,11 @@ def scan(end_s: float, channel: str = "Height Retrace", side: int = 8) -> model.
     return model.Scan(REGION, channel, "m", values, START + round(end_s * S), f"scan-{end_s:g}.nc")
 
 
-def entry(at_s: float, kind: str, who: str, what: str, response: int | None = None, reason: str = "") -> object:
-    return model.JournalEntries((model.JournalEntry(START + round(at_s * S), kind, who, what, response, reason),))
+def entry(
+    at_s: float, kind: str, who: str, what: str, response: int | None = None, reason: str = "", **codes: Any
+) -> object:
+    made = model.JournalEntry(START + round(at_s * S), kind, who, what, response, reason, **codes)
+    return model.JournalEntries((made,))
 
 
 def processes(at_s: float, *states: model.ProcessState) -> tuple[float, object]:
@@ -58,7 +62,17 @@ def night() -> list[tuple[float, object]]:
     return [
         *packets,
         (1500, ControlState(ControlMode.AUTOMATED, None, (TIP,))),
-        (1501, entry(1500, "control", "judge", "flagged tip-shape-changed")),
+        (
+            1501,
+            entry(
+                1500,
+                "control",
+                "judge",
+                "flagged",
+                event=model.ControlEvent.PROBLEM_FLAGGED,
+                problem=int(model.Problem.TIP_SHAPE_CHANGED),
+            ),
+        ),
         (1510, ControlState(ControlMode.AUTOMATED, "corrector", (TIP,))),
         (1520, entry(1520, "request", "corrector", "x-pulse", 0)),
         (1530, entry(1530, "request", "corrector", "x-pulse", 0)),

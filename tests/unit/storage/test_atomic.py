@@ -11,6 +11,9 @@ from pathlib import Path
 import pytest
 
 from afspm.errors import FileError
+from afspm.logic.arbitration import ArbitrationState
+from afspm.logic.state import SavedState
+from afspm.model import ControlMode
 from afspm.process.memory import Memory
 from afspm.scheduler.state_file import StateFile
 from afspm.storage import atomic
@@ -86,7 +89,7 @@ def test_on_a_full_disk_what_was_saved_before_is_still_the_last(tmp_path: Path) 
 import resource, signal, sys
 from pathlib import Path
 from afspm.errors import FileError
-from afspm.storage.atomic import CheckpointFile, load
+from afspm.storage.atomic import CheckpointFile, load_checkpoint
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
 path = Path(sys.argv[1])
@@ -98,7 +101,7 @@ while failed < 3:
         saved += 1
     except FileError:
         failed += 1
-    assert load(path, int) == (10**20 + saved - 1, "")
+    assert load_checkpoint(path, int) == (10**20 + saved - 1, "")
 print(saved)
 """
     done = subprocess.run([sys.executable, "-c", script, str(tmp_path / "x")], capture_output=True, text=True)
@@ -183,16 +186,16 @@ def test_a_scheduler_after_a_power_cut_knows_the_problems_and_gives_control_to_n
 ) -> None:
     log = logging.getLogger("scheduler")
     path = tmp_path / "scheduler.json"
-    state = {"control": {"mode": 1, "holder": "series", "solving": 3, "problems": {"3": "a"}, "ended": False}}
+    control = ArbitrationState(ControlMode.AUTOMATED, "series", solving=3, problems={3: "a"})
+    saved = SavedState(control, granted_to="token", last_ns=7)
     file = StateFile(path, log)
-    file.save({**state, "granted_to": "token", "last_ns": 7})
+    file.save(saved)
     file.close()
-    assert StateFile(path, log).load()["control"]["holder"] == "series"
+    assert StateFile(path, log).load() == saved
     assert not caplog.records
     path.write_bytes(left)
-    again = StateFile(path, log).load()
-    assert again["control"] == {**state["control"], "holder": None, "solving": 0}
-    assert (again["granted_to"], again["last_ns"]) == (None, 7)
+    assert StateFile(path, log).load() == saved.without_holder()
+    assert saved.without_holder().control.holder is None
     assert "nobody in control" in caplog.text
 
 

@@ -1,4 +1,4 @@
-"""What the supervisor does about one child: start it, watch it, start it again, give it up, let it end."""
+"""Supervision of one child: start it, watch it, start it again, give it up, let it end."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ChildPolicy:
 
 
 class HeartbeatReport(Protocol):
-    """What a heartbeat says; None where the process does not say."""
+    """The content of a heartbeat; None where the process does not say."""
 
     @property
     def closing(self) -> bool: ...
@@ -109,7 +109,7 @@ class ChildWatch:
         return self.phase in (ChildPhase.DONE, ChildPhase.GIVEN_UP)
 
     def died(self, code: int) -> bool:
-        """Whether a process that ended with this code had not finished."""
+        """Return whether a process that ended with this code had not finished."""
         return code not in (*self._policy.final_codes, ExitCode.ORPHAN)
 
     def begin(self, now_s: float) -> list[ChildEffect]:

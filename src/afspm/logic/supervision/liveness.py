@@ -1,4 +1,4 @@
-"""Whether a process lives, judged by its heartbeats: busy is not dead, and late is not dead if it was we who slept.
+"""Liveness of a process by its heartbeats: busy is not dead, and late is not dead if this computer slept.
 
 Nor is dead who does not beat and is seen to work: something in it keeps the thread that beats from its turn.
 """
@@ -28,7 +28,7 @@ class ProcessHealth(Enum):
 
 @dataclass(frozen=True)
 class LivenessPolicy:
-    """How patient to be; all in real seconds.
+    """Patience with a process; all in real seconds.
 
     Attributes:
         beat_period_s: between two beats.
@@ -88,7 +88,7 @@ class Liveness:
         self._deadline_s = now_s + self._policy.closing_s
 
     def check(self, now_s: float, *, works: bool | None = None) -> ProcessHealth:
-        """How it is. To be asked at least once a beat period, since we can't judge while we sleep ourselves.
+        """Return how it is. To be asked at least once a beat period, since we can't judge while we sleep ourselves.
 
         Args:
             works: whether it was seen to work lately; None: that is not known.

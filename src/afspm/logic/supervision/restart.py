@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class RestartPolicy:
-    """How often and how soon; all in real seconds.
+    """The frequency and delay of restarts; all in real seconds.
 
     Attributes:
         budget: how many restarts within `window_s`; one more and it is given up.

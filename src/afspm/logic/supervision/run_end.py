@@ -1,4 +1,4 @@
-"""How a run ends: who is asked to when, who is killed when. Decisions only."""
+"""The end of a run: when processes are asked to end, killed and left. Decisions only."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LEAVE_AFTER_S = 3.0  # after being killed
 
 
 class EndReason(Enum):
-    """What ended a run."""
+    """The reason for which a run ended."""
 
     EXPERIMENT_ENDED = auto()
     ALL_DONE = auto()
@@ -24,13 +24,18 @@ class EndReason(Enum):
     """A process that the experiment can't do without was given up, or all were."""
 
     @property
+    def is_final(self) -> bool:
+        """Return whether there is nothing to resume."""
+        return self in (EndReason.EXPERIMENT_ENDED, EndReason.ALL_DONE)
+
+    @property
     def exit_code(self) -> int:
         """Of `afspm run`."""
         return {EndReason.EXPERIMENT_ENDED: 0, EndReason.ALL_DONE: 0, EndReason.STOPPED: 130, EndReason.LOST: 1}[self]
 
 
 class EndStep(Enum):
-    """What is to be done with those that still run."""
+    """The next step with processes that still run."""
 
     ASK = auto()
     """Close their stdin: they end cleanly."""
@@ -89,7 +94,7 @@ class RunEnd:
                 return None
 
     def step(self, now_s: float, *, busy: bool = False) -> tuple[RunEnd, EndStep | None]:
-        """What the time has come for, if anything, and the ending after it.
+        """Return what the time has come for, if anything, and the ending after it.
 
         Args:
             busy: somebody still works on a step, within what it declared: before they are asked, a component (a picture

@@ -26,7 +26,7 @@ class ChildSpec:
 
     @property
     def essential(self) -> bool:
-        """Whether the experiment can't go on without it."""
+        """True where the experiment can't go on without it."""
         return self.role is not Role.COMPONENT
 
 
@@ -54,12 +54,12 @@ class ChildLife:
         return None if self.beat is None or self.beat.closing else self.beat_s + liveness.silence_s / 2.0
 
     def is_overdue(self, now_s: float, liveness: LivenessPolicy) -> bool:
-        """Whether that time has come."""
+        """Return whether that time has come."""
         due_s = self.overdue_s(liveness)
         return due_s is not None and now_s >= due_s
 
     def is_busy(self, now_s: float, liveness: LivenessPolicy) -> bool:
-        """Whether it works on a step, as its last beat says or is seen, and for no longer than it declared."""
+        """Return whether it works on a step, as its last beat says or is seen, and for no longer than it declared."""
         if self.beat is None or self.beat.closing:
             return False
         longest_s, age_s = self.beat.longest_step_s or liveness.longest_step_s, self.beat.step_age_s or 0.0
@@ -69,7 +69,7 @@ class ChildLife:
         return 0.0 < age_s <= longest_s
 
     def is_silent(self, now_s: float, liveness: LivenessPolicy) -> bool:
-        """Whether it should have beaten long ago, and does not work either."""
+        """Return whether it should have beaten long ago, and does not work either."""
         beating = self.beat is not None and not self.beat.closing
         return beating and now_s - self.beat_s >= liveness.silence_s and not self.is_busy(now_s, liveness)
 
@@ -98,8 +98,11 @@ class SupervisedChild:
         return self.given_up or self.watch.over
 
     def may_still_finish(self, now_s: float, liveness: LivenessPolicy, *, can_hear: bool) -> bool:
-        """Whether it is too early to say that it has nothing left to do: it starts, has not beaten for a moment, is
-        frozen and can be started again, or was, and has yet to hear what it missed, if it still can."""
+        """Return whether it may have something left to do.
+
+        It starts, has not beaten for a moment, is frozen and can be started again, or was started again and has yet to
+        hear what it missed, if it still can.
+        """
         life = self.life
         if life is None or not self.spec.beats or self.spec.role is not Role.COMPONENT:
             return False
@@ -114,7 +117,7 @@ class SupervisedChild:
 
 @dataclass(frozen=True)
 class ProcessReport:
-    """What became of one process; `ordered` counts the starts that a person ordered."""
+    """The fate of one process; `ordered` counts the starts that a person ordered."""
 
     name: str
     starts: int

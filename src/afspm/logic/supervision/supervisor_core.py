@@ -68,7 +68,7 @@ class SupervisorCore:
 
     @property
     def is_over(self) -> bool:
-        """Whether the run has ended and nothing of it runs any more."""
+        """True when the run has ended and nothing of it runs any more."""
         return self.ending is not None and not any(child.life for child in self.children.values())
 
     def step(self, event: SupervisorEvent, now_s: float) -> list[SupervisorEffect]:
@@ -109,7 +109,7 @@ class SupervisorCore:
         return effects
 
     def may_start(self, name: str) -> bool:
-        """Whether a process that is to be started still is: the run may have ended meanwhile."""
+        """Return whether a process that is to be started still is: the run may have ended meanwhile."""
         return self.ending is None or self.children[name].rescued
 
     def deadline_s(self) -> float | None:
@@ -256,12 +256,12 @@ class SupervisorCore:
     # --- the end ---
 
     def _may_be_rescued(self, child: SupervisedChild) -> bool:
-        """Whether it is started once more though the experiment has ended: it had not finished when it died."""
+        """Return whether it is started once more though the experiment has ended: it had not finished when it died."""
         return self._has_just_ended and child.spec.beats and child.spec.role is Role.COMPONENT and not child.rescued
 
     @property
     def _has_just_ended(self) -> bool:
-        """Whether the experiment itself has ended, and nobody has been asked to leave."""
+        """True while the experiment itself has ended, and nobody has been asked to leave."""
         ending = self.ending
         return ending is not None and ending.why is EndReason.EXPERIMENT_ENDED and ending.last is None
 
@@ -304,7 +304,7 @@ class SupervisorCore:
                 self._command(ProcessAction.KILL, child)
 
     def _unfinished(self, ending: RunEnd) -> list[str]:
-        """The names of those with something to finish; a translator may have after it was asked to end: the tip."""
+        """Return who has something to finish; a translator may have it after it was asked to end: the tip."""
         now_s, is_asked = self._now_s, ending.last is not None
         has_ended = ending.why is EndReason.EXPERIMENT_ENDED
         # a scheduler on another computer may be there

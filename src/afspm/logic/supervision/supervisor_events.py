@@ -100,7 +100,7 @@ SupervisorEvent = (
 
 
 class ProcessAction(Enum):
-    """What the supervisor does to a process."""
+    """An action of the supervisor on a process."""
 
     START = auto()
     """`ProcessStarted` or `StartFailed` follows."""

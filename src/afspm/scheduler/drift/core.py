@@ -29,6 +29,7 @@ from afspm.model import (
     ControlRequest,
     ControlState,
     Frame,
+    LoggedPacket,
     Packet,
     PacketHeader,
     Parameter,
@@ -166,10 +167,10 @@ class DriftCore:
             self._gate.restore(kept["scans"])
             self._channel = self._settings.channel or kept["channel"]
 
-    def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None:
+    def restore_cache(self, packets: Iterable[LoggedPacket]) -> None:
         entries = list(packets)
         self.core.restore_cache(entries)
-        for packet, source_ns in entries:
+        for packet, source_ns, _ in entries:
             if packet.envelope == "ScopeStateMsg":
                 self._note_state(packet.payload, packet.time_ns if source_ns is None else source_ns)
 
@@ -177,7 +178,7 @@ class DriftCore:
     def leave_at_s(self) -> float:
         return self.core.leave_at_s
 
-    def cached(self) -> Iterable[tuple[Packet, int | None]]:
+    def cached(self) -> Iterable[LoggedPacket]:
         return self.core.cached()
 
     @property

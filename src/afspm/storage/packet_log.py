@@ -1,0 +1,240 @@
+"""The packet log: everything that the scheduler publishes, appended before it is published.
+
+It is what a run knows for certain. The cache of a restarted scheduler is read from it, the recorder follows it, and the
+record (HDF5 files and an SQLite journal) derives from it. The system takes a packet at once, which outlives a kill of
+all processes; a moment later it is on the disk, which outlives a power cut (see `disk`).
+
+The log is bounded. The recorder commits the position up to which everything is in the record and on the disk; segments
+before it are written over, after what the scheduler still caches of them is appended anew.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import deque
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from afspm.model import LoggedPacket
+from afspm.storage.atomic import replace_file
+from afspm.storage.disk import SYNCER
+from afspm.storage.segment import SUFFIX, SegmentWriter, number_of, path_of, read_segment, segments
+
+LOG_FOLDER = "packets"
+"""In the state folder of a run."""
+COMMITTED_FILE = "recorded"
+"""In the log's folder, if the run is recorded: the position up to which it is."""
+SEGMENT_BYTES = 16 << 20
+CAPACITY_BYTES = 64 << 20
+"""The log is not made smaller than this; nor than twice what is cached."""
+MOST_UNRECORDED_BYTES = 1 << 30
+SPARE_BYTES = 256 << 20
+"""So much room is kept to be written over: what a flood takes until it is recorded."""
+SYNCED_WITHIN_S = 5.0
+_SPARE_SUFFIX = ".spare"
+
+
+class Position(NamedTuple):
+    """A place between two packets of a log."""
+
+    segment: int
+    offset: int
+
+
+START = Position(0, 0)
+
+
+class PacketLog:
+    """Appends packets. One process writes a log; any number read it meanwhile.
+
+    Args:
+        folder: made when the first packet is appended.
+        most_unrecorded_bytes: how much may wait for the recorder; beyond it the oldest is given up.
+
+    Attributes:
+        has_grown: a segment was filled since the last `clean`.
+    """
+
+    def __init__(self, folder: Path, *, most_unrecorded_bytes: int = MOST_UNRECORDED_BYTES) -> None:
+        self._folder = folder
+        self._most_unrecorded_bytes = most_unrecorded_bytes
+        self._segment: SegmentWriter | None = None
+        self._full = deque((path, path.stat().st_size) for path in segments(folder))
+        self._spare = sorted(folder.glob(f"*{_SPARE_SUFFIX}"))
+        used = [number_of(path) for path in (*self._spare, *(path for path, _ in self._full))]
+        self._number = max([*used, (committed(folder) or START).segment])
+        self.has_grown = True
+
+    def append(self, entry: LoggedPacket) -> None:
+        """Write a packet behind the others; when this returns it outlives a kill.
+
+        Raises:
+            OSError: the disk is full …; nothing of it is in the log then.
+        """
+        if self._segment is not None and self._segment.size >= SEGMENT_BYTES:
+            self.close()
+        segment = self._segment = self._segment or self._opened()
+        try:
+            segment.append(entry)
+        except OSError:
+            if not segment.take_back():
+                self.close()  # half a packet at the end of a segment is no harm, in the middle it would be
+            raise
+
+    def clean(self, cached: Iterable[LoggedPacket]) -> bool:
+        """Free the oldest segments while the log is too large. What is `cached` stays in the log.
+
+        Returns:
+            False: packets were given up that the recorder has not had.
+
+        Raises:
+            OSError: the disk is full, or does not sync.
+        """
+        self.has_grown = False
+        live = {entry.packet.time_ns: len(entry.packet.payload) for entry in cached}
+        limit = max(CAPACITY_BYTES, 2 * sum(live.values()))
+        recorded = committed(self._folder)
+        all_recorded = True
+        while self._full and self._size > limit:
+            path, _ = self._full[0]
+            is_recorded = recorded is None or number_of(path) < recorded.segment
+            if not is_recorded and self._size <= limit + self._most_unrecorded_bytes:
+                break
+            all_recorded = all_recorded and is_recorded
+            self._carry_forward(path, live)
+            self._full.popleft()
+            self._free(path)
+        return all_recorded
+
+    def close(self) -> None:
+        """Finish the segment that is being written. Safe to repeat; `append` begins another."""
+        if self._segment is not None:
+            self._full.append((self._segment.path, self._segment.size))
+            self._segment.close()
+            self._segment = None
+            self.has_grown = True
+
+    @property
+    def _size(self) -> int:
+        return (self._segment.size if self._segment else 0) + sum(size for _, size in self._full)
+
+    def _opened(self) -> SegmentWriter:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._number += 1
+        path = path_of(self._folder, self._number)
+        if self._spare:
+            with contextlib.suppress(OSError):  # a reader has it open, where such files can't be renamed
+                return SegmentWriter(path, self._spare.pop())
+        return SegmentWriter(path)
+
+    def _carry_forward(self, path: Path, live: dict[int | None, int]) -> None:
+        carried = [entry for entry, _ in read_segment(path) if entry.history and entry.packet.time_ns in live]
+        for entry in carried:
+            self.append(entry)
+        if carried:
+            SYNCER.now(SYNCED_WITHIN_S)  # before the only other copy is written over
+
+    def _free(self, path: Path) -> None:
+        with contextlib.suppress(OSError):
+            self._spare.append(path.replace(path.with_suffix(_SPARE_SUFFIX)))
+        if len(self._spare) > SPARE_BYTES // SEGMENT_BYTES:
+            with contextlib.suppress(OSError):
+                self._spare.pop(0).unlink()
+
+
+class LogReader:
+    """Follows a log while it is written.
+
+    Attributes:
+        position: behind the last packet that was read.
+        newest: the number of the segment that was written when the log was read last.
+    """
+
+    def __init__(self, folder: Path, position: Position = START) -> None:
+        self.position = position
+        self.newest = position.segment
+        self._folder = folder
+
+    def read(self, most_bytes: int) -> list[tuple[LoggedPacket, Position]]:
+        """Return the packets that came since, up to about so many bytes, each with the position behind it.
+
+        Raises:
+            OSError: the log can't be read.
+        """
+        found: list[tuple[LoggedPacket, Position]] = []
+        segment, start = self.position
+        while True:
+            later = [number for number in map(number_of, segments(self._folder)) if number > segment]
+            self.newest = max(later, default=segment)
+            for entry, offset in read_segment(path_of(self._folder, segment), start):
+                found.append((entry, Position(segment, offset)))
+                most_bytes -= len(entry.packet.payload)
+                if most_bytes <= 0:
+                    break
+            # a segment that had a successor before it was read to its end does not grow any more
+            if most_bytes <= 0 or not later:
+                self.position = found[-1][1] if found else Position(segment, start)
+                return found
+            segment, start = later[0], 0
+
+
+def log_folder(state_dir: Path) -> Path:
+    """Return where the packet log of a run is."""
+    return state_dir / LOG_FOLDER
+
+
+def logged_packets(folder: Path) -> Iterator[LoggedPacket]:
+    """Yield all packets of a log in the order in which they were appended; those carried forward come again."""
+    for path in segments(folder):
+        yield from (entry for entry, _ in read_segment(path))
+
+
+def cached_packets(folder: Path) -> list[LoggedPacket]:
+    """Return what the scheduler's cache held when the log was written last, oldest first."""
+    kept: dict[str, dict[int, LoggedPacket]] = {}
+    for entry in logged_packets(folder):
+        if entry.history:
+            of_envelope = kept.setdefault(entry.packet.envelope, {})
+            of_envelope[entry.packet.time_ns or 0] = entry
+            while len(of_envelope) > entry.history:
+                del of_envelope[min(of_envelope)]
+    entries = (entry for of_envelope in kept.values() for entry in of_envelope.values())
+    return sorted(entries, key=lambda entry: entry.packet.time_ns or 0)
+
+
+def expect_recorder(folder: Path) -> None:
+    """Have the log keep packets until a recorder has committed them. Raises OSError."""
+    if committed(folder) is None:
+        folder.mkdir(parents=True, exist_ok=True)
+        commit(folder, START)
+
+
+def commit(folder: Path, position: Position) -> None:
+    """Say that everything before a position is recorded, and on the disk. Raises OSError."""
+    text = f"{position.segment} {position.offset}\n"
+    replace_file(folder / COMMITTED_FILE, [text.encode("ascii")], synced=False)
+
+
+def committed(folder: Path) -> Position | None:
+    """Return the position up to which everything is recorded; None: there is no recorder."""
+    try:
+        segment, offset = (folder / COMMITTED_FILE).read_text(encoding="ascii").split()
+        return Position(int(segment), int(offset))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError):
+        return START
+
+
+def discard_if_recorded(folder: Path) -> None:
+    """Remove the log of an experiment that has ended, unless the recorder has not had all of it."""
+    position = committed(folder)
+    if position is not None and LogReader(folder, position).read(1):
+        return
+    for pattern in (f"*{SUFFIX}", f"*{_SPARE_SUFFIX}", COMMITTED_FILE):
+        for file in folder.glob(pattern):
+            with contextlib.suppress(OSError):
+                file.unlink()
+    with contextlib.suppress(OSError):
+        folder.rmdir()

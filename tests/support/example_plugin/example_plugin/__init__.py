@@ -1,0 +1,1 @@
+"""A laboratory's own package, which joins afspm by being installed."""

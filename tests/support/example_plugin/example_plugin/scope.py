@@ -1,0 +1,9 @@
+"""A driver: the simulated microscope under another name."""
+
+from __future__ import annotations
+
+from afspm.microscopes.simulator import Simulator
+
+
+class ExampleScope(Simulator):
+    """A microscope of the laboratory."""

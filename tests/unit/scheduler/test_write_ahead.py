@@ -1,0 +1,191 @@
+"""What the scheduler writes before it tells: on a disk that works, is full, hangs, or loses its power."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from afspm.clock import ExperimentClock
+from afspm.logic.state import SavedState
+from afspm.model import LoggedPacket, Packet
+from afspm.scheduler.state_file import StateFile
+from afspm.scheduler.write_ahead import WriteAhead
+from afspm.storage import disk, packet_log
+from afspm.storage.packet_log import PacketLog, cached_packets, commit, expect_recorder, logged_packets
+
+STATE = SavedState(last_ns=7)
+DEADLINE_S = 20.0
+
+
+def own(time_ns: int, envelope: str = "JournalEntries", size: int = 1) -> LoggedPacket:
+    return LoggedPacket(Packet(envelope, b"x" * size, time_ns), None, 1)
+
+
+class Bench:
+    """A scheduler's disk: what is written with it, and what it caches."""
+
+    def __init__(self, folder: Path) -> None:
+        self.packets = folder / "packets"
+        self.cached: list[LoggedPacket] = []
+        self.state = StateFile(folder / "scheduler.json", logging.getLogger("scheduler"))
+        self.writes = WriteAhead(
+            self.state, PacketLog(self.packets), lambda: list(self.cached), logging.getLogger("scheduler")
+        )
+
+    def publish(self, *entries: LoggedPacket) -> None:
+        self.cached += entries
+        self.writes.write(None, entries)
+
+    def logged(self) -> list[int]:
+        return [entry.packet.time_ns or 0 for entry in logged_packets(self.packets)]
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    made = Bench(tmp_path)
+    yield made
+    made.writes.close()
+
+
+def test_what_was_written_is_there_at_once(bench: Bench) -> None:
+    bench.publish(own(1))
+    bench.writes.write(STATE, [own(2, "ControlState")])
+    assert cached_packets(bench.packets) == [own(1), own(2, "ControlState")]
+    assert bench.state.load() == STATE
+
+
+class FullDisk:
+    """No packet can be appended while it `is_full`."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.is_full = True
+        append = PacketLog.append
+
+        def appended(log: PacketLog, entry: LoggedPacket) -> None:
+            if self.is_full:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            append(log, entry)
+
+        monkeypatch.setattr(PacketLog, "append", appended)
+
+
+def test_what_found_no_room_is_written_before_what_comes_once_there_is_room(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    bench.publish(own(1))
+    full = FullDisk(monkeypatch)
+    bench.publish(own(2), own(3))
+    bench.publish(own(4))
+    del bench.cached[1]  # it is superseded meanwhile
+    assert bench.logged() == [1]
+    full.is_full = False
+    bench.publish(own(5))
+    bench.publish(own(6))
+    assert bench.logged() == [1, 3, 4, 5, 6]
+    assert [record.levelname for record in caplog.records] == ["CRITICAL", "INFO"], "told once, and that it is over"
+
+
+def test_a_disk_that_hangs_is_not_waited_for_and_all_is_written_once_it_answers(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    answers = threading.Event()
+    append = PacketLog.append
+
+    def hangs(log: PacketLog, entry: LoggedPacket) -> None:
+        answers.wait(DEADLINE_S)
+        append(log, entry)
+
+    monkeypatch.setattr(PacketLog, "append", hangs)
+    clock = ExperimentClock.real()
+    began_s = clock.monotonic_s()
+    for time_ns in range(1, 20):
+        bench.publish(own(time_ns))
+    assert clock.monotonic_s() - began_s < 10 * disk.DEADLINE_S
+    answers.set()
+    bench.writes.close()
+    assert bench.logged() == list(range(1, 20))
+    assert "has not answered" in caplog.text
+
+
+def test_what_was_too_much_for_a_disk_that_hangs_is_written_as_far_as_it_is_cached(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers = threading.Event()
+    append = PacketLog.append
+
+    def hangs(log: PacketLog, entry: LoggedPacket) -> None:
+        answers.wait(DEADLINE_S)
+        append(log, entry)
+
+    monkeypatch.setattr(PacketLog, "append", hangs)
+    bench.writes._disk._most_bytes = 1000
+    for time_ns in range(1, 8):
+        bench.publish(own(time_ns, size=300))
+    answers.set()
+    assert bench.writes._disk.submit(lambda: None).done.acquire(timeout=DEADLINE_S)
+    bench.publish(own(8))
+    assert bench.logged() == list(range(1, 9))
+
+
+def test_what_is_cached_survives_the_log_being_written_over(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(packet_log, "SEGMENT_BYTES", 1000)
+    monkeypatch.setattr(packet_log, "CAPACITY_BYTES", 3000)
+    bench.publish(own(1, "ControlState"))
+    for time_ns in range(2, 100):
+        scan = LoggedPacket(Packet("Scan2d", b"s" * 300, time_ns), time_ns, 1)
+        bench.cached[1:] = [scan]
+        bench.writes.write(None, [scan])
+    bench.writes.close()
+    assert cached_packets(bench.packets) == [own(1, "ControlState"), scan]
+    assert len(bench.logged()) < 30
+
+
+def test_it_is_told_when_the_recorder_does_not_keep_up(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    monkeypatch.setattr(packet_log, "SEGMENT_BYTES", 1000)
+    monkeypatch.setattr(packet_log, "CAPACITY_BYTES", 2000)
+    expect_recorder(bench.packets)
+    log = PacketLog(bench.packets, most_unrecorded_bytes=2000)
+    monkeypatch.setattr(bench.writes, "_log", log)
+    for time_ns in range(1, 40):
+        bench.writes.write(None, [own(time_ns, size=300)])
+    assert bench.writes._disk.submit(lambda: None).done.acquire(timeout=DEADLINE_S)
+    assert "does not keep up" in caplog.text
+    commit(bench.packets, packet_log.Position(10**6, 0))
+    for time_ns in range(40, 60):
+        bench.writes.write(None, [own(time_ns, size=300)])
+    bench.writes.close()
+    assert caplog.records[-1].levelname == "INFO", "it is told that it does again"
+
+
+@pytest.mark.parametrize("steps", range(3))
+def test_a_packet_is_logged_only_after_the_state_that_it_tells_of(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, steps: int
+) -> None:
+    done: list[str] = []
+
+    def until_cut(name: str, do: Callable[..., Any]) -> Callable[..., Any]:
+        def step(*arguments: Any, **named: Any) -> Any:
+            if len(done) == steps:
+                raise OSError("the power is gone")
+            done.append(name)
+            return do(*arguments, **named)
+
+        return step
+
+    monkeypatch.setattr(StateFile, "save", until_cut("state", StateFile.save))
+    monkeypatch.setattr(PacketLog, "append", until_cut("packet", PacketLog.append))
+    bench.writes.write(STATE, [own(1)])
+    assert done == ["state", "packet"][:steps]
+    assert bool(bench.state.load()) == (steps > 0)
+    assert bench.logged() == [1] * (steps > 1)
