@@ -22,7 +22,7 @@ from afspm.microscopes.simulator.faults import Fault
 from afspm.microscopes.simulator.instrument import PanelEvent
 from afspm.simulation.drift import Relaxation
 from afspm.simulation.surfaces import KINDS
-from afspm.simulation.world_settings import WorldSettings
+from afspm.simulation.world import WorldSettings
 from afspm.units import Unit
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -74,7 +74,8 @@ def simulator_page() -> str:
 
 def _table_page(title: str, cls: type) -> str:
     """A table of settings that is a dataclass in the code."""
-    text, meanings = _docstring(cls, "Attributes")
+    told = [_docstring(one, "Attributes") for one in cls.__mro__ if dataclasses.is_dataclass(one)]
+    text, meanings = told[0][0], {name: meaning for _, meanings in reversed(told) for name, meaning in meanings.items()}
     lines = [f"### {title}", "", text, "", "| key | default | meaning |", "| --- | --- | --- |"]
     within = []
     for one in dataclasses.fields(cls):

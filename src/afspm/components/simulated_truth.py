@@ -39,8 +39,8 @@ def true_drift(run_dir: Path, scans: Sequence[DriftScan]) -> Array | None:
     time_s = np.array([scan.mid_s for scan in scans])
     tip_m = np.array([scan.region.center_m for scan in scans])
     followed_m = np.stack([np.interp(time_s, followed[:, 0], followed[:, axis]) for axis in (1, 2)], axis=-1)
-    on_sample_m = world.to_sample(tip_m + followed_m, time_s)
-    at_first_m: Array = world.to_tip(on_sample_m, time_s[0]) - followed_m[0]
+    on_sample_m = world.sample.to_sample(tip_m + followed_m, time_s)
+    at_first_m: Array = world.sample.to_tip(on_sample_m, time_s[0]) - followed_m[0]
     return tip_m - at_first_m
 
 

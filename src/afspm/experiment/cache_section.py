@@ -15,7 +15,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field
 
@@ -25,6 +25,7 @@ from afspm.experiment.document import Document
 from afspm.experiment.known import WiringClass
 from afspm.experiment.published import length_m, wire_of
 from afspm.experiment.sections import Section, parse
+from afspm.experiment.toml_lines import Settings, Table
 from afspm.logic.envelopes import CacheRule, Envelopes
 from afspm.model import PacketHeader
 from afspm.units import Length
@@ -71,13 +72,13 @@ class CacheSettings:
         """The beginnings of the rules' envelopes, as far as they are fixed."""
         return tuple(re.split(r"[{}]", rule.envelope)[0] for rule in self.rules if rule.envelope)
 
-    def to_settings(self) -> dict[str, Any]:
+    def to_settings(self) -> Settings:
         """In JSON's types; `CacheRule` by its fields."""
         rules = [{k: v for k, v in vars(rule).items() if v is not None} for rule in self.rules]
         return {"rules": rules, "mapping": self.mapping, "history": dict(self.history)}
 
 
-def read(table: Mapping[str, Any], logic: Mapping[str, Any] | None, document: Document) -> CacheSettings:
+def read(table: Table, logic: Table | None, document: Document) -> CacheSettings:
     """Return the section, with what the paper's form says of the cache where the section says nothing.
 
     Args:
@@ -118,12 +119,12 @@ def _check_mapping(name: str, document: Document) -> None:
             return
 
 
-def _published_history(logic: Mapping[str, Any]) -> dict[str, int]:
+def _published_history(logic: Table) -> dict[str, int]:
     count = logic.get("default_scan_history")
     return {"Scan2d": count} if isinstance(count, int) and count > 0 else {}
 
 
-def _published_rules(logic: Mapping[str, Any]) -> list[CacheRule]:
+def _published_rules(logic: Table) -> list[CacheRule]:
     """Histories by size, [[width, height], count]; a number is in nm, as in the envelopes' names."""
     histories = logic.get("proto_with_history_list")
     if wire_of(histories) is not WiringClass.HISTORIES or not isinstance(histories, Mapping):

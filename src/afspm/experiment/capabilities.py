@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from afspm.errors import AfspmError
+from afspm.experiment.toml_lines import Table
 from afspm.model import Parameter, names
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ class MicroscopeCapabilities:
     sets: Mapping[str, tuple[Parameter, ...]]
 
 
-def of_class(microscope: type, settings: Mapping[str, Any]) -> MicroscopeCapabilities | None:
+def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None:
     """Return the abilities of a `Driver` class with these settings; None where the class does not tell."""
     from afspm.translator.driver import Driver
 

@@ -8,7 +8,7 @@ import importlib.util
 import inspect
 import sys
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from afspm.experiment.findings import closest, nearest
 from afspm.experiment.known import SHORT_NAME_PACKAGES
 from afspm.experiment.parts import DECLARED_KEYS
 from afspm.experiment.published import GUIDE
+from afspm.experiment.toml_lines import Table
 from afspm.model import Role
 
 # By where they come from: a class of the user is recognised by what it is derived from.
@@ -46,7 +47,7 @@ class ComponentDeclaration:
         )
 
     @classmethod
-    def of_table(cls, table: Mapping[str, Any]) -> ComponentDeclaration:
+    def of_table(cls, table: Table) -> ComponentDeclaration:
         return cls(**{key: names for key in DECLARED_KEYS if (names := _names(table.get(key))) is not None})
 
 

@@ -8,10 +8,10 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from afspm.experiment import toml_lines
 from afspm.experiment.findings import Findings, SourceLocation
+from afspm.experiment.toml_lines import Settings
 
 
 @dataclass
@@ -26,7 +26,7 @@ class Document:
     """
 
     files: tuple[Path, ...]
-    data: dict[str, Any] = field(default_factory=dict)
+    data: Settings = field(default_factory=dict)
     places: dict[toml_lines.Path, SourceLocation] = field(default_factory=dict)
     homes: tuple[Path, ...] = ()
     is_whole: bool = True
@@ -82,7 +82,7 @@ def _text(file: Path, findings: Findings) -> str | None:
     return None
 
 
-def _parse(text: str, file: Path, findings: Findings) -> dict[str, Any] | None:
+def _parse(text: str, file: Path, findings: Findings) -> Settings | None:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -124,13 +124,13 @@ def _habit(what: str, written: str) -> str:
     return next((hint for said, line, hint in _HABITS if what.startswith(said) and re.search(line, written)), "")
 
 
-def _lay_over(document: Document, data: dict[str, Any], where: dict[toml_lines.Path, SourceLocation]) -> None:
+def _lay_over(document: Document, data: Settings, where: dict[toml_lines.Path, SourceLocation]) -> None:
     _merge(document.data, data, (), document.places)
     document.places.update(where)
 
 
 def _merge(
-    below: dict[str, Any], above: dict[str, Any], path: toml_lines.Path, places: dict[toml_lines.Path, SourceLocation]
+    below: Settings, above: Settings, path: toml_lines.Path, places: dict[toml_lines.Path, SourceLocation]
 ) -> None:
     for key, value in above.items():
         here = (*path, key)

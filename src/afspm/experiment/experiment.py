@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
@@ -14,6 +14,7 @@ from afspm.experiment import document as documents
 from afspm.experiment import parts as sorting
 from afspm.experiment.findings import Finding
 from afspm.experiment.implied_parts import RECORDS
+from afspm.experiment.toml_lines import Table
 from afspm.launch import Launch
 from afspm.model import Role
 
@@ -120,7 +121,7 @@ class Experiment:
         take_address: Callable[[], str],
         only: Collection[str] = (),
         without: Collection[str] = (),
-        clock: Mapping[str, Any] | None = None,
+        clock: Table | None = None,
         run: str = "",
         simulated: bool = False,
         run_dir: str = "",

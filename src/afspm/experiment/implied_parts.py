@@ -6,11 +6,12 @@ import importlib.util
 import shutil
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from afspm.components.notifications import END, OCCASIONS, Targets, address
 from afspm.errors import ConfigError
 from afspm.experiment.parts import ExperimentPart
+from afspm.experiment.toml_lines import Settings
 from afspm.model import Role
 
 if TYPE_CHECKING:
@@ -46,13 +47,13 @@ def notifier(resolved: ResolvedExperiment) -> ExperimentPart | None:
     if not is_wanted or resolved.saying(NOTIFIES) or not resolved.with_role(Role.SCHEDULER):
         return None
     wanted = targets(section, resolved.document.folders[0])
-    settings: dict[str, Any] = {"program": list(wanted.command)} if wanted.command else {}
+    settings: Settings = {"program": list(wanted.command)} if wanted.command else {}
     settings |= {"webhook": wanted.webhook} if wanted.webhook else {}
     settings |= {"on": list(section.on), "unsolved_after": section.unsolved_after, "folder": wanted.folder}
     return _implied(resolved, NOTIFIER, settings, "notify")
 
 
-def _implied(resolved: ResolvedExperiment, name: str, settings: dict[str, Any], section: str) -> ExperimentPart:
+def _implied(resolved: ResolvedExperiment, name: str, settings: Settings, section: str) -> ExperimentPart:
     free_name, place = resolved.parts.free_name(name), resolved.document.place(section)
     return ExperimentPart(free_name, name.capitalize(), (), settings, {}, place, implied=True)
 

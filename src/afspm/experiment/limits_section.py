@@ -31,6 +31,7 @@ from afspm.errors import AfspmError
 from afspm.experiment.document import Document
 from afspm.experiment.findings import nearest
 from afspm.experiment.sections import Section, parse, report
+from afspm.experiment.toml_lines import Settings, Table
 from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.model import Parameter, Region, names
 from afspm.units import Angle, Duration, Length, parse_quantity, si
@@ -99,7 +100,7 @@ class LimitsReader:
     def _known_actions(self) -> frozenset[str]:
         return frozenset((*names.BASE_ACTIONS, *names.EXTENSION_ACTIONS)) if self.actions is None else self.actions
 
-    def read(self, table: Mapping[str, Any]) -> ExperimentLimits:
+    def read(self, table: Table) -> ExperimentLimits:
         """Return the limits; what is wrong is reported and left out."""
         own = {key: value for key, value in table.items() if key in LimitsSection.model_fields}
         whole = parse(LimitsSection, "limits", own, self.document)
@@ -233,14 +234,14 @@ def _rate(value: Quantity, unit: str) -> float:
     return si(f"{number} {over}", unit) / si(f"1 {under}", "s")
 
 
-def to_settings(limits: ExperimentLimits) -> dict[str, Any]:
+def to_settings(limits: ExperimentLimits) -> Settings:
     """As the scheduler process gets them, in JSON's types; `Limit` and `Region` by their fields."""
 
-    def plain(limit: Limit) -> dict[str, Any]:
+    def plain(limit: Limit) -> Settings:
         fields = {key: value for key, value in asdict(limit).items() if value is not None}
         return fields | ({"only": sorted(limit.only)} if limit.only is not None else {})
 
-    settings: dict[str, Any] = {
+    settings: Settings = {
         "parameters": {name: plain(limit) for name, limit in limits.parameters.items()},
         "actions": {name: plain(limit) for name, limit in limits.actions.items()},
         "most_pixels": limits.most_pixels,

@@ -13,7 +13,7 @@ from afspm.experiment.document import Document
 from afspm.experiment.findings import SourceLocation, closest, nearest
 from afspm.experiment.known import WIRE_KEYS
 from afspm.experiment.published import PublishedSetting, wire_of
-from afspm.experiment.toml_lines import Path
+from afspm.experiment.toml_lines import Path, Settings, Table
 from afspm.experiment.toml_writer import value as toml
 
 SECTIONS: Final = ("clock", "control", "limits", "problems", "cache", "security", "restart", "record", "notify")
@@ -44,8 +44,8 @@ class ExperimentPart:
     name: str
     class_path: str
     command: tuple[str, ...]
-    settings: Mapping[str, Any]
-    own: Mapping[str, Any]
+    settings: Table
+    own: Table
     place: SourceLocation
     implied: bool = False
 
@@ -54,13 +54,13 @@ class ExperimentPart:
 class ExperimentParts:
     """The sorted and expanded file."""
 
-    variables: dict[str, Any] = field(default_factory=dict)
-    sections: dict[str, dict[str, Any]] = field(default_factory=dict)
-    intermediaries: dict[str, dict[str, Any]] = field(default_factory=dict)
+    variables: Settings = field(default_factory=dict)
+    sections: dict[str, Settings] = field(default_factory=dict)
+    intermediaries: dict[str, Settings] = field(default_factory=dict)
     components: list[ExperimentPart] = field(default_factory=list)
     became: dict[Path, str] = field(default_factory=dict)
     """Of each line of the published form, where it is ours under another name or is no more."""
-    instead: dict[str, dict[str, Any]] = field(default_factory=dict)
+    instead: dict[str, Settings] = field(default_factory=dict)
     """Tables of components that have no counterpart, by their names, as they are in the file."""
 
     def free_name(self, wanted: str) -> str:
@@ -74,7 +74,7 @@ class ExperimentParts:
 def sort(document: Document) -> ExperimentParts:
     """Sort and expand; report what can't be part of an experiment."""
     parts = ExperimentParts()
-    raw_components: dict[str, dict[str, Any]] = {}
+    raw_components: dict[str, Settings] = {}
     for key, value in document.data.items():
         if not isinstance(value, dict):
             parts.variables[key] = value
@@ -102,14 +102,14 @@ def sort(document: Document) -> ExperimentParts:
     return parts
 
 
-def _is_component(name: str, table: dict[str, Any], document: Document) -> bool:
+def _is_component(name: str, table: Settings, document: Document) -> bool:
     marked = table.get("component", False)
     if not isinstance(marked, bool):
         document.error(f"`component` of [{name}] is {marked!r}, not true or false", name, "component")
     return marked is True
 
 
-def _component(name: str, table: dict[str, Any], document: Document) -> ExperimentPart | None:
+def _component(name: str, table: Settings, document: Document) -> ExperimentPart | None:
     class_path, command = table.get("class", ""), table.get("command", ())
     if not isinstance(class_path, str):
         document.error(f"`class` of [{name}] is not text", name, "class", hint='class = "module.Name"')
@@ -169,9 +169,7 @@ class _FromPublished:
             self._put(settings, ours.settings[key], (part.name, key), table)
         return replace(part, class_path=ours.ours, settings=settings)
 
-    def _put(
-        self, settings: dict[str, Any], setting: PublishedSetting, here: tuple[str, str], table: Mapping[str, Any]
-    ) -> None:
+    def _put(self, settings: Settings, setting: PublishedSetting, here: tuple[str, str], table: Table) -> None:
         value = table[here[1]]
         try:
             becomes = setting.becomes(self.channels.get(value, value) if here[1] == "channel_id" else value, table)
@@ -184,7 +182,7 @@ class _FromPublished:
         self.parts.became[here] = ", ".join(f"{name} = {toml(one)}" for name, one in becomes.items()) or setting.why
 
 
-def _misspelt(table: Mapping[str, Any], wanted: tuple[str, ...]) -> str:
+def _misspelt(table: Table, wanted: tuple[str, ...]) -> str:
     for key in table:
         near = closest(key, wanted, 0.7)
         if near:
@@ -222,7 +220,7 @@ class VariableReferences:
         used: the keys that were referred to.
     """
 
-    def __init__(self, document: Document, variables: Mapping[str, Any]) -> None:
+    def __init__(self, document: Document, variables: Table) -> None:
         self._document = document
         self._variables = variables
         self.used: set[str] = set()

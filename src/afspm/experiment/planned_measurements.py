@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
+from afspm.experiment.toml_lines import Table
 from afspm.logic.limit_checker import LimitChecker
 from afspm.logic.limits import ExperimentLimits
 from afspm.model import ControlRequest, ProbePosition, Region, Request, ScanParameters
@@ -30,7 +29,7 @@ class PlannedMeasurements:
     needs_parameters: tuple[str, ...] = ()
 
 
-def plan_of(component: type, settings: Mapping[str, Any]) -> PlannedMeasurements | None:
+def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
     """Return the plan of a component with these settings; None where it has none, or none that can be known.
 
     Raises:

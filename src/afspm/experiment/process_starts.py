@@ -13,6 +13,7 @@ from afspm.experiment import limits_section
 from afspm.experiment.experiment import ProcessStart
 from afspm.experiment.findings import nearest
 from afspm.experiment.known import DASHBOARD, DASHBOARD_PASSWORD
+from afspm.experiment.toml_lines import Settings
 from afspm.experiment.toml_writer import SECRET
 from afspm.experiment.wiring import ProcessSockets
 from afspm.launch import Launch, Sockets
@@ -221,7 +222,7 @@ _OF_OTHERS = {"request_timeout", "request_retries", "solved_by_hand"}
 _IN_SECONDS = ("lease", "grace", "malfunction_after")
 
 
-def _for_scheduler(resolved: ResolvedExperiment) -> dict[str, Any]:
+def _for_scheduler(resolved: ResolvedExperiment) -> Settings:
     """Return the sections that the scheduler enforces, as arguments of its constructor. Times in s, lengths in m."""
     dumped = resolved.sections.control.model_dump(mode="json", exclude=_OF_OTHERS)
     control = {f"{key}_s" if key in _IN_SECONDS else key: value for key, value in dumped.items()}

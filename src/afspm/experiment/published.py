@@ -9,6 +9,7 @@ from typing import Any, Final
 from afspm import units
 from afspm.errors import AfspmError, InvalidValue
 from afspm.experiment.known import PUBLISHED_WIRES, SHORT_WIRE_CLASSES, WIRE_CLASSES, WiringClass
+from afspm.experiment.toml_lines import Settings, Table
 from afspm.logic.envelopes import default_envelope
 from afspm.model import PacketHeader
 
@@ -18,7 +19,7 @@ GUIDE: Final = "see docs/how-to/from-the-published-implementation.md"
 CHANNEL: Final = "Height"
 """The channel of the simulated microscope that stands for the one that a published picture was given."""
 
-Becomes = Callable[[Any, Mapping[str, Any]], dict[str, Any]]
+Becomes = Callable[[Any, Table], Settings]
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ def evaluated(value: Any, channels: Mapping[str, str]) -> Any:
     return {key: evaluated(item, channels) for key, item in with_channels(value, channels).items()}
 
 
-def with_channels(table: Mapping[str, Any], channels: Mapping[str, str]) -> dict[str, Any]:
+def with_channels(table: Table, channels: Mapping[str, str]) -> Settings:
     """Return the table of a published function with the names that its channels have here; others as they are."""
     renamed = dict(table)
     match wire_of(renamed):
@@ -78,7 +79,7 @@ def with_channels(table: Mapping[str, Any], channels: Mapping[str, str]) -> dict
     return renamed
 
 
-def envelope(table: Mapping[str, Any]) -> Any:
+def envelope(table: Table) -> Any:
     """Return the envelope that a published function makes: create_spec_envelope, or create_roi_scan_envelope.
 
     A size without a unit is in nm, as in the envelopes themselves. What makes no envelope is returned as it is.
@@ -97,13 +98,13 @@ def length_m(value: Any) -> float:
     return units.si(value, "m") if isinstance(value, str) else float(value) * 1e-9
 
 
-def renamed_channels(components: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+def renamed_channels(components: Mapping[str, Table]) -> dict[str, str]:
     """Return the channels that a file gives to simulated pictures, each with its name here."""
     pictures = (table for table in components.values() if last(table) in _PICTURES)
     return {str(table["channel_id"]): CHANNEL for table in pictures if "channel_id" in table}
 
 
-def class_of(table: Mapping[str, Any]) -> PublishedClass | None:
+def class_of(table: Table) -> PublishedClass | None:
     """Return what a component's class is here; None where the class is not a published one of these."""
     name, path = last(table), str(table.get("class", ""))
     if not path.startswith(COMPONENTS) and name != "DriftImageTranslator":  # beside the file, in its samples
@@ -122,7 +123,7 @@ def without_counterpart(path: str) -> str:
     return INSTEAD.get(path.rpartition(".")[2], "") if path.startswith(COMPONENTS) else ""
 
 
-def put(settings: dict[str, Any], name: str, value: Any) -> None:
+def put(settings: Settings, name: str, value: Any) -> None:
     """Set a setting that may be within tables: put({}, "drift.channel", "Height").
 
     Raises:
@@ -137,7 +138,7 @@ def put(settings: dict[str, Any], name: str, value: Any) -> None:
         raise InvalidValue(f"it is {name} here, which is {settings[key]!r} already", hint="say one of them")
 
 
-def last(table: Mapping[str, Any]) -> str:
+def last(table: Table) -> str:
     """Return the name of a table's class, without its module."""
     return str(table.get("class", "")).rpartition(".")[2]
 
@@ -153,7 +154,7 @@ def _gone(why: str, *names: str) -> dict[str, PublishedSetting]:
 def _paper(ours: str) -> PublishedSetting:
     """Return a setting of the paper's tracker, whose queue is what the published scheduler caches."""
 
-    def becomes(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
+    def becomes(value: Any, table: Table) -> Settings:
         settings = {"drift.tracker.class": "paper", f"drift.tracker.{ours}": value}
         count = _within(table, "pubsubcache", "update_cache_kwargs", "cache_logic", "default_scan_history")
         return settings if count is None else {**settings, "drift.tracker.queue": count}
@@ -167,7 +168,7 @@ def _within(value: Any, *keys: str) -> Any:
     return value
 
 
-def _estimator(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
+def _estimator(value: Any, table: Table) -> Settings:
     """Return the published drift model: descriptor and transform, by names of enumerations."""
     given = {"descriptor_type": "BRIEF", "transform_type": "TRANSLATION", "fitting": "RANSAC"}
     given |= {key: item for key, item in dict(value).items() if key != "class"}
@@ -183,16 +184,16 @@ def _estimator(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _oldest(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
+def _oldest(value: Any, table: Table) -> Settings:
     if value is not True:
         raise InvalidValue("the paper's tracker compares with the oldest scan that fits", hint="leave the line out")
     return {}
 
 
-def _client(address: Callable[[Mapping[str, Any]], str]) -> Becomes:
+def _client(address: Callable[[Table], str]) -> Becomes:
     """The table of a client that the published translator was given: where the controller is, and its timeout."""
 
-    def becomes(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
+    def becomes(value: Any, table: Table) -> Settings:
         if not isinstance(value, Mapping):
             raise InvalidValue(f"{value!r} is no table of a client", hint='address = "…" says where the controller is')
         found = {"address": address(value)}
@@ -206,17 +207,17 @@ def _client(address: Callable[[Mapping[str, Any]], str]) -> Becomes:
 
 
 def _refused(hint: str) -> PublishedSetting:
-    def becomes(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
+    def becomes(value: Any, table: Table) -> Settings:
         raise InvalidValue("this is not taken over", hint=hint)
 
     return PublishedSetting(becomes)
 
 
-def _width(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
+def _width(value: Any, table: Table) -> Settings:
     return {"width": f"{value[0]} {table.get('physical_units', 'nm')}"} if "img_path" in table else {}
 
 
-def _velocity(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
+def _velocity(value: Any, table: Table) -> Settings:
     unit = f"{table.get('spatial_units', 'nm')}/{table.get('temporal_units', 's')}"
     x, y = (units.si(f"{part} {unit}", "m/s") for part in value)
     return {"drift.velocity_m_per_s": [x, y, 0.0]}

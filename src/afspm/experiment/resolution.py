@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from afspm.experiment.document import Document
 from afspm.experiment.findings import nearest
 from afspm.experiment.parts import EMULATED, SIMULATED, ExperimentPart, ExperimentParts
 from afspm.experiment.sections import ExperimentSections, read_sections
+from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.wiring import BoundSocket, Wiring, WiringKeys
 from afspm.logic.limits import ExperimentLimits
 from afspm.model import ProblemNames, Role
@@ -50,7 +51,7 @@ class ResolvedProcess:
     wires: WiringKeys
     role: Role = Role.COMPONENT
     declared: ComponentDeclaration = field(default_factory=ComponentDeclaration)
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: Settings = field(default_factory=dict)
     component: type | None = None
     class_path: str = ""
     wrong: frozenset[str] | None = None
@@ -336,7 +337,7 @@ def _messages(given: Any, document: Document) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _problems(table: Mapping[str, Any], document: Document) -> dict[str, int]:
+def _problems(table: Table, document: Document) -> dict[str, int]:
     """[problems]: each name with its number; a wrong one is reported and left out."""
     named: dict[str, int] = {}
     for name, number in table.items():

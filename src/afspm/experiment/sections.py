@@ -12,6 +12,7 @@ from pydantic import Field
 from afspm.errors import AfspmError
 from afspm.experiment.document import Document
 from afspm.experiment.findings import nearest
+from afspm.experiment.toml_lines import Settings
 from afspm.units import Duration
 
 
@@ -121,7 +122,7 @@ class ExperimentSections(Section):
     notify: NotifySection = NotifySection()
 
 
-def read_sections(tables: Mapping[str, dict[str, Any]], document: Document) -> ExperimentSections:
+def read_sections(tables: Mapping[str, Settings], document: Document) -> ExperimentSections:
     """Read them all; what is wrong with one is reported, and its defaults taken."""
     return ExperimentSections.model_construct(
         **{
@@ -134,7 +135,7 @@ def read_sections(tables: Mapping[str, dict[str, Any]], document: Document) -> E
 S = TypeVar("S", bound=Section)
 
 
-def parse(model: type[S], name: str, table: dict[str, Any], document: Document) -> S:
+def parse(model: type[S], name: str, table: Settings, document: Document) -> S:
     """Return the section `[name]`; what is wrong with it is reported, and its defaults returned."""
     try:
         return model.model_validate(table)

@@ -22,6 +22,7 @@ from afspm.experiment import class_loader
 from afspm.experiment.document import Document
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.sections import report
+from afspm.experiment.toml_lines import Settings, Table
 
 _ANNOTATED = ("m", "s", "rad", "V", "A", "m/s", "Hz")
 _KINDS_WITHOUT_NAME = {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
@@ -30,12 +31,12 @@ _TYPES = pydantic.ConfigDict(arbitrary_types_allowed=True)
 
 def check(
     component: type,
-    settings: Mapping[str, Any],
+    settings: Table,
     path: tuple[str, ...],
     document: Document,
     given: Collection[str] = (),
     wrong: set[str] | None = None,
-) -> dict[str, Any]:
+) -> Settings:
     """Return the settings as the process gets them: validated, in SI units, of JSON's types. Reports what is wrong.
 
     Args:
@@ -46,7 +47,7 @@ def check(
     parameters = {name: p for name, p in everything.items() if p.kind not in _KINDS_WITHOUT_NAME and name not in given}
     takes_any = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in everything.values())
     kinds = _annotations(component)
-    checked: dict[str, Any] = {}
+    checked: Settings = {}
     unknown: list[str] = []
     for name, value in settings.items():
         if name in parameters:
@@ -84,7 +85,7 @@ def default_of(component: type, name: str) -> Any:
     return None if parameter is None or parameter.default is inspect.Parameter.empty else parameter.default
 
 
-def listening(component: type, settings: Mapping[str, Any]) -> Iterator[tuple[str, str, bool]]:
+def listening(component: type, settings: Table) -> Iterator[tuple[str, str, bool]]:
     """(setting, address, whether keys guard it) of each place at which the component will listen by its settings."""
     everything = {**{name: default_of(component, name) for name in _parameters(component)}, **settings}
     for name, annotation in _annotations(component).items():
@@ -132,7 +133,7 @@ def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Documen
         return jsonable(value, folder)
 
 
-def _object(value: dict[str, Any], path: tuple[str, ...], document: Document) -> dict[str, Any]:
+def _object(value: Settings, path: tuple[str, ...], document: Document) -> Settings:
     """Return an intermediary class of the user's own: checked here, made by the process."""
     settings = {key: item for key, item in value.items() if key != "class"}
     try:
@@ -194,9 +195,9 @@ def _constructors(component: type) -> Sequence[Callable[..., Any]]:
 
 
 @cache
-def _annotations(component: type) -> Mapping[str, Any]:
+def _annotations(component: type) -> Table:
     """Of every parameter, resolved; those that can't be (imported for typing only) are left out."""
-    kinds: dict[str, Any] = {}
+    kinds: Settings = {}
     for init in reversed(_constructors(component)):
         try:
             kinds |= typing.get_type_hints(init, include_extras=True)
@@ -207,7 +208,7 @@ def _annotations(component: type) -> Mapping[str, Any]:
 
 def _report_missing(
     parameters: Mapping[str, inspect.Parameter],
-    settings: Mapping[str, Any],
+    settings: Table,
     unknown: list[str],
     path: tuple[str, ...],
     document: Document,

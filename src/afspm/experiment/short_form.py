@@ -12,6 +12,7 @@ from afspm.experiment.findings import SourceLocation
 from afspm.experiment.known import WIRE_KEYS, WiringClass
 from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.published import INSTEAD, envelope, last, wire_of
+from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.toml_writer import dumps
 from afspm.experiment.toml_writer import value as toml
 from afspm.model import Role
@@ -89,7 +90,7 @@ def _variable(name: str, value: Any, addresses: Collection[str]) -> str:
     return f"{toml(value)} stands where it is named"
 
 
-def _intermediary(table: Mapping[str, Any]) -> str:
+def _intermediary(table: Table) -> str:
     kind = wire_of(table)
     if kind in (WiringClass.ENVELOPE, WiringClass.SPECTRA):
         return f"the envelope {toml(envelope(table))}"
@@ -104,8 +105,8 @@ def _shown(path: tuple[str, ...]) -> str:
     return path[0] if len(path) == 1 else f"[{path[0]}] {path[1]}"
 
 
-def _table(part: ExperimentPart, resolved: ResolvedExperiment) -> dict[str, Any]:
-    what: dict[str, Any] = {"class": part.class_path} if part.class_path else {"command": list(part.command)}
+def _table(part: ExperimentPart, resolved: ResolvedExperiment) -> Settings:
+    what: Settings = {"class": part.class_path} if part.class_path else {"command": list(part.command)}
     own = {key: value for key, value in part.own.items() if key not in {"class", "command", *WIRE_KEYS}}
     wires = resolved.processes[part.name].wires
     if wires.envelopes is not None and "envelopes" not in own:
@@ -113,7 +114,7 @@ def _table(part: ExperimentPart, resolved: ResolvedExperiment) -> dict[str, Any]
     return {"component": True, **what, **own, **_remote(wires, resolved.processes[part.name].role), **part.settings}
 
 
-def _remote(wires: WiringKeys, role: Role) -> dict[str, Any]:
+def _remote(wires: WiringKeys, role: Role) -> Settings:
     """The addresses that other computers reach or are on: they can't be left out."""
     places = {
         "publisher": wires.publish,
@@ -122,7 +123,7 @@ def _remote(wires: WiringKeys, role: Role) -> dict[str, Any]:
     }
     if role is Role.COMPONENT:
         places["control_client"] = wires.control
-    found: dict[str, Any] = {key: at for key, at in places.items() if at is not None and _is_remote(at)}
+    found: Settings = {key: at for key, at in places.items() if at is not None and _is_remote(at)}
     if role is Role.COMPONENT and any(map(_is_remote, wires.subscribe or ())):
         found["subscriber"] = {"class": "Subscriber", "sub_url": wires.subscribe}
     return found
@@ -132,7 +133,7 @@ def _is_remote(address: str) -> bool:
     return is_address(address) and not is_local(address)
 
 
-def _sections(resolved: ResolvedExperiment) -> dict[str, dict[str, Any]]:
+def _sections(resolved: ResolvedExperiment) -> dict[str, Settings]:
     sections = {name: dict(table) for name, table in resolved.parts.sections.items()}
     wirings = [process.wires for process in resolved.processes.values()]
     timeouts = [wires.request_timeout_s for wires in wirings if wires.request_timeout_s]
@@ -146,7 +147,7 @@ def _sections(resolved: ResolvedExperiment) -> dict[str, dict[str, Any]]:
     return sections
 
 
-def _cache(resolved: ResolvedExperiment) -> dict[str, Any]:
+def _cache(resolved: ResolvedExperiment) -> Settings:
     rules = [
         {
             "message": rule.message,
@@ -167,7 +168,7 @@ def _length(length_m: float | None) -> str | None:
     return None if length_m is None else f"{length_m * 1e9:.9g} nm"
 
 
-def _instead(name: str, table: Mapping[str, Any]) -> str:
+def _instead(name: str, table: Table) -> str:
     """Return a component without counterpart: as a series of scans where its data say which, else a comment."""
     called = table.get("get_next_params") or table.get("message_received_method") or table.get("per_loop_method") or ""
     was = f"# [{name}] was {last(table)}{f', which called {called}' if called else ''}."
@@ -177,7 +178,7 @@ def _instead(name: str, table: Mapping[str, Any]) -> str:
     return f"{was}\n# It is taken for one region again and again: see that this is so.\n{dumps({name: series})}"
 
 
-def _series(table: Mapping[str, Any]) -> dict[str, Any] | None:
+def _series(table: Table) -> Settings | None:
     """ScanSeries, where what the function is given says one region, and how long to wait after each scan."""
     given = table.get("next_params_kwargs")
     data = next((one for one in given.values() if isinstance(one, Mapping)), {}) if isinstance(given, Mapping) else {}

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import count
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 Path: TypeAlias = tuple[str | int, ...]
 """A way into the parsed document: keys, and indices into arrays."""
+Table: TypeAlias = Mapping[str, Any]
+"""A table of a TOML file, to read."""
+Settings: TypeAlias = dict[str, Any]
+"""What a table has become: settings of a component, in types of TOML or JSON."""
 
 _TOKEN = re.compile(
     r'''"""(?:\\.|[^\\])*?"{3,5}'''

@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from datetime import date, datetime, time
 from typing import TYPE_CHECKING, Any
 
+from afspm.experiment.toml_lines import Settings, Table
+
 if TYPE_CHECKING:
     from afspm.experiment.experiment import Experiment
 
@@ -25,10 +27,10 @@ def to_toml(experiment: Experiment, *, secrets: bool = True) -> str:
         secrets: else an environment variable is named in place of each, which has to be set where it is read back.
     """
     parts = experiment.parts
-    tables: dict[str, Any] = dict(parts.variables)
+    tables: Settings = dict(parts.variables)
     tables.update(parts.sections)
     for part in parts.components:
-        what: dict[str, Any] = {"class": part.class_path} if part.class_path else {"command": list(part.command)}
+        what: Settings = {"class": part.class_path} if part.class_path else {"command": list(part.command)}
         own = {k: v for k, v in part.own.items() if k not in {"class", "command", "component"}}
         tables[part.name] = {"component": True, **what, **own, **part.settings}
     return dumps(tables if secrets else _without(_secrets_in(tables), tables))
@@ -56,7 +58,7 @@ def _without(secrets: list[str], value: Any) -> Any:
     return value
 
 
-def dumps(document: Mapping[str, Any]) -> str:
+def dumps(document: Table) -> str:
     """Return a document of plain TOML values as text."""
     lines = [f"{_key(k)} = {value(v)}" for k, v in document.items() if not isinstance(v, Mapping)]
     blocks = ["\n".join(lines)] if lines else []
@@ -64,7 +66,7 @@ def dumps(document: Mapping[str, Any]) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def _table(path: tuple[str, ...], table: Mapping[str, Any]) -> str:
+def _table(path: tuple[str, ...], table: Table) -> str:
     header = "[" + ".".join(map(_key, path)) + "]"
     return "\n".join([header, *(f"{_key(k)} = {value(v)}" for k, v in table.items() if v is not None)])
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from afspm.addresses import hint_on, is_address
 from afspm.experiment.document import Document
@@ -17,6 +17,7 @@ from afspm.experiment.findings import SourceLocation
 from afspm.experiment.known import WIRE_KEYS, WiringClass
 from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.published import wire_of
+from afspm.experiment.toml_lines import Settings, Table
 from afspm.model import Role
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ class WiringKeys:
     cache_out: str | None = None
     request_timeout_s: float | None = None
     request_retries: int | None = None
-    cache_logic: dict[str, Any] | None = None
+    cache_logic: Settings | None = None
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def _apply_address(wires: WiringKeys, key: str, address: str) -> None:
             wires.cache_out = address
 
 
-def _apply_table(wires: WiringKeys, table: Mapping[str, Any]) -> None:
+def _apply_table(wires: WiringKeys, table: Table) -> None:
     match wire_of(table):
         case WiringClass.PUBLISHER:
             wires.publish = table.get("url")
@@ -132,7 +133,7 @@ def _apply_table(wires: WiringKeys, table: Mapping[str, Any]) -> None:
             wires.cache_logic = logic.get("cache_logic") if isinstance(logic, dict) else None
 
 
-def _add_subscriber(wires: WiringKeys, table: Mapping[str, Any]) -> None:
+def _add_subscriber(wires: WiringKeys, table: Table) -> None:
     urls = table.get("sub_url", ())
     wires.subscribe = [*(wires.subscribe or ()), *([urls] if isinstance(urls, str) else urls)]
     topics = table.get("topics_to_sub")
@@ -140,7 +141,7 @@ def _add_subscriber(wires: WiringKeys, table: Mapping[str, Any]) -> None:
         wires.envelopes = [*(wires.envelopes or ()), *([topics] if isinstance(topics, str) else topics)]
 
 
-def _apply_timeouts(wires: WiringKeys, table: Mapping[str, Any]) -> None:
+def _apply_timeouts(wires: WiringKeys, table: Table) -> None:
     timeout_ms, retries = table.get("request_timeout_ms"), table.get("request_retries")
     if isinstance(timeout_ms, int | float):
         wires.request_timeout_s = timeout_ms / 1000

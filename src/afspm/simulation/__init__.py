@@ -4,16 +4,15 @@
     scan = world.scan(Region((0.0, 0.0), (1e-6, 1e-6)), (128, 128), line_s=1.0, start_s=0.0)
     unit, height = scan.channels()["Height"]
 
-A feature at `x_sample` is found at `x_tip = world.to_tip(x_sample, t)`; that is `x_sample + world.drift_m(t)` where the
-sample neither turns nor expands.
+A feature at `x_sample` is found at `x_tip = world.sample.to_tip(x_sample, t)`; that is
+`x_sample + world.drift_m(t)` where the sample neither turns nor expands.
 """
 
 from __future__ import annotations
 
 from afspm.simulation.scanning import SimulatedScan
-from afspm.simulation.surfaces.readers import READERS, Heightmap
+from afspm.simulation.surfaces.picture import READERS, Heightmap
 from afspm.simulation.tip import TipState
-from afspm.simulation.world import World
-from afspm.simulation.world_settings import WorldSettings
+from afspm.simulation.world import World, WorldSettings
 
 __all__ = ["READERS", "Heightmap", "SimulatedScan", "TipState", "World", "WorldSettings"]

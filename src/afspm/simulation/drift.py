@@ -125,11 +125,11 @@ class Drift:
         return np.maximum(since, 0.0)
 
 
-class Compensation:
+class ScannerCompensation:
     """By how much a scanner has followed the sample by itself, with velocities that it was told from time to time."""
 
-    def __init__(self) -> None:
-        self._turns: list[tuple[float, float, float, float, float]] = []  # time, (x, y) by then, velocity from then on
+    def __init__(self, turns: Iterable[tuple[float, float, float, float, float]] = ()) -> None:
+        self.turns = list(turns)  # time, (x, y) by then, velocity from then on
 
     def set(self, velocity_m_per_s: tuple[float, float], t_s: float) -> None:
         """From a time on, the scanner moves along with a velocity.
@@ -137,32 +137,23 @@ class Compensation:
         Raises:
             InvalidValue: before the time of the velocity that it has.
         """
-        if self._turns and t_s < self._turns[-1][0]:
-            raise InvalidValue(f"a velocity from {t_s:g} s on, after one from {self._turns[-1][0]:g} s on")
+        if self.turns and t_s < self.turns[-1][0]:
+            raise InvalidValue(f"a velocity from {t_s:g} s on, after one from {self.turns[-1][0]:g} s on")
         x, y = self.at(t_s)[:2]
         velocity_x, velocity_y = velocity_m_per_s
-        self._turns.append((t_s, float(x), float(y), float(velocity_x), float(velocity_y)))
+        self.turns.append((t_s, float(x), float(y), float(velocity_x), float(velocity_y)))
 
     def at(self, t_s: ArrayLike) -> NDArray[np.float64]:
         """(x, y, z) in m at experiment times, shape t.shape + (3,); z is not followed."""
         t = np.asarray(t_s, dtype=np.float64)
         followed = np.zeros((*t.shape, 3))
         # in a long night there are thousands, and asked for is what was last
-        first = bisect_right(self._turns, t.min(initial=math.inf), key=lambda turn: turn[0]) - 1
-        for since_s, x, y, velocity_x, velocity_y in self._turns[max(first, 0) :]:
+        first = bisect_right(self.turns, t.min(initial=math.inf), key=lambda turn: turn[0]) - 1
+        for since_s, x, y, velocity_x, velocity_y in self.turns[max(first, 0) :]:
             later = t >= since_s
             followed[later, 0] = x + velocity_x * (t[later] - since_s)
             followed[later, 1] = y + velocity_y * (t[later] - since_s)
         return followed
-
-    def to_list(self) -> list[list[float]]:
-        """As plain JSON."""
-        return [list(turn) for turn in self._turns]
-
-    def restore(self, plain: Iterable[Iterable[float]]) -> None:
-        """Take up what `to_list` gave. Raises TypeError or ValueError if it is something else."""
-        turns = [tuple(map(float, turn)) for turn in plain]
-        self._turns = [(t, x, y, velocity_x, velocity_y) for t, x, y, velocity_x, velocity_y in turns]
 
 
 def random_walk(seed: int, t_s: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -21,7 +21,7 @@ _SPLINE_VARIANCE = 1.0 / 3.0  # of the cubic B-spline as a blur, in samples squa
 
 
 @dataclass(frozen=True)
-class Grid:
+class SampleGrid:
     """Points on which the sample is drawn, finer than the scan, along the axes of the sample.
 
     Attributes:
@@ -37,7 +37,7 @@ class Grid:
     shape: tuple[int, int]
 
     @classmethod
-    def covering(cls, x_m: Array, y_m: Array, step_m: tuple[float, float], margin_m: float) -> Grid:
+    def covering(cls, x_m: Array, y_m: Array, step_m: tuple[float, float], margin_m: float) -> SampleGrid:
         """Around all positions, with room for a tip that reaches over by the margin."""
         # On multiples of the step, so that the same place is drawn alike by every scan of that resolution.
         first = [math.floor((a.min() - margin_m) / d) - 8 for a, d in zip((x_m, y_m), step_m, strict=True)]
@@ -52,16 +52,16 @@ class Grid:
         y: Array = self.y0_m + self.dy_m * np.arange(ny, dtype=np.float64)
         return x[None, :], y[:, None]
 
-    def rows(self, start: int, stop: int) -> Grid:
+    def rows(self, start: int, stop: int) -> SampleGrid:
         """Only these rows."""
-        return Grid(self.x0_m, self.y0_m + start * self.dy_m, self.dx_m, self.dy_m, (stop - start, self.shape[1]))
+        return SampleGrid(self.x0_m, self.y0_m + start * self.dy_m, self.dx_m, self.dy_m, (stop - start, self.shape[1]))
 
 
 @dataclass
 class Sampler:
     """Positions on a grid, prepared so that several pictures on that grid can be read at them."""
 
-    grid: Grid
+    grid: SampleGrid
     x_m: Array
     y_m: Array
     _index: NDArray[np.intp] = field(init=False, repr=False)
@@ -111,7 +111,7 @@ def reach_m(tip: TipState, height_range_m: float) -> float:
     return reach + (math.hypot(*tip.second_apex_m[:2]) if tip.second_apex_m else 0.0)
 
 
-def felt(height_m: Array, grid: Grid, tip: TipState, blur_steps: tuple[float, float]) -> tuple[Single, float]:
+def felt(height_m: Array, grid: SampleGrid, tip: TipState, blur_steps: tuple[float, float]) -> tuple[Single, float]:
     """The apex's path over a surface, on the same grid, band limited.
 
     Args:
@@ -131,7 +131,7 @@ def felt(height_m: Array, grid: Grid, tip: TipState, blur_steps: tuple[float, fl
     return path, offset
 
 
-def _dilated(surface: Single, grid: Grid, tip: TipState) -> Single:
+def _dilated(surface: Single, grid: SampleGrid, tip: TipState) -> Single:
     height_range = float(np.ptp(surface))
     slope = 1.0 / math.tan(math.radians(tip.half_angle_deg))
     radius = tip.imaging_radius_m
@@ -154,7 +154,7 @@ def _under_parabola(surface: Single, axis: int, step_m: float, radius_m: float, 
     return result
 
 
-def _under_cone(surface: Single, grid: Grid, slope: float, reach_m: float) -> Single:
+def _under_cone(surface: Single, grid: SampleGrid, slope: float, reach_m: float) -> Single:
     """An eight-sided pyramid: lines of that slope along both axes and both diagonals, by doubling the stride."""
     directions = ((1, 0), (0, 1), (1, 1), (1, -1))
     for rows, columns in directions:

@@ -12,12 +12,62 @@ from numpy.typing import NDArray
 
 from afspm.simulation.feedback import Loop
 from afspm.simulation.fields import Array
-from afspm.simulation.imaging import Grid, Sampler, across_m, felt, reach_m
+from afspm.simulation.imaging import SampleGrid, Sampler, across_m, felt, reach_m
 from afspm.simulation.noise import NoiseSettings, disturbances, flattened, height_noise
 from afspm.simulation.scanning import Course, ScannerSettings
-from afspm.simulation.signals import SignalSettings, current_a, phase_deg
+from afspm.simulation.settings import check
 from afspm.simulation.surfaces import Relief
 from afspm.simulation.tip import TipState
+
+
+@dataclass(frozen=True)
+class SignalSettings:
+    """How the sample answers.
+
+    Attributes:
+        dissipation: energy lost to the sample a cycle, as a share of what the cantilever loses itself, mean of both
+            materials; dissipation_contrast: their difference.
+        conductance_s: of the contact when the tip taps gently (mean over the cycle).
+        conductance_contrast: ln of the ratio of both materials' conductances.
+        current_decay_m: the gap over which that current falls by e.
+        preamplifier_a: where the current amplifier saturates.
+    """
+
+    dissipation: float = 0.12
+    dissipation_contrast: float = 0.12
+    conductance_s: float = 100e-12
+    conductance_contrast: float = 1.5
+    current_decay_m: float = 4e-9
+    preamplifier_a: float = 10e-9
+
+    def __post_init__(self) -> None:
+        check(self, from_zero="dissipation conductance_s", above_zero="current_decay_m preamplifier_a")
+
+
+def phase_deg(settings: SignalSettings, loop: Loop, amplitude_v: Array, material: Array, slope: Array) -> Array:
+    """Phase of the cantilever behind its drive: sin(phase) = A / A0 * (1 + dissipation) (Cleveland et al. 1998).
+
+    Free it lags by 90 degrees; on a slope the flank of the tip touches more of the sample and dissipates more.
+    """
+    share = amplitude_v / loop.settings.free_amplitude_v
+    lost = settings.dissipation + settings.dissipation_contrast * (material - 0.5)
+    lost = lost * (1.0 + 0.5 * np.sqrt(1.0 + slope * slope) - 0.5) * (1.0 - share) / 0.3
+    return np.asarray(np.degrees(np.arcsin(np.clip(share * (1.0 + lost), 0.0, 1.0))))
+
+
+def current_a(settings: SignalSettings, loop: Loop, gap_m: Array, material: Array, bias_v: float) -> Array:
+    """Exponential in the gap; tunnelling at the setpoint's current, tapping at the conductance of the contact."""
+    contrast = settings.conductance_contrast * (material - 0.5)
+    if loop.settings.mode == "current":
+        # The feedback holds the current, so a better conductor shows in the height; what is left is the error.
+        mean = np.copysign(loop.setpoint, bias_v)
+        exponent = -gap_m / loop.settings.decay_m
+    else:
+        mean = np.float64(settings.conductance_s * bias_v)
+        exponent = contrast - gap_m / settings.current_decay_m + 2.0 * (loop.force - 1.0)
+    current = mean * np.exp(np.clip(exponent, -60.0, 60.0))
+    return np.asarray(np.clip(current, -settings.preamplifier_a, settings.preamplifier_a))
+
 
 Channels = dict[str, tuple[str, Array]]
 TipTimes = Sequence[tuple[float, TipState]]
@@ -166,7 +216,7 @@ def _pixel_times_s(course: Course) -> Array:
     return np.stack([start + along, start + course.line_s - along])
 
 
-def _grid(course: Course, setup: Setup, x: Array, y: Array, tips: TipTimes) -> tuple[Grid, tuple[float, float]]:
+def _grid(course: Course, setup: Setup, x: Array, y: Array, tips: TipTimes) -> tuple[SampleGrid, tuple[float, float]]:
     """A grid that is fine enough and not too large, and the blur (y, x) in its steps."""
     turn = complex(setup.turn(course.start_s))
     pixel = (course.pixel_m[0] / abs(turn), course.pixel_m[1] / abs(turn))
@@ -177,7 +227,7 @@ def _grid(course: Course, setup: Setup, x: Array, y: Array, tips: TipTimes) -> t
         pixel = (pixel[1], pixel[0])
     # A first look at coarse steps tells how high the sample is, thus how far the tip can touch beside its apex.
     extent = (float(np.ptp(x)) or pixel[0], float(np.ptp(y)) or pixel[1])
-    look = Grid.covering(x, y, (max(extent[0] / 48, pixel[0]), max(extent[1] / 48, pixel[1])), 0.0)
+    look = SampleGrid.covering(x, y, (max(extent[0] / 48, pixel[0]), max(extent[1] / 48, pixel[1])), 0.0)
     rise = 1.2 * float(np.ptp(setup.sample(*look.axes_m(), max(look.dx_m, look.dy_m)).height_m))
     margin = max(reach_m(tip, rise) for _, tip in tips) + 2 * max(pixel)
     area = (extent[0] + 2 * margin) * (extent[1] + 2 * margin)
@@ -188,10 +238,10 @@ def _grid(course: Course, setup: Setup, x: Array, y: Array, tips: TipTimes) -> t
     coarser = max(1.0, math.sqrt(area / (step[0] * step[1]) / _MOST_POINTS))
     step = (step[0] * coarser, step[1] * coarser)
     blur = setup.scanner.band_limit_px
-    return Grid.covering(x, y, step, margin), (blur * pixel[1] / step[1], blur * pixel[0] / step[0])
+    return SampleGrid.covering(x, y, step, margin), (blur * pixel[1] / step[1], blur * pixel[0] / step[0])
 
 
-def _rows_of_grid(grid: Grid, y: Array, margin_m: float) -> tuple[Grid, int, int]:
+def _rows_of_grid(grid: SampleGrid, y: Array, margin_m: float) -> tuple[SampleGrid, int, int]:
     """The part of the grid that a tip touches while it is at those y."""
     start = max(0, math.floor((y.min() - margin_m - grid.y0_m) / grid.dy_m) - 7)
     stop = min(grid.shape[0], math.ceil((y.max() + margin_m - grid.y0_m) / grid.dy_m) + 8)

@@ -114,6 +114,31 @@ class Course:
         return 2.0 * self.shape[0] * self.region.size_m[0]
 
 
+class ScannerPlace:
+    """Where the piezo was sent, and how far it still is from there.
+
+    Attributes:
+        at_m: (x, y) where it was sent last.
+        came_from_m, came_s: where it was before, and when it was sent.
+    """
+
+    def __init__(self, creep: float, start_s: float) -> None:
+        self._creep = creep
+        self.at_m, self.came_from_m, self.came_s = (0.0, 0.0), (0.0, 0.0), start_s
+
+    def move_to(self, position_m: tuple[float, float], t_s: float) -> None:
+        """Send it to a position, unless it is there."""
+        if position_m != self.at_m:
+            self.came_from_m, self.came_s, self.at_m = self.at_m, t_s, position_m
+
+    def creep_m(self, t_s: Array) -> Array:
+        """Return what is missing of the last move at times, (n, 2)."""
+        move = np.subtract(self.at_m, self.came_from_m)
+        since = np.maximum(np.asarray(t_s) - self.came_s, 0.0) + 1.0
+        left = self._creep * np.maximum(1.0 - np.log10(since) / 4.0, 0.0)
+        return np.asarray(left[:, None] * move)
+
+
 @dataclass(frozen=True)
 class SimulatedScan:
     """A scan, computed when it starts; what the caller hands out of it before its end is up to the caller.

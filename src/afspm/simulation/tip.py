@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from afspm.simulation import chance
-from afspm.simulation.settings import build, check, one_of
+from afspm.simulation.settings import check, one_of
 
 FLAWS = ("blunt", "double", "contaminated")
 CONDITIONS = ("sharp", *FLAWS)
@@ -45,14 +44,6 @@ class TipState:
         """Of what touches the sample: apex or debris."""
         return self.radius_m + self.debris_m
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> TipState:
-        return build(cls, values, "tip")
-
 
 @dataclass(frozen=True)
 class TipSettings:
@@ -80,8 +71,35 @@ class TipSettings:
 
 
 @dataclass(frozen=True)
-class TipChangeSettings:
-    """When the tip changes, and what a repair does to it.
+class TipRepairSettings:
+    """The repairs of `TipChangeSettings`.
+
+    Attributes:
+        pulse_threshold_v: below, a pulse does nothing.
+        pulse_cures, pulse_worsens: probabilities, of a pulse far above the threshold that lasts `pulse_duration_s`.
+        pulse_duration_s: a longer one does more, but not more than two of these; a shorter one less.
+        crash_cures, crash_worsens: probabilities, of a crash `crash_depth_m` deep.
+        crash_depth_m: a crash so many times as deep does what so many of these do, until one of them does anything.
+        crash_speed_m_per_s: slower crashes are that much less likely to do anything.
+    """
+
+    pulse_threshold_v: float = 2.0
+    pulse_cures: float = 0.5
+    pulse_worsens: float = 0.08
+    pulse_duration_s: float = 50e-3
+    crash_cures: float = 0.85
+    crash_worsens: float = 0.1
+    crash_depth_m: float = 5e-9
+    crash_speed_m_per_s: float = 50e-9
+
+    def __post_init__(self) -> None:
+        check(self, from_zero="pulse_threshold_v", above_zero="pulse_duration_s crash_depth_m crash_speed_m_per_s")
+        check(self, fraction="pulse_cures pulse_worsens crash_cures crash_worsens")
+
+
+@dataclass(frozen=True)
+class TipChangeSettings(TipRepairSettings):
+    """When the tip changes by itself, and what a repair does to it.
 
     The chances of a repair are made up, so that one is seen to take some trying. How they grow is a simple picture and
     no theory: a crash takes material from the apex, or leaves some there, all along its way in; a pulse moves by its
@@ -94,12 +112,6 @@ class TipChangeSettings:
         blunt_weight, double_weight, contaminated_weight: how likely each is.
         schedule: pairs of seconds after the start and a condition: changes that come for certain.
         wear_m_per_m: the radius grows so much a metre scanned at a gentle setpoint.
-        pulse_threshold_v: below, a pulse does nothing.
-        pulse_cures, pulse_worsens: probabilities, of a pulse far above the threshold that lasts `pulse_duration_s`.
-        pulse_duration_s: a longer one does more, but not more than two of these; a shorter one less.
-        crash_cures, crash_worsens: probabilities, of a crash `crash_depth_m` deep.
-        crash_depth_m: a crash so many times as deep does what so many of these do, until one of them does anything.
-        crash_speed_m_per_s: slower crashes are that much less likely to do anything.
     """
 
     per_hour: float = 0.0
@@ -110,20 +122,11 @@ class TipChangeSettings:
     contaminated_weight: float = 1.0
     schedule: tuple[tuple[float, str], ...] = field(default_factory=tuple)
     wear_m_per_m: float = 0.0
-    pulse_threshold_v: float = 2.0
-    pulse_cures: float = 0.5
-    pulse_worsens: float = 0.08
-    pulse_duration_s: float = 50e-3
-    crash_cures: float = 0.85
-    crash_worsens: float = 0.1
-    crash_depth_m: float = 5e-9
-    crash_speed_m_per_s: float = 50e-9
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check(self, from_zero="per_hour per_metre hardness_exponent blunt_weight double_weight contaminated_weight")
-        check(self, from_zero="wear_m_per_m pulse_threshold_v")
-        check(self, above_zero="pulse_duration_s crash_depth_m crash_speed_m_per_s")
-        check(self, fraction="pulse_cures pulse_worsens crash_cures crash_worsens")
+        check(self, from_zero="wear_m_per_m")
         for _, condition in self.schedule:
             one_of(condition, CONDITIONS, "schedule")
         object.__setattr__(self, "schedule", tuple(sorted(self.schedule)))
@@ -136,30 +139,6 @@ class TipChange:
     t_s: float
     cause: str
     tip: TipState
-
-
-class TipHistory:
-    """Every shape the tip has had, by time; what was foreseen and did not come to pass can be taken back."""
-
-    def __init__(self, changes: list[TipChange]) -> None:
-        self.changes = changes
-
-    def at(self, t_s: float) -> TipState:
-        """The tip at a time."""
-        return next((c.tip for c in reversed(self.changes) if c.t_s <= t_s), self.changes[0].tip)
-
-    def between(self, start_s: float, end_s: float) -> list[TipChange]:
-        """Changes in (start, end]."""
-        return [change for change in self.changes if start_s < change.t_s <= end_s]
-
-    def add(self, change: TipChange) -> None:
-        """At its place in time."""
-        self.changes.append(change)
-        self.changes.sort(key=lambda c: c.t_s)
-
-    def forget_after(self, t_s: float) -> None:
-        """Takes back what was to come after a time (the scan was stopped)."""
-        self.changes = [c for c in self.changes if c.t_s <= t_s or c.cause == "start"]
 
 
 class TipMaker:
@@ -266,3 +245,94 @@ def chance_changes(
             break
         found.append((t, flaw))
     return found
+
+
+class SimulatedTip:
+    """The tip through the night: every shape it has had, by time, and what changes it.
+
+    What is foreseen (the rest of a scan that was stopped: changes, wear) can be taken back.
+
+    Attributes:
+        history: in the order of time; the first is that of the start.
+        scheduled_until_s: up to when the changes of the schedule have happened.
+    """
+
+    def __init__(self, settings: TipSettings, changes: TipChangeSettings, seed: int, start_s: float) -> None:
+        self._settings, self._seed, self._start_s = changes, seed, start_s
+        self._maker = TipMaker(settings)
+        self.history = [TipChange(start_s, "start", self._maker.first(chance.generator(seed, 0)))]
+        self.scheduled_until_s = start_s
+        self.advance(start_s)
+
+    def at(self, t_s: float) -> TipState:
+        """Return the tip at a time."""
+        return next((c.tip for c in reversed(self.history) if c.t_s <= t_s), self.history[0].tip)
+
+    def between(self, start_s: float, end_s: float) -> list[TipChange]:
+        """Return the changes in (start, end]."""
+        return [change for change in self.history if start_s < change.t_s <= end_s]
+
+    def begin(self, t_s: float) -> None:
+        """Go to a time, and take back what was to come after it."""
+        self.history = [c for c in self.history if c.t_s <= t_s or c.cause == "start"]
+        self.scheduled_until_s = min(self.scheduled_until_s, t_s)
+        self.advance(t_s)
+
+    def advance(self, until_s: float) -> None:
+        """Let the scheduled changes up to a time happen."""
+        for number, (after_s, condition) in enumerate(self._settings.schedule):
+            t_s = self._start_s + after_s
+            if self.scheduled_until_s < t_s <= until_s or (t_s == until_s == self._start_s):
+                self._change(t_s, "schedule", condition, chance.generator(self._seed, 6, number))
+        self.scheduled_until_s = max(self.scheduled_until_s, until_s)
+
+    def foresee(self, start_s: float, end_s: float, speed_m_s: float, hardness: float, call: int) -> None:
+        """Add the changes that will come during a scan: scheduled ones, and by chance."""
+        s = self._settings
+        rate = (s.per_hour / 3600.0 + s.per_metre * speed_m_s) * hardness
+        seed = chance.subseed(self._seed, "tip changes")
+        for number, (t_s, flaw) in enumerate(chance_changes(s, start_s, end_s, rate, seed, call)):
+            self.advance(t_s)
+            self._change(t_s, "chance", flaw, chance.generator(seed, call, number))
+        self.advance(end_s)
+
+    def wear(self, t_s: float, worn_m: float) -> None:
+        """Let the apex grow by what it has been rubbed off."""
+        tip = self.history[-1].tip
+        self._add(TipChange(t_s, "wear", replace(tip, radius_m=tip.radius_m + worn_m)))
+
+    def pulse(self, voltage_v: float, duration_s: float, t_s: float, random: np.random.Generator) -> str:
+        """Return what a bias pulse did; see `_treat`. It depends on the voltage above all."""
+        s = self._settings
+        strength = max(0.0, abs(voltage_v) / s.pulse_threshold_v - 1.0) if s.pulse_threshold_v else 1.0
+        if strength == 0.0:
+            return "unchanged"
+        effect = 1.0 - math.exp(-3.0 * strength)
+        chances = Chances(s.pulse_cures, s.pulse_worsens).weakened(effect).of_times(pulse_times(s, duration_s))
+        return self._treat("pulse", t_s, chances, random)
+
+    def crash(self, depth_m: float, speed_m_s: float, t_s: float, random: np.random.Generator) -> str:
+        """Return what a crash did; see `_treat`."""
+        s = self._settings
+        effect = min(1.0, speed_m_s / s.crash_speed_m_per_s)
+        chances = Chances(s.crash_cures, s.crash_worsens).of_times(crash_times(s, depth_m)).weakened(effect)
+        return self._treat("crash", t_s, chances, random)
+
+    def _treat(self, cause: str, t_s: float, chances: Chances, random: np.random.Generator) -> str:
+        """Return what a treatment did: "cured", "worsened" or "unchanged"."""
+        draw = random.random()
+        if draw < chances.cures:
+            self._change(t_s, cause, "sharp", random)
+            return "cured"
+        flaw = drawn_flaw(self._settings, random)
+        if draw < chances.cures + chances.worsens and flaw is not None:
+            self._change(t_s, cause, flaw, random)
+            return "worsened"
+        return "unchanged"
+
+    def _change(self, t_s: float, cause: str, condition: str, random: np.random.Generator) -> None:
+        self._add(TipChange(t_s, cause, self._maker.changed(self.at(t_s), condition, random)))
+
+    def _add(self, change: TipChange) -> None:
+        self.history.append(change)
+        self.history.sort(key=lambda c: c.t_s)

@@ -7,43 +7,115 @@ stopped: tip changes, wear) is taken back. The same seed and the same calls give
 
 from __future__ import annotations
 
-import cmath
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from afspm.errors import ConfigError, InvalidValue
+from afspm.errors import ConfigError, ErrorCollector, InvalidValue
 from afspm.model import Feedback, Region
-from afspm.simulation import chance, marks, spectra
-from afspm.simulation.drift import Compensation, Drift
-from afspm.simulation.feedback import Loop
+from afspm.model.snapshot import restored, snapshot
+from afspm.simulation import chance, spectra
+from afspm.simulation.drift import DriftSettings, ScannerCompensation
+from afspm.simulation.feedback import FeedbackSettings, Loop
 from afspm.simulation.fields import Array
-from afspm.simulation.marks import Mark
-from afspm.simulation.measuring import Felt, Setup, at_rest, feel, measure
-from afspm.simulation.scanning import Course, SimulatedScan
+from afspm.simulation.measuring import Felt, Setup, SignalSettings, TipTimes, at_rest, feel, measure
+from afspm.simulation.noise import NoiseSettings
+from afspm.simulation.sample import Sample, SurfaceMark
+from afspm.simulation.scanning import Course, ScannerPlace, ScannerSettings, SimulatedScan
 from afspm.simulation.settings import build, nearest
-from afspm.simulation.surfaces import Relief, surface_from
+from afspm.simulation.surfaces import surface_from
 from afspm.simulation.tip import (
-    Chances,
+    SimulatedTip,
     TipChange,
-    TipHistory,
-    TipMaker,
+    TipChangeSettings,
+    TipSettings,
     TipState,
-    chance_changes,
-    crash_times,
-    drawn_flaw,
     indented_m,
-    pulse_times,
 )
-from afspm.simulation.world_settings import WorldSettings, read_settings
 
-STATE_VERSION = 1
+# What suits a sample better than the general defaults; the user's settings go on top.
+_FITTING: dict[str, dict[str, dict[str, Any]]] = {
+    # Atoms are seen by the foremost atom of the tip, not by its apex as a whole.
+    "lattice": {
+        "tip": {"radius_m": 0.12e-9, "half_angle_deg": 35.0},
+        "noise": {"white_m": 3e-12, "one_over_f_m": 3e-12, "line_offset_m": 3e-12, "scar_m": 0.05e-9},
+        "feedback": {"mode": "current", "setpoint": 100e-12},
+    },
+    "steps": {"tip": {"second_below_radii": 0.015, "debris_radii": 1.0, "length_jump_radii": 0.1}},
+    "stamper": {
+        # Bumps this large only show what is wrong with a tip when that is large as well.
+        "tip": {"blunt_radii": 18.0, "second_distance_radii": 30.0, "second_below_radii": 2.0, "debris_radii": 4.0},
+        "noise": {"white_m": 0.3e-9, "one_over_f_m": 0.5e-9, "line_offset_m": 0.5e-9, "scar_m": 8e-9},
+    },
+    "particles": {"noise": {"white_m": 0.2e-9, "one_over_f_m": 0.2e-9, "line_offset_m": 0.2e-9, "scar_m": 4e-9}},
+}
+
+
+@dataclass(frozen=True)
+class WorldSettings:
+    """All but the surface, which has settings of its kind."""
+
+    tip: TipSettings = field(default_factory=TipSettings)
+    tip_changes: TipChangeSettings = field(default_factory=TipChangeSettings)
+    drift: DriftSettings = field(default_factory=DriftSettings)
+    feedback: FeedbackSettings = field(default_factory=FeedbackSettings)
+    scanner: ScannerSettings = field(default_factory=ScannerSettings)
+    noise: NoiseSettings = field(default_factory=NoiseSettings)
+    signals: SignalSettings = field(default_factory=SignalSettings)
+    iv: spectra.IVSettings = field(default_factory=spectra.IVSettings)
+    force: spectra.ForceSettings = field(default_factory=spectra.ForceSettings)
+
+
+def read_settings(settings: Mapping[str, Any]) -> tuple[object, WorldSettings]:
+    """The surface's table and the rest, from one table of all.
+
+    Raises:
+        ConfigError: unknown names or values without sense, of all tables at once; FileError: the surface's file.
+    """
+    tables = dict(settings)
+    names = ["surface", *WorldSettings.__dataclass_fields__]
+    errors = ErrorCollector()
+    for name in [name for name in tables if name not in names]:
+        errors.add(ConfigError(f"no setting named {name!r}", where=f"simulation.{name}", hint=nearest(name, names)))
+        del tables[name]
+    surface = tables.pop("surface", "steps")
+    kind = surface.get("kind", "steps") if isinstance(surface, Mapping) else surface
+    for name, fitting in _FITTING.get(str(kind), {}).items():
+        own = tables.get(name, {})
+        tables[name] = {**fitting, **own} if isinstance(own, Mapping) else own
+    with errors:
+        built = build(WorldSettings, tables, "simulation")
+    if errors.errors:
+        with errors:  # else it is made later
+            surface_from(surface)
+    errors.raise_all()
+    return surface, built
+
+
+STATE_VERSION = 2
 _POINT_M = 1e-12
 _SAME_PLACE_M = 20e-12
+
+
+@dataclass(frozen=True)
+class WorldState:
+    """All that a world needs to go on as if nothing had happened; see `World`, `SimulatedTip` and `Sample`."""
+
+    seed: int
+    start_s: float
+    calls: int
+    scheduled_until_s: float
+    at_m: tuple[float, float]
+    came_from_m: tuple[float, float]
+    came_s: float
+    held_z_m: float | None
+    tips: list[TipChange]
+    marks: list[SurfaceMark]
+    compensation: list[tuple[float, float, float, float, float]]
 
 
 class World:
@@ -54,34 +126,22 @@ class World:
     ) -> None:
         self.settings = settings or WorldSettings()
         self.seed, self.start_s = seed, start_s
-        self._surface_table = dict(surface) if isinstance(surface, Mapping) else {"kind": surface}
-        self._surface = surface_from(self._surface_table)
-        self._surface_seed = chance.subseed(seed, "surface") % 2**62
-        self._drift = Drift(self.settings.drift, seed, start_s)
-        self._compensation = Compensation()
-        self._maker = TipMaker(self.settings.tip)
-        first = self._maker.first(chance.generator(seed, 0))
-        self._tips = TipHistory([TipChange(start_s, "start", first)])
-        self._marks: list[Mark] = []
+        self.sample = Sample(surface, self.settings.drift, seed, start_s)
+        self._tip = SimulatedTip(self.settings.tip, self.settings.tip_changes, seed, start_s)
         self._calls = 0
-        self._scheduled_until_s = start_s
-        self._at_m = (0.0, 0.0)
-        self._came_from_m, self._came_s = (0.0, 0.0), start_s
+        self._place = ScannerPlace(self.settings.scanner.creep, start_s)
         self._held_z_m: float | None = None
         self._felt_at_rest: tuple[Any, Felt] | None = None
-        self._advance(start_s)
 
     @classmethod
     def from_settings(cls, settings: Mapping[str, Any], seed: int, start_s: float) -> World:
-        """A world as tables ask for: `surface`, and the fields of `WorldSettings`.
+        """Return the world that tables ask for: `surface`, and the fields of `WorldSettings`.
 
         Raises:
             ConfigError: unknown names or values without sense. FileError: the surface's file.
         """
         surface, built = read_settings(settings)
         return cls(surface, built, seed=seed, start_s=start_s)
-
-    # -- measuring
 
     def scan(
         self,
@@ -95,7 +155,7 @@ class World:
         direction: str = "up",
         slope: tuple[float, float] = (0.0, 0.0),
     ) -> SimulatedScan:
-        """Scans a region, from `start_s` on.
+        """Scan a region, from `start_s` on.
 
         Args:
             region: in tip coordinates.
@@ -114,25 +174,14 @@ class World:
             raise InvalidValue(f"bias {bias_v} V and slope {slope} must be finite")
         call = self._begin(start_s, region.center_m)
         self._foresee(course, loop, call)
-        tips = [(start_s, self._tips.at(start_s))]
-        tips += [(change.t_s, change.tip) for change in self._tips.between(start_s, course.end_s)]
+        tips = [(start_s, self._tip.at(start_s))]
+        tips += [(change.t_s, change.tip) for change in self._tip.between(start_s, course.end_s)]
         setup = self._setup(loop, bias_v, slope, start_s)
         measured = measure(course, tips, setup, chance.generator(self.seed, 2, call))
         self._held_z_m = measured.last_z_m
         self._wear(course, loop)
-        drift = self._drift.at(course.row_times_s(0.25))
-        truth = {
-            "start_s": start_s,
-            "end_s": course.end_s,
-            "tips": [{"t_s": t, **tip.to_dict()} for t, tip in tips],
-            "drift_start_m": self.drift_m(start_s).tolist(),
-            "drift_end_m": self.drift_m(course.end_s).tolist(),
-            "turn_start": self._turn(start_s),
-            "turn_end": self._turn(course.end_s),
-            "compensated_start_m": self._compensation.at(start_s).tolist(),
-            "compensated_end_m": self._compensation.at(course.end_s).tolist(),
-            "pressed_m": measured.pressed_m,
-        }
+        drift = self.sample.drift.at(course.row_times_s(0.25))
+        truth = {**_truth_of_scan(self.sample, course, tips), "pressed_m": measured.pressed_m}
         return SimulatedScan(course, drift, truth, measured.channels)
 
     def at_rest(
@@ -145,7 +194,7 @@ class World:
         slope: tuple[float, float] = (0.0, 0.0),
         random: np.random.Generator,
     ) -> dict[str, float]:
-        """What each channel shows while the tip stands at a place: nothing comes of having looked.
+        """Return what each channel shows while the tip stands at a place: nothing comes of having looked.
 
         With the feedback off, z is where `hold` or the last scan has left it.
 
@@ -160,9 +209,10 @@ class World:
         loop = Loop.of(self.settings.feedback, feedback)
         course = Course(Region(position_m, (_POINT_M, _POINT_M)), (1, 1), 1e-3, t_s)
         setup = self._setup(loop, bias_v, slope, t_s)
-        tip = self._tips.at(t_s)
-        where = [round(at_m / _SAME_PLACE_M) for at_m in (*self._on_sample(position_m, t_s), self.seen_drift_m(t_s)[2])]
-        key = (where, tip, len(self._marks))
+        tip = self._tip.at(t_s)
+        where_m = (*self.sample.under(position_m, t_s), self.sample.seen_drift_m(t_s)[2])
+        where = [round(at_m / _SAME_PLACE_M) for at_m in where_m]
+        key = (where, tip, len(self.sample.marks))
         if self._felt_at_rest is None or self._felt_at_rest[0] != key:
             self._felt_at_rest = key, feel(course, [(t_s, tip)], setup)
         return at_rest(course, self._felt_at_rest[1], setup, random)
@@ -185,7 +235,7 @@ class World:
         feedback: Feedback | None = None,
         bias_v: float = 0.1,
     ) -> spectra.Curves:
-        """A curve at a position: (names, units, values [n_points, n_variables]). Kinds are "IV" and "force".
+        """Return a curve at a position: (names, units, values [n_points, n_variables]). Kinds are "IV" and "force".
 
         Raises:
             InvalidValue: an unknown kind, or feedback without sense.
@@ -196,9 +246,9 @@ class World:
             raise InvalidValue(f"bias {bias_v} V and position {position_m} must be finite")
         loop = Loop.of(self.settings.feedback, feedback)
         call = self._begin(t_s, position_m)
-        tip = self._tips.at(t_s)
-        x, y = self._on_sample(position_m, t_s)
-        relief = self._relief(np.array([[x]]), np.array([[y]]), 0.0, t_s)
+        tip = self._tip.at(t_s)
+        x, y = self.sample.under(position_m, t_s)
+        relief = self.sample.relief(np.array([[x]]), np.array([[y]]), 0.0, t_s)
         material = float(relief.material[0, 0])
         random = chance.generator(self.seed, 3, call)
         if kind == "IV":
@@ -206,7 +256,7 @@ class World:
         return spectra.force_distance(self.settings.force, tip, material, random)
 
     def spectrum_s(self, kind: str) -> float:
-        """How long such a curve takes."""
+        """Return the duration of such a curve."""
         return self.settings.iv.duration_s if kind == "IV" else self.settings.force.duration_s
 
     def compensate(self, velocity_m_per_s: tuple[float, float], t_s: float) -> None:
@@ -217,16 +267,14 @@ class World:
         """
         if not all(map(math.isfinite, (*velocity_m_per_s, t_s))):
             raise InvalidValue(f"a velocity of {velocity_m_per_s} m/s from {t_s} s on")
-        self._compensation.set(velocity_m_per_s, t_s)
+        self.sample.compensation.set(velocity_m_per_s, t_s)
 
     # -- treating the tip
 
     def pulse(
         self, voltage_v: float, duration_s: float, t_s: float, position_m: tuple[float, float] | None = None
     ) -> str:
-        """A bias pulse: may cure or worsen the tip, and leaves a little mound.
-
-        Whether it does depends on the voltage above all, and a little on the duration (`tip.pulse_times`).
+        """Pulse the bias: may cure or worsen the tip (`tip.pulse_times`), and leaves a little mound.
 
         Args:
             position_m: where the tip was moved to; None: where it measured last.
@@ -236,26 +284,19 @@ class World:
         """
         if not (math.isfinite(voltage_v) and math.isfinite(duration_s) and duration_s > 0):
             raise InvalidValue(f"a pulse of {voltage_v} V for {duration_s} s", hint="finite, and longer than nothing")
-        call = self._begin(t_s, self._at_m if position_m is None else position_m)
-        s = self.settings.tip_changes
-        strength = max(0.0, abs(voltage_v) / s.pulse_threshold_v - 1.0) if s.pulse_threshold_v else 1.0
-        if strength == 0.0:
-            return "unchanged"
-        effect = 1.0 - math.exp(-3.0 * strength)
+        call = self._begin(t_s, self._place.at_m if position_m is None else position_m)
         random = chance.generator(self.seed, 4, call)
-        chances = Chances(s.pulse_cures, s.pulse_worsens).weakened(effect).of_times(pulse_times(s, duration_s))
-        outcome = self._treat("pulse", t_s, chances, random)
+        outcome = self._tip.pulse(voltage_v, duration_s, t_s, random)
         if outcome != "unchanged":
-            radius = self._tips.at(t_s).imaging_radius_m * random.uniform(0.5, 1.0)
-            self._mark("pulse", self._at_m, t_s, -0.3 * radius, radius)
+            radius = self._tip.at(t_s).imaging_radius_m * random.uniform(0.5, 1.0)
+            self.sample.mark("pulse", self._place.at_m, t_s, -0.3 * radius, radius)
         return outcome
 
     def crash(self, position_m: tuple[float, float], depth_m: float, speed_m_s: float, t_s: float) -> str:
-        """Drives the tip into the sample: may cure or worsen it, and leaves a crater that later scans see.
+        """Drive the tip into the sample: may cure or worsen it (`tip.crash_times`), and leaves a crater.
 
-        The deeper, the more likely it does anything (`tip.crash_times`), and the deeper is the crater
-        (`tip.indented_m`); of that a part springs back. Simulated: material is pushed aside over three times the radius
-        of contact, about as far as plastic flow reaches around an indenter.
+        A part of its depth (`tip.indented_m`) springs back. Simulated: material is pushed aside over three times the
+        radius of contact, about as far as plastic flow reaches around an indenter.
 
         Args:
             depth_m: beyond the surface.
@@ -267,204 +308,106 @@ class World:
             what = f"a crash at {position_m}, {depth_m} m deep with {speed_m_s} m/s"
             raise InvalidValue(what, hint="finite, deeper and faster than nothing")
         call = self._begin(t_s, position_m)
-        s = self.settings.tip_changes
-        effect = min(1.0, speed_m_s / s.crash_speed_m_per_s)
         random = chance.generator(self.seed, 5, call)
-        tip = self._tips.at(t_s)
+        tip = self._tip.at(t_s)
         into_m = indented_m(tip, depth_m)
         radius = 3.0 * math.sqrt(2.0 * tip.imaging_radius_m * into_m) * random.uniform(0.8, 1.4)
-        chances = Chances(s.crash_cures, s.crash_worsens).of_times(crash_times(s, depth_m)).weakened(effect)
-        outcome = self._treat("crash", t_s, chances, random)
-        self._mark("crash", position_m, t_s, into_m * random.uniform(0.6, 0.9), radius)
+        outcome = self._tip.crash(depth_m, speed_m_s, t_s, random)
+        self.sample.mark("crash", position_m, t_s, into_m * random.uniform(0.6, 0.9), radius)
         self._held_z_m = None
         return outcome
 
-    # -- the truth
-
     def drift_m(self, t_s: ArrayLike) -> Array:
-        """(x, y, z) by which the sample is displaced: x_tip = x_sample + drift. Shape t.shape + (3,).
+        """Return (x, y, z) by which the sample is displaced: x_tip = x_sample + drift. Shape t.shape + (3,).
 
         On a sample that turns or expands that is so at the place that it does about: see `to_sample` and `to_tip`.
         """
-        return self._drift.at(t_s)
-
-    def seen_drift_m(self, t_s: ArrayLike) -> Array:
-        """The same as far as the scanner does not follow it by itself."""
-        return self._drift.at(t_s) - self._compensation.at(t_s)
-
-    def to_sample(self, xy_m: ArrayLike, t_s: ArrayLike) -> Array:
-        """Map positions (..., 2) at experiment times (...) from the tip's coordinates to the sample's.
-
-        The tip's are those of a scanner that does not follow drift by itself.
-        """
-        at = np.asarray(xy_m, dtype=np.float64) - self.drift_m(t_s)[..., :2]
-        return np.stack(self._drift.unturned(at[..., 0], at[..., 1], t_s), axis=-1)
-
-    def to_tip(self, xy_m: ArrayLike, t_s: ArrayLike) -> Array:
-        """Undo `to_sample`."""
-        at = np.asarray(xy_m, dtype=np.float64)
-        turned = np.stack(self._drift.turned(at[..., 0], at[..., 1], t_s), axis=-1)
-        return np.asarray(turned + self.drift_m(t_s)[..., :2])
+        return self.sample.drift.at(t_s)
 
     @property
     def tip(self) -> TipState:
         """The tip after all that has been asked for so far."""
-        return self._tips.changes[-1].tip
-
-    def tip_at(self, t_s: float) -> TipState:
-        """The tip at a time."""
-        return self._tips.at(t_s)
-
-    def surface_m(self, x_m: ArrayLike, y_m: ArrayLike, t_s: float = math.inf) -> Array:
-        """True heights at sample coordinates, shaped as x and y broadcast, with the marks made up to a time."""
-        x, y = np.asarray(x_m, dtype=np.float64), np.asarray(y_m, dtype=np.float64)
-        shape = np.broadcast_shapes(x.shape, y.shape)
-        x, y = (a if a.ndim == 2 else a.reshape((1,) * (2 - a.ndim) + a.shape) if a.ndim < 2 else a for a in (x, y))
-        return self._relief(x, y, 0.0, t_s).height_m.reshape(shape)
+        return self._tip.history[-1].tip
 
     def truth(self, t_s: float) -> dict[str, Any]:
-        """What nobody on the wire is told, JSON-able: drift, tip, what happened to it, marks on the sample."""
+        """Return what nobody on the wire is told, JSON-able: drift, tip, what happened to it, marks on the sample."""
         return {
             "t_s": t_s,
             "seed": self.seed,
-            "surface": dict(self._surface_table),
+            "surface": dict(self.sample.table),
             "drift_m": self.drift_m(t_s).tolist(),
-            "turn": self._turn(t_s),
-            "compensated_m": self._compensation.at(t_s).tolist(),
-            "tip": self._tips.at(t_s).to_dict(),
-            "tip_changes": [
-                {"t_s": c.t_s, "cause": c.cause, "tip": c.tip.to_dict()} for c in self._tips.changes if c.t_s <= t_s
-            ],
-            "marks": [asdict(mark) for mark in self._marks if mark.t_s <= t_s],
+            "turn": self.sample.turn(t_s),
+            "compensated_m": self.sample.compensation.at(t_s).tolist(),
+            "tip": asdict(self._tip.at(t_s)),
+            "tip_changes": [asdict(change) for change in self._tip.history if change.t_s <= t_s],
+            "marks": [asdict(mark) for mark in self.sample.marks if mark.t_s <= t_s],
         }
 
     # -- being killed and coming back
 
     def state(self) -> dict[str, Any]:
-        """All that `restore` needs to go on as if nothing had happened, JSON-able."""
-        return {
-            "version": STATE_VERSION,
-            "seed": self.seed,
-            "start_s": self.start_s,
-            "calls": self._calls,
-            "scheduled_until_s": self._scheduled_until_s,
-            "at_m": list(self._at_m),
-            "came_from_m": list(self._came_from_m),
-            "came_s": self._came_s,
-            "held_z_m": self._held_z_m,
-            "tips": [{"t_s": c.t_s, "cause": c.cause, "tip": c.tip.to_dict()} for c in self._tips.changes],
-            "marks": [asdict(mark) for mark in self._marks],
-            "compensation": self._compensation.to_list(),
-        }
+        """Return all that `restore` needs to go on as if nothing had happened, JSON-able."""
+        state = WorldState(
+            seed=self.seed,
+            start_s=self.start_s,
+            calls=self._calls,
+            scheduled_until_s=self._tip.scheduled_until_s,
+            at_m=self._place.at_m,
+            came_from_m=self._place.came_from_m,
+            came_s=self._place.came_s,
+            held_z_m=self._held_z_m,
+            tips=self._tip.history,
+            marks=self.sample.marks,
+            compensation=self.sample.compensation.turns,
+        )
+        return snapshot(state, "world", STATE_VERSION)
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Becomes the world that `state` was taken from; its settings must be the same.
+        """Become the world that `state` was taken from; its settings must be the same.
 
         Raises:
             InvalidValue: a state of another world or version, or a damaged one; nothing has changed then.
         """
-        mine = {"version": STATE_VERSION, "seed": self.seed, "start_s": self.start_s}
-        for name, value in mine.items():
-            if state.get(name) != value:
-                raise InvalidValue(f"a saved state with {name} {state.get(name)!r} instead of {value!r}")
-        try:
-            tips = [TipChange(c["t_s"], c["cause"], TipState.from_dict(c["tip"])) for c in state["tips"]]
-            found = [build(Mark, mark, "marks") for mark in state["marks"]]
-            calls, until = int(state["calls"]), float(state["scheduled_until_s"])
-            at, came_from = (tuple(map(float, state[name])) for name in ("at_m", "came_from_m"))
-            came_s, held = float(state["came_s"]), state["held_z_m"]
-            compensation = Compensation()
-            compensation.restore(state.get("compensation", ()))
-        except (KeyError, TypeError, ValueError, ConfigError) as error:
-            raise InvalidValue(f"a damaged saved state: {error}") from error
-        self._tips, self._marks, self._calls, self._scheduled_until_s = TipHistory(tips), found, calls, until
-        self._at_m, self._came_from_m = (at[0], at[1]), (came_from[0], came_from[1])
-        self._came_s, self._held_z_m = came_s, held
-        self._compensation = compensation
+        found = restored(WorldState, state, "world", STATE_VERSION)
+        for name in ("seed", "start_s"):
+            theirs, mine = getattr(found, name), getattr(self, name)
+            if theirs != mine:
+                raise InvalidValue(f"a saved state with {name} {theirs!r} instead of {mine!r}")
+        self._calls, self._held_z_m = found.calls, found.held_z_m
+        self._place.at_m, self._place.came_from_m, self._place.came_s = found.at_m, found.came_from_m, found.came_s
+        self._tip.history, self._tip.scheduled_until_s = found.tips, found.scheduled_until_s
+        self.sample.marks, self.sample.compensation = found.marks, ScannerCompensation(found.compensation)
 
     # -- inside
 
     def _begin(self, t_s: float, position_m: tuple[float, float]) -> int:
-        """Goes to a time and a place; returns the number of this call."""
+        """Go to a time and a place; return the number of this call."""
         if not (math.isfinite(t_s) and t_s >= self.start_s - 1e-6):
             raise InvalidValue(f"the world starts at {self.start_s:g} s, nothing can be done at {t_s:g} s")
-        self._tips.forget_after(t_s)
-        self._scheduled_until_s = min(self._scheduled_until_s, t_s)
-        self._marks = [mark for mark in self._marks if mark.t_s <= t_s]
-        self._advance(t_s)
-        if position_m != self._at_m:
-            self._came_from_m, self._came_s, self._at_m = self._at_m, t_s, position_m
+        self.sample.marks = [mark for mark in self.sample.marks if mark.t_s <= t_s]
+        self._tip.begin(t_s)
+        self._place.move_to(position_m, t_s)
         self._calls += 1
         return self._calls
 
-    def _advance(self, until_s: float) -> None:
-        """Lets the scheduled changes up to a time happen."""
-        for number, (after_s, condition) in enumerate(self.settings.tip_changes.schedule):
-            t_s = self.start_s + after_s
-            if self._scheduled_until_s < t_s <= until_s or (t_s == until_s == self.start_s):
-                tip = self._maker.changed(self._tips.at(t_s), condition, chance.generator(self.seed, 6, number))
-                self._tips.add(TipChange(t_s, "schedule", tip))
-        self._scheduled_until_s = max(self._scheduled_until_s, until_s)
-
     def _foresee(self, course: Course, loop: Loop, call: int) -> None:
-        """Changes of the tip that will come during a scan: scheduled ones, and by chance."""
-        s = self.settings.tip_changes
-        hardness = loop.force**s.hardness_exponent if loop.on and loop.engages else float(not loop.on)
+        exponent = self.settings.tip_changes.hardness_exponent
+        hardness = loop.force**exponent if loop.on and loop.engages else float(not loop.on)
         speed = course.length_m / (course.end_s - course.start_s)
-        rate = (s.per_hour / 3600.0 + s.per_metre * speed) * hardness
-        seed = chance.subseed(self.seed, "tip changes")
-        found = chance_changes(s, course.start_s, course.end_s, rate, seed, call)
-        for number, (t_s, flaw) in enumerate(found):
-            self._advance(t_s)
-            random = chance.generator(seed, call, number)
-            self._tips.add(TipChange(t_s, "chance", self._maker.changed(self._tips.at(t_s), flaw, random)))
-        self._advance(course.end_s)
+        self._tip.foresee(course.start_s, course.end_s, speed, hardness, call)
 
     def _wear(self, course: Course, loop: Loop) -> None:
-        """The apex grows by what it has been rubbed off."""
         s = self.settings.tip_changes
         if s.wear_m_per_m and loop.engages:
-            worn = s.wear_m_per_m * course.length_m * loop.force**s.hardness_exponent
-            tip = replace(self.tip, radius_m=self.tip.radius_m + worn)
-            self._tips.add(TipChange(course.end_s, "wear", tip))
-
-    def _treat(self, cause: str, t_s: float, chances: Chances, random: np.random.Generator) -> str:
-        draw = random.random()
-        tip = self._tips.at(t_s)
-        if draw < chances.cures:
-            self._tips.add(TipChange(t_s, cause, self._maker.changed(tip, "sharp", random)))
-            return "cured"
-        flaw = drawn_flaw(self.settings.tip_changes, random)
-        if draw < chances.cures + chances.worsens and flaw is not None:
-            self._tips.add(TipChange(t_s, cause, self._maker.changed(tip, flaw, random)))
-            return "worsened"
-        return "unchanged"
-
-    def _mark(self, kind: str, position_m: tuple[float, float], t_s: float, depth_m: float, radius_m: float) -> None:
-        self._marks.append(Mark(self._on_sample(position_m, t_s), depth_m, radius_m, t_s, kind))
-
-    def _on_sample(self, position_m: tuple[float, float], t_s: float) -> tuple[float, float]:
-        x, y = self.to_sample(np.add(position_m, self._compensation.at(t_s)[:2]), t_s)
-        return float(x), float(y)
-
-    def _turn(self, t_s: float) -> dict[str, Any]:
-        turn = complex(self._drift.turn(t_s))
-        return {"angle_rad": cmath.phase(turn), "scale": abs(turn), "about_m": list(self.settings.drift.about_m)}
-
-    def _relief(self, x_m: Array, y_m: Array, resolution_m: float, t_s: float) -> Relief:
-        relief = self._surface.relief(x_m, y_m, resolution_m, self._surface_seed)
-        for mark in self._marks:
-            if mark.t_s <= t_s:
-                marks.draw(mark, relief, x_m, y_m)
-        return relief
+            self._tip.wear(course.end_s, s.wear_m_per_m * course.length_m * loop.force**s.hardness_exponent)
 
     def _setup(self, loop: Loop, bias_v: float, slope: tuple[float, float], start_s: float) -> Setup:
         return Setup(
-            sample=lambda x, y, resolution_m: self._relief(x, y, resolution_m, start_s),
-            drift_m=self.seen_drift_m,
-            turn=self._drift.turn,
-            unturned=self._drift.unturned,
-            offset_m=self._creep_m,
+            sample=lambda x, y, resolution_m: self.sample.relief(x, y, resolution_m, start_s),
+            drift_m=self.sample.seen_drift_m,
+            turn=self.sample.drift.turn,
+            unturned=self.sample.drift.unturned,
+            offset_m=self._place.creep_m,
             scanner=self.settings.scanner,
             noise=self.settings.noise,
             signals=self.settings.signals,
@@ -474,9 +417,17 @@ class World:
             slope=slope,
         )
 
-    def _creep_m(self, t_s: Array) -> Array:
-        """How far the piezo is from where it was sent, (x, y): what is missing of its last move."""
-        move = np.subtract(self._at_m, self._came_from_m)
-        since = np.maximum(np.asarray(t_s) - self._came_s, 0.0) + 1.0
-        left = self.settings.scanner.creep * np.maximum(1.0 - np.log10(since) / 4.0, 0.0)
-        return np.asarray(left[:, None] * move)
+
+def _truth_of_scan(sample: Sample, course: Course, tips: TipTimes) -> dict[str, Any]:
+    start_s, end_s = course.start_s, course.end_s
+    return {
+        "start_s": start_s,
+        "end_s": end_s,
+        "tips": [{"t_s": t, **asdict(tip)} for t, tip in tips],
+        "drift_start_m": sample.drift.at(start_s).tolist(),
+        "drift_end_m": sample.drift.at(end_s).tolist(),
+        "turn_start": sample.turn(start_s),
+        "turn_end": sample.turn(end_s),
+        "compensated_start_m": sample.compensation.at(start_s).tolist(),
+        "compensated_end_m": sample.compensation.at(end_s).tolist(),
+    }

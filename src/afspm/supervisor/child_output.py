@@ -24,7 +24,7 @@ Stream = Literal["stdout", "stderr"]
 
 
 @dataclass(frozen=True, slots=True)
-class Printed:
+class OutputLine:
     """A child wrote a line."""
 
     name: str
@@ -90,7 +90,7 @@ class ChildOutput:
     The child never has to wait for us: a driver that says much must not become slow.
     """
 
-    def __init__(self, name: str, pid: int, stream: Stream, tell: Callable[[Printed | OutputDropped], None]) -> None:
+    def __init__(self, name: str, pid: int, stream: Stream, tell: Callable[[OutputLine | OutputDropped], None]) -> None:
         self._name, self._pid, self._stream, self._tell = name, pid, stream, tell
         self._clock = ExperimentClock.real()
         self._thinning = OutputLimit(self._clock.monotonic_s())
@@ -124,4 +124,4 @@ class ChildOutput:
 
     def _tell_line(self, line: bytes) -> None:
         text = line.decode("utf-8", errors="replace").rstrip("\r\n")
-        self._tell(Printed(self._name, self._pid, self._stream, text))
+        self._tell(OutputLine(self._name, self._pid, self._stream, text))

@@ -18,14 +18,14 @@ from afspm.experiment import ProcessStart
 from afspm.launch import Launch
 from afspm.logic.supervision.supervisor_events import Exited
 from afspm.model import Role
-from afspm.supervisor.child_output import ChildOutput, OutputDropped, Printed, Stream
+from afspm.supervisor.child_output import ChildOutput, OutputDropped, OutputLine, Stream
 from afspm.supervisor.windows_job import WindowsJob
 
 LONGEST_LINE = 1 << 16  # a child that prints without end of line must not fill our memory
 FED_S = 0.2  # a pipe takes a launch line at once, unless it is long and the child does not read
 LAST_WORDS_S = 3.0  # how long its output may still be read after an exit; a grandchild that left can hold the pipe open
 
-ChildEvent = Printed | OutputDropped | Exited
+ChildEvent = OutputLine | OutputDropped | Exited
 HOST = "afspm.process.host"
 GUARD = "afspm.process.foreign"
 

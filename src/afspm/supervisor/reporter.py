@@ -1,6 +1,6 @@
-"""Tells the scheduler how it is with the processes and what they say, and hears what it orders.
+"""Reports states of processes and log lines to the scheduler, and receives its orders.
 
-All of it in a thread of its own: the supervisor hands over and goes on, whether the scheduler is there, slow or dead.
+In a thread of its own: the supervisor hands over and goes on, whether the scheduler is there, slow or dead.
 """
 
 from __future__ import annotations
@@ -40,23 +40,24 @@ from afspm.process.context import new_session
 from afspm.transport.port import ControlConnected, ControlDisconnected, Incoming, ReplyReceived
 from afspm.transport.zmq_port import ZmqPort, open_port
 
-STATES_S = 2.0
-"""Real time between two times that all states are told, at most."""
-LINES_S = 0.2
-"""Real time between two times that lines are told, at least."""
-AGAIN_S = 5.0
-"""Real time after which what is not answered is told again."""
+STATES_PERIOD_S = 2.0
+"""Longest real time between two reports of all states."""
+LINES_PERIOD_S = 0.2
+"""Shortest real time between two reports of lines."""
+RESEND_AFTER_S = 5.0
+"""Real time after which a report without an answer is sent again."""
 MOST_LINES = 5000
-"""So many lines wait for a scheduler that is not there; of more the oldest are left out."""
+"""Lines that wait for a scheduler that is not there; of more the oldest are dropped."""
 LONGEST_LINE = 2000
 """Characters."""
 _BATCH_BYTES = LONGEST // 4
-_CLOSED_S = 1.0
+_CLOSE_WITHIN_S = 1.0
+_MOST_FAILURES = 100
 
 
 @dataclass(frozen=True, slots=True)
 class ReportFailed:
-    """The scheduler can't be told."""
+    """The scheduler does not take reports."""
 
     text: str
 
@@ -64,8 +65,71 @@ class ReportFailed:
 ReporterEvent = RestartOrdered | ReportFailed | SchedulerAnswered
 
 
+class ReportQueue:
+    """The newest states, and the lines, that are still to be reported. Thread-safe.
+
+    Args:
+        clock: of the experiment.
+        name: under which dropped lines are noted.
+    """
+
+    def __init__(self, clock: Clock, name: str) -> None:
+        self._clock, self._name = clock, name
+        self._lock = threading.Lock()
+        self._lines: deque[LogLine] = deque()
+        self._dropped = 0
+        self._states: tuple[ProcessState, ...] = ()
+        self._has_changed = False
+        self._states_s = self._lines_s = -math.inf
+
+    def put_states(self, states: tuple[ProcessState, ...], *, changed: bool) -> None:
+        self._states, self._has_changed = states, self._has_changed or changed
+
+    def put_line(self, name: str, level: str, text: str) -> bool:
+        """Append a line; returns whether it is the only one."""
+        line = LogLine(self._clock.now_ns(), name, level, text[:LONGEST_LINE])
+        with self._lock:
+            if len(self._lines) >= MOST_LINES:
+                self._lines.popleft()
+                self._dropped += 1
+            self._lines.append(line)
+            return len(self._lines) == 1
+
+    def take(self, supervisor: str) -> ProcessStates | LogLines | None:
+        """Return what is due; None: nothing is yet."""
+        now_s = self._clock.monotonic_s()
+        if self._states and (self._has_changed or now_s >= self._states_s + STATES_PERIOD_S):
+            self._has_changed, self._states_s = False, now_s
+            return ProcessStates(self._clock.now_ns(), supervisor, self._states)
+        if self._lines and now_s >= self._lines_s + LINES_PERIOD_S:
+            self._lines_s = now_s
+            return LogLines(self.take_lines())
+        return None
+
+    def take_lines(self) -> tuple[LogLine, ...]:
+        """Return as many lines as the scheduler takes at a time."""
+        batch, size = [], 0
+        with self._lock:
+            if self._dropped:
+                what = f"dropped {self._dropped} lines: the scheduler did not take them"
+                batch.append(LogLine(self._lines[0].time_ns, self._name, "WARNING", what))
+                self._dropped = 0
+            while self._lines and size < _BATCH_BYTES:
+                batch.append(self._lines.popleft())
+                size += 4 * len(batch[-1].text) + 100
+        return tuple(batch)
+
+    def due_s(self) -> float:
+        """Return when something is due, in real monotonic time."""
+        if self._has_changed:
+            return -math.inf
+        states_s = self._states_s if self._states else self._clock.monotonic_s()
+        lines_s = self._lines_s + LINES_PERIOD_S if self._lines else math.inf
+        return min(states_s + STATES_PERIOD_S, lines_s)
+
+
 class Reporter:
-    """Begins to tell with `start`, ends with `close`.
+    """Reports states and lines to the scheduler, from `start` to `close`, in a thread of its own.
 
     Args:
         launch: how the scheduler is asked; its name is "supervisor:" and what tells this supervisor from others.
@@ -73,58 +137,42 @@ class Reporter:
         supervisor: what tells this supervisor from others.
 
     Attributes:
-        post: called with news, in the reporter's thread.
+        post: called with events, in the reporter's thread.
     """
 
     def __init__(self, launch: Launch, clock: Clock, supervisor: str) -> None:
-        self.post: Callable[[ReporterEvent], None] = lambda news: None
-        self._launch = launch
-        self._clock = clock
-        self._supervisor = supervisor
-        self._lock = threading.Lock()
-        self._lines: deque[LogLine] = deque()
-        self._left_out = 0
-        self._states: tuple[ProcessState, ...] = ()
-        self._is_new = False
-        self._closing = False
+        self.post: Callable[[ReporterEvent], None] = lambda event: None
+        self._launch, self._clock, self._supervisor = launch, clock, supervisor
+        self._queue = ReportQueue(clock, launch.name)
+        self._is_closing = False
         self._port: ZmqPort | None = None
         self._thread = threading.Thread(target=self._run, name="reporter", daemon=True)
-        self._talk = _Talk(launch.name, launch.run)
-        self._states_s = self._lines_s = -math.inf
-        self._complaints: set[str] = set()
+        self._request = _OpenRequest(launch.name, launch.run)
+        self._failures: set[str] = set()
 
     # --- of the supervisor, any thread ---
 
     def start(self) -> None:
-        """Begin to tell."""
+        """Begin to report."""
         self._thread.start()
 
     def states(self, states: tuple[ProcessState, ...], *, changed: bool) -> None:
         """Take the states of all processes; report them at once if they have `changed`."""
-        self._states, self._is_new = states, self._is_new or changed
+        self._queue.put_states(states, changed=changed)
         if changed:
             self._wake()
 
     def line(self, name: str, level: int, text: str) -> None:
-        """A process, or the supervisor itself, said something; `level` is that of `logging`."""
-        if level <= logging.DEBUG:
-            return
-        line = LogLine(self._clock.now_ns(), name, logging.getLevelName(level), text[:LONGEST_LINE])
-        with self._lock:
-            if len(self._lines) >= MOST_LINES:
-                self._lines.popleft()
-                self._left_out += 1
-            self._lines.append(line)
-            is_first = len(self._lines) == 1
-        if is_first:
+        """Take a line of a process, or of the supervisor itself; `level` is that of `logging`."""
+        if level > logging.DEBUG and self._queue.put_line(name, logging.getLevelName(level), text):
             self._wake()
 
     def close(self) -> None:
-        """Tell no more. Takes a second at most."""
-        self._closing = True
+        """Report no more. Takes a second at most."""
+        self._is_closing = True
         self._wake()
         if self._thread.is_alive():
-            self._thread.join(_CLOSED_S)
+            self._thread.join(_CLOSE_WITHIN_S)
 
     def _wake(self) -> None:
         if (port := self._port) is not None:
@@ -136,114 +184,82 @@ class Reporter:
         try:
             port = open_port(self._launch, ExperimentClock.real())
         except AfspmError as error:
-            self._complain(str(error))
+            self._fail(str(error))
             self.post(SchedulerAnswered())  # or not: there is no asking
             return
         try:
             self._port = port
-            while not self._closing:
-                self._tell(port)
+            while not self._is_closing:
+                self._send(port)
                 for incoming in port.poll(self._timeout_s()):
-                    self._hear(incoming)
+                    self._receive(incoming)
         finally:
             port.close()
 
-    def _tell(self, port: ZmqPort) -> None:
-        """Ask again, or what comes next, if it is time for either."""
-        talk, now_s = self._talk, self._clock.monotonic_s()
-        if not talk.connected:
+    def _send(self, port: ZmqPort) -> None:
+        """Send the open request again, or the next one, if it is time for either."""
+        request, now_s = self._request, self._clock.monotonic_s()
+        if not request.connected or (request.sent and now_s < request.sent_s + RESEND_AFTER_S):
             return
-        if talk.asked is None:
-            thing = self._next(now_s)
-            if thing is None:
-                return
-            talk.ask(thing)
-        elif now_s < talk.asked_s + AGAIN_S:
-            return
-        assert talk.asked is not None
-        talk.asked_s = now_s
-        port.send(wire.encode_request(talk.asked))
-
-    def _next(self, now_s: float) -> ProcessStates | LogLines | None:
-        if self._states and (self._is_new or now_s >= self._states_s + STATES_S):
-            self._is_new, self._states_s = False, now_s
-            return ProcessStates(self._clock.now_ns(), self._supervisor, self._states)
-        if self._lines and now_s >= self._lines_s + LINES_S:
-            self._lines_s = now_s
-            return LogLines(self._some_lines())
-        return None
-
-    def _some_lines(self) -> tuple[LogLine, ...]:
-        some, size = [], 0
-        with self._lock:
-            if self._left_out:
-                what = f"{self._left_out} lines are left out here: the scheduler did not take them"
-                some.append(LogLine(self._lines[0].time_ns, self._launch.name, "WARNING", what))
-                self._left_out = 0
-            while self._lines and size < _BATCH_BYTES:
-                some.append(self._lines.popleft())
-                size += 4 * len(some[-1].text) + 100
-        return tuple(some)
+        sent = request.sent or request.open(self._queue.take(self._supervisor))
+        if sent is not None:
+            request.sent_s = now_s
+            port.send(wire.encode_request(sent))
 
     def _timeout_s(self) -> float:
-        talk, now_s = self._talk, self._clock.monotonic_s()
-        if not talk.connected:
-            return STATES_S
-        if talk.asked is not None:
-            return max(0.0, talk.asked_s + AGAIN_S - now_s)
-        due_s = self._states_s + STATES_S if self._states else now_s + STATES_S
-        if self._lines:
-            due_s = min(due_s, self._lines_s + LINES_S)
-        return 0.0 if self._is_new else max(0.0, due_s - now_s)
+        request, now_s = self._request, self._clock.monotonic_s()
+        if not request.connected:
+            return STATES_PERIOD_S
+        due_s = request.sent_s + RESEND_AFTER_S if request.sent else self._queue.due_s()
+        return max(0.0, due_s - now_s)
 
-    def _hear(self, incoming: Incoming) -> None:
-        talk = self._talk
+    def _receive(self, incoming: Incoming) -> None:
+        request = self._request
         if isinstance(incoming, ControlConnected):
-            talk.connected, talk.asked_s = True, -math.inf  # what was asked may be lost
+            request.connected, request.sent_s = True, -math.inf  # what was sent may be lost
         elif isinstance(incoming, ControlDisconnected):
-            talk.connected = False
-        elif isinstance(incoming, ReplyReceived) and talk.is_answer(incoming.response):
-            talk.asked = None
-            if not talk.answered and incoming.response.code != OTHER_RUN_RESPONSE:
-                talk.answered = True
+            request.connected = False
+        elif isinstance(incoming, ReplyReceived) and request.sent and incoming.response.id == request.sent.id:
+            request.sent = None
+            if not request.answered and incoming.response.code != OTHER_RUN_RESPONSE:
+                request.answered = True
                 self.post(SchedulerAnswered())
             self._answered(incoming.response)
 
     def _answered(self, response: Response) -> None:
         if not response.ok:
-            self._closing = self._closing or response.code == ControlResponse.CMD_NOT_SUPPORTED
-            self._complain(response.reason)
+            self._is_closing = self._is_closing or response.code == ControlResponse.CMD_NOT_SUPPORTED
+            self._fail(response.reason)
             return
         try:
             orders = wire.decode_orders(response.payload)
         except WireError as error:
-            self._complain(str(error))
+            self._fail(str(error))
             return
         for name in orders:
             self.post(RestartOrdered(name))
 
-    def _complain(self, why: str) -> None:
-        if why not in self._complaints and len(self._complaints) < 100:
-            self._complaints.add(why)
+    def _fail(self, why: str) -> None:
+        if why not in self._failures and len(self._failures) < _MOST_FAILURES:
+            self._failures.add(why)
             self.post(ReportFailed(f"the scheduler is not told how it is with the processes here: {why}"))
 
 
-class _Talk:
-    """The question that is open, of which there is one at a time."""
+class _OpenRequest:
+    """The request that waits for its answer; there is one at a time."""
 
     def __init__(self, name: str, run: str) -> None:
         self.connected = self.answered = False
-        self.asked: Request | None = None
-        self.asked_s = -math.inf
+        self.sent: Request | None = None
+        self.sent_s = -math.inf
         self._name, self._session, self._count = name, new_session(run), 0
 
-    def ask(self, thing: ProcessStates | LogLines) -> None:
-        self._count += 1
-        told = RelayedMessage(*wire.encode(thing))
-        self.asked = Request(RELAY_REQUEST, told, id=f"{self._name}/{self._session}/{self._count}")
-
-    def is_answer(self, response: Response) -> bool:
-        return self.asked is not None and response.id == self.asked.id
+    def open(self, message: ProcessStates | LogLines | None) -> Request | None:
+        if message is not None:
+            self._count += 1
+            relayed = RelayedMessage(*wire.encode(message))
+            self.sent = Request(RELAY_REQUEST, relayed, id=f"{self._name}/{self._session}/{self._count}")
+        return self.sent
 
 
 _LONGEST_COMPUTER_NAME = 60

@@ -41,14 +41,14 @@ from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import Role
 from afspm.supervisor import signals
 from afspm.supervisor.activity_monitor import ActivityMonitor
-from afspm.supervisor.child_output import OutputDropped, Printed
+from afspm.supervisor.child_output import OutputDropped, OutputLine
 from afspm.supervisor.clock_check import ClockCheck
 from afspm.supervisor.log import LineReader, RunLog
 from afspm.supervisor.process import ChildEvent, ChildProcess, Task
 from afspm.supervisor.reaper import Reaper
 from afspm.supervisor.reporter import Reporter, ReporterEvent, ReportFailed
 from afspm.transport.heartbeat import HeartbeatListener
-from afspm.transport.wakeup import WakeUp
+from afspm.transport.polling import WakeUp
 
 REPORT_PERIOD_S = 0.1
 """Real time between two looks at the states of processes, for the reporter."""
@@ -148,7 +148,7 @@ class Supervisor:
         # a person who wants it to end does not wait behind what the processes print
         for event in sorted(self._wakeup.take(), key=lambda event: not isinstance(event, EndSignal)):
             match event:
-                case Printed():
+                case OutputLine():
                     level, text = self._lines[event.name].read(event.stream, event.line)
                     self._log.write(event.name, level, text)
                 case OutputDropped():

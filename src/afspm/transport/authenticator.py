@@ -10,7 +10,7 @@ from zmq.utils import z85
 
 from afspm.errors import ConfigError
 from afspm.transport.keys import Keys, public_keys
-from afspm.transport.wakeup import WakeUp
+from afspm.transport.polling import WakeUp
 
 DOMAIN = b"afspm"
 _ADDRESS = "inproc://zeromq.zap.01"

@@ -30,7 +30,7 @@ def receive_frames(socket: Socket) -> list[zmq.Frame]:
 
 def is_readable(socket: Socket) -> bool:
     """Return whether a message can be received at once."""
-    return bool(socket.poll(0))
+    return bool(zmq.zmq_poll([(socket, zmq.POLLIN)], 0))
 
 
 def contents(frames: Sequence[zmq.Frame]) -> list[Buffer]:

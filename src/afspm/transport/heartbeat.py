@@ -13,8 +13,7 @@ import zmq
 
 from afspm.transport.frames import receive_frames
 from afspm.transport.network import Network
-from afspm.transport.polling import milliseconds
-from afspm.transport.wakeup import WakeUp
+from afspm.transport.polling import WakeUp, milliseconds
 from afspm.wire import BEAT, CLOSING
 
 

@@ -6,9 +6,9 @@ real one.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 from afspm.clock import Clock
 from afspm.model import Packet, Response
@@ -63,32 +63,6 @@ class ControlConnected:
 @dataclass(frozen=True, slots=True)
 class ControlDisconnected:
     """The scheduler is gone for now; the connection is made again by itself."""
-
-
-class LaunchedSockets(Protocol):
-    """The part of `afspm.launch.Sockets` that ports need."""
-
-    @property
-    def publish(self) -> str | None: ...
-    @property
-    def subscribe(self) -> Sequence[str]: ...
-    @property
-    def serve(self) -> str | None: ...
-    @property
-    def control(self) -> str | None: ...
-
-
-class LaunchedProcess(Protocol):
-    """The part of `afspm.launch.Launch` that ports need."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def sockets(self) -> LaunchedSockets: ...
-    @property
-    def envelopes(self) -> Sequence[str] | None: ...
-    @property
-    def keys(self) -> Mapping[str, Any] | None: ...
 
 
 Incoming = PacketReceived | ReplyReceived | CaughtUp | Killed | ParentGone | ControlConnected | ControlDisconnected

@@ -14,7 +14,7 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -95,6 +95,7 @@ class TcpGuard:
         self._port = 0
         self._backlogs: dict[int, Backlog] = {}
         self._replayed: dict[int, int] = {}
+        self._heard: set[int] = set()
         self._settled: set[int] = set()
         self._published = self._unchecked = 0
         self._lock = threading.Lock()
@@ -120,10 +121,15 @@ class TcpGuard:
         with self._lock:
             self._backlogs.pop(descriptor, None)
 
-    def settled(self, descriptors: Iterable[int]) -> None:
-        """Nothing is left to receive, after messages by these connections."""
+    def heard(self, descriptor: int) -> None:
+        """Whole messages were taken of a connection."""
+        self._heard.add(descriptor)
+
+    def settle(self) -> None:
+        """Nothing is left to receive, after the messages that were heard."""
         with self._lock:
-            self._settled.update(descriptors)
+            self._settled |= self._heard
+        self._heard.clear()
 
     def published(self, count: int) -> None:
         """So many bytes were sent to all subscribers."""

@@ -95,10 +95,6 @@ class TranslatorLink:
                 gone.append(LinkDown())
         return gone
 
-    def close(self) -> None:
-        self.monitor.close()
-        self.socket.close()
-
 
 def _parted(frames: list[bytes]) -> tuple[list[bytes], list[bytes]]:
     """What stands before the first empty frame, and behind it; both are empty where there is none."""

@@ -17,7 +17,7 @@ import pytest
 from afspm.errors import AfspmError
 from afspm.launch import Launch
 from afspm.logic.supervision.supervisor_events import Exited
-from afspm.supervisor.child_output import OutputDropped, Printed
+from afspm.supervisor.child_output import OutputDropped, OutputLine
 from afspm.supervisor.process import ChildEvent, ChildProcess, Task
 
 DEADLINE_S = 15.0
@@ -49,26 +49,26 @@ def start(events: Queue[ChildEvent]) -> Iterator[Start]:
 
 def test_the_launch_line_arrives_and_the_answer_comes_back(start: Start, events: Queue[ChildEvent]) -> None:
     child = start("print(input())")
-    assert events.get(timeout=DEADLINE_S) == Printed("child", child.pid, "stdout", Launch("child").to_json())
+    assert events.get(timeout=DEADLINE_S) == OutputLine("child", child.pid, "stdout", Launch("child").to_json())
     assert events.get(timeout=DEADLINE_S) == Exited("child", child.pid, 0)
 
 
 def test_the_last_words_come_before_the_exit(start: Start, events: Queue[ChildEvent]) -> None:
     child = start("import sys; print('it broke', file=sys.stderr); sys.exit(3)")
-    assert events.get(timeout=DEADLINE_S) == Printed("child", child.pid, "stderr", "it broke")
+    assert events.get(timeout=DEADLINE_S) == OutputLine("child", child.pid, "stderr", "it broke")
     assert events.get(timeout=DEADLINE_S) == Exited("child", child.pid, 3)
 
 
 def test_bytes_that_are_no_text_are_shown_as_well_as_can_be(start: Start, events: Queue[ChildEvent]) -> None:
     start(r"import sys; sys.stdout.buffer.write(b'caf\xe9\n')")
     printed = events.get(timeout=DEADLINE_S)
-    assert isinstance(printed, Printed)
+    assert isinstance(printed, OutputLine)
     assert printed.line == "caf\N{REPLACEMENT CHARACTER}"
 
 
 def test_closing_stdin_ends_a_child_that_waits_for_it(start: Start, events: Queue[ChildEvent]) -> None:
     child = start("import sys; print('up', flush=True); sys.stdin.read(); sys.exit(81)")
-    assert isinstance(events.get(timeout=DEADLINE_S), Printed)
+    assert isinstance(events.get(timeout=DEADLINE_S), OutputLine)
     child.close_stdin()
     assert events.get(timeout=DEADLINE_S) == Exited("child", child.pid, 81)
 
@@ -76,7 +76,7 @@ def test_closing_stdin_ends_a_child_that_waits_for_it(start: Start, events: Queu
 def test_a_child_that_does_not_read_its_launch_line_does_not_block_us(events: Queue[ChildEvent]) -> None:
     deaf = [sys.executable, "-c", "import time; print('up', flush=True); time.sleep(60)"]
     child = ChildProcess(Task(Launch("deaf", settings={"long": "x" * 1_000_000}), tuple(deaf)), events.put)
-    assert isinstance(events.get(timeout=DEADLINE_S), Printed)
+    assert isinstance(events.get(timeout=DEADLINE_S), OutputLine)
     child.close_stdin()
     exited = events.get(timeout=DEADLINE_S)
     assert isinstance(exited, Exited)
@@ -101,7 +101,7 @@ def test_killing_takes_what_the_child_has_started_along(start: Start, events: Qu
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGSTOP")
 def test_a_frozen_child_can_be_killed(start: Start, events: Queue[ChildEvent]) -> None:
     child = start("import sys; print('up', flush=True); sys.stdin.read()")
-    assert isinstance(events.get(timeout=DEADLINE_S), Printed)
+    assert isinstance(events.get(timeout=DEADLINE_S), OutputLine)
     os.kill(child.pid, signal.SIGSTOP)
     child.kill()
     assert events.get(timeout=DEADLINE_S) == Exited("child", child.pid, -signal.SIGKILL)
@@ -115,9 +115,9 @@ def test_a_program_that_is_not_there_is_named(events: Queue[ChildEvent]) -> None
 @pytest.mark.skipif(sys.platform == "win32", reason="a pipe handed on by inheritance is a matter of POSIX")
 def test_a_child_does_not_hold_the_stdin_of_another_open(start: Start, events: Queue[ChildEvent]) -> None:
     first = start("import sys; print('up', flush=True); sys.stdin.read()")
-    assert isinstance(events.get(timeout=DEADLINE_S), Printed)
+    assert isinstance(events.get(timeout=DEADLINE_S), OutputLine)
     start("import sys; print('up', flush=True); sys.stdin.read()")
-    assert isinstance(events.get(timeout=DEADLINE_S), Printed)
+    assert isinstance(events.get(timeout=DEADLINE_S), OutputLine)
     first.close_stdin()
     assert events.get(timeout=DEADLINE_S) == Exited("child", first.pid, 0)
 
@@ -125,7 +125,7 @@ def test_a_child_does_not_hold_the_stdin_of_another_open(start: Start, events: Q
 def test_output_is_not_held_back(start: Start, events: Queue[ChildEvent]) -> None:
     start("import sys; print('at once'); sys.stdin.read()")
     printed = events.get(timeout=DEADLINE_S)
-    assert isinstance(printed, Printed)
+    assert isinstance(printed, OutputLine)
     assert printed.line == "at once"
 
 
@@ -134,7 +134,7 @@ def test_a_child_that_prints_without_end_is_not_kept_in_memory(start: Start, eve
     got = [events.get(timeout=DEADLINE_S)]
     while not isinstance(got[-1], Exited):
         got.append(events.get(timeout=DEADLINE_S))
-    printed = [event.line for event in got if isinstance(event, Printed)]
+    printed = [event.line for event in got if isinstance(event, OutputLine)]
     left_out = sum(event.lines for event in got if isinstance(event, OutputDropped))
     assert printed[0] == "waiting 0"
     assert {"waiting 199999", "no stage"} <= set(printed)
@@ -149,7 +149,7 @@ def test_a_secret_of_others_is_not_in_its_environment(
     monkeypatch.setenv("NIGHT_LAMP", "on")
     code = "import os; print(os.environ.get('NIGHT_HOOK'), os.environ.get('NIGHT_LAMP'))"
     child = ChildProcess(replace(python(code), hidden=("NIGHT_HOOK",)), events.put)
-    assert events.get(timeout=DEADLINE_S) == Printed("child", child.pid, "stdout", "None on")
+    assert events.get(timeout=DEADLINE_S) == OutputLine("child", child.pid, "stdout", "None on")
 
 
 KILLED_SUPERVISOR = """

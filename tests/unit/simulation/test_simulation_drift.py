@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from afspm.errors import InvalidValue
-from afspm.simulation.drift import Compensation, Drift, DriftSettings, Relaxation, random_walk
+from afspm.simulation.drift import Drift, DriftSettings, Relaxation, ScannerCompensation, random_walk
 
 START = 1.75e9
 
@@ -59,17 +59,17 @@ def test_a_scanner_that_follows_with_the_right_velocity_sees_no_drift() -> None:
     world = World.from_settings({"drift": {"velocity_m_per_s": [1e-9, -2e-9, 0.0]}}, 1, 0.0)
     world.compensate((5e-10, 0.0), 100.0)
     world.compensate((1e-9, -2e-9), 300.0)
-    seen = world.seen_drift_m(np.array([0.0, 100.0, 300.0, 1e4]))
+    seen = world.sample.seen_drift_m(np.array([0.0, 100.0, 300.0, 1e4]))
     expected = [[0.0, 0.0], [1e-7, -2e-7], [3e-7 - 1e-7, -6e-7], [2e-7, -6e-7]]
     np.testing.assert_allclose(seen[:, :2], expected, atol=1e-18)
     np.testing.assert_allclose(world.drift_m(1e4)[:2], [1e-5, -2e-5])  # what the sample does is another matter
     again = World.from_settings({"drift": {"velocity_m_per_s": [1e-9, -2e-9, 0.0]}}, 1, 0.0)
     again.restore(world.state())
-    np.testing.assert_array_equal(again.seen_drift_m(5e3), world.seen_drift_m(5e3))
+    np.testing.assert_array_equal(again.sample.seen_drift_m(5e3), world.sample.seen_drift_m(5e3))
 
 
 def test_a_scanner_has_followed_what_it_was_told_since_whenever_that_is_asked() -> None:
-    compensation = Compensation()
+    compensation = ScannerCompensation()
     turns = [(10.0, 1e-9), (20.0, 3e-9), (20.0, -2e-9), (35.0, 0.0)]
     for since_s, velocity in turns:
         compensation.set((velocity, -velocity), since_s)

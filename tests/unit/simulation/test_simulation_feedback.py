@@ -10,8 +10,7 @@ import pytest
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Feedback, Region
 from afspm.simulation import World
-from afspm.simulation.feedback import FeedbackSettings, Loop
-from afspm.simulation.sensor import SensorSettings
+from afspm.simulation.feedback import FeedbackSettings, Loop, SensorSettings
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))
 DT = 1e-4

@@ -43,11 +43,11 @@ def test_a_pixel_shows_the_sample_at_its_own_place(angle_deg: float, center: tup
     region = Region(center, (900e-9, 500e-9), np.radians(angle_deg))
     values = height(world, region)
     x, y = region.pixels_m(values.shape)
-    expected = world.surface_m(x, y)
+    expected = world.sample.surface_m(x, y)
     assert relative_error(values, expected) < 0.05
     for wrong in (values[::-1], values[:, ::-1], values[::-1, ::-1]):
         assert relative_error(wrong, expected) > 0.3
-    half_a_frame = world.surface_m(x + region.size_m[0] / 2, y + region.size_m[1] / 2)
+    half_a_frame = world.sample.surface_m(x + region.size_m[0] / 2, y + region.size_m[1] / 2)
     assert relative_error(values, half_a_frame) > 0.3
 
 
@@ -57,7 +57,7 @@ def test_the_error_of_place_is_far_below_a_pixel() -> None:
     values = height(world, region, (96, 128))
     x, y = region.pixels_m(values.shape)
     pixel = 900e-9 / 127
-    errors = {s: relative_error(values, world.surface_m(x + s * pixel, y)) for s in (-0.25, 0.0, 0.25)}
+    errors = {s: relative_error(values, world.sample.surface_m(x + s * pixel, y)) for s in (-0.25, 0.0, 0.25)}
     assert errors[0.0] < errors[-0.25]
     assert errors[0.0] < errors[0.25]
 
@@ -69,8 +69,8 @@ def test_drift_is_where_the_sample_went() -> None:
     region = Region((0.0, 0.0), (900e-9, 500e-9))
     values = height(world, region, start_s=5000.0)
     x, y = region.pixels_m(values.shape)
-    assert relative_error(values, world.surface_m(x - 310e-9, y + 120e-9)) < 0.05
-    assert relative_error(values, world.surface_m(x + 310e-9, y - 120e-9)) > 0.3
+    assert relative_error(values, world.sample.surface_m(x - 310e-9, y + 120e-9)) < 0.05
+    assert relative_error(values, world.sample.surface_m(x + 310e-9, y - 120e-9)) > 0.3
 
 
 @pytest.mark.parametrize("direction", ["up", "down"])
@@ -81,10 +81,10 @@ def test_every_row_has_the_drift_of_its_own_time(direction: str) -> None:
     x, y = region.pixels_m((48, 64))
     row = np.arange(48) if direction == "up" else np.arange(48)[::-1]
     since = (10.0 + row + 0.25)[:, None]
-    expected = world.surface_m(x - 4e-9 * since, y - 2e-9 * since)
+    expected = world.sample.surface_m(x - 4e-9 * since, y - 2e-9 * since)
     assert relative_error(scan.channels()["Height"][1], expected) < 0.05
     np.testing.assert_allclose(scan.drift_m[:, 0], 4e-9 * since[:, 0], atol=1e-15)
-    assert relative_error(scan.channels()["Height"][1], world.surface_m(x - 4e-9 * (58 - since), y)) > 0.3
+    assert relative_error(scan.channels()["Height"][1], world.sample.surface_m(x - 4e-9 * (58 - since), y)) > 0.3
 
 
 TURNS = {"rotation_rad_per_s": 2e-3, "expansion_per_s": -5e-5, "about_m": [1.2e-6, -0.4e-6]}
@@ -108,14 +108,14 @@ def test_a_sample_that_turns_and_shrinks_is_seen_turned_and_smaller(start_s: flo
     values = height(world, region, start_s=start_s)
     x, y = region.pixels_m(values.shape)
     times_s = np.broadcast_to(1000.0 + since_s, x.shape)
-    at = world.to_sample(np.stack([x, y], axis=-1), times_s)
+    at = world.sample.to_sample(np.stack([x, y], axis=-1), times_s)
     back = np.stack(turned(at[..., 0], at[..., 1], since_s), axis=-1)
     drift = np.stack([0.3e-9 * since_s, 0.2e-9 * since_s], axis=-1)
     np.testing.assert_allclose(back + drift, np.stack([x, y], axis=-1), atol=1e-16)
-    np.testing.assert_allclose(world.to_tip(at, times_s), np.stack([x, y], axis=-1), atol=1e-16)
-    assert relative_error(values, world.surface_m(at[..., 0], at[..., 1])) < 0.05
-    at_first = world.to_sample(np.stack([x, y], axis=-1), np.full(x.shape, start_s))
-    assert relative_error(values, world.surface_m(at_first[..., 0], at_first[..., 1])) > 0.3
+    np.testing.assert_allclose(world.sample.to_tip(at, times_s), np.stack([x, y], axis=-1), atol=1e-16)
+    assert relative_error(values, world.sample.surface_m(at[..., 0], at[..., 1])) < 0.05
+    at_first = world.sample.to_sample(np.stack([x, y], axis=-1), np.full(x.shape, start_s))
+    assert relative_error(values, world.sample.surface_m(at_first[..., 0], at_first[..., 1])) > 0.3
 
 
 def test_what_is_done_at_a_place_is_done_where_the_sample_has_turned_to() -> None:

@@ -7,14 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from afspm.simulation.imaging import Grid, Sampler, felt
+from afspm.simulation.imaging import SampleGrid, Sampler, felt
 from afspm.simulation.tip import TipState
 
 STEP = 1e-9
 
 
 def felt_of(height: np.ndarray, tip: TipState, blur: float = 0.0) -> np.ndarray:
-    grid = Grid(0.0, 0.0, STEP, STEP, (height.shape[0], height.shape[1]))
+    grid = SampleGrid(0.0, 0.0, STEP, STEP, (height.shape[0], height.shape[1]))
     path, offset = felt(height, grid, tip, (blur, blur))
     return path + offset
 
@@ -75,7 +75,7 @@ def test_a_spline_read_at_points_is_the_blur_that_was_asked_for() -> None:
     x = np.arange(200) * STEP
     wave = 2 * np.pi / (16 * STEP)
     height = np.broadcast_to(1e-9 * np.sin(wave * x), (200, 200))
-    grid = Grid(0.0, 0.0, STEP, STEP, (200, 200))
+    grid = SampleGrid(0.0, 0.0, STEP, STEP, (200, 200))
     path, offset = felt(np.array(height), grid, TipState(1e-15, 1.0), (2.0, 2.0))
     at = np.random.default_rng(3).uniform(50 * STEP, 150 * STEP, (2, 5, 40))
     seen = Sampler(grid, at[0], at[1]).spline(path) + offset

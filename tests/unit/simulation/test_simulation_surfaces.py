@@ -10,8 +10,8 @@ import pytest
 
 from afspm.errors import ConfigError, FileError
 from afspm.simulation.surfaces import surface_from
-from afspm.simulation.surfaces.readers import read
-from afspm.simulation.surfaces.stamper import _frame_edges
+from afspm.simulation.surfaces.patterns import _frame_edges
+from afspm.simulation.surfaces.picture import read
 
 GENERATED = ["steps", "particles", "stamper", "lattice", "rough", "flat"]
 DATA = Path(__file__).parents[4] / "shared" / "data"

@@ -71,8 +71,8 @@ def test_a_scheduled_change_comes_in_the_middle_of_a_scan() -> None:
     difference = np.abs(changed - usual).max(axis=1)
     assert difference[:24].max() < 1e-9
     assert difference[25:].max() > 10e-9
-    assert w.tip_at(24.0).is_sharp
-    assert w.tip_at(25.0).flaws == ("double",)
+    assert w._tip.at(24.0).is_sharp
+    assert w._tip.at(25.0).flaws == ("double",)
     assert w.truth(10.0)["tip"]["flaws"] == ()
     assert [c["cause"] for c in w.truth(48.0)["tip_changes"]] == ["start", "schedule"]
 
@@ -145,9 +145,9 @@ def test_a_crash_leaves_a_crater_that_later_scans_see_and_earlier_ones_did_not()
     assert x[row, column] == pytest.approx(1.5e-7 + moved, abs=3e-8)
     assert y[row, column] == pytest.approx(-2e-7, abs=3e-8)
     assert later.min() < -3e-9
-    at_crater = w.surface_m(np.array([1.5e-7 - 1e-7]), np.array([-2e-7]))
+    at_crater = w.sample.surface_m(np.array([1.5e-7 - 1e-7]), np.array([-2e-7]))
     assert at_crater[0] < -3e-9
-    assert w.surface_m(np.array([5e-8]), np.array([-2e-7]), t_s=50.0)[0] == 0.0
+    assert w.sample.surface_m(np.array([5e-8]), np.array([-2e-7]), t_s=50.0)[0] == 0.0
 
 
 def test_pulses_and_crashes_cure_and_worsen_as_often_as_told() -> None:
@@ -173,7 +173,7 @@ def test_a_deeper_crash_leaves_a_deeper_crater_as_far_as_the_tip_holds_out() -> 
         w = world(surface="flat", tip={"condition": condition})
         w.crash((0.0, 0.0), depth_m, 50e-9, 1.0)
         (mark,) = w.truth(2.0)["marks"]
-        assert float(w.surface_m(0.0, 0.0)[()]) < -0.5 * mark["depth_m"]
+        assert float(w.sample.surface_m(0.0, 0.0)[()]) < -0.5 * mark["depth_m"]
         return float(mark["depth_m"])
 
     asked_m = [1e-9, 2e-9, 5e-9, 10e-9, 20e-9, 50e-9, 1e-6]
@@ -278,4 +278,4 @@ def test_a_lattice_is_tunnelled_on_unless_told_otherwise() -> None:
     assert set(seen) == {"Height", "Height Retrace", "Current"}
     assert np.median(seen["Current"][1]) == pytest.approx(-100e-12, rel=0.1)
     x, y = region.pixels_m((64, 64))
-    assert np.corrcoef(seen["Height"][1].ravel(), w.surface_m(x, y).ravel())[0, 1] > 0.8
+    assert np.corrcoef(seen["Height"][1].ravel(), w.sample.surface_m(x, y).ravel())[0, 1] > 0.8

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from afspm.microscopes.simulator.files import Measured, encode_scan
 from typer.testing import CliRunner
 
 from afspm.cli.app import app
@@ -18,6 +17,7 @@ from afspm.files import FileContent
 from afspm.model import Region, Scan
 from afspm.simulation import World
 from afspm.study.scan_series import series
+from afspm.translator.own_files import FileFacts, encode_scan
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))
 PIXELS = 48
@@ -65,7 +65,7 @@ def run_folder(tmp_path: Path) -> Path:
     (folder / "scans").mkdir(parents=True)
     for k in range(6):
         scan = world.scan(REGION, (PIXELS, PIXELS), 1.0, 600.0 * k)
-        measured = Measured(int(scan.end_s * 1e9), {"scan-speed [m/s]": 2e-6})
+        measured = FileFacts(int(scan.end_s * 1e9), {"scan-speed [m/s]": 2e-6})
         (folder / "scans" / f"scan-{k}.nc").write_bytes(encode_scan(REGION, scan.channels(), measured))
     start = {"n": 1, "time_s": 0.0, "event": "start", "settings": settings, "seed": 1}
     (folder / "truth.jsonl").write_text(json.dumps(start) + "\n", encoding="utf-8")

@@ -9,7 +9,7 @@ import pytest
 from afspm.clock import ExperimentClock
 from afspm.launch import Launch
 from afspm.logic.supervisor_registry import LONGEST
-from afspm.model import ControlResponse, Response
+from afspm.model import ControlResponse, LogLines, Response
 from afspm.supervisor import reporter as reporting
 from afspm.supervisor.reporter import Reporter
 from afspm.wire import encode
@@ -24,24 +24,24 @@ def reporter() -> Reporter:
 def test_the_oldest_lines_go_and_that_is_said(reporter: Reporter) -> None:
     for n in range(reporting.MOST_LINES + 7):
         reporter.line("one", logging.INFO, f"line {n}")
-    lines = reporter._some_lines()
-    assert lines[0].text == "7 lines are left out here: the scheduler did not take them"
+    lines = reporter._queue.take_lines()
+    assert lines[0].text == "dropped 7 lines: the scheduler did not take them"
     assert lines[0].level == "WARNING"
     assert lines[1].text == "line 7"
-    assert reporter._some_lines()[0].text == f"line {len(lines) + 6}"
+    assert reporter._queue.take_lines()[0].text == f"line {len(lines) + 6}"
 
 
 def test_a_batch_is_no_longer_than_the_scheduler_takes(reporter: Reporter) -> None:
     for _ in range(1000):
         reporter.line("one", logging.INFO, "µ" * 10_000)
-    lines = reporter._some_lines()
+    lines = reporter._queue.take_lines()
     assert len(lines[0].text) == reporting.LONGEST_LINE
-    assert len(encode(reporting.LogLines(lines))[1]) <= LONGEST
+    assert len(encode(LogLines(lines))[1]) <= LONGEST
 
 
 def test_what_is_for_developers_is_left_out(reporter: Reporter) -> None:
     reporter.line("one", logging.DEBUG, "started, process 7")
-    assert reporter._some_lines() == ()
+    assert reporter._queue.take_lines() == ()
 
 
 def test_orders_that_can_not_be_read_are_told_and_do_not_end_it(reporter: Reporter) -> None:

@@ -60,7 +60,7 @@ def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, direction: 
     assert peer.set(names.SCAN_DIRECTION, direction).ok
     scans = scanned(peer)
     x, y = region.pixels_m((48, 32))
-    truth = made.emulator.rig.world.surface_m(x, y)
+    truth = made.emulator.rig.world.sample.surface_m(x, y)
 
     def likeness(values: np.ndarray) -> float:
         return float(np.corrcoef(values.ravel(), truth.ravel())[0, 1])

@@ -133,11 +133,14 @@ class BankTracker:
             before=before,
             after=after,
             matched=placed,
-            reason="" if placed else self._why_not(tried, found, adrift=used is not None),
+            reason="" if placed else _why_not(tried, found, adrift=used is not None),
             lost=state.lost,
             registrations=registrations,
             forecast=self.forecast,
-            quality={"references": float(len(used.measured) if used else 0), **self._linear_quality()},
+            quality={
+                "references": float(len(used.measured) if used else 0),
+                **({} if state.similarity is None else {"linear_sd": state.similarity.sd}),
+            },
         )
 
     def set_velocity(self, time_s: float, velocity_m_s: ArrayLike, covariance: ArrayLike) -> None:
@@ -321,24 +324,11 @@ class BankTracker:
         if state.similarity is not None:
             state.similarity = state.similarity.without_scan(number)
 
-    def _why_not(self, tried: Table[int, Registration], found: Comparison | None, *, adrift: bool) -> str:
-        if adrift:
-            return "it matches only scans that matched nothing older"
-        if found is not None:
-            far = f"found {found.surprise**0.5:.1f} standard deviations from where it was expected"
-            return f"{far}; believed if the next one is too"
-        if tried:
-            return next(iter(tried.values())).reason
-        return "no earlier scan of this part of the sample is kept"
-
     def _with_velocity(self, filters: Filters, time_s: float, velocity_m_s: Array, covariance: Array) -> Filters:
         """With a velocity of the sample itself that was measured at about the time of the filters."""
         elsewhen = filters.models.over(abs(filters.time_s - time_s))[1][:, 2:, 2:]
         rarest = self._settings.rarest
         return filters.updated(filters.velocity_rows(), velocity_m_s, covariance + elsewhen, forget=1.0, rarest=rarest)
-
-    def _linear_quality(self) -> dict[str, float]:
-        return {} if self._state.similarity is None else {"linear_sd": self._state.similarity.sd}
 
     def _forecast_of(self, filters: Filters) -> BankForecast:
         state = self._state
@@ -351,8 +341,6 @@ class BankTracker:
     def _limit_m(self, scan: DriftScan) -> float:
         """Half of how far a scan may be off and still be compared."""
         return (1.0 - self._references.choice.overlap_min) * min(scan.region.size_m) / 2
-
-    # -- being killed and coming back
 
     def state(self) -> dict[str, Any]:
         """See `Tracker`."""
@@ -374,3 +362,14 @@ class BankTracker:
 def _drifts(filters: Filters) -> tuple[Array, Array]:
     """The expected displacement (2,) of now, and those (n, 2) that the scans show."""
     return (filters.weight @ filters.mean)[:2], filters.scan_drifts_m()
+
+
+def _why_not(tried: Table[int, Registration], found: Comparison | None, *, adrift: bool) -> str:
+    if adrift:
+        return "it matches only scans that matched nothing older"
+    if found is not None:
+        far = f"found {found.surprise**0.5:.1f} standard deviations from where it was expected"
+        return f"{far}; believed if the next one is too"
+    if tried:
+        return next(iter(tried.values())).reason
+    return "no earlier scan of this part of the sample is kept"

@@ -274,8 +274,8 @@ class TipModules:
         if which in ((), (drift,)):
             world, now_s = self._core.rig.world, self._core.now_s
             times_s = np.array([now_s - _TRACKED_S, now_s])
-            atom_m = world.to_sample(self._core.rig.probe_at(now_s), now_s)
-            tracked_m = np.column_stack([world.to_tip([atom_m, atom_m], times_s), world.drift_m(times_s)[:, 2]])
+            atom_m = world.sample.to_sample(self._core.rig.probe_at(now_s), now_s)
+            tracked_m = np.column_stack([world.sample.to_tip([atom_m, atom_m], times_s), world.drift_m(times_s)[:, 2]])
             x, y, z = ((tracked_m[1] - tracked_m[0]) / _TRACKED_S).tolist()
             return self._set_drift(1, x, y, z)
         return ()

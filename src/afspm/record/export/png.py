@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from afspm.clock import iso_utc
+from afspm.formatting import scale
 from afspm.model import Scan, Spectrum
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
@@ -18,7 +19,6 @@ from afspm.record.tables import ScanRow, SpectrumRow
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k"}
 _DPI = 150
 
 
@@ -41,7 +41,7 @@ def scan_figure(scan: Scan, title: str) -> Figure:
 
     figure = Figure(figsize=(5.2, 4.6), layout="constrained")
     axes = figure.add_subplot()
-    factor, unit = _in(scan.unit, float(np.nanmax(np.abs(scan.values), initial=0.0)))
+    factor, unit = scale(float(np.nanmax(np.abs(scan.values), initial=0.0)), scan.unit)
     known = scan.values[np.isfinite(scan.values)]
     low, high = np.percentile(known, (0.5, 99.5)) * factor if known.size else (0.0, 1.0)
     width, height = scan.region.size_m
@@ -52,7 +52,7 @@ def scan_figure(scan: Scan, title: str) -> Figure:
     axes.set_axis_off()
     figure.colorbar(image, ax=axes, label=unit or scan.channel)
     bar_m = _round_length(width / 4)
-    text_factor, text_unit = _in("m", bar_m)
+    text_factor, text_unit = scale(bar_m, "m")
     left, low_edge = 0.05 * width, 0.05 * height
     for color, line in (("black", 6.0), ("white", 3.0)):
         axes.plot([left, left + bar_m], [low_edge, low_edge], color=color, linewidth=line, solid_capstyle="butt")
@@ -85,14 +85,6 @@ def _image(figure: Figure) -> bytes:
 def _title(run: Run, text: str, interrupted: bool) -> str:
     marks = [mark for mark, is_so in (("SIMULATED", run.simulated), ("interrupted", interrupted)) if is_so]
     return ", ".join([*marks, text])
-
-
-def _in(unit: str, largest: float) -> tuple[float, str]:
-    """The factor and the unit by which values up to `largest` are easily read."""
-    if not unit or unit in ("deg", "°", "%") or not largest or not math.isfinite(largest):
-        return 1.0, unit
-    exponent = min(max(3 * math.floor(math.log10(largest) / 3), -15), 3)
-    return 10.0**-exponent, f"{_PREFIXES[exponent]}{unit}"
 
 
 def _round_length(length_m: float) -> float:

@@ -6,12 +6,10 @@ from collections.abc import Mapping
 
 from afspm.errors import ConfigError
 from afspm.simulation.settings import build, one_of
-from afspm.simulation.surfaces.lattice import Lattice
-from afspm.simulation.surfaces.particles import Particles
+from afspm.simulation.surfaces.ground import Flat, Particles, Rough, Steps
+from afspm.simulation.surfaces.patterns import Lattice, Stamper
 from afspm.simulation.surfaces.picture import Picture
 from afspm.simulation.surfaces.relief import Relief, Surface
-from afspm.simulation.surfaces.stamper import Stamper
-from afspm.simulation.surfaces.steps import Flat, Rough, Steps
 
 KINDS: dict[str, type[Surface]] = {
     "steps": Steps,

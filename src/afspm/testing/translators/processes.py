@@ -11,7 +11,7 @@ from queue import Empty, SimpleQueue
 from afspm.clock import Clock
 from afspm.experiment import ProcessStart
 from afspm.logic.supervision.supervisor_events import Exited, describe_exit
-from afspm.supervisor.child_output import Printed
+from afspm.supervisor.child_output import OutputLine
 from afspm.supervisor.log import LineReader, RunLog
 from afspm.supervisor.process import ChildEvent, ChildProcess, from_start
 
@@ -77,7 +77,7 @@ class Processes:
     def _tell(self, event: ChildEvent) -> None:
         """Called in the threads of the processes."""
         match event:
-            case Printed():
+            case OutputLine():
                 level, text = self._readers[event.name].read(event.stream, event.line)
                 self._write(event.name, level, text)
                 if level >= logging.WARNING:
