@@ -12,7 +12,7 @@ from afspm.model import Packet
 MEMORY_LIMIT_BYTES = 256 << 20
 
 
-class Backlog:
+class PacketBacklog:
     """A queue of packets. Those beyond `limit_bytes` wait in a temporary file, which goes when it is empty."""
 
     def __init__(self, limit_bytes: int = MEMORY_LIMIT_BYTES) -> None:

@@ -25,7 +25,7 @@ HANDLERS = {
 }
 
 
-class Dispatcher:
+class MessageDispatcher:
     """Brings packets to the handlers of `component`, of which `base` has the empty ones.
 
     Args:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from afspm import wire
-from afspm.client.backlog import Backlog
+from afspm.client.backlog import PacketBacklog
 from afspm.client.link import ExperimentLink
 from afspm.errors import ExperimentEnded, WireError
 from afspm.model import Packet
@@ -47,7 +47,7 @@ class Events(Iterator[PublishedEvent]):
     def __init__(self, link: ExperimentLink, prefixes: tuple[str, ...], timeout_s: float | None) -> None:
         self._link = link
         self._timeout_s = timeout_s
-        backlog = self._backlog = Backlog()
+        backlog = self._backlog = PacketBacklog()
 
         # no reference to self: an iterator that was dropped is forgotten by its __del__
         def keep(packet: Packet, ours: bool) -> None:

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from afspm import wire
-from afspm.client.backlog import Backlog
+from afspm.client.backlog import PacketBacklog
 from afspm.client.component import Component
-from afspm.client.dispatch import Dispatcher, overrides
+from afspm.client.dispatch import MessageDispatcher, overrides
 from afspm.client.link import ExperimentLink
 from afspm.client.scope import Scope
 from afspm.clock import NS_PER_S, Clock
@@ -35,10 +35,10 @@ class ComponentLoop:
         self._activity = context.activity
         self._activity.longest_step_s = component.longest_step_s
         self._is_script = overrides(component, Component, "run")
-        self._backlog = Backlog()
+        self._backlog = PacketBacklog()
         self._has_begun = False
         launch = context.launch
-        self._dispatcher = Dispatcher(component, Component, launch.envelopes, context.log)
+        self._dispatcher = MessageDispatcher(component, Component, launch.envelopes, context.log)
         self._ticker = None if self._is_script else _ticker(component, context.clock)
         self._link = ExperimentLink.of_launch(
             launch, context.open_port(), context.session, activity=self._activity, log=context.log

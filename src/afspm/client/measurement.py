@@ -54,7 +54,7 @@ class _Watch:
 
 
 @dataclass
-class _Task:
+class _MeasurementTask:
     """The progress of a measurement."""
 
     target: Target
@@ -108,7 +108,9 @@ class MeasurementRunner:
         if key is not None and (found := self._results.find(check_key(key), target.facts())) is not None:
             return found
         self._link.wait_caught_up(until_s)  # what is cached must not be taken for ours
-        task = _Task(target, key, f"{self._link.name}/{KEYED}/{key}" if key else self._link.next_id(), until_s)
+        task = _MeasurementTask(
+            target, key, f"{self._link.name}/{KEYED}/{key}" if key else self._link.next_id(), until_s
+        )
         try:
             self._take_up(task)
             things = self._finish(task)
@@ -134,7 +136,7 @@ class MeasurementRunner:
         since_ns = -1 if intent["since_ns"] is None else intent["since_ns"]
         return _Watch(self._link, target, Cycle(target.busy, target.fits, since_ns=since_ns, resumed=True))
 
-    def _take_up(self, task: _Task) -> None:
+    def _take_up(self, task: _MeasurementTask) -> None:
         """Continue what an earlier life, or an earlier call, was at, if it was this."""
         intent, watch = self._results.pending, self._unfinished
         if task.key is None and watch is not None:
@@ -154,7 +156,7 @@ class MeasurementRunner:
         if watch is not None:
             self._link.log.info("%s %s: taken up where it was", task.target.what, task.key)
 
-    def _finish(self, task: _Task) -> list[Any]:
+    def _finish(self, task: _MeasurementTask) -> list[Any]:
         """Return the newest result of each name: a restarted translator may have published one twice."""
         if task.watch is not None:
             task.watch.wait_if_begun(task.until_s)
@@ -168,7 +170,7 @@ class MeasurementRunner:
                 results = self._measure(task).results
         return list({task.target.name_of(thing): thing for thing in results}.values())
 
-    def _measure(self, task: _Task) -> Cycle:
+    def _measure(self, task: _MeasurementTask) -> Cycle:
         """Attempt after attempt, until one is complete."""
         watch = task.watch
         if watch is not None and watch.is_over() and watch.cycle.outcome is not CycleOutcome.COMPLETED:
@@ -182,7 +184,7 @@ class MeasurementRunner:
             if task.watch is not None and task.watch.is_over() and self._is_done(task, task.watch.cycle):
                 return task.watch.cycle
 
-    def _attempt(self, task: _Task) -> None:
+    def _attempt(self, task: _MeasurementTask) -> None:
         """Prepare and begin once, and follow to the end.
 
         What was asked for in an earlier life is asked for with the same id, so that it is not executed twice; so is
@@ -230,7 +232,7 @@ class MeasurementRunner:
             if is_new:
                 raise
 
-    def _write_down(self, task: _Task) -> None:
+    def _write_down(self, task: _MeasurementTask) -> None:
         if task.key is not None:
             self._results.intend(
                 {
@@ -242,7 +244,7 @@ class MeasurementRunner:
                 }
             )
 
-    def _follow(self, task: _Task, watch: _Watch) -> None:
+    def _follow(self, task: _MeasurementTask, watch: _Watch) -> None:
         """From the success of the action to the end of it."""
         link, cycle = self._link, watch.cycle
         with link.clock.late():
@@ -256,7 +258,7 @@ class MeasurementRunner:
                 hint="it goes on; stop it with scope.action('stop-scan') if it should not",
             )
 
-    def _is_done(self, task: _Task, cycle: Cycle) -> bool:
+    def _is_done(self, task: _MeasurementTask, cycle: Cycle) -> bool:
         """Return whether the result is complete; else note why not, before the next attempt."""
         target = task.target
         missing = self._channels.get(target.what, frozenset()) - frozenset(map(target.name_of, cycle.results))

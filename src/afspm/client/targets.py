@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 from afspm.errors import InvalidValue
 from afspm.formatting import area_text, position_text
 from afspm.model import Frame, Region, Scan, ScanParameters, ScopeState, Spectrum, names
+from afspm.model.snapshot import from_plain, to_plain
 
 XY = tuple[float, float]
 
@@ -47,9 +48,7 @@ class ScanTarget:
 
     def facts(self) -> dict[str, Any]:
         """Return the target in JSON's types, by which a later life of the component recognises it."""
-        region = self.region
-        numbers = region and [*region.center_m, *region.size_m, region.angle_rad, region.frame.value]
-        return {"what": self.what, "region": numbers, "shape": self.shape and list(self.shape)}
+        return {"what": self.what, **to_plain(self)}
 
     def fits(self, scan: Scan) -> bool:
         """Return whether a scan can be this one."""
@@ -92,12 +91,7 @@ class SpectrumTarget:
 
     def facts(self) -> dict[str, Any]:
         """Return the target in JSON's types, by which a later life of the component recognises it."""
-        return {
-            "what": self.what,
-            "at_m": self.at_m and list(self.at_m),
-            "kind": self.kind,
-            "frame": self.frame.value,
-        }
+        return {"what": self.what, **to_plain(self)}
 
     def fits(self, spectrum: Spectrum) -> bool:
         """Return whether a spectrum can be this one."""
@@ -121,13 +115,9 @@ Target = ScanTarget | SpectrumTarget
 
 def target_from(facts: dict[str, Any]) -> Target:
     """Return the target that gave these facts."""
-    if facts["what"] == SpectrumTarget.what:
-        return SpectrumTarget.of(facts["at_m"], facts["kind"], Frame(facts["frame"]))
-    region = None
-    if facts["region"] is not None:
-        x, y, width, height, angle, frame = facts["region"]
-        region = Region((x, y), (width, height), angle, Frame(frame))
-    return ScanTarget.of(region, facts["shape"], Frame.TIP)
+    kind = SpectrumTarget if facts["what"] == SpectrumTarget.what else ScanTarget
+    target: Target = from_plain(kind, {name: value for name, value in facts.items() if name != "what"})
+    return target
 
 
 def xy_of(xy_m: Any) -> XY:

@@ -6,20 +6,22 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from afspm.components.drift_pictures import DriftPictures
-    from afspm.components.drift_table import DriftTable
-    from afspm.components.feedback_analysis import FeedbackAnalysis
-    from afspm.components.feedback_tuner import FeedbackTuner
-    from afspm.components.log_collector import LogCollector
-    from afspm.components.metadata import Metadata
-    from afspm.components.night_picture import NightPicture
-    from afspm.components.notifier import Notifier
-    from afspm.components.planned_scans import RegionGrid, ScanList, ScanSeries
-    from afspm.components.recorder import Recorder
-    from afspm.components.rescanner import Rescanner
-    from afspm.components.spectroscopy_grid import SpectroscopyGrid
-    from afspm.components.tip_classifier import TipClassifier
-    from afspm.components.tip_corrector import TipCorrector
+    from afspm.components.drift_pictures import DriftPictures as DriftPictures
+    from afspm.components.drift_table import DriftTable as DriftTable
+    from afspm.components.feedback_analysis import FeedbackAnalysis as FeedbackAnalysis
+    from afspm.components.feedback_tuner import FeedbackTuner as FeedbackTuner
+    from afspm.components.log_collector import LogCollector as LogCollector
+    from afspm.components.metadata import Metadata as Metadata
+    from afspm.components.night_picture import NightPicture as NightPicture
+    from afspm.components.notifier import Notifier as Notifier
+    from afspm.components.planned_scans import RegionGrid as RegionGrid
+    from afspm.components.planned_scans import ScanList as ScanList
+    from afspm.components.planned_scans import ScanSeries as ScanSeries
+    from afspm.components.recorder import Recorder as Recorder
+    from afspm.components.rescanner import Rescanner as Rescanner
+    from afspm.components.spectroscopy_grid import SpectroscopyGrid as SpectroscopyGrid
+    from afspm.components.tip_classifier import TipClassifier as TipClassifier
+    from afspm.components.tip_corrector import TipCorrector as TipCorrector
 
 _MODULES = {
     "DriftPictures": "drift_pictures",
@@ -40,24 +42,7 @@ _MODULES = {
     "TipCorrector": "tip_corrector",
 }
 
-__all__ = [
-    "DriftPictures",
-    "DriftTable",
-    "FeedbackAnalysis",
-    "FeedbackTuner",
-    "LogCollector",
-    "Metadata",
-    "NightPicture",
-    "Notifier",
-    "Recorder",
-    "RegionGrid",
-    "Rescanner",
-    "ScanList",
-    "ScanSeries",
-    "SpectroscopyGrid",
-    "TipClassifier",
-    "TipCorrector",
-]
+__all__ = list(_MODULES)
 
 
 def __getattr__(name: str) -> Any:

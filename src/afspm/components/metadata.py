@@ -4,46 +4,20 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from afspm.client.component import Component
 from afspm.clock import iso_utc
 from afspm.components.line_file import LineFile, csv_line
-from afspm.model import ControlState, Region, Scan, ScopeState, ScopeStatus, Spectrum
+from afspm.model import ControlState, Scan, ScopeState, ScopeStatus, Spectrum
 
 COLUMNS = (
-    "time",
-    "measurement",
-    "filename",
-    "channel",
-    "center_x",
-    "center_y",
-    "width",
-    "height",
-    "length_units",
-    "angle_deg",
-    "columns",
-    "rows",
-    "units",
-    "in_control",
-    "mode",
-    "problems",
-    "state",
-)
+    "time", "measurement", "filename", "channel", "center_x", "center_y", "width", "height", "length_units",
+    "angle_deg", "columns", "rows", "units", "in_control", "mode", "problems", "state",
+)  # fmt: skip
+_IDENTITY = 4  # columns that no two rows share: time, measurement, file and channel
 _BUSY = {ScopeState.SCANNING: "scan", ScopeState.SPEC: "spectrum"}
-
-
-@dataclass(frozen=True)
-class ControlProvenance:
-    """The holder of control and the state when a measurement began; texts, empty where not known."""
-
-    in_control: str = ""
-    mode: str = ""
-    problems: str = ""
-    state: str = ""
 
 
 class Metadata(Component):
@@ -69,7 +43,7 @@ class Metadata(Component):
 
     def on_start(self) -> None:
         self._table = LineFile(Path(self.run_dir) / self.file, ",".join(COLUMNS))
-        self._written = {_identity(row) for row in csv.reader(self._table.lines())}
+        self._written = {tuple(row[:_IDENTITY]) for row in csv.reader(self._table.lines())}
 
     def on_control(self, control_state: ControlState) -> None:
         self._control = control_state
@@ -88,82 +62,67 @@ class Metadata(Component):
         self._saw_begin = True
         self.memory["began_ns"] = -1 if now_ns is None else now_ns
         self.memory["what"], self.memory["finished_ns"] = what, None
-        self.memory["circumstances"] = self._now(status)
+        self.memory["conditions"] = self._now(status)
         self.memory.save()
 
-    def _now(self, status: ScopeStatus) -> list[str]:
-        if self._control is None:
-            return ["", "", "", status.state.name.lower()]
-        problems = " ".join(self.scope.problems.name(number) for number in self._control.problems)
-        return [self._control.holder or "", self._control.mode.name.lower(), problems, status.state.name.lower()]
+    def _now(self, status: ScopeStatus) -> dict[str, str]:
+        state = status.state.name.lower()
+        if (control := self._control) is None:
+            return {"state": state}
+        problems = " ".join(map(self.scope.problems.name, control.problems))
+        return {
+            "in_control": control.holder or "",
+            "mode": control.mode.name.lower(),
+            "problems": problems,
+            "state": state,
+        }
 
     def on_scan(self, scan: Scan) -> None:
         if scan.values.size:
-            timed = replace(scan, time_ns=self._time_ns(scan))
-            self._write("scan", scan.time_ns, lambda at: scan_row(timed, at))
+            rows, columns = scan.shape
+            lengths = [_number(value) for value in (*scan.region.center_m, *scan.region.size_m)]
+            place = dict(zip(("center_x", "center_y", "width", "height"), lengths, strict=True))
+            angle = _number(math.degrees(scan.region.angle_rad))
+            pixels = {"columns": str(columns), "rows": str(rows), "units": scan.unit}
+            self._write("scan", scan, {"channel": scan.channel, **place, "angle_deg": angle, **pixels})
 
     def on_spectrum(self, spectrum: Spectrum) -> None:
-        timed = replace(spectrum, time_ns=self._time_ns(spectrum))
-        self._write("spectrum", spectrum.time_ns, lambda at: spectrum_row(timed, at))
+        points, variables = spectrum.values.shape
+        x, y = ("", "") if spectrum.position_m is None else map(_number, spectrum.position_m)
+        of_values = {"columns": str(variables), "rows": str(points), "units": " ".join(spectrum.units)}
+        self._write("spectrum", spectrum, {"channel": spectrum.kind, "center_x": x, "center_y": y, **of_values})
 
-    def _time_ns(self, measured: Scan | Spectrum) -> int | None:
-        """Return when it was finished, or else when it was sent: rows are told apart by it."""
-        if measured.time_ns is None and self.packet is not None:
-            return self.packet.time_ns
-        return measured.time_ns
+    def _write(self, what: str, measured: Scan | Spectrum, columns: dict[str, str]) -> None:
+        self._under_way = None  # should it scan on without another state between them, that is the next one
+        time_ns = measured.time_ns
+        if time_ns is None and self.packet is not None:
+            time_ns = self.packet.time_ns  # rows are told apart by it
+        row = {
+            "time": iso_utc(time_ns),
+            "measurement": what,
+            "filename": measured.filename,
+            "length_units": "m",
+        } | columns
+        identity = tuple(row[column] for column in COLUMNS[:_IDENTITY])
+        if identity in self._written:
+            return  # replayed after a restart
+        row |= self._conditions(what, measured.time_ns)
+        self._table.append([csv_line(row.get(column, "") for column in COLUMNS)])
+        self._written.add(identity)
 
-    def _circumstances(self, what: str, time_ns: int | None) -> ControlProvenance:
+    def _conditions(self, what: str, time_ns: int | None) -> dict[str, str]:
         """Return those noted when it began, if it is the measurement that they were noted for."""
         if self.memory.get("what") != what:
-            return ControlProvenance()
+            return {}
         finished_ns = self.memory["finished_ns"]
         if finished_ns is None and time_ns is not None:
             self.memory["finished_ns"] = time_ns
             self.memory.save()
         elif finished_ns != time_ns and not self._saw_begin:
-            return ControlProvenance()  # a later one, that began while we were not running
-        return ControlProvenance(*self.memory["circumstances"])
-
-    def _write(self, what: str, time_ns: int | None, row_at: Callable[[ControlProvenance], list[str]]) -> None:
-        self._under_way = None  # should it scan on without another state between them, that is the next one
-        identity = _identity(row_at(ControlProvenance()))
-        if identity in self._written:
-            return  # replayed after a restart
-        self._table.append([csv_line(row_at(self._circumstances(what, time_ns)))])
-        self._written.add(identity)
-
-
-def scan_row(scan: Scan, circumstances: ControlProvenance) -> list[str]:
-    """One channel of a scan as a row."""
-    rows, columns = scan.shape
-    what = ["scan", scan.filename, scan.channel]
-    return _row(scan.time_ns, what, _of_region(scan.region), [str(columns), str(rows), scan.unit], circumstances)
-
-
-def spectrum_row(spectrum: Spectrum, circumstances: ControlProvenance) -> list[str]:
-    """A spectrum as a row: its points are rows, its variables columns."""
-    points, variables = spectrum.values.shape
-    place = ["", ""] if spectrum.position_m is None else [_number(v) for v in spectrum.position_m]
-    what = ["spectrum", spectrum.filename, spectrum.kind]
-    of_values = [str(variables), str(points), " ".join(spectrum.units)]
-    return _row(spectrum.time_ns, what, [*place, "", "", "m", ""], of_values, circumstances)
-
-
-def _row(
-    time_ns: int | None, what: list[str], place: list[str], of_values: list[str], at: ControlProvenance
-) -> list[str]:
-    return [iso_utc(time_ns), *what, *place, *of_values, at.in_control, at.mode, at.problems, at.state]
-
-
-def _of_region(region: Region) -> list[str]:
-    lengths = [_number(value) for value in (*region.center_m, *region.size_m)]
-    return [*lengths, "m", _number(math.degrees(region.angle_rad))]
+            return {}  # a later one, that began while we were not running
+        conditions: dict[str, str] = self.memory["conditions"]
+        return conditions
 
 
 def _number(value: float) -> str:
     return f"{value:.9g}"
-
-
-def _identity(row: list[str]) -> tuple[Any, ...]:
-    """Return what no two rows share: time, measurement, file and channel."""
-    return tuple(row[:4])

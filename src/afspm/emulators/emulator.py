@@ -18,8 +18,8 @@ from afspm.emulators.rig import Rig
 from afspm.errors import AfspmError, ErrorCollector
 from afspm.exit_codes import ExitCode
 from afspm.translator.emulated_controller import AddressNotice, notice_file
+from afspm.transport.polling import WakeUp
 from afspm.transport.port import Killed
-from afspm.transport.wakeup import WakeUp
 from afspm.transport.zmq_port import open_port
 
 if TYPE_CHECKING:

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from afspm.clock import NS_PER_S
 from afspm.errors import FileError
 from afspm.files import igor
-from afspm.files.content import FileContent
-from afspm.files.times import clock_ns
+from afspm.files.content import FileContent, clock_ns
 from afspm.model import Region, Scan, Spectrum
 
 Note = Mapping[str, Any]
@@ -85,7 +84,7 @@ def number(note: Note, key: str) -> float | None:
 
 
 def upwards(note: Note) -> bool | None:
-    """Whether small y was scanned first."""
+    """Return True if small y was scanned first; None if that is not known."""
     down = number(note, "ScanDown")
     return None if down is None else down == 0.0
 

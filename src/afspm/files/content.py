@@ -1,9 +1,10 @@
-"""What is in a file of a controller."""
+"""The content of a file of a controller, and the times in it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from datetime import datetime, tzinfo
 from typing import Any
 
 from afspm.model import Scan, Spectrum
@@ -45,3 +46,18 @@ class FileContent:
                 if scan.channel.casefold().startswith(start):
                     return scan
         return heights[0] if len(self.scans) == 1 and heights else None
+
+
+def local_ns(text: str, layout: str, zone: tzinfo | None) -> int:
+    """Return a date and time of the controller's clock in ns since the Unix epoch.
+
+    Raises:
+        ValueError: it is not of that layout (as of `datetime.strptime`).
+    """
+    return clock_ns(datetime.strptime(text.strip(), layout), zone)  # noqa: DTZ007  (the zone comes next)
+
+
+def clock_ns(time: datetime, zone: tzinfo | None) -> int:
+    """Return a time without a zone, of the controller's clock, in ns since the Unix epoch."""
+    moment = time.astimezone() if zone is None else time.replace(tzinfo=zone)
+    return round(moment.timestamp() * 1e6) * 1000

@@ -32,7 +32,7 @@ _FILE_NAME = re.compile(r"-X([pm])-(.+)\.nc$")
 
 @dataclass(frozen=True, eq=False)
 class _Raw:
-    """What is needed of a file, whichever NetCDF it is.
+    """The parts that are needed of a file, whichever NetCDF it is.
 
     Attributes:
         values: FloatField, (time, value, y, x).

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from afspm.errors import FileError
-from afspm.files.content import FileContent
+from afspm.files.content import FileContent, local_ns
 from afspm.files.gxsm import CONTROLLER
 from afspm.files.igor import decoded
-from afspm.files.times import local_ns
 from afspm.model import Spectrum
 from afspm.units import convert
 

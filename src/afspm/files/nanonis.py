@@ -15,8 +15,7 @@ import numpy as np
 
 from afspm.clock import NS_PER_S
 from afspm.errors import FileError
-from afspm.files.content import FileContent
-from afspm.files.times import local_ns
+from afspm.files.content import FileContent, local_ns
 from afspm.model import Region, Scan
 
 CONTROLLER = "Nanonis"

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from afspm.errors import FileError
-from afspm.files.content import FileContent
+from afspm.files.content import FileContent, local_ns
 from afspm.files.nanonis import CONTROLLER
-from afspm.files.times import local_ns
 from afspm.model import Spectrum
 
 _TABLE = "[DATA]"

@@ -1,29 +1,20 @@
-"""NetCDF, classic format (64-bit offsets): arrays with named dimensions, units and attributes in one file.
+"""NetCDF, classic format: arrays with named dimensions, units and attributes in one file, through scipy.
 
-xarray, MATLAB, Gwyddion's users' scripts, `ncdump` … read it. Of the format only what scans need is here:
-numbers and texts, no records; what is written are float64. The format: Unidata, "The NetCDF Classic Format
-Specification".
+xarray, MATLAB, Gwyddion's users' scripts, `ncdump` … read it. What is written are float64.
 """
 
 from __future__ import annotations
 
-import math
-import struct
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.errors import FileError
-
-_MAGIC = b"CDF\x02"
-_DIMENSIONS, _VARIABLES, _ATTRIBUTES = 10, 11, 12
-_CHAR, _DOUBLE = 2, 6
-_KINDS = {1: ">i1", _CHAR: "S1", 3: ">i2", 4: ">i4", 5: ">f4", _DOUBLE: ">f8"}
-_OFFSETS = {b"CDF\x01": ">i", _MAGIC: ">q"}  # of where arrays begin
 
 Attributes = Mapping[str, str | float]
 
@@ -39,7 +30,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class File:
-    """What is in a file: arrays of numbers, those of characters as texts, and what is said of the whole."""
+    """The arrays of numbers in a file, those of characters as texts, and the attributes of the whole."""
 
     variables: Mapping[str, Variable]
     texts: Mapping[str, str]
@@ -47,148 +38,74 @@ class File:
 
 
 def encoded(variables: Mapping[str, Variable], attributes: Attributes) -> bytes:
-    """The bytes of a file."""
-    sizes = {
-        name: size
-        for variable in variables.values()
-        for name, size in zip(variable.dimensions, variable.values.shape, strict=True)
-    }
-    ids = {name: number for number, name in enumerate(sizes)}
-    dimensions = b"".join(_text(name) + struct.pack(">i", size) for name, size in sizes.items())
-    head = _MAGIC + struct.pack(">i", 0) + _list(_DIMENSIONS, len(sizes), dimensions) + _attributes(attributes)
-
-    def described(begins: list[int]) -> bytes:
-        entries = b""
-        for (name, variable), begin in zip(variables.items(), begins, strict=True):
-            axes = [ids[dimension] for dimension in variable.dimensions]
-            entries += _text(name) + struct.pack(f">i{len(axes)}i", len(axes), *axes)
-            # the size field of an array beyond 4 GiB is not used
-            size = min(variable.values.size * 8, 2**32 - 4)
-            entries += _attributes(variable.attributes) + struct.pack(">iIq", _DOUBLE, size, begin)
-        return _list(_VARIABLES, len(variables), entries)
-
-    begin = len(head) + len(described([0] * len(variables)))
-    begins = []
-    for variable in variables.values():
-        begins.append(begin)
-        begin += variable.values.size * 8
-    data = [variable.values.astype(">f8").tobytes() for variable in variables.values()]
-    return b"".join([head, described(begins), *data])
+    """Return the bytes of a file."""
+    made = io.BytesIO()
+    file = _netcdf_file(made, "w")
+    file._attributes.update(_as_bytes(attributes))  # as attributes of the object, some names would be its own
+    for name, variable in variables.items():
+        for axis, size in zip(variable.dimensions, variable.values.shape, strict=True):
+            if axis not in file.dimensions:
+                file.createDimension(axis, size)
+        written = file.createVariable(name, ">f8", variable.dimensions)
+        written[:] = variable.values
+        written._attributes.update(_as_bytes(variable.attributes))
+    file.flush()
+    return made.getvalue()
 
 
 def read(path: Path) -> File:
-    """The variables and the global attributes of a file of the classic format.
+    """Return the variables and the global attributes of a file.
 
     Raises:
-        FileError: missing, not whole, or something else.
+        FileError: missing, not whole, something else, or scipy is missing.
     """
     try:
         content = path.read_bytes()
     except OSError as error:
         raise FileError(f"can't be read: {error}", where=str(path)) from error
-    if content[:4] not in _OFFSETS:
+    if content[:4] not in (b"CDF\x01", b"CDF\x02"):
         raise FileError("is no NetCDF file of the classic format", where=str(path))
     try:
-        return _Reader(content).file()
-    except (struct.error, ValueError, IndexError, OverflowError) as error:
-        raise FileError(f"is not whole: {error}", where=str(path)) from error
+        file = _netcdf_file(
+            io.BytesIO(content), "r"
+        )  # a file on disk would set aside whatever a damaged header asks for
+        return _file(file)
+    except FileError:
+        raise
+    except Exception as error:  # scipy stumbles in any way over a broken file
+        raise FileError(f"is not whole: {type(error).__name__}: {error}", where=str(path)) from error
 
 
-class _Reader:
-    def __init__(self, content: bytes) -> None:
-        self._content = content
-        self._offset = _OFFSETS[content[:4]]
-        self._at = 8
-
-    def file(self) -> File:
-        if self._content[4:8] != bytes(4):
-            raise ValueError("it has records, which is not read")
-        dimensions = [(self._text(), self._take(">i")) for _ in range(self._count(_DIMENSIONS))]
-        attributes = self._attributes()
-        variables: dict[str, Variable] = {}
-        texts: dict[str, str] = {}
-        for _ in range(self._count(_VARIABLES)):
-            name = self._text()
-            axes = [dimensions[self._index(len(dimensions))] for _ in range(self._size())]
-            own = self._attributes()
-            kind = self._take(">i")
-            self._take(">I")  # the size, which the shape says too
-            values = self._values(kind, tuple(size for _, size in axes), self._take(self._offset))
-            if kind == _CHAR:
-                texts[name] = _decoded(values.tobytes())
-            else:
-                variables[name] = Variable(tuple(axis for axis, _ in axes), values.astype(np.float64), own)
-        return File(variables, texts, attributes)
-
-    def _values(self, kind: int, shape: tuple[int, ...], begin: int) -> NDArray[Any]:
-        count = math.prod(shape)
-        if min(shape, default=1) < 1 or begin < 0 or kind not in _KINDS:
-            raise ValueError(f"an array of type {kind} and shape {shape} at byte {begin}")
-        return np.frombuffer(self._content, _KINDS[kind], count, begin).reshape(shape)
-
-    def _take(self, kind: str) -> int:
-        (value,) = struct.unpack_from(kind, self._content, self._at)
-        self._at += struct.calcsize(kind)
-        return int(value)
-
-    def _count(self, tag: int) -> int:
-        found, count = self._take(">i"), self._size()
-        if found != tag and (found, count) != (0, 0):
-            raise ValueError(f"a list of kind {found} where one of {tag} was to be")
-        return count
-
-    def _size(self) -> int:
-        """How many of something follow: no more than there are bytes."""
-        size = self._take(">i")
-        if not 0 <= size <= len(self._content) - self._at:
-            raise ValueError(f"{size} of something in {len(self._content)} bytes")
-        return size
-
-    def _index(self, count: int) -> int:
-        index = self._take(">i")
-        if not 0 <= index < count:
-            raise ValueError(f"number {index} of {count}")
-        return index
-
-    def _raw(self, length: int) -> bytes:
-        raw = self._content[self._at : self._at + length]
-        self._at += length + -length % 4
-        return raw
-
-    def _text(self) -> str:
-        return self._raw(self._size()).decode()
-
-    def _attributes(self) -> dict[str, str | float]:
-        """Text as it is, of numbers the first."""
-        found: dict[str, str | float] = {}
-        for _ in range(self._count(_ATTRIBUTES)):
-            name, kind, count = self._text(), self._take(">i"), self._size()
-            if kind not in _KINDS:
-                raise ValueError(f"an attribute of type {kind}")
-            raw = self._raw(count * np.dtype(_KINDS[kind]).itemsize)
-            found[name] = _decoded(raw) if kind == _CHAR else float(np.frombuffer(raw, _KINDS[kind], 1)[0])
-        return found
-
-
-def _decoded(raw: bytes) -> str:
-    return raw.split(b"\0", 1)[0].decode("utf-8", "replace")
-
-
-def _list(tag: int, count: int, entries: bytes) -> bytes:
-    return struct.pack(">ii", tag if count else 0, count) + entries
-
-
-def _text(text: str) -> bytes:
-    raw = text.encode()
-    return struct.pack(">i", len(raw)) + raw + b"\0" * (-len(raw) % 4)
-
-
-def _attributes(attributes: Attributes) -> bytes:
-    entries = b""
-    for name, value in attributes.items():
-        entries += _text(name)
-        if isinstance(value, str):
-            entries += struct.pack(">i", _CHAR) + _text(value)
+def _file(file: Any) -> File:
+    variables: dict[str, Variable] = {}
+    texts: dict[str, str] = {}
+    for name, found in file.variables.items():
+        if found.data.dtype.kind == "S":
+            texts[name] = _text(found.data.tobytes())
         else:
-            entries += struct.pack(">iid", _DOUBLE, 1, value)
-    return _list(_ATTRIBUTES, len(attributes), entries)
+            variables[name] = Variable(found.dimensions, found.data.astype(np.float64), _told(found._attributes))
+    return File(variables, texts, _told(file._attributes))
+
+
+def _netcdf_file(content: io.BytesIO, mode: Literal["r", "w"]) -> Any:
+    try:
+        from scipy.io import netcdf_file
+    except ImportError:
+        raise FileError("NetCDF needs scipy", hint='pip install "afspm[files]"') from None
+    return netcdf_file(content, mode, mmap=False, version=2)
+
+
+def _as_bytes(attributes: Attributes) -> dict[str, Any]:
+    return {name: value.encode() if isinstance(value, str) else np.float64(value) for name, value in attributes.items()}
+
+
+def _told(attributes: Mapping[str, Any]) -> dict[str, str | float]:
+    """Return text as it is, of numbers the first."""
+    return {
+        name: _text(value) if isinstance(value, bytes) else float(np.ravel(value)[0])
+        for name, value in attributes.items()
+    }
+
+
+def _text(raw: bytes) -> str:
+    return raw.split(b"\0", 1)[0].decode("utf-8", "replace")

@@ -36,7 +36,7 @@ def read_hdf5(path: Path, zone: tzinfo | None) -> FileContent:
 
 
 def about_of(file: Any) -> dict[str, Any]:
-    """What the record noted beside the values: who was in control, problems … Raises FileError: it is damaged."""
+    """Return what the record noted beside the values: holder of control, problems … Raises FileError: it is damaged."""
     try:
         about: dict[str, Any] = json.loads(hdf5.text(file["entry"][ABOUT]["about"][()]))
     except (KeyError, ValueError) as error:

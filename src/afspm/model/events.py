@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 
-from afspm.model.enums import ControlMode
+from afspm.model.state import ControlMode
 
 PERSON = ":"
 """Between a component and the person that it acts for: "dashboard:Ada"."""

@@ -7,22 +7,18 @@ import sys
 from contextlib import suppress
 
 STEPS_BACK = 10
-"""Of POSIX' niceness: about a tenth of a core is left where all cores are busy with others, and as much as is wanted
-where they are not."""
+"""Of POSIX' niceness: leaves about a tenth of a core where all cores are busy, and as much as is wanted elsewhere."""
 
 
 def step_back() -> None:
-    """Take the processor only where no process of ordinary priority wants it.
+    """Take the processor only where no process of ordinary priority wants it, if the system allows that.
 
-    To be called before threads are started: on Linux those that are there keep their priority, and heartbeats theirs.
-    Where it can't be done, nothing is: it is a courtesy.
+    Call it before threads are started: on Linux those that are there keep their priority, and heartbeats theirs.
     """
-    if sys.platform == "win32":
-        import ctypes
+    with suppress(OSError):
+        if sys.platform == "win32":
+            import psutil
 
-        below_normal = 0x4000  # BELOW_NORMAL_PRIORITY_CLASS
-        with suppress(OSError):
-            ctypes.windll.kernel32.SetPriorityClass(ctypes.windll.kernel32.GetCurrentProcess(), below_normal)
-    else:
-        with suppress(OSError):
+            psutil.Process().nice(psutil.BELOW_NORMAL_PRIORITY_CLASS)
+        else:
             os.nice(STEPS_BACK)

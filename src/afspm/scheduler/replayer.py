@@ -11,12 +11,11 @@ from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import TransportError, WireError
 from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlResponse, Packet, Response
 from afspm.transport.network import Network
-from afspm.transport.polling import Poller, milliseconds
+from afspm.transport.polling import Poller, WakeUp, milliseconds
 from afspm.transport.publisher import Publisher
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.replay import Published
 from afspm.transport.router import PeerAsked, Router
-from afspm.transport.wakeup import WakeUp
 
 REASON = "this is a replay of a recorded run: nothing can be asked of it"
 FAREWELL_S = 0.5  # real: for those who are told that it is over

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 from afspm.clock import Clock
 from afspm.errors import FileError
 from afspm.exit_codes import ExitCode
+from afspm.launch import Launch
 from afspm.logic.fencing import Epoch
 from afspm.logic.scheduler_core import SchedulerCore
 from afspm.logic.settings import SchedulerSettings
@@ -23,24 +24,8 @@ from afspm.scheduler.state_file import StateFile
 from afspm.scheduler.wire_codec import WireCodec
 from afspm.scheduler.write_ahead import WriteAhead
 from afspm.storage.packet_log import PacketLog, cached_packets, log_folder
-from afspm.transport.port import LaunchedProcess
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.scheduler_sockets import SchedulerSockets
-
-
-class SchedulerLaunch(LaunchedProcess, Protocol):
-    """The part of `afspm.launch.Launch` that is needed here."""
-
-    @property
-    def clock(self) -> Mapping[str, Any]: ...
-    @property
-    def run(self) -> str: ...
-    @property
-    def simulated(self) -> bool: ...
-    @property
-    def state_dir(self) -> str: ...
-    @property
-    def request_timeout_s(self) -> float: ...
 
 
 class SchedulerActivity(Protocol):
@@ -53,7 +38,7 @@ class SchedulerContext(Protocol):
     """The part of `process.context.ProcessContext` that is needed here."""
 
     @property
-    def launch(self) -> SchedulerLaunch: ...
+    def launch(self) -> Launch: ...
     @property
     def clock(self) -> Clock: ...
     @property

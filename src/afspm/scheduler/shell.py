@@ -21,10 +21,10 @@ from afspm.model import (
     Response,
     ResponseDetail,
 )
-from afspm.transport.hold_back import STATE, HoldBack
 from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
+from afspm.transport.state_delay import StateDelay
 from afspm.transport.translator_link import LinkReply, LinkUp
 from afspm.wire.protocol import LONGEST_ID
 
@@ -80,7 +80,7 @@ class SchedulerShell:
         self._warnings = warnings
         self._log = log
         self._replay: tuple[Packet, ...] = ()
-        self._hold_back = HoldBack()
+        self._state_delay = StateDelay()
         self._look_at_s = 0.0  # at the deadlines, in real monotonic time
         self.ended = False
         self._tip_is_safe = True
@@ -237,7 +237,7 @@ class SchedulerShell:
         self._release(now_s)
         if self._core_due_s() <= now_s:
             self._take(events.Tick())
-        held_s = self._hold_back.due_s
+        held_s = self._state_delay.due_s
         self._look_at_s = self._core_due_s() if held_s is None else min(held_s, self._core_due_s())
 
     def _core_due_s(self) -> float:
@@ -281,13 +281,13 @@ class SchedulerShell:
 
     def _publish(self, packet: Packet) -> None:
         publisher, now_s = self._sockets.publisher, self._clock.monotonic_s()
-        for one in self._hold_back.take(packet, now_s, wanted=publisher.has_plain_subscriber(STATE)):
+        for one in self._state_delay.take(packet, now_s, wanted=publisher.has_plain_subscriber(wire.Topic.SCOPE_STATE)):
             publisher.publish(one)
-        if self._hold_back.due_s is not None:
-            self._look_at_s = min(self._look_at_s, self._hold_back.due_s)
+        if self._state_delay.due_s is not None:
+            self._look_at_s = min(self._look_at_s, self._state_delay.due_s)
 
     def _release(self, now_s: float = math.inf) -> None:
-        for packet in self._hold_back.release(now_s):
+        for packet in self._state_delay.release(now_s):
             self._sockets.publisher.publish(packet)
 
     def _write_down(self, effects: list[events.Effect]) -> None:

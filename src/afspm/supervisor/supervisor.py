@@ -48,7 +48,7 @@ from afspm.supervisor.process import ChildEvent, ChildProcess, Task
 from afspm.supervisor.reaper import Reaper
 from afspm.supervisor.reporter import Reporter, ReporterEvent, ReportFailed
 from afspm.transport.heartbeat import HeartbeatListener
-from afspm.transport.wakeup import WakeUp
+from afspm.transport.polling import WakeUp
 
 REPORT_PERIOD_S = 0.1
 """Real time between two looks at the states of processes, for the reporter."""

@@ -194,13 +194,15 @@ class Driver(ABC):
         self._told: dict[str, Value] = {}
 
     def patience_s(self, of_s: float) -> float:
-        """How long to wait, in experiment seconds, for what takes the controller `of_s` at most on its own computer:
-        longer where so much passes while a program draws breath (an emulated controller at sixty times the speed)."""
+        """Return how long to wait, in experiment seconds, for what takes the controller `of_s` at most.
+
+        It is longer where so much passes while a program runs at all (an emulated controller at sixty times the speed).
+        """
         return max(of_s, self.program_s / self.clock.real_s(1.0))
 
     @classmethod
     def rows(cls, settings: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
-        """What these settings add to the table, or change of it: here what the experiment file says."""
+        """Return the rows that these settings add to the table, or change in it."""
         return settings.get("parameters") or {}
 
     @classmethod
@@ -231,7 +233,7 @@ class Driver(ABC):
 
     @abstractmethod
     def status(self) -> ScopeStatus:
-        """What the controller is doing now."""
+        """Return the state of the controller now."""
 
     @abstractmethod
     def get(self, vendor: str) -> Value:
@@ -257,7 +259,7 @@ class Driver(ABC):
         """
 
     def lines(self, start: int) -> Sequence[ScanLines]:
-        """What a running scan has of complete lines beyond the first `start`, in the order in which they are scanned.
+        """Return the complete lines of a running scan beyond the first `start`, in the order in which they are scanned.
 
         To be written where the controller can tell (`live_lines_s`).
 
@@ -297,7 +299,11 @@ class Driver(ABC):
             if asked:
                 group.write(asked)
         if left:
-            self.set({self.table[name].vendor: self.table[name].to_vendor(value) for name, value in left.items()})
+            self.write_rows(left)
+
+    def write_rows(self, values: Mapping[str, Value]) -> None:
+        """Set parameters that the table alone says how to set."""
+        self.set({self.table[name].vendor: self.table[name].to_vendor(value) for name, value in values.items()})
 
     def wait_for(self, condition: Callable[[], bool], at_most_s: float) -> bool:
         """Ask the controller until something holds, which it does with a delay. Return False after so long, real time.
@@ -315,7 +321,7 @@ class Driver(ABC):
         self.for_a_while({names.TIP_BIAS_VOLTAGE: wanted[names.PULSE_VOLTAGE]}, float(wanted[names.PULSE_DURATION]))
 
     def same(self, name: str, a: Value, b: Value, among: Mapping[str, Value]) -> bool:
-        """Whether two values of a parameter are one to the controller's precision.
+        """Return True if two values of a parameter are one to the controller's precision.
 
         To be written only where a `resolution` in the table can't say it.
 
@@ -325,7 +331,7 @@ class Driver(ABC):
         return self.table[name].same(a, b)
 
     def in_force(self, wanted: Collection[str]) -> dict[str, Value]:
-        """What `read` gives; what was set is told as it was set, as long as the controller has the same.
+        """Return what `read` gives; what was set is told as it was set, as long as the controller has the same.
 
         Raises:
             InvalidValue: the controller says what is no number: it can be told to nobody.

@@ -144,7 +144,7 @@ def wired_to(launch: Launch, microscope: Driver) -> EmulatedController | None:
         raise ConfigError(f"nobody tells where [{launch.controller}] listens", where=launch.name)
     if not microscope.controller_at:
         what = f"{type(microscope).__name__} has no controller_at, so it can't be wired to [{launch.controller}]"
-        raise ConfigError(what, where=launch.name, hint="see the how-to on writing a translator")
+        raise ConfigError(what, where=launch.name, hint='see the how-to page "Write a driver"')
     return EmulatedController(launch.controller, notice_file(launch.state_dir, launch.controller), launch.run)
 
 

@@ -70,7 +70,7 @@ class Outbox:
         return again
 
     def look(self) -> bool:
-        """Whether there are new results that can be read."""
+        """Return True if there are new results that can be read."""
         listed = list(self._microscope.results())
         known = set(self._kept["known"])
         new = [result for result in listed if result not in known]

@@ -76,7 +76,7 @@ class ParameterSpec:
         return "deg" if self.si_unit == "rad" else self.si_unit
 
     def parse(self, text: str, unit: str | None = None) -> Value:
-        """What a peer asks for, converted and checked.
+        """Return the value that a peer asks for, converted and checked.
 
         Raises:
             Refused: PARAM_ERROR, with the value, the bound that it breaks and where that was set.
@@ -128,7 +128,7 @@ class ParameterSpec:
         return float(value)
 
     def same(self, a: Value, b: Value) -> bool:
-        """Whether two values are the same to the controller's precision."""
+        """Return True if two values are the same to the controller's precision."""
         if isinstance(a, str) or isinstance(b, str):
             return a == b
         # what went through the vendor's unit and back may differ in the last bits

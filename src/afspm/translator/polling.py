@@ -1,4 +1,4 @@
-"""How often a controller is looked at: eagerly when something is about to end, seldom else. Pure.
+"""The time between two looks at a controller: eagerly when something is about to end, seldom else. Pure.
 
 The end of a scan is to be noticed within 20 ms of the controller saying so, and a controller that serves one request
 after the other is not to be kept busy with ours meanwhile. So the time between two looks shrinks in proportion to
@@ -81,7 +81,7 @@ class AdaptivePolling:
         self._measuring = self._expected = self._over_s = None
 
     def wait_s(self, now_s: float) -> float:
-        """So long may pass until the next look."""
+        """Return the time until the next look."""
         expected = self._expected
         if expected is None:
             return self._idle_s

@@ -66,7 +66,7 @@ class ResultFiles(ABC):
         return None if running is None else running.get("frame")
 
     def forget(self) -> None:
-        """What is running or has ended was broken off: nothing comes of it."""
+        """Forget what is running or has ended: it was broken off."""
         self._kept["running"] = self._kept["ended"] = None
 
     def load(self, result: str) -> Content:
@@ -100,8 +100,8 @@ class ResultFiles(ABC):
 
 
 @dataclass(frozen=True)
-class Printed:
-    """What a controller's files leave out of the numbers that were set.
+class FilePrecision:
+    """The precision of a controller's files: what they leave out of the numbers that were set.
 
     Attributes:
         part: of the largest length, what is left out of each.

@@ -61,7 +61,7 @@ class StatusSequence:
         return self._say(ScopeStatus(state))
 
     def interrupt(self) -> list[SequenceStep]:
-        """What is running was told to stop."""
+        """Note that what is running was told to stop."""
         return self._say(_INTERRUPTED)
 
     def observe(self, seen: ScopeStatus, results: bool, now_s: float) -> list[SequenceStep]:

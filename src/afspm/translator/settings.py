@@ -1,4 +1,4 @@
-"""What is in force at the microscope: read together, checked together, published together."""
+"""The settings in force at the microscope: read together, checked together, published together."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class SettingsGroup(ABC):
 
 
 class KeptSettings(SettingsGroup):
-    """What a controller is told with an action, and does not keep itself.
+    """Settings that a controller is told with an action, and does not keep itself.
 
     Args:
         at_first: the values before anybody sets them.
@@ -89,7 +89,7 @@ def watched(table: ParameterTable) -> list[str]:
 
 
 def messages(values: Mapping[str, Value]) -> dict[str, Published]:
-    """What to publish of the values, by message: those that the microscope has all the parameters for."""
+    """Return the messages to publish of the values, by name: those that the microscope has all the parameters for."""
     published: dict[str, Published] = {}
     if all(name in values for name in FRAME if name != names.SCAN_ANGLE):
         published["ScanParameters2d"] = scan_parameters(values)
@@ -123,6 +123,12 @@ def frame(values: Mapping[str, Value]) -> tuple[Region, tuple[int, int]]:
     return region, shape
 
 
+def frame_values(region: Region, shape: tuple[int, int]) -> dict[str, Value]:
+    """Return the values that describe a frame, by generic names, in SI: the reverse of `frame`."""
+    corner, size, (rows, columns) = region.top_left_m, region.size_m, shape
+    return dict(zip(FRAME, (*corner, *size, region.angle_rad, columns, rows), strict=True))
+
+
 def feedback(values: Mapping[str, Value]) -> Feedback:
     """The z feedback that values describe. Of a tip that is known to be withdrawn nobody is told that it is without
     feedback, which would be a danger at the sample."""
@@ -137,7 +143,7 @@ def feedback(values: Mapping[str, Value]) -> Feedback:
 
 
 def check_together(values: Mapping[str, Value], table: ParameterTable, max_pixels: int) -> None:
-    """What a frame must be as a whole: not empty, not too many pixels, all of it within reach of the probe.
+    """Check a frame as a whole: it is not empty, not too many pixels, all of it within reach of the probe.
 
     Raises:
         Refused: PARAM_ERROR.

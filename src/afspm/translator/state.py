@@ -1,4 +1,4 @@
-"""What a translator keeps on disk, so that a restarted one tells the same story and does nothing twice."""
+"""The state that a translator keeps on disk, so that a restarted one tells the same story and does nothing twice."""
 
 from __future__ import annotations
 

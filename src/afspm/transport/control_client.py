@@ -135,7 +135,3 @@ class ControlClient:
             self._send(wire.encode_request(Request(CLOCK_REQUEST, id=f"{self._name}/{self._token}/0")))
         elif self.version is Version.OURS:
             self._send([])
-
-    def close(self) -> None:
-        self.monitor.close()
-        self.socket.close()

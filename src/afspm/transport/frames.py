@@ -1,4 +1,4 @@
-"""Whole messages to and from sockets, without copying what is large."""
+"""Messages to and from sockets, each whole, without copying what is large."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def receive_frames(socket: Socket) -> list[zmq.Frame]:
 
 def is_readable(socket: Socket) -> bool:
     """Return whether a message can be received at once."""
-    return bool(socket.poll(0))
+    return bool(zmq.zmq_poll([(socket, zmq.POLLIN)], 0))
 
 
 def contents(frames: Sequence[zmq.Frame]) -> list[Buffer]:

@@ -224,7 +224,6 @@ class Monitor:
     """
 
     def __init__(self, network: Network, socket: zmq.Socket[bytes], events: int) -> None:
-        self._watched = socket
         address = f"inproc://monitor-{next(_numbers)}"
         socket.monitor(address, events)
         self.socket = network.socket(zmq.PAIR)
@@ -234,12 +233,7 @@ class Monitor:
     def drain(self) -> list[ConnectionEvent]:
         """Return all events that have come."""
         events: list[ConnectionEvent] = []
-        while self.socket.poll(0):
+        while zmq.zmq_poll([(self.socket, zmq.POLLIN)], 0):
             kind, value = _EVENT.unpack(self.socket.recv_multipart(zmq.NOBLOCK)[0])
             events.append(ConnectionEvent(kind & 0xFFFF, value))
         return events
-
-    def close(self) -> None:
-        if not self._watched.closed:
-            self._watched.disable_monitor()
-        self.socket.close()

@@ -2,20 +2,62 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import socket
+from collections import deque
 from typing import Any, Generic, TypeVar
 
 import zmq
 
-from afspm.transport.wakeup import WakeUp
-
 S = TypeVar("S")
+T = TypeVar("T")
 _LONGEST_MS = 2**31 - 1  # 24 days
 
 
 def milliseconds(timeout_s: float | None) -> int | None:
     """Round a timeout up, so that a wait does not end just before a deadline; None waits for ever."""
     return None if timeout_s is None else max(0, math.ceil(min(timeout_s * 1000.0, _LONGEST_MS)))
+
+
+class WakeUp(Generic[T]):
+    """A queue with a descriptor to poll: `post` from any thread, `take` from the thread that polls.
+
+    A pair of sockets and not a pipe, since Windows can only wait on sockets.
+    """
+
+    def __init__(self) -> None:
+        self._items: deque[T] = deque()
+        self._reader, self._writer = socket.socketpair()
+        self._reader.settimeout(0)
+        self._writer.settimeout(0)
+
+    def fileno(self) -> int:
+        """The descriptor that becomes readable when `post` was called."""
+        return self._reader.fileno()
+
+    def writer_fileno(self) -> int:
+        """The descriptor that `signal.set_wakeup_fd` may write to."""
+        return self._writer.fileno()
+
+    def post(self, item: T | None = None) -> None:
+        """Wake the poller up, with something to take or for nothing."""
+        if item is not None:
+            self._items.append(item)
+        # full: it will wake up anyway; closed: nobody is left to wake up
+        with contextlib.suppress(BlockingIOError, OSError):
+            self._writer.send(b"\0")
+
+    def take(self) -> list[T]:
+        """Return the items posted since the last call, oldest first; later ones wait for the next call."""
+        with contextlib.suppress(BlockingIOError, OSError):
+            while len(self._reader.recv(4096)) == 4096:
+                pass
+        return [self._items.popleft() for _ in range(len(self._items))]
+
+    def close(self) -> None:
+        self._reader.close()
+        self._writer.close()
 
 
 class Poller(Generic[S]):

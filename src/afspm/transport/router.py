@@ -15,8 +15,6 @@ from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.tcp_guard import TcpGuard
 from afspm.wire.protocol import ANSWER, QUESTION
 
-MOST_A_TURN = 20
-"""Messages taken before everything else is looked at again. The socket takes one of each client in turn."""
 _LAST_WORDS = 200
 """Messages looked through for the last words of who has gone."""
 
@@ -77,8 +75,11 @@ class Router:
         self._guard = network.watch(self.address, TcpGuard())
 
     def receive(self) -> list[RouterEvent]:
-        """Return the next requests, and the changes of connections that came before and with them, in order."""
-        messages = self._messages(MOST_A_TURN)
+        """Return the next request, and the changes of connections that came before it, in order.
+
+        The socket gives one message of each client in turn.
+        """
+        messages = self._messages(1)
         # drained after the messages were received: so every connection that they came by is known
         changes = self._changes()
         gone = [connection for connection, came in changes if not came]
@@ -106,11 +107,11 @@ class Router:
     def _messages(self, most: int) -> list[list[zmq.Frame]]:
         """The next messages, at most so many."""
         messages: list[list[zmq.Frame]] = []
-        while is_readable(self.socket):
-            if len(messages) == most:
-                return messages
-            messages.append(receive_frames(self.socket))
-        self._guard.settled({descriptor_of(frames[0]) for frames in messages})
+        while len(messages) < most and (frames := receive_frames(self.socket)):
+            messages.append(frames)
+            self._guard.heard(descriptor_of(frames[0]))
+        if not is_readable(self.socket):
+            self._guard.settle()
         return messages
 
     def _changes(self) -> list[tuple[_Connection, bool]]:
@@ -201,13 +202,9 @@ class Router:
                 "nothing of keys are let in by [security] plain = true"
             )
 
-    def close(self) -> None:
-        self.monitor.close()
-        self.socket.close()
-
 
 def _name(identity: bytes) -> str:
-    """What a peer calls itself; the socket gives others an identity that begins with a zero byte."""
+    """The peer's own name; the socket gives peers without one an identity that begins with a zero byte."""
     if identity.startswith(b"\0"):
         return ""
     try:

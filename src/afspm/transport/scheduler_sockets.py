@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Hashable
 
 from afspm.errors import ConfigError
+from afspm.launch import Launch
 from afspm.model import Packet
 from afspm.transport.network import Monitor, Network
-from afspm.transport.polling import Poller
-from afspm.transport.port import LaunchedProcess
+from afspm.transport.polling import Poller, WakeUp
 from afspm.transport.publisher import Publisher
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.router import Router
 from afspm.transport.subscriber import Subscriber
 from afspm.transport.translator_link import TranslatorLink
-from afspm.transport.wakeup import WakeUp
 
 Source = Router | TranslatorLink | Subscriber | Publisher | Monitor
 
@@ -31,7 +30,7 @@ class SchedulerSockets:
         ConfigError: one is missing.
     """
 
-    def __init__(self, launch: LaunchedProcess, log: RateLimitedLog, *, since_ns: int, epoch: bytes = b"") -> None:
+    def __init__(self, launch: Launch, log: RateLimitedLog, *, since_ns: int, epoch: bytes = b"") -> None:
         sockets = launch.sockets
         if sockets.publish is None or sockets.serve is None or sockets.control is None or not sockets.subscribe:
             raise ConfigError(

@@ -121,10 +121,6 @@ class Subscriber:
             self._newest_ns = time_ns
         return True
 
-    def close(self) -> None:
-        self.monitor.close()
-        self.socket.close()
-
 
 def _check(prefixes: tuple[str, ...], name: str) -> None:
     if len(Marker(topic(name, 10**9), 10**18, prefixes).encode()) > LONGEST:

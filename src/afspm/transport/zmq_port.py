@@ -1,24 +1,79 @@
-"""The port of a component over ZeroMQ: one poller for all of its sockets."""
+"""The port of a component over ZeroMQ, and what it shares with a translator's: one poller for all sockets."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from typing import Generic, TypeVar
 
 from afspm.clock import Clock
 from afspm.errors import ConfigError
+from afspm.launch import Launch
 from afspm.transport.control_client import ControlClient
 from afspm.transport.network import Network
-from afspm.transport.polling import Poller, milliseconds
-from afspm.transport.port import Incoming, LaunchedProcess, ReplyReceived
+from afspm.transport.polling import Poller, WakeUp, milliseconds
+from afspm.transport.port import Incoming, ReplyReceived
 from afspm.transport.publisher import Publisher
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.replay import Published
 from afspm.transport.subscriber import Subscriber
-from afspm.transport.wakeup import WakeUp
+
+T = TypeVar("T")
 
 
-class ZmqPort:
+class BasePort(Generic[T]):
+    """Waits for its sockets, and publishes.
+
+    Args:
+        publish: the address to publish on; None: it has none.
+    """
+
+    def __init__(self, network: Network, clock: Clock, publish: str | None) -> None:
+        self._network = network
+        self._clock = clock
+        self._wake_up: WakeUp[T] = WakeUp()
+        self._poller: Poller[Callable[[], Sequence[T]]] = Poller(self._wake_up)
+        self._published = Published(clock)
+        self._publisher = None
+        self._closed = False
+        if publish is not None:
+            self._publisher = Publisher(network, publish, self._published)
+            self._poller.register(self._publisher.socket, self._serve)
+            self._poller.register(self._publisher.monitor.socket, self._serve)
+
+    @property
+    def clock(self) -> Clock:
+        return self._clock
+
+    @property
+    def publish_address(self) -> str | None:
+        """Where others can subscribe to what we publish, with the port that was found."""
+        return self._publisher.address if self._publisher else None
+
+    def poll(self, timeout_s: float | None) -> list[T]:
+        receivers, woken = self._poller.wait(milliseconds(timeout_s))
+        found = self._wake_up.take() if woken else []
+        for receive in receivers:
+            found += receive()
+        return found
+
+    def wake_up(self, incoming: T | None = None) -> None:
+        self._wake_up.post(incoming)
+
+    def close(self) -> None:
+        """The network is the port's own: it is closed too."""
+        if not self._closed:
+            self._closed = True
+            self._network.close()
+            self._wake_up.close()
+
+    def _serve(self) -> Sequence[T]:
+        if self._publisher is not None:
+            self._publisher.serve()
+        return []
+
+
+class ZmqPort(BasePort[Incoming]):
     """See `transport.port.Port`.
 
     Args:
@@ -44,20 +99,10 @@ class ZmqPort:
         control: str | None = None,
         publish: str | None = None,
     ) -> None:
-        self._network = network
+        super().__init__(network, clock, publish)
         self._name = name
-        self._clock = clock
-        self._wake_up: WakeUp[Incoming] = WakeUp()
-        self._closed = False
         log = RateLimitedLog(logging.getLogger("afspm.transport"), clock)
-        self._publisher = None
-        self._published = Published(clock)
         self._control = None
-        self._poller: Poller[Callable[[], Sequence[Incoming]]] = Poller(self._wake_up)
-        if publish is not None:
-            self._publisher = Publisher(network, publish, self._published)
-            self._poller.register(self._publisher.socket, self._serve)
-            self._poller.register(self._publisher.monitor.socket, self._serve)
         if control is not None:
             self._control = ControlClient(network, name, control, log)
             self._poller.register(self._control.socket, self._control.receive)
@@ -67,15 +112,6 @@ class ZmqPort:
             self._poller.register(subscriber.socket, subscriber.receive)
             self._poller.register(subscriber.monitor.socket, subscriber.follow)
 
-    @property
-    def clock(self) -> Clock:
-        return self._clock
-
-    @property
-    def publish_address(self) -> str | None:
-        """Where others can subscribe to what we publish, with the port that was found."""
-        return self._publisher.address if self._publisher else None
-
     def send(self, frames: Sequence[bytes]) -> None:
         if self._control is None:
             raise ConfigError(
@@ -84,13 +120,6 @@ class ZmqPort:
         if (answer := self._control.send(frames)) is not None:
             self._wake_up.post(ReplyReceived(answer))
 
-    def poll(self, timeout_s: float | None) -> list[Incoming]:
-        receivers, woken = self._poller.wait(milliseconds(timeout_s))
-        found: list[Incoming] = self._wake_up.take() if woken else []
-        for receive in receivers:
-            found += receive()
-        return found
-
     def publish(self, envelope: str, payload: bytes) -> None:
         if self._publisher is None:
             raise ConfigError(
@@ -98,23 +127,8 @@ class ZmqPort:
             )
         self._publisher.publish(self._published.stamp(envelope, payload))
 
-    def wake_up(self, incoming: Incoming | None = None) -> None:
-        self._wake_up.post(incoming)
 
-    def close(self) -> None:
-        """The network is the port's own: it is closed too."""
-        if not self._closed:
-            self._closed = True
-            self._network.close()
-            self._wake_up.close()
-
-    def _serve(self) -> list[Incoming]:
-        if self._publisher is not None:
-            self._publisher.serve()
-        return []
-
-
-def open_port(launch: LaunchedProcess, clock: Clock) -> ZmqPort:
+def open_port(launch: Launch, clock: Clock) -> ZmqPort:
     """Open the port of a component as its launch line says. Raises TransportError."""
     sockets = launch.sockets
     return ZmqPort(

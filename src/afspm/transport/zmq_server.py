@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import zmq
 
 from afspm.clock import Clock
 from afspm.errors import ConfigError
+from afspm.launch import Launch
 from afspm.transport.frames import descriptor_of, is_readable, property_of, receive_frames, send_frames, user_of
 from afspm.transport.network import ACCEPTED, DISCONNECTED, Monitor, Network
-from afspm.transport.polling import Poller, milliseconds
-from afspm.transport.port import LaunchedProcess, RequestReceived, Served, SubscriberJoined
-from afspm.transport.publisher import Publisher
-from afspm.transport.replay import Published
+from afspm.transport.port import RequestReceived, Served, SubscriberJoined
 from afspm.transport.tcp_guard import TcpGuard
-from afspm.transport.wakeup import WakeUp
+from afspm.transport.zmq_port import BasePort
 from afspm.wire.protocol import ANSWER, QUESTION, answer_as_version_1
 
 _WITH_ID = 3  # frames of a request
 _WITHOUT_EPOCH = 3  # frames up to the empty one: connection, number; the epoch comes behind them
 
 
-class ZmqServerPort:
+class ZmqServerPort(BasePort[Served]):
     """See `transport.port.ServerPort`.
 
     To a requester it is a REP socket: it gives back whatever came before the empty frame, so that a scheduler of ours
@@ -40,16 +38,11 @@ class ZmqServerPort:
     def __init__(
         self, network: Network, clock: Clock, *, serve: str, publish: str | None, allowed: str | None = None
     ) -> None:
-        self._network = network
-        self._clock = clock
+        super().__init__(network, clock, publish)
         self._allowed = allowed
         self._has_keys = network.keys is not None and network.keys.binds_encrypted(requests=True)
         self._asker: list[bytes] | None = None
         self._asked_by_version_1: int | None = None
-        self._closed = False
-        self._wake_up: WakeUp[Served] = WakeUp()
-        self._published = Published(clock)
-        self._publisher = None if publish is None else Publisher(network, publish, self._published)
         self._socket = network.socket(zmq.ROUTER)
         # A name belongs to its newest connection, else a scheduler that connects anew before the old connection is
         # found dead is never heard. And what it says is never freed: the library keeps the queues that nobody reads.
@@ -58,32 +51,17 @@ class ZmqServerPort:
         self._monitor = Monitor(network, self._socket, ACCEPTED | DISCONNECTED)
         self.serve_address = network.bind(self._socket, serve, requests=True)
         self._guard = network.watch(self.serve_address, TcpGuard())
-        self._poller: Poller[Callable[[], Sequence[Served]]] = Poller(self._wake_up)
         self._poller.register(self._socket, self._request)
         self._poller.register(self._monitor.socket, self._follow)
-        if self._publisher is not None:
-            self._poller.register(self._publisher.socket, self._serve)
-            self._poller.register(self._publisher.monitor.socket, self._serve)
-
-    @property
-    def clock(self) -> Clock:
-        return self._clock
-
-    @property
-    def publish_address(self) -> str | None:
-        """Where others can subscribe to what we publish, with the port that was found."""
-        return self._publisher.address if self._publisher else None
 
     def poll(self, timeout_s: float | None) -> list[Served]:
         if is_busy := self._asker is not None:
             self._poller.pause(self._socket)
-        receivers, woken = self._poller.wait(milliseconds(timeout_s))
-        if is_busy:
-            self._poller.register(self._socket, self._request)
-        found: list[Served] = self._wake_up.take() if woken else []
-        for receive in receivers:
-            found += receive()
-        return found
+        try:
+            return super().poll(timeout_s)
+        finally:
+            if is_busy:
+                self._poller.register(self._socket, self._request)
 
     def _serve(self) -> list[Served]:
         return [SubscriberJoined()] if self._publisher is not None and self._publisher.serve() else []
@@ -96,8 +74,9 @@ class ZmqServerPort:
     def _request(self) -> list[Served]:
         """The next request, if the last one was answered."""
         while self._asker is None and (frames := receive_frames(self._socket)):
+            self._guard.heard(descriptor_of(frames[0]))
             if not is_readable(self._socket):
-                self._guard.settled([descriptor_of(frames[0])])
+                self._guard.settle()
             request = self._accepted(frames)
             if request is not None:
                 return [request]
@@ -152,18 +131,8 @@ class ZmqServerPort:
         if self._publisher is not None:
             self._publisher.kill()
 
-    def wake_up(self, incoming: Served | None = None) -> None:
-        self._wake_up.post(incoming)
 
-    def close(self) -> None:
-        """The network is the port's own: it is closed too."""
-        if not self._closed:
-            self._closed = True
-            self._network.close()
-            self._wake_up.close()
-
-
-def open_server_port(launch: LaunchedProcess, clock: Clock) -> ZmqServerPort:
+def open_server_port(launch: Launch, clock: Clock) -> ZmqServerPort:
     """Open the port of a translator. Raises TransportError, or ConfigError if it has no address to answer on."""
     if launch.sockets.serve is None:
         raise ConfigError("it has no address to answer requests on", where=launch.name, hint="serve = address")

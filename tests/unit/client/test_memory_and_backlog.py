@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from afspm.client.backlog import Backlog
+from afspm.client.backlog import PacketBacklog
 from afspm.errors import FileError, InvalidValue
 from afspm.model import Packet
 from afspm.process.memory import Memory
@@ -114,7 +114,7 @@ OPERATIONS = st.lists(st.one_of(st.none(), st.tuples(st.binary(max_size=40), st.
 
 @given(OPERATIONS)
 def test_a_backlog_is_a_queue_however_much_of_it_is_on_disk(operations: list[tuple[bytes, int | None] | None]) -> None:
-    backlog, model = Backlog(limit_bytes=60), deque[Packet]()
+    backlog, model = PacketBacklog(limit_bytes=60), deque[Packet]()
     for number, operation in enumerate(operations):
         if operation is None:
             assert backlog.take() == (model.popleft() if model else None)
@@ -131,14 +131,14 @@ def test_a_backlog_is_a_queue_however_much_of_it_is_on_disk(operations: list[tup
 
 
 def test_a_packet_larger_than_the_limit_is_kept_all_the_same() -> None:
-    backlog = Backlog(limit_bytes=10)
+    backlog = PacketBacklog(limit_bytes=10)
     backlog.put(Packet("Scan2d", b"x" * 100, 1))
     backlog.put(Packet("Scan2d", memoryview(b"y" * 100), 2))
     assert [bytes(p.payload[:1]) for p in iter(backlog.take, None)] == [b"x", b"y"]
 
 
 def test_what_comes_later_does_not_overtake_what_waits_on_disk() -> None:
-    backlog = Backlog(limit_bytes=10)
+    backlog = PacketBacklog(limit_bytes=10)
     for time_ns in range(3):  # the first in memory, the others on disk
         backlog.put(Packet("Scan2d", b"x" * 8, time_ns))
     first = backlog.take()

@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 
 from afspm.client.component import Component
-from afspm.client.dispatch import Dispatcher
+from afspm.client.dispatch import MessageDispatcher
 from afspm.errors import Refused
 from afspm.model import Region, ScanParameters
 from afspm.process.failure import describe
 
-OURS = Path(Dispatcher.give.__code__.co_filename).parents[1]
+OURS = Path(MessageDispatcher.give.__code__.co_filename).parents[1]
 
 
 def made_up(code: str, **names: object) -> dict[str, Any]:

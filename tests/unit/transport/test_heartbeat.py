@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from afspm.transport.heartbeat import Heartbeat, HeartbeatListener, HeartbeatSender, read_beat
-from afspm.transport.wakeup import WakeUp
+from afspm.transport.polling import WakeUp
 
 
 def beats(listener: HeartbeatListener, count: int, timeout_s: float = 5.0) -> list[Heartbeat]:

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 import zmq
 
-from afspm.transport.polling import Poller, milliseconds
-from afspm.transport.wakeup import WakeUp
+from afspm.transport.polling import Poller, WakeUp, milliseconds
 
 LONG_MS = 30_000
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from afspm.transport.wakeup import WakeUp
+from afspm.transport.polling import WakeUp
 
 
 @pytest.fixture

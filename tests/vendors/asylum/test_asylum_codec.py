@@ -72,35 +72,11 @@ def test_numbers_come_back(value: float) -> None:
     np.testing.assert_equal(reply.results, (value,))
 
 
-def test_several_results_and_those_by_reference_come_back() -> None:
+def test_several_results_come_back_and_waves_are_passed_over() -> None:
     several = wire.IgorFunction(lambda: None, "", "vsd")
     assert xop.reply(wire.success(several, (1.0, "", "root:"), "7")).results == (1.0, "", "root:")
-    by_reference = wire.IgorFunction(lambda: None, "vVS")
-    assert xop.reply(wire.success(by_reference, (1.0, (2.0, "a")), "7")).passed_back == (2.0, "a")
-
-
-def test_waves_come_back_column_by_column() -> None:
-    content = wire.wave([1.0, 2.0, 3.0, 4.0, 5.0, math.nan], note="height")
-    content["dimension"] = {"size": [2, 3], "delta": [0.5, 1.0]}
-    content["data"]["unit"] = "m"
-    (wave,) = xop.reply(wire.success(wire.IgorFunction(lambda: None, "", "w"), content, "7")).results
-    assert isinstance(wave, xop.Wave)
-    np.testing.assert_array_equal(wave.values, [[1.0, 3.0, 5.0], [2.0, 4.0, math.nan]])
-    assert (wave.unit, wave.steps, wave.offsets, wave.note) == ("m", (0.5, 1.0), (0.0, 0.0), "height")
-    assert xop.reply(wire.success(wire.IgorFunction(lambda: None, "", "w"), None, "7")).results == (None,)
-
-
-def test_complex_waves_and_waves_of_texts() -> None:
-    def wave_of(kind: str, raw: Any, size: list[int]) -> Any:
-        value = {"type": kind, "data": {"raw": raw}, "dimension": {"size": size}}
-        message = {"errorCode": {"value": 0}, "result": {"type": "wave", "value": value}}
-        (wave,) = xop.reply(json.dumps(message).encode()).results
-        assert isinstance(wave, xop.Wave)
-        return wave.values.tolist()
-
-    assert wave_of("NT_FP64 | NT_CMPLX", {"real": [1, "nan"], "imag": [2, 0]}, [2])[0] == 1 + 2j
-    assert wave_of("TEXT_WAVE_TYPE", ["a", "b"], [2]) == ["a", "b"]
-    assert wave_of("NT_FP64", [], [0]) == []
+    wave = wire.wave([1.0, 2.0], note="height")
+    assert xop.reply(wire.success(wire.IgorFunction(lambda: None, "", "w"), wave, "7")).results == (None,)
 
 
 def test_an_error_has_its_number_its_meaning_and_what_igor_printed() -> None:
@@ -148,7 +124,7 @@ def test_json_of_another_shape_is_a_reply_or_has_a_name(content: dict[str, Any])
         reply = xop.reply(json.dumps(content).encode())
     except xop.BadReply:
         return
-    assert all(isinstance(one, float | str | xop.Wave | None) for one in reply.results)
+    assert all(isinstance(one, float | str | None) for one in reply.results)
 
 
 @pytest.mark.parametrize(
@@ -158,8 +134,6 @@ def test_json_of_another_shape_is_a_reply_or_has_a_name(content: dict[str, Any])
         {"type": "variable", "value": True},
         {"type": "string", "value": 1},
         {"type": "struct", "value": 1},
-        {"type": "wave", "value": {"type": "NT_FP64", "data": {"raw": [1, 2]}, "dimension": {"size": [3]}}},
-        {"type": "wave", "value": {"type": "NT_FP64", "data": {"raw": ["x"]}, "dimension": {"size": [1]}}},
     ],
 )
 def test_a_result_of_another_type_is_none(value: dict[str, Any]) -> None:

@@ -203,7 +203,6 @@ class Asylum(Driver):
 
     @action(names.STOP_SPEC)
     def stop_spec(self) -> None:
-        """Break the force curve off."""
         self._igor().do("DoForceFunc", "Reset")
         self._activity.stopped()
 
@@ -236,7 +235,7 @@ class Asylum(Driver):
 
 
 def _checked_name(name: str) -> str:
-    """What Asylum takes for a base name."""
+    """Return a base name that Asylum takes. Raises ConfigError."""
     fits = not name or (re.fullmatch(_NAME, name) and "mask" not in name.lower())
     if not fits:
         hint = 'up to 17 letters, digits and "_", a letter first, no "Mask"'

@@ -1,4 +1,4 @@
-"""What Asylum is doing, and what is awaited of it."""
+"""The state of Asylum, and what is awaited of it."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from afspm.microscopes.asylum.session import Session
 from afspm.microscopes.asylum.xop import MISSING, XopError
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.translator.result_files import SCAN, as_list, as_region
+from afspm.translator.state import Kept
 
 FORCE: Final = "force"
 
@@ -25,7 +26,7 @@ _SAVE: Final = 2.0
 
 
 class Activity:
-    """What is running at the controller, whoever began it.
+    """The measurement that runs at the controller, begun by a request or at its panel.
 
     Args:
         files: takes what comes of it.
@@ -39,7 +40,7 @@ class Activity:
         self,
         session: Session,
         files: AsylumFiles,
-        kept: dict[str, Any],
+        kept: Kept,
         folders: Mapping[str, str],
         frame_in_force: Callable[[], Region],
         clock: Clock,
@@ -56,7 +57,7 @@ class Activity:
         self._on_arrival: Callable[[], None] | None = None
 
     def status(self) -> ScopeStatus:
-        """What it is doing now; what has ended is awaited from here on."""
+        """Return what it is doing now; what has ended is awaited from here on."""
         state = self._session.doing().state
         if self._on_arrival is not None:
             return self._arriving(self._on_arrival, state)
@@ -182,7 +183,7 @@ class Activity:
         )
 
     def stopped(self) -> None:
-        """What is running was told to stop: nothing comes of it."""
+        """Note that what is running was told to stop: nothing comes of it."""
         self._stopping, self._on_arrival = True, None
         self.forget()
 
@@ -197,7 +198,7 @@ class Activity:
 
     @property
     def was_led_away(self) -> bool:
-        """Whether a scan has taken the tip from where it was sent."""
+        """True if a scan has taken the tip from where it was sent."""
         return bool(self._kept.get("led_away"))
 
     def takes_on_arrival(self, take: Callable[[], None]) -> None:

@@ -1,4 +1,4 @@
-"""What comes of a measurement: the file that Asylum saves of it, once it is whole."""
+"""The results of measurements: the file that Asylum saves of it, once it is whole."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from afspm.translator.result_files import (
     SCAN,
     Content,
     Entry,
-    Printed,
+    FilePrecision,
     ResultFiles,
     as_region,
     lines_missing,
@@ -26,7 +26,7 @@ from afspm.translator.result_files import (
     newest,
 )
 
-_PRINTED: Final = Printed(part=1e-4, angle_rad=1e-4 * math.tau)
+_PRECISION: Final = FilePrecision(part=1e-4, angle_rad=1e-4 * math.tau)
 """A note prints five digits of a number."""
 _NUMBERED: Final = re.compile(r".*\d{4}\.ibw", re.IGNORECASE)
 
@@ -184,4 +184,4 @@ def _content(path: Path, measured: Entry) -> Content:
     content: Sequence[Scan | Spectrum] = found.scans if measured["what"] == SCAN else found.spectra
     if not content:
         raise FileError(f"holds no {measured['what']}", where=str(path))
-    return [_PRINTED.as_set(one, measured) for one in content]
+    return [_PRECISION.as_set(one, measured) for one in content]

@@ -1,4 +1,4 @@
-"""What Igor is asked, by the functions of Asylum's software and of `afspm.ipf`."""
+"""Questions to Igor, by the functions of Asylum's software and of `afspm.ipf`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LONGEST_LIST: Final = 800
 
 @dataclass(frozen=True)
 class Doing:
-    """What the controller says of itself.
+    """The state that the controller tells of itself.
 
     Attributes:
         bits: of ARGetStatus; None where that is not there.
@@ -45,7 +45,7 @@ class Doing:
 
     @property
     def engaged(self) -> bool:
-        """Whether the tip is at the sample; where that can't be known it is to be taken care of as if it were."""
+        """True if the tip is at the sample; where that can't be known it is to be taken care of as if it were."""
         return self.bits is None or bool(self.bits & (_ENGAGED | _SCANNING)) or self.scanning
 
 
@@ -87,17 +87,17 @@ class Session:
         self._link.close()
 
     def feedback_on(self) -> bool:
-        """Whether the z feedback runs; where Igor can't be asked, whether the tip is at the sample."""
+        """Return True if the z feedback runs; where Igor can't be asked, if the tip is at the sample."""
         return bool(self.number("AfspmFeedbackOn")) if self.at_once else self.doing().engaged
 
     def controller(self) -> str:
-        """What it calls itself."""
+        """Return what it calls itself."""
         return f"Asylum Research, {self.text('AfspmController')}" if self.at_once else "Asylum Research"
 
     # --- values ---
 
     def doing(self) -> Doing:
-        """What the controller does now."""
+        """Return what the controller does now."""
         bits, values = self._look((SCAN_STATUS, MAP_STATUS))
         scanning, mapping = (bool(value) and not math.isnan(value) for value in values)
         return Doing(None if math.isnan(bits) else int(bits), scanning, mapping)

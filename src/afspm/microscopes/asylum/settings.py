@@ -16,7 +16,7 @@ from afspm.files.asylum import clockwise, counter_clockwise
 from afspm.microscopes.asylum.session import Session
 from afspm.model import ControlResponse, Region, names
 from afspm.translator.parameters import FEEDBACK_ON, Value
-from afspm.translator.settings import FRAME, POSITION, SettingsGroup, frame
+from afspm.translator.settings import FRAME, POSITION, SettingsGroup, frame, frame_values
 
 GLOBALS: Final = (
     "XOffset", "YOffset", "FastScanSize", "SlowScanSize", "ScanAngle", "ScanPoints", "ScanLines", "ScanRate",
@@ -32,20 +32,13 @@ def generic(found: Mapping[str, float]) -> dict[str, Value]:
     """Of Asylum's `GLOBALS`, the generic parameters in SI."""
     size_m = (found["FastScanSize"], found["SlowScanSize"])
     region = Region((found["XOffset"], found["YOffset"]), size_m, counter_clockwise(found["ScanAngle"]))
-    return {
-        names.SCAN_TOP_LEFT_X: region.top_left_m[0],
-        names.SCAN_TOP_LEFT_Y: region.top_left_m[1],
-        names.SCAN_SIZE_X: size_m[0],
-        names.SCAN_SIZE_Y: size_m[1],
-        names.SCAN_ANGLE: region.angle_rad,
-        names.SCAN_RESOLUTION_X: round(found["ScanPoints"]),
-        names.SCAN_RESOLUTION_Y: round(found["ScanLines"]),
-        names.SCAN_SPEED: PATH_OF_A_LINE * found["FastScanSize"] * found["ScanRate"],
-    }
+    shape = (round(found["ScanLines"]), round(found["ScanPoints"]))
+    speed_m_s = PATH_OF_A_LINE * found["FastScanSize"] * found["ScanRate"]
+    return {**frame_values(region, shape), names.SCAN_SPEED: speed_m_s}
 
 
 def asylums(wanted: Mapping[str, Value], before: Mapping[str, Value]) -> dict[str, float]:
-    """What to set at Asylum for generic parameters that are wanted, given all of `NAMES` as they were.
+    """Return what to set at Asylum for generic parameters that are wanted, given all of `NAMES` as they were.
 
     All that depends on each other is set, as PV does none of what the panel does. Asylum scans by its ScanRate, so
     that is set to keep the speed when the width changes.

@@ -11,9 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from afspm.errors import AfspmError, InvalidValue
 from afspm.translator.driver import ControllerLost
 
@@ -64,30 +61,13 @@ class XopError(AfspmError):
 
 
 class BadReply(ControllerLost):
-    """What came is no reply: whoever is there can't be trusted."""
+    """The bytes that came are no reply: the peer can't be trusted."""
 
     code = "igor-bad-reply"
 
 
-@dataclass(frozen=True, eq=False)
-class Wave:
-    """An array of Igor's.
-
-    Attributes:
-        values: in its shape, real or complex numbers or texts.
-        unit: of the values.
-        steps, offsets: of each dimension.
-        note: its text.
-    """
-
-    values: NDArray[Any]
-    unit: str = ""
-    steps: tuple[float, ...] = ()
-    offsets: tuple[float, ...] = ()
-    note: str = ""
-
-
-Result = float | str | Wave | None
+Result = float | str | None
+"""None: a wave, which no function that is asked for here returns."""
 
 
 @dataclass(frozen=True)
@@ -98,13 +78,11 @@ class Reply:
         message_id: that of the request; None where it could not be read.
         error: the number and the message of an error; None: it was done.
         results: what the function returned, one or several.
-        passed_back: its parameters that are passed by reference.
     """
 
     message_id: str | None
     error: tuple[int, str] | None = None
     results: tuple[Result, ...] = ()
-    passed_back: tuple[Result, ...] = ()
 
 
 def request(name: str, parameters: Sequence[Parameter], message_id: str) -> bytes:
@@ -128,7 +106,7 @@ def request(name: str, parameters: Sequence[Parameter], message_id: str) -> byte
 
 
 def reply(message: bytes) -> Reply:
-    """What a reply says.
+    """Return what a reply says.
 
     Raises:
         BadReply: it is none.
@@ -155,7 +133,7 @@ def _reply(content: Mapping[str, Any]) -> Reply:
         return Reply(message_id, (number, f"{told} {history}".strip()))
     found = content.get("result", [])
     results = [_value(one) for one in (found if isinstance(found, list) else [found])]
-    return Reply(message_id, None, tuple(results), tuple(_value(one) for one in content.get("passByReference", [])))
+    return Reply(message_id, None, tuple(results))
 
 
 def _value(one: Mapping[str, Any]) -> Result:
@@ -167,7 +145,7 @@ def _value(one: Mapping[str, Any]) -> Result:
             raise ValueError(f"{value!r} is no text")
         return value
     if kind == "wave":
-        return None if value is None else _wave(value)
+        return None
     raise ValueError(f"a result of type {kind!r}")
 
 
@@ -176,21 +154,3 @@ def _number(value: Any) -> float:
     if value in ("nan", "inf", "-inf") or (isinstance(value, int | float) and not isinstance(value, bool)):
         return float(value)
     raise ValueError(f"{value!r} is no number")
-
-
-def _wave(content: Mapping[str, Any]) -> Wave:
-    raw, dimension = content["data"]["raw"], content["dimension"]
-    if content["type"] == "TEXT_WAVE_TYPE":
-        flat: NDArray[Any] = np.array([str(one) for one in raw])
-    elif isinstance(raw, dict):
-        flat = np.array([complex(_number(a), _number(b)) for a, b in zip(raw["real"], raw["imag"], strict=True)])
-    else:
-        flat = np.array([_number(one) for one in raw], dtype=np.float64)
-    shape = [int(size) for size in dimension["size"]]
-    return Wave(
-        flat.reshape(shape, order="F"),
-        str(content["data"].get("unit", "")),
-        tuple(_number(step) for step in dimension.get("delta", [1.0] * len(shape))),
-        tuple(_number(offset) for offset in dimension.get("offset", [0.0] * len(shape))),
-        str(content.get("note", "")),
-    )

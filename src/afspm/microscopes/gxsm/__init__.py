@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.errors import ConfigError, Refused
-from afspm.microscopes.gxsm.activity import SHOWS_S, Activity
+from afspm.microscopes.gxsm.activity import SHOWS_S, Activity, Saving
 from afspm.microscopes.gxsm.hardware import (
     ABORT,
     APPROACH,
     AUTOSAVE_OFF,
     REPEAT_OFF,
     Hardware,
+    Offered,
     available,
     execute,
     recognised,
 )
 from afspm.microscopes.gxsm.link import Address, Asking, open_link
-from afspm.microscopes.gxsm.live import new_lines
 from afspm.microscopes.gxsm.result_files import SOON_S, GxsmFiles
+from afspm.microscopes.gxsm.scan_memory import new_lines
 from afspm.microscopes.gxsm.settings import (
     REFNAMES,
     FeedbackSwitch,
@@ -84,14 +86,13 @@ class Gxsm(Driver):
             raise ConfigError(f"{saving!r} saves nothing", where="saving", hint=f"{' or '.join(_SAVERS)}")
         self.controller_at = address
         Address.parse(address)
-        self._saves = saving == "afspm"
+        folders = (None if path is None else Path(path) for path in (scan_dir, probe_dir))
+        self._saving = Saving(saving == "afspm", *folders)
         self._given_hardware = hardware
-        self._scan_dir, self._probe_dir = (None if path is None else Path(path) for path in (scan_dir, probe_dir))
         self._feedback_actions: Sequence[str] = feedback_actions or ()
-        self._secret_file = None if secret_file is None else Path(secret_file)
-        self._reply_timeout_s = reply_timeout_s
+        secret = None if secret_file is None else Path(secret_file)
+        self._open = partial(open_link, timeout_s=reply_timeout_s, secret_file=secret)
         self._whole_table = self.table
-        self._refs: dict[str, str] = {}
         self._asking: Asking | None = None
         self._kept = KeptSettings(_AT_FIRST)
 
@@ -106,53 +107,50 @@ class Gxsm(Driver):
         """The link; what this GXSM has, in which unit it has it, and how it saves."""
         self.close()
         address = Address.parse(self.controller_at)
-        ask = self._asking = Asking(
-            open_link(address, self._reply_timeout_s, self.clock.monotonic_s, self._secret_file)
-        )
+        ask = self._asking = Asking(self._open(address, monotonic_s=self.clock.monotonic_s))
         self.prove()
-        self._refnames, self._actions = ask.names("list_refnames"), ask.names("list_actions")
-        missing = [ref for ref in REFNAMES if ref not in self._refnames]
+        refnames, actions = ask.names("list_refnames"), ask.names("list_actions")
+        missing = [ref for ref in REFNAMES if ref not in refnames]
         if missing:
             raise ControllerLost(f"this GXSM has no {', '.join(missing)}", where="list_refnames")
-        found = recognised(self._refnames, self._actions)
-        self._hardware = Hardware(self._given_hardware) if self._given_hardware else found
+        found = recognised(refnames, actions)
+        hardware = Hardware(self._given_hardware) if self._given_hardware else found
+        self._offered = Offered(refnames, actions, hardware)
         self._find_parameters()
         self.lacking = self._missing_actions()
-        self._frame = ScanFrame(ask, user_unit_m(ask))
-        if self._saves and AUTOSAVE_OFF in self._actions:
+        scan_frame = ScanFrame(ask, user_unit_m(ask))
+        if self._saving.by_us and AUTOSAVE_OFF in self._offered.actions:
             ask.call("action", AUTOSAVE_OFF)
             self.log.info("GXSM's Auto Save of scans is off from now on, and stays off: see the setting saving")
         self._kept.kept_in(self.memory)
         waits_s = (self.patience_s(self.result_timeout_s / 2), self.patience_s(SOON_S))
-        self._files = GxsmFiles(self.memory, *waits_s, self.log, rewritten=not self._saves)
+        self._files = GxsmFiles(self.memory, *waits_s, self.log, rewritten=not self._saving.by_us)
         self._activity = Activity(
             ask,
-            self._hardware,
-            self._frame,
+            hardware,
+            scan_frame,
             self._files,
             self.memory,
             self.clock,
             self.log,
             set_frame=lambda: frame(self.in_force(FRAME)),
             shows_s=self.patience_s(SHOWS_S),
-            saves=self._saves,
-            scan_dir=self._scan_dir,
-            probe_dir=self._probe_dir,
+            saving=self._saving,
         )
-        self._tip = TipPlace(self._frame, self.memory, self._sets_out)
-        own = FrameSettings(self._frame, self._tip, is_led=self._hardware is Hardware.RPSPMC)
+        self._tip = TipPlace(scan_frame, self.memory, self._sets_out)
+        own = FrameSettings(scan_frame, self._tip, is_led=self._offered.hardware is Hardware.RPSPMC)
         feedback = FeedbackSwitch(ask, self._activity.doing, self._feedback_actions)
         self.groups = (own, self._tip, self._kept, feedback)
 
     def _find_parameters(self) -> None:
         table = self._whole_table
         vendors = {name: spec.vendor for name, spec in table.items() if name not in self.translated}
-        self._refs = available(vendors, self._refnames)
-        lacking = sorted(vendors.keys() - self._refs.keys())
-        if self._feedback_actions and self._actions.issuperset(self._feedback_actions):
+        there = available(vendors, self._offered.refnames)
+        lacking = sorted(vendors.keys() - there.keys())
+        if self._feedback_actions and self._offered.actions.issuperset(self._feedback_actions):
             table = table.extended({FEEDBACK_ON: {"read_only": False}}, where="feedback_actions")
         self.table = table.without(lacking)
-        self.log.info("GXSM with the hardware %s; unsupported: %s", self._hardware.value, ", ".join(lacking) or "none")
+        self.log.info("GXSM with the hardware %s; unsupported: %s", self._offered.kind, ", ".join(lacking) or "none")
 
     def _missing_actions(self) -> dict[str, str]:
         """GXSM says 0 to actions that it does not have."""
@@ -164,13 +162,12 @@ class Gxsm(Driver):
             if "command" in what:
                 needed[name] = [str(what["command"])]
         return {
-            name: f"this GXSM has no action {' or '.join(wanted[:3])} with its hardware ({self._hardware.value})"
+            name: f"this GXSM has no action {' or '.join(wanted[:3])} with its hardware ({self._offered.kind})"
             for name, wanted in needed.items()
-            if self._actions.isdisjoint(wanted)
+            if self._offered.actions.isdisjoint(wanted)
         }
 
     def close(self) -> None:
-        """Let go of the link. What was begun goes on."""
         if self._asking is not None:
             self._asking.close()
             self._asking = None
@@ -182,18 +179,16 @@ class Gxsm(Driver):
         return self._asking
 
     def status(self) -> ScopeStatus:
-        """What GXSM is doing now."""
         return self._activity.status()
 
     def next_change_s(self) -> float | None:
-        """When a move or the wait for files is over."""
         return self._activity.next_change_s()
 
     # --- parameters ---
 
     def get(self, vendor: str) -> Value:
         if vendor == names.CONTROLLER:
-            return f"{self._files.program or 'GXSM'} ({self._hardware.value})"
+            return f"{self._files.program or 'GXSM'} ({self._offered.kind})"
         return number(self._ask, self._there(vendor))
 
     def set(self, values: Mapping[str, Value]) -> None:
@@ -203,14 +198,14 @@ class Gxsm(Driver):
     def _there(self, vendor: str) -> str:
         """Return the name that this GXSM has, of those that a parameter may have: of others it does not say that it has
         them not."""
-        there = available({"": vendor}, self._refnames)
+        there = available({"": vendor}, self._offered.refnames)
         if not there:
             raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, f"this GXSM has no parameter {vendor!r}")
         return there[""]
 
     def _way_s(self, way_m: float) -> float:
         """Return the time that the tip takes for so long a way; none if GXSM does not tell its speed."""
-        if names.MOVE_SPEED not in self._refs:
+        if names.MOVE_SPEED not in self.table:
             return 0.0
         speed_m_s = float(self.read_rows([names.MOVE_SPEED])[names.MOVE_SPEED])
         return way_m / speed_m_s if speed_m_s > 0.0 else 0.0
@@ -221,11 +216,9 @@ class Gxsm(Driver):
     # --- results ---
 
     def results(self) -> Sequence[str]:
-        """The last scans and spectra that GXSM saved."""
         return self._files.results(self.clock.now_s())
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
-        """Read the files of one."""
         return self._files.load(result)
 
     def lines(self, start: int) -> Sequence[ScanLines]:
@@ -243,13 +236,12 @@ class Gxsm(Driver):
     @action(names.START_SCAN)
     def start_scan(self) -> None:
         """Scan the frame once, with the channels and the direction of GXSM's panel."""
-        if REPEAT_OFF in self._actions:  # it would never end
+        if REPEAT_OFF in self._offered.actions:  # it would never end
             self._ask.call("action", REPEAT_OFF)
         self._activity.start_scan()
 
     @action(names.STOP_SCAN)
     def stop_scan(self) -> None:
-        """Break the scan off."""
         self._activity.stop_scan()
 
     @action(names.START_SPEC)
@@ -257,15 +249,14 @@ class Gxsm(Driver):
         """Take a spectrum of the kind `x-spec-kind` where the probe was sent to last: it is sent there again, since a
         scan has moved it."""
         kind = str(self._kept[names.SPEC_KIND])
-        if execute(kind) not in self._actions:
-            reason = f"this GXSM has no {execute(kind)} with its hardware ({self._hardware.value}): see x-spec-kind"
+        if execute(kind) not in self._offered.actions:
+            reason = f"this GXSM has no {execute(kind)} with its hardware ({self._offered.kind}): see x-spec-kind"
             raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, reason)
-        reach_m = math.hypot(*self._frame.region().size_m)
+        reach_m = math.hypot(*self._tip.frame.region().size_m)
         self._activity.start_curve(kind, self._tip.xy_m(), self._way_s(reach_m))
 
     @action(names.STOP_SPEC)
     def stop_spec(self) -> None:
-        """Break the spectrum off."""
         self._activity.stop_curve()
 
     @action(names.PULSE, state=ScopeState.BUSY_PARAM)

@@ -1,21 +1,23 @@
-"""What GXSM is doing. It never says that something began or ended: that is seen by looking."""
+"""The state of GXSM. It never says that something began or ended: that is seen by looking."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from afspm.clock import Clock
 from afspm.microscopes.gxsm.errors import GxsmError
 from afspm.microscopes.gxsm.hardware import ABORT, STATUS, Doing, Hardware, decoded, execute
 from afspm.microscopes.gxsm.link import Asking
 from afspm.microscopes.gxsm.result_files import GxsmFiles, endings
+from afspm.microscopes.gxsm.scan_memory import Rows, is_unfinished, looked_at
 from afspm.microscopes.gxsm.settings import ScanFrame
-from afspm.microscopes.gxsm.staleness import Rows, is_unfinished, looked_at
 from afspm.model import Region, ScopeState, ScopeStatus
 from afspm.translator.result_files import SCAN, as_list
+from afspm.translator.state import Kept
 
 SETTLES_S: Final = 0.3
 """So long GXSM needs from the end of a scan until it is done with it: a file that is saved before lacks its end."""
@@ -23,6 +25,31 @@ SHOWS_S: Final = 1.0
 """So long what was begun may take to be seen running; 0.3 s were measured."""
 _CHANNELS: Final = 40
 _NO_CHANNEL: Final = "EE:"
+
+
+@dataclass(frozen=True)
+class Saving:
+    """The way that scans and spectra are saved.
+
+    Attributes:
+        by_us: True if GXSM is told to save a scan at its end; if not, it does so by itself.
+        scan_dir, probe_dir: where files are, if not where GXSM says that it saves channels.
+    """
+
+    by_us: bool
+    scan_dir: Path | None = None
+    probe_dir: Path | None = None
+
+
+@dataclass
+class ScanProgress:
+    """The running scan as it was seen: its channels, its line, and since when it has ended."""
+
+    endings: list[str] = field(default_factory=list)
+    settles_until_s: float = 0.0
+    ended_ns: int = 0
+    y_before: int | None = None
+    y_moved: bool = False
 
 
 class Activity:
@@ -33,8 +60,6 @@ class Activity:
         frame: of the next scan; `set_frame` gives the same, as it was set, and (rows, columns).
         kept: JSON-able, and lasts: when the tip arrives that was sent away.
         shows_s: how long what was begun may take to be seen running, in experiment time.
-        saves: whether GXSM is told to save a scan at its end; if not, it does so by itself.
-        scan_dir, probe_dir: where files are, if not where GXSM says that it saves channels.
     """
 
     def __init__(
@@ -43,15 +68,13 @@ class Activity:
         hardware: Hardware,
         frame: ScanFrame,
         files: GxsmFiles,
-        kept: dict[str, Any],
+        kept: Kept,
         clock: Clock,
         log: logging.Logger,
         *,
         set_frame: Callable[[], tuple[Region, tuple[int, int]]],
         shows_s: float,
-        saves: bool,
-        scan_dir: Path | None,
-        probe_dir: Path | None,
+        saving: Saving,
     ) -> None:
         self._ask = ask
         self._hardware = hardware
@@ -61,18 +84,13 @@ class Activity:
         self._clock = clock
         self._log = log
         self._shows_s = shows_s
-        self._saves = saves
-        self._scan_dir, self._probe_dir = scan_dir, probe_dir
+        self._saving = saving
         self._stopping = False
         self._execute = ""
         self._kept = kept
         self._idle_ns = 0  # when it was last seen to measure nothing
         self._shows_until_s = 0.0
-        self._endings: list[str] = []
-        self._settles_until_s = 0.0
-        self._ended_ns = 0
-        self._y_before: int | None = None
-        self._y_moved = False
+        self._scan = ScanProgress()
         self._seen_last: tuple[tuple[int, int], Rows | None] = (0, 0), None
 
     # --- what is begun ---
@@ -80,7 +98,7 @@ class Activity:
     def start_scan(self) -> None:
         """Scan the frame."""
         self._begin_scan(self._clock.now_ns())
-        self._y_before = int(self._ask.number("y_current"))
+        self._scan.y_before = int(self._ask.number("y_current"))
         rows, columns = self._set_frame()[1]
         self._files.before = looked_at(self._ask, len(self._channels()), (0, rows - 1), columns)
         self._shows_until_s = self._clock.now_s() + self._shows_s
@@ -124,7 +142,7 @@ class Activity:
     def next_change_s(self) -> float | None:
         """When the tip has arrived, what was begun must show, or files must be there."""
         now_s = self._clock.now_s()
-        times = (self._arrives_s, self._shows_until_s, self._settles_until_s, self._files.next_s() or 0.0)
+        times = (self._arrives_s, self._shows_until_s, self._scan.settles_until_s, self._files.next_s() or 0.0)
         return min((at_s for at_s in times if at_s > now_s), default=None)
 
     # --- what goes on ---
@@ -134,24 +152,24 @@ class Activity:
         the scan before."""
         if self._files.what != SCAN or self._shows_until_s > 0.0:
             return []
-        if not self._endings:
-            self._endings = [next(iter(endings([Path(path)])), "") for path in self._channels()]
-        return self._endings
+        if not self._scan.endings:
+            self._scan.endings = [next(iter(endings([Path(path)])), "") for path in self._channels()]
+        return self._scan.endings
 
     def lines_done(self) -> int:
         """Return how many lines of the running scan are complete; until the first is, GXSM tells of the scan before."""
         y = int(self._ask.number("y_current"))
-        if self._y_before is None:
-            self._y_before = y
-        self._y_moved = self._y_moved or y != self._y_before
-        return y if self._y_moved else 0
+        if self._scan.y_before is None:
+            self._scan.y_before = y
+        self._scan.y_moved = self._scan.y_moved or y != self._scan.y_before
+        return y if self._scan.y_moved else 0
 
     def doing(self) -> Doing:
-        """What GXSM says."""
+        """Return what GXSM says."""
         return decoded(self._hardware, self._ask.numbers("rtquery", STATUS))
 
     def status(self) -> ScopeStatus:
-        """What GXSM is doing now; what has ended is awaited from here on."""
+        """Return what GXSM is doing now; what has ended is awaited from here on."""
         doing, now_s = self.doing(), self._clock.now_s()
         # a RedPitaya does not tell measuring from a program of its own that may lead the tip
         led = self._hardware is Hardware.RPSPMC and now_s < self._arrives_s
@@ -182,7 +200,7 @@ class Activity:
         return ScopeStatus(ScopeState.INTERRUPTED if self._files.broken_off else ScopeState.FREE)
 
     def _measuring(self, doing: Doing) -> ScopeStatus:
-        self._shows_until_s = self._settles_until_s = 0.0
+        self._shows_until_s = self._scan.settles_until_s = 0.0
         if not self._files.what and not self._stopping:  # somebody began it at the panel
             if doing.scanning:
                 self._begin_scan(self._idle_ns)
@@ -202,9 +220,9 @@ class Activity:
 
     def _is_settled(self, now_s: float) -> bool:
         """Return whether GXSM is done with the scan that has just ended."""
-        if not self._settles_until_s:
-            self._settles_until_s, self._ended_ns = now_s + SETTLES_S, self._clock.now_ns()
-        return now_s >= self._settles_until_s
+        if not self._scan.settles_until_s:
+            self._scan.settles_until_s, self._scan.ended_ns = now_s + SETTLES_S, self._clock.now_ns()
+        return now_s >= self._scan.settles_until_s
 
     def _forestalled(self) -> ScopeStatus:
         """The tip was on its way to a spectrum: that must not be taken into what somebody measures."""
@@ -219,15 +237,14 @@ class Activity:
         self._ask.call("action", action)
 
     def _begin_scan(self, begun_ns: int) -> None:
-        self._stopping, self._endings = False, []
-        self._settles_until_s, self._y_before, self._y_moved = 0.0, None, False
+        self._stopping, self._scan = False, ScanProgress()
         region, shape = self._set_frame()
         taken = {"frame": as_list(region), "shape": list(shape)}
         self._files.begin(SCAN, self._folder(), begun_ns, taken)
 
     def _begin_curve(self, kind: str, position_m: tuple[float, float]) -> None:
         self._stopping = False
-        folder = self._probe_dir or self._folder()
+        folder = self._saving.probe_dir or self._folder()
         self._files.begin(kind, folder, 0, {"position": list(position_m)})
 
     def _stop(self) -> None:
@@ -241,14 +258,14 @@ class Activity:
             self._files.end(now_ns, now_ns)
             return
         is_whole = self._is_whole()
-        if is_whole and self._saves:
+        if is_whole and self._saving.by_us:
             try:
                 self._ask.call("autosave")
             except GxsmError as error:
                 self._log.error("the scan can't be saved: %s", error)
         # only now: before, GXSM may still tell of the folder of the scan before
         channels, folder = self._channels(), self._folder()
-        self._files.end(self._ended_ns, self._clock.now_ns(), channels, folder, is_whole=is_whole)
+        self._files.end(self._scan.ended_ns, self._clock.now_ns(), channels, folder, is_whole=is_whole)
 
     def _is_whole(self) -> bool:
         """Return whether the scan that has ended came to its end, as far as GXSM's memory tells."""
@@ -262,8 +279,8 @@ class Activity:
 
     def _folder(self) -> Path | None:
         """Return where GXSM saves; before its first scan it does not say, and saves where it was started."""
-        if self._scan_dir:
-            return self._scan_dir
+        if self._saving.scan_dir:
+            return self._saving.scan_dir
         channels = self._channels(1)
         return Path(channels[0]).parent if channels else self._ask.working_folder()
 

@@ -78,7 +78,7 @@ def answer(method, arguments) -> str:  # type: ignore[no-untyped-def]
 
 
 def wanted() -> bool:
-    """Whether the script is to go on."""
+    """Return True if the script is to go on."""
     return gxsm is not None and gxsm.get("script-control") > 0.5
 
 

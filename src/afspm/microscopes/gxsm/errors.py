@@ -1,4 +1,4 @@
-"""What a call to GXSM may come to besides an answer."""
+"""The errors of a call to GXSM."""
 
 from __future__ import annotations
 

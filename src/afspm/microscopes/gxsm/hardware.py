@@ -1,4 +1,4 @@
-"""What stands behind GXSM: its drivers ("HwI") differ in what they have and in how they tell what they are doing."""
+"""The hardware behind GXSM: its drivers ("HwI") differ in what they have and in how they tell what they are doing."""
 
 from __future__ import annotations
 
@@ -28,8 +28,21 @@ class Hardware(Enum):
 
 
 @dataclass(frozen=True)
+class Offered:
+    """The names that a running GXSM has, and its kind of hardware."""
+
+    refnames: frozenset[str]
+    actions: frozenset[str]
+    hardware: Hardware
+
+    @property
+    def kind(self) -> str:
+        return self.hardware.value
+
+
+@dataclass(frozen=True)
 class Doing:
-    """What GXSM says that it is doing.
+    """The state that GXSM tells of itself.
 
     Attributes:
         scanning, probing: both, where it does not tell them apart.
@@ -57,7 +70,7 @@ def recognised(refnames: Collection[str], actions: Collection[str]) -> Hardware:
 
 
 def decoded(hardware: Hardware, slots: list[float]) -> Doing:
-    """What `rtquery("s")` says; of its three numbers only the first has a meaning.
+    """Return what `rtquery("s")` says; of its three numbers only the first has a meaning.
 
     Raises:
         BadReply: that is no set of bits.

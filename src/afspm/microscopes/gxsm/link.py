@@ -1,4 +1,4 @@
-"""How GXSM is called: one small protocol, whichever way it goes."""
+"""Calls of GXSM: one small protocol, whichever way they go."""
 
 from __future__ import annotations
 

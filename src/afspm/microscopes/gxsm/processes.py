@@ -1,4 +1,4 @@
-"""The process that is to be signalled, as Linux tells of it: a signal to the wrong one would end it."""
+"""The process that is to be signalled: a signal to the wrong one would end it. Linux only."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import psutil
+
 from afspm.translator.driver import ControllerLost
 
-_PROC: Final = Path("/proc")
 _SIGUSR1_BIT: Final = 1 << 9  # signal 10, counted from 1
-_DEAD: Final = ("Z", "X")
 
 
 class NoProcess(ControllerLost):
@@ -19,21 +19,21 @@ class NoProcess(ControllerLost):
 
 
 @dataclass(frozen=True)
-class Process:
-    """A process, told from a later one with the same number by when it was started."""
+class GxsmProcess:
+    """A process, told from a later one with the same number by when it was started, in ticks."""
 
     pid: int
-    started: str
+    started: str | None
 
     def lives(self) -> bool:
-        """Whether it is still there."""
-        return _started(self.pid) == self.started
+        """Return True if it is still there; asked often, so without psutil, which is ten times slower."""
+        return self.started is not None and _started(self.pid) == self.started
 
     def working_folder(self) -> Path | None:
         """Return the folder in which it runs; None: it may not be known."""
         try:
-            return (_PROC / str(self.pid) / "cwd").readlink()
-        except OSError:
+            return Path(psutil.Process(self.pid).cwd())
+        except psutil.Error:
             return None
 
     def signal(self, number: int) -> None:
@@ -50,50 +50,40 @@ class Process:
             raise ControllerLost(f"GXSM, process {self.pid}, can't be signalled: {error}") from error
 
 
-def find(process: str) -> Process:
-    """The process of a name, or of a number, which expects to be signalled.
+def find(process: str) -> GxsmProcess:
+    """Return the process of a name, or of a number, which expects to be signalled.
 
     Raises:
         NoProcess: there is none. ControllerLost: there are several, or it does not expect signals.
     """
-    if process.isdigit():
-        pids = [int(process)] if _started(int(process)) else []
-    else:
-        pids = [pid for pid in _all() if _name(pid) == process]
-    if not pids:
+    named = (one.pid for one in psutil.process_iter(["name"]) if process in (str(one.pid), one.info["name"]))
+    found = [one for one in (GxsmProcess(pid, _started(pid)) for pid in named) if one.lives()]
+    if not found:
         raise NoProcess(f"no process is called {process!r}", hint="is Gxsm4 running?")
-    if len(pids) > 1:
+    if len(found) > 1:
         hint = 'one can be chosen by its number: address = "shm:@<number>"'
-        raise ControllerLost(f"{len(pids)} processes are called {process!r}", hint=hint)
-    started = _started(pids[0])
-    if started is None or not _expects_signals(pids[0]):
-        raise ControllerLost(f"process {pids[0]} does not serve its shared memory", hint="was GXSM started with -s?")
-    return Process(pids[0], started)
-
-
-def _all() -> list[int]:
-    return [int(entry.name) for entry in _PROC.iterdir() if entry.name.isdigit() and _started(int(entry.name))]
-
-
-def _read(pid: int, file: str) -> str:
-    try:
-        return (_PROC / str(pid) / file).read_text(errors="replace")
-    except OSError:
-        return ""
-
-
-def _name(pid: int) -> str:
-    return _read(pid, "comm").rstrip("\n")
+        raise ControllerLost(f"{len(found)} processes are called {process!r}", hint=hint)
+    if not _expects_signals(found[0].pid):
+        raise ControllerLost(
+            f"process {found[0].pid} does not serve its shared memory", hint="was GXSM started with -s?"
+        )
+    return found[0]
 
 
 def _started(pid: int) -> str | None:
-    """When, in ticks since the computer was; None if it is gone."""
-    fields = _read(pid, "stat").rpartition(")")[2].split()
-    return fields[19] if len(fields) > 19 and fields[0] not in _DEAD else None
+    try:
+        fields = Path("/proc", str(pid), "stat").read_text(errors="replace").rpartition(")")[2].split()
+    except OSError:
+        return None
+    return fields[19] if len(fields) > 19 and fields[0] not in ("Z", "X") else None
 
 
 def _expects_signals(pid: int) -> bool:
-    """Whether it handles the signal, or waits for it: one that does neither is ended by it."""
-    lines = (line.partition(":") for line in _read(pid, "status").splitlines())
+    """Return True if it handles the signal, or waits for it: one that does neither is ended by it."""
+    try:
+        status = Path("/proc", str(pid), "status").read_text(errors="replace")
+    except OSError:
+        return False
+    lines = (line.partition(":") for line in status.splitlines())
     masks = {key: value.strip() for key, _, value in lines if key in ("SigBlk", "SigCgt")}
     return any(int(mask, 16) & _SIGUSR1_BIT for mask in masks.values())

@@ -1,4 +1,4 @@
-"""What comes of a measurement: GXSM's files, which come late, one for each channel, one after the other."""
+"""The results of measurements: GXSM's files, which come late, one for each channel, one after the other."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from afspm.clock import NS_PER_S
 from afspm.errors import AfspmError
 from afspm.files import read
 from afspm.files.content import FileContent
-from afspm.microscopes.gxsm.staleness import Rows
+from afspm.microscopes.gxsm.scan_memory import Rows
 from afspm.model import Region
-from afspm.translator.result_files import SCAN, Content, Entry, Printed, ResultFiles, as_region, lines_missing
+from afspm.translator.result_files import SCAN, Content, Entry, FilePrecision, ResultFiles, as_region, lines_missing
 
 _NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+\.nc)$")
-_PRINTED: Final = Printed(part=1e-5, angle_rad=1e-6)
+_PRECISION: Final = FilePrecision(part=1e-5, angle_rad=1e-6)
 _CLOCK_NS: Final = 2 * NS_PER_S
 """Files tell the second in which a scan began."""
 _LATE_NS: Final = 20 * NS_PER_S
@@ -58,7 +58,7 @@ class GxsmFiles(ResultFiles):
 
     @property
     def before(self) -> Rows | None:
-        """What was in GXSM's memory before the running scan; None: nobody has looked."""
+        """The rows in GXSM's memory before the running scan; None: nobody has looked."""
         found: Rows | None = self._kept["running"]["before"]
         return found
 
@@ -144,7 +144,7 @@ class GxsmFiles(ResultFiles):
 
     def read(self, entry: Entry) -> Content:
         contents = [self._whole.get(Path(file)) or read(file) for file in entry["files"]]
-        return [_PRINTED.as_set(one, entry) for content in contents for one in content]
+        return [_PRECISION.as_set(one, entry) for content in contents for one in content]
 
     def _new(self, ended: Entry) -> dict[Path, FileContent]:
         """The files of what has ended that are whole: they have stopped growing, and can be read."""
@@ -170,9 +170,11 @@ class GxsmFiles(ResultFiles):
         return {file: found[file] for file in sorted(found, key=lambda file: file.stat().st_mtime_ns)[-1:]}
 
     def _is_of_before(self, content: FileContent, begun_ns: int) -> bool:
-        """Whether it is a scan of before: the last one, saved again, or one that was stopped, saved late. When it began
-        is told by the clock of GXSM's computer, which may be another than ours, and be set meanwhile: what began before
-        the last scan did, by that clock, is new."""
+        """Return True if it is a scan of before: the last one, saved again, or one that was stopped, saved late.
+
+        When it began is told by the clock of GXSM's computer, which may be another than ours, and be set meanwhile:
+        what began before the last scan did, by that clock, is new.
+        """
         start_ns, known = content.start_ns, self._kept["starts"]
         if start_ns is None:
             return False
@@ -192,7 +194,7 @@ class GxsmFiles(ResultFiles):
         self._kept["behind_ns"] = ended["begun_ns"] - max(starts) if starts and ended["begun_ns"] else 0
 
     def _all(self, ended: Entry, files: Iterable[Path], now_s: float) -> bool:
-        """Whether no file is missing; those that did not come with the scan before are not waited for as long."""
+        """Return True if no file is missing; those that the scan before did not have are not waited for as long."""
         missing = set(ended["channels"]) - endings(files).keys()
         return not missing or (missing <= set(self._kept["absent"]) and now_s >= ended["soon_s"])
 
@@ -231,13 +233,13 @@ class GxsmFiles(ResultFiles):
                 self._kept["channels"][ending] = [scan.channel, scan.unit]
         names = [str(file) for file in files]
         # numbered by its end: files of spectra may be overwritten
-        content = [_PRINTED.as_set(one, ended) for file in files.values() for one in file]
+        content = [_PRECISION.as_set(one, ended) for file in files.values() for one in file]
         self._add(f"{names[0]} ({ended['end_ns']})", ended, {"files": names}, content)
         self._kept["ended"] = None
 
 
 def endings(files: Iterable[Path]) -> dict[str, Path]:
-    """What tells the channels of a scan from each other: what follows the number in a file's name; the last of each."""
+    """Return the last file of each channel of a scan, by what follows the number in its name."""
     named = ((_NUMBERED.search(file.name), file) for file in files)
     return {match[1]: file for match, file in named if match}
 

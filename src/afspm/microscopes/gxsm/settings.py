@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 from afspm import units
 from afspm.errors import AfspmError, Refused
@@ -17,7 +17,8 @@ from afspm.microscopes.gxsm.hardware import Doing
 from afspm.microscopes.gxsm.link import Asking
 from afspm.model import ControlResponse, Region, names
 from afspm.translator.parameters import FEEDBACK_ON, Value
-from afspm.translator.settings import FRAME, POSITION, SettingsGroup, frame
+from afspm.translator.settings import FRAME, POSITION, SettingsGroup, frame, frame_values
+from afspm.translator.state import Kept
 
 ANGSTROM_M: Final = 1e-10
 _UNITS: Final = {"AA": "Å", "Ang": "Å", "\u00c5": "Å", "\u212b": "Å", "\u03bcm": "um", "\u00b5m": "um"}
@@ -62,16 +63,9 @@ class ScanFrame:
     def read(self) -> dict[str, Value]:
         """In SI, by generic names."""
         columns, rows, width, height, x, y, clockwise_deg = (number(self._ask, ref) for ref in REFNAMES)
-        size_x, size_y = width * self._unit_m, height * self._unit_m
-        return {
-            names.SCAN_TOP_LEFT_X: x * self._unit_m - size_x / 2,
-            names.SCAN_TOP_LEFT_Y: y * self._unit_m - size_y / 2,
-            names.SCAN_SIZE_X: size_x,
-            names.SCAN_SIZE_Y: size_y,
-            names.SCAN_ANGLE: 0.0 - math.radians(math.remainder(clockwise_deg, 720.0)),
-            names.SCAN_RESOLUTION_X: round(columns),
-            names.SCAN_RESOLUTION_Y: round(rows),
-        }
+        center_m, size_m = (x * self._unit_m, y * self._unit_m), (width * self._unit_m, height * self._unit_m)
+        angle_rad = 0.0 - math.radians(math.remainder(clockwise_deg, 720.0))
+        return frame_values(Region(center_m, size_m, angle_rad), (round(rows), round(columns)))
 
     def write(self, values: Mapping[str, Value]) -> None:
         """Change what is given. X goes before Y: setting one in x, GXSM changes that in y."""
@@ -154,23 +148,23 @@ class TipPlace(SettingsGroup):
 
     names = POSITION
 
-    def __init__(self, scan_frame: ScanFrame, kept: dict[str, Any], on_move: Callable[[float], None]) -> None:
-        self._frame = scan_frame
+    def __init__(self, scan_frame: ScanFrame, kept: Kept, on_move: Callable[[float], None]) -> None:
+        self.frame = scan_frame
         self._kept = kept
         self.on_move = on_move
 
     def xy_m(self) -> tuple[float, float]:
         """Return where the tip was sent, (x, y) in m."""
         sent = self._kept.get("probe")
-        return self._frame.tip() if sent is None else (float(sent[0]), float(sent[1]))
+        return self.frame.tip() if sent is None else (float(sent[0]), float(sent[1]))
 
     def read(self) -> dict[str, Value]:
         return dict(zip(POSITION, self.xy_m(), strict=True))
 
     def write(self, values: Mapping[str, Value]) -> None:
         x, y = (float(values.get(name, was)) for name, was in zip(POSITION, self.xy_m(), strict=True))
-        way_m = math.dist(self._frame.tip(), (x, y))
-        self._frame.move_tip((x, y))
+        way_m = math.dist(self.frame.tip(), (x, y))
+        self.frame.move_tip((x, y))
         self._kept["probe"] = [x, y]
         self.on_move(way_m)
 

@@ -22,7 +22,7 @@ from typing import Any, Final
 from afspm.errors import ConfigError
 from afspm.microscopes.gxsm import pickles
 from afspm.microscopes.gxsm.errors import BadReply, GxsmError
-from afspm.microscopes.gxsm.processes import NoProcess, Process, find
+from afspm.microscopes.gxsm.processes import GxsmProcess, NoProcess, find
 from afspm.translator.driver import ControllerLost
 
 _FOLDER: Final = Path("/dev/shm")
@@ -65,7 +65,7 @@ class SharedMemoryLink:
         self._closed = Event()
         path = _FOLDER / block
         try:
-            self._process: Process = find(process)
+            self._process: GxsmProcess = find(process)
         except NoProcess:
             if path.exists():
                 self._memory = self._mapped(path)

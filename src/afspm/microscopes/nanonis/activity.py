@@ -1,11 +1,11 @@
-"""What Nanonis is doing, from what both connections say of it."""
+"""The state of Nanonis, from what both connections say of it."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Final
+from typing import Final
 
 from afspm.clock import Clock
 from afspm.errors import Refused
@@ -17,6 +17,7 @@ from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.translator.driver import ControllerLost
 from afspm.translator.result_files import SCAN, as_list
 from afspm.translator.settings import frame
+from afspm.translator.state import Kept
 
 _SETTLES_S: Final = 1.0
 """Real time that a spectrum may take to be seen running."""
@@ -42,7 +43,7 @@ class Activity:
         session: Session,
         files: NanonisFiles,
         probe: Probe,
-        kept: dict[str, Any],
+        kept: Kept,
         clock: Clock,
         log: logging.Logger,
     ) -> None:
@@ -126,8 +127,10 @@ class Activity:
 
     @contextmanager
     def occupied(self, state: ScopeState, lasts_s: float) -> Iterator[None]:
-        """What is begun in the block takes so long, experiment time, which Nanonis itself does not tell: also where its
-        answer is lost, or the connection, or this process."""
+        """Note that what is begun in the block takes so long, experiment time, which Nanonis itself does not tell.
+
+        It holds also where its answer is lost, or the connection, or this process.
+        """
         self._kept["occupied"] = [state.name, self._clock.now_s() + lasts_s]
         try:
             yield

@@ -25,7 +25,7 @@ _UP: Final = 1
 
 @dataclass(frozen=True)
 class Grabbing:
-    """How Nanonis hands out the scan in its memory, which its specification does not say.
+    """The way that Nanonis hands out the scan in its memory, which its specification does not say.
 
     Attributes:
         rows: "top-first" whatever the direction of the scan, or as they were "recorded".

@@ -30,7 +30,7 @@ _NUMBERS: Final = {code: struct.Struct(">" + code) for code in "HIifd"}
 
 
 class BadReply(ControllerLost):
-    """What came can't be the reply: nothing that follows on that connection can be trusted."""
+    """The bytes that came can't be the reply: nothing that follows on that connection can be trusted."""
 
     code = "nanonis-reply"
 
@@ -109,7 +109,7 @@ def request(name: str, arguments: Sequence[Any], release: int = NEWEST) -> bytes
 
 
 def body_bytes(header: bytes, asked: str) -> int:
-    """How many bytes follow the header of a reply to `asked`.
+    """Return how many bytes follow the header of a reply to `asked`.
 
     Raises:
         BadReply: it is the reply to something else, or none at all.

@@ -1,4 +1,4 @@
-"""What comes of a measurement: Nanonis' file of it, or, where there is none, what it has in memory."""
+"""The results of measurements: Nanonis' file of it, or, where there is none, what it has in memory."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from afspm.errors import AfspmError, FileError
 from afspm.files import read
 from afspm.microscopes.nanonis import fetched
 from afspm.translator.driver import LOST
-from afspm.translator.result_files import SCAN, Content, Entry, Printed, ResultFiles, lines_missing, newest
+from afspm.translator.result_files import SCAN, Content, Entry, FilePrecision, ResultFiles, lines_missing, newest
 
-_PRINTED: Final = Printed(part=2e-6, angle_rad=1e-3, positions=True)
+_PRECISION: Final = FilePrecision(part=2e-6, angle_rad=1e-3, positions=True)
 """A file prints seven digits of a position, and degrees with three."""
 
 Fetch = Callable[[Entry], Content]
@@ -59,7 +59,7 @@ class NanonisFiles(ResultFiles):
         return self._kept["running"] is not None and bool(self._kept["running"].get("seen", True))
 
     def seen(self) -> None:
-        """What is running was seen running."""
+        """Note that what is running was seen running."""
         if self._kept["running"] is not None:
             self._kept["running"]["seen"] = True
 
@@ -159,4 +159,4 @@ def _files(folder: Path, what: str) -> list[Path]:
 
 
 def _content(path: Path, entry: Entry) -> Content:
-    return [_PRINTED.as_set(one, entry) for one in read(path)]
+    return [_PRECISION.as_set(one, entry) for one in read(path)]

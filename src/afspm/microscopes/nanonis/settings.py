@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Final
 
 from afspm.microscopes.nanonis.protocol import BadReply
-from afspm.model import names
+from afspm.model import Region, names
 from afspm.translator.parameters import FEEDBACK_ON, Value, refuse_value
-from afspm.translator.settings import FRAME, POSITION, SettingsGroup, frame
+from afspm.translator.settings import FRAME, POSITION, SettingsGroup, frame, frame_values
 
 Ask = Callable[..., tuple[Any, ...]]
 
@@ -61,16 +61,8 @@ class ScanFrame(Group):
         x, y, width, height, clockwise_deg = self._numbers("Scan.FrameGet")
         if min(columns, rows) < 1 or min(width, height) <= 0.0:
             raise BadReply(f"Nanonis says that the frame is {width} m x {height} m of {columns} x {rows} pixels")
-        size_x, size_y = width * _share(columns), height * _share(rows)
-        return {
-            names.SCAN_TOP_LEFT_X: x - size_x / 2,
-            names.SCAN_TOP_LEFT_Y: y - size_y / 2,
-            names.SCAN_SIZE_X: size_x,
-            names.SCAN_SIZE_Y: size_y,
-            names.SCAN_ANGLE: 0.0 - math.radians(clockwise_deg),
-            names.SCAN_RESOLUTION_X: columns,
-            names.SCAN_RESOLUTION_Y: rows,
-        }
+        size_m = (width * _share(columns), height * _share(rows))
+        return frame_values(Region((x, y), size_m, 0.0 - math.radians(clockwise_deg)), (rows, columns))
 
     def write(self, values: Mapping[str, Value]) -> None:
         region, (rows, columns) = frame(self.merged(values))

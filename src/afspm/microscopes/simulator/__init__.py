@@ -6,7 +6,8 @@ instrument afterwards, with the same tip, and what it was measuring has gone on 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
@@ -30,9 +31,13 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+Table = dict[str, Any]
+"""Settings as the experiment file has them."""
+Rows = dict[str, Table]
+
 _FAULT = "x-fault"
 _FAULT_PARAMETERS = ("x-fault-kind", "x-fault-count", "x-fault-duration")
-_AT_FIRST: dict[str, Any] = {
+_AT_FIRST: Table = {
     names.SCAN_TOP_LEFT_X: "-0.5 um",
     names.SCAN_TOP_LEFT_Y: "-0.5 um",
     names.SCAN_SIZE_X: "1 um",
@@ -60,6 +65,20 @@ _AT_FIRST: dict[str, Any] = {
     "x-fault-count": 1,
     "x-fault-duration": 1.0,
 }
+
+
+def _told(
+    name: str, do: Callable[[Instrument, float], None], *, state: ScopeState | None = None, refuses: bool = True
+) -> Callable[[Simulator], None]:
+    """Return the action that has the instrument do something now, unless a simulated fault refuses."""
+
+    @action(name, state=state)
+    def act(self: Simulator) -> None:
+        if refuses:
+            self.faults.maybe_refuse()
+        do(self._instrument, self.clock.now_s())
+
+    return act
 
 
 class Simulator(Driver):
@@ -90,28 +109,28 @@ class Simulator(Driver):
         self,
         *,
         seed: int = 1,
-        surface: str | dict[str, Any] = "steps",
-        tip: dict[str, Any] | None = None,
-        tip_changes: dict[str, Any] | None = None,
-        drift: dict[str, Any] | None = None,
-        feedback: dict[str, Any] | None = None,
-        scanner: dict[str, Any] | None = None,
-        noise: dict[str, Any] | None = None,
-        signals: dict[str, Any] | None = None,
-        iv: dict[str, Any] | None = None,
-        force: dict[str, Any] | None = None,
-        initial: dict[str, Any] | None = None,
+        surface: str | Table = "steps",
+        tip: Table | None = None,
+        tip_changes: Table | None = None,
+        drift: Table | None = None,
+        feedback: Table | None = None,
+        scanner: Table | None = None,
+        noise: Table | None = None,
+        signals: Table | None = None,
+        iv: Table | None = None,
+        force: Table | None = None,
+        initial: Table | None = None,
         approach_s: Duration = 1.0,
-        faults: list[dict[str, Any]] | None = None,
+        faults: list[Table] | None = None,
         fault_action: bool = False,
-        panel: list[dict[str, Any]] | None = None,
-        parameters: dict[str, dict[str, Any]] | None = None,
-        actions: dict[str, dict[str, Any]] | None = None,
+        panel: list[Table] | None = None,
+        parameters: Rows | None = None,
+        actions: Rows | None = None,
         poll_period_s: Duration = 0.25,
         result_timeout_s: Duration = 10.0,
         live_lines_s: Duration | None = None,
     ) -> None:
-        world: dict[str, Any] = {
+        world: Table = {
             "surface": surface,
             "tip": tip,
             "tip_changes": tip_changes,
@@ -164,12 +183,13 @@ class Simulator(Driver):
                 errors.add(ConfigError(f"there is no action {event.action!r}", where=f"panel[{i}].action"))
 
     @classmethod
-    def rows(cls, settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    def rows(cls, settings: Mapping[str, Any]) -> Rows:
         loop = _loop_of(settings)
         return _merged({} if loop is None else _rows_for(loop.mode), settings.get("parameters") or {})
 
     def connect(self) -> None:
         """Switch the instrument on, or find it as it was."""
+        import_module("scipy.io")  # which saves files: the first is not to be later than others
         kept = self.memory
         if "start_s" not in kept:
             values = {name: self.table[name].to_vendor(value) for name, value in self._initial.items()}
@@ -196,15 +216,12 @@ class Simulator(Driver):
             truth.note(kept["start_s"], "start", facts)
 
     def status(self) -> ScopeStatus:
-        """What the instrument is doing now."""
         return ScopeStatus(self._instrument.state(self.clock.now_s()))
 
     def next_change_s(self) -> float | None:
-        """When the instrument will do something by itself."""
         return self._instrument.next_change_s()
 
     def get(self, vendor: str) -> Value:
-        """The value in force; every parameter has its generic name here."""
         if vendor == names.CONTROLLER:
             return f"simulated microscope of afspm {version('afspm')}"
         if vendor not in self.memory["values"]:
@@ -221,63 +238,22 @@ class Simulator(Driver):
         self._instrument.set(dict(values), self.clock.now_s())
 
     def results(self) -> Sequence[str]:
-        """The last saved files."""
         return self._instrument.results()
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
-        """Read a saved file."""
         return list(read(result))
 
     def lines(self, start: int) -> Sequence[ScanLines]:
-        """The lines that are complete by now."""
         return self._instrument.lines(start, self.clock.now_s())
 
-    @action(names.START_SCAN)
-    def start_scan(self) -> None:
-        """Scan the frame."""
-        self.faults.maybe_refuse()
-        self._instrument.start_scan(self.clock.now_s())
-
-    @action(names.STOP_SCAN)
-    def stop_scan(self) -> None:
-        """Break the scan off."""
-        self.faults.maybe_refuse()
-        self._instrument.stop(self.clock.now_s())
-
-    @action(names.START_SPEC)
-    def start_spec(self) -> None:
-        """Take a spectrum of the kind `x-spec-kind` where the probe is."""
-        self.faults.maybe_refuse()
-        self._instrument.start_spectrum(self.clock.now_s())
-
-    @action(names.STOP_SPEC)
-    def stop_spec(self) -> None:
-        """Break the spectrum off."""
-        self.faults.maybe_refuse()
-        self._instrument.stop(self.clock.now_s())
-
-    @action(names.PULSE, state=ScopeState.BUSY_PARAM)
-    def pulse(self) -> None:
-        """A bias pulse of `x-pulse-voltage` for `x-pulse-duration`."""
-        self.faults.maybe_refuse()
-        self._instrument.pulse(self.clock.now_s())
-
-    @action(names.CRASH, state=ScopeState.MOVING)
-    def crash(self) -> None:
-        """Drive the tip `x-crash-depth` into the sample at `x-crash-speed`, where the probe is."""
-        self.faults.maybe_refuse()
-        self._instrument.crash(self.clock.now_s())
-
-    @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
-    def retract(self) -> None:
-        """Take the tip away."""
-        self._instrument.retract(self.clock.now_s())
-
-    @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
-    def engage(self) -> None:
-        """Bring the tip to the sample."""
-        self.faults.maybe_refuse()
-        self._instrument.engage(self.clock.now_s())
+    start_scan = _told(names.START_SCAN, Instrument.start_scan)
+    stop_scan = _told(names.STOP_SCAN, Instrument.stop)
+    start_spec = _told(names.START_SPEC, Instrument.start_spectrum)
+    stop_spec = _told(names.STOP_SPEC, Instrument.stop)
+    pulse = _told(names.PULSE, Instrument.pulse, state=ScopeState.BUSY_PARAM)
+    crash = _told(names.CRASH, Instrument.crash, state=ScopeState.MOVING)
+    engage = _told(names.ENGAGE, Instrument.engage, state=ScopeState.COARSE_MOTOR)
+    retract = _told(names.RETRACT, Instrument.retract, state=ScopeState.COARSE_MOTOR, refuses=False)
 
     @action(_FAULT, while_busy=True)
     def fault(self) -> None:
@@ -286,7 +262,6 @@ class Simulator(Driver):
         self.faults.demand(Fault(str(kind), 0.0, int(count), float(duration_s)))
 
     def own_actions(self) -> dict[str, Action]:
-        """Without "x-fault" unless it is wanted."""
         found = super().own_actions()
         return found if self._fault_action else {name: a for name, a in found.items() if name != _FAULT}
 
@@ -298,20 +273,20 @@ class Simulator(Driver):
         return run_translator(self, context, FaultyTranslator)
 
 
-_SETPOINTS: Final[dict[str, dict[str, Any]]] = {
+_SETPOINTS: Final[Rows] = {
     "amplitude": {"unit": "V", "range": ["1 mV", "10 V"]},
     "current": {"unit": "A", "range": ["1 pA", "100 nA"]},
     "frequency-shift": {"unit": "Hz", "range": ["-100 kHz", "-1 mHz"]},
 }
 
 
-def _rows_for(mode: str) -> dict[str, dict[str, Any]]:
+def _rows_for(mode: str) -> Rows:
     """Return the rows that depend on the operating mode: what its setpoint is."""
     return {names.ZCTRL_SETPOINT: _SETPOINTS[mode], names.SPEC_KIND: {"choices": ["IV", "force"]}}
 
 
-def _merged(*tables: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    merged: dict[str, dict[str, Any]] = {}
+def _merged(*tables: Mapping[str, Mapping[str, Any]]) -> Rows:
+    merged: Rows = {}
     for table in tables:
         for name, row in table.items():
             # what is no table is for the table of parameters to refuse

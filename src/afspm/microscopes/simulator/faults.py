@@ -84,7 +84,7 @@ class Faults:
             self._kept["armed"][fault.kind] = [fault.count, fault.duration_s]
 
     def strikes(self, kind: str) -> float | None:
-        """Whether the next request (or file) is affected: the duration if so. Counts it."""
+        """Return the duration of the fault if the next request (or file) is affected, and count it."""
         count, duration_s = self._kept["armed"].get(kind, (0, 0.0))
         if not count:
             return None

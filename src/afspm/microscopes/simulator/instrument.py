@@ -27,6 +27,7 @@ from afspm.storage.atomic import write_atomic
 from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 from afspm.translator.parameters import ParameterTable, Value
 from afspm.translator.settings import feedback, frame
+from afspm.translator.state import Kept
 
 LISTED_RESULTS = 16
 
@@ -43,7 +44,7 @@ NS_PER_S = 1_000_000_000
 
 @dataclass(frozen=True)
 class PanelEvent:
-    """What a person does at the controller's own panel, which nobody asked the translator for.
+    """An act of a person at the controller's own panel, which nobody asked the translator for.
 
     Attributes:
         at_s: experiment seconds after the start.
@@ -71,7 +72,7 @@ class Instrument:
         self,
         world: World,
         table: ParameterTable,
-        kept: dict[str, Any],
+        kept: Kept,
         folder: Path,
         *,
         faults: Faults,
@@ -84,8 +85,7 @@ class Instrument:
         self._world = world
         self._table = table
         self._kept = kept
-        self._folder = folder
-        self._faults = faults
+        self._files = SavedFiles(folder, kept, faults)
         self._truth = truth
         self._log = log
         self._panel = sorted(panel, key=lambda event: event.at_s)
@@ -110,20 +110,20 @@ class Instrument:
     # --- what is going on ---
 
     def state(self, now_s: float) -> ScopeState:
-        """What the instrument is doing, after everything has happened that was to happen until now."""
+        """Return the state of the instrument, after everything has happened that was to happen until now."""
         self._advance(now_s)
         doing = self._kept["doing"]
         return ScopeState.FREE if doing is None else _STATES[doing["what"]]
 
     def next_change_s(self) -> float | None:
         """When the next thing happens by itself; None if nothing will, or `wake` will tell."""
-        times = [self._panel_s(), self._whole_s()]
+        times = [self._panel_s(), self._files.whole_s()]
         if self._kept["doing"] is not None and not self._drawing():
             times.append(self._kept["doing"]["end_s"])
         return min((at_s for at_s in times if at_s is not None), default=None)
 
     def results(self) -> list[str]:
-        """The files of the last scans and spectra, oldest first."""
+        """Return the files of the last scans and spectra, oldest first."""
         return list(self._kept["results"])
 
     def lines(self, start: int, now_s: float) -> list[ScanLines]:
@@ -143,8 +143,8 @@ class Instrument:
 
     def _advance(self, now_s: float) -> None:
         while (at_s := self.next_change_s()) is not None and at_s <= now_s:
-            if at_s == self._whole_s():
-                self._complete_file()
+            if at_s == self._files.whole_s():
+                self._files.complete()
             elif at_s == self._panel_s():
                 self._someone_at_the_panel(at_s)
             else:
@@ -168,7 +168,7 @@ class Instrument:
             self._settle()
 
     def _drawing(self) -> bool:
-        """Whether a scan is still being worked out: then it lasts until that is done, however fast time passes."""
+        """Return True if a scan is still being worked out: it then lasts until that is done, however fast time is."""
         return self._scan is not None and not self._scan.done()
 
     def _settle(self) -> None:
@@ -257,7 +257,7 @@ class Instrument:
         self._kept["values"][names.ENGAGED] = True
         self._begin("approach", now_s, self._approach_s)
 
-    def _treated(self, what: str, now_s: float, lasts_s: float, facts: dict[str, Any]) -> None:
+    def _treated(self, what: str, now_s: float, lasts_s: float, facts: Kept) -> None:
         self._settle()
         self._begin(what, now_s, lasts_s)
         self._note(now_s, what, facts)
@@ -272,7 +272,7 @@ class Instrument:
 
     # --- what comes of it ---
 
-    def _drawn_meanwhile(self, doing: dict[str, Any]) -> Future[SimulatedScan]:
+    def _drawn_meanwhile(self, doing: Kept) -> Future[SimulatedScan]:
         """The picture is worked out while the scan lasts and beside everything else, so that nobody waits for it."""
         future: Future[SimulatedScan] = Future()
 
@@ -287,7 +287,7 @@ class Instrument:
         Thread(target=work, daemon=True, name="simulated scan").start()
         return future
 
-    def _draw(self, doing: dict[str, Any]) -> SimulatedScan:
+    def _draw(self, doing: Kept) -> SimulatedScan:
         values = self._si(doing["values"])
         region, shape = frame(values)
         return self._world.scan(
@@ -301,13 +301,13 @@ class Instrument:
             slope=(float(values[names.SAMPLE_SLOPE_X]), float(values[names.SAMPLE_SLOPE_Y])),
         )
 
-    def _save_scan(self, scan: SimulatedScan, doing: dict[str, Any]) -> None:
-        content = encode_scan(scan.course.region, scan.channels(), self._measured(doing))
+    def _save_scan(self, scan: SimulatedScan, doing: Kept) -> None:
+        content = encode_scan(scan.course.region, scan.channels(), self._facts(doing))
         name = f"scan-{self._kept['scans']:04d}.nc"
-        self._save(name, content, doing["end_s"])
+        self._files.save(name, content, doing["end_s"])
         self._note(doing["end_s"], "scan", {"file": name, "scan": dict(scan.truth)})
 
-    def _save_spectrum(self, doing: dict[str, Any]) -> None:
+    def _save_spectrum(self, doing: Kept) -> None:
         values = self._si(doing["values"])
         position_m = (float(values[names.PROBE_POS_X]), float(values[names.PROBE_POS_Y]))
         kind = str(values[names.SPEC_KIND])
@@ -315,40 +315,15 @@ class Instrument:
         variables, units, curve = self._world.spectrum(kind, position_m, doing["start_s"], feedback(values), bias_v)
         spectrum = Spectrum(position_m, kind, tuple(variables), tuple(units), curve)
         name = f"spectrum-{self._kept['spectra']:04d}-{kind}.nc"
-        self._save(name, encode_spectrum(spectrum, self._measured(doing)), doing["end_s"])
+        self._files.save(name, encode_spectrum(spectrum, self._facts(doing)), doing["end_s"])
         self._note(doing["end_s"], "spectrum", {"file": name, "position_m": position_m, "kind": kind})
 
-    def _measured(self, doing: dict[str, Any]) -> FileFacts:
-        values = self._si(doing["values"])
-        attributes = {
-            f"{name} [{self._table[name].si_unit}]" if self._table[name].si_unit else name: (
-                value if isinstance(value, str) else float(value)
-            )
-            for name, value in values.items()
-        }
-        return FileFacts(int(doing["end_s"] * NS_PER_S), attributes)
-
-    def _save(self, name: str, content: bytes, end_s: float) -> None:
-        path = self._folder / name
-        whole_after_s = self._faults.strikes("half-file")
-        if whole_after_s is None:
-            write_atomic(path, [content])
-        else:
-            write_atomic(_hidden(path), [content])
-            path.write_bytes(content[: len(content) // 2])
-            self._kept["half"] = [str(path), end_s + whole_after_s]
-        self._kept["results"] = [*self._kept["results"], str(path)][-LISTED_RESULTS:]
-
-    def _whole_s(self) -> float | None:
-        half = self._kept.get("half")
-        return None if half is None else float(half[1])
-
-    def _complete_file(self) -> None:
-        path = Path(self._kept.pop("half")[0])
-        try:
-            _hidden(path).replace(path)
-        except OSError as error:
-            raise FileError(f"can't be completed: {error}", where=str(path)) from error
+    def _facts(self, doing: Kept) -> FileFacts:
+        rows, facts = self._table, dict[str, str | float]()
+        for name, value in self._si(doing["values"]).items():
+            key = f"{name} [{rows[name].si_unit}]" if rows[name].si_unit else name
+            facts[key] = value if isinstance(value, str) else float(value)
+        return FileFacts(int(doing["end_s"] * NS_PER_S), facts)
 
     # --- the panel, and the truth ---
 
@@ -368,7 +343,7 @@ class Instrument:
             except Refused as refused:
                 self._log.warning("at the panel: %s", refused)
 
-    def _note(self, time_s: float, event: str, facts: dict[str, Any]) -> None:
+    def _note(self, time_s: float, event: str, facts: Kept) -> None:
         if not self._drawing():
             facts = {**facts, "truth": self._world.truth(time_s)}
         self._truth.note(time_s, event, facts)
@@ -384,6 +359,40 @@ def _line_s(values: dict[str, Value], width_m: float) -> float:
 
 def _distance(before: dict[str, Value], after: dict[str, Value], *axes: str) -> float:
     return math.hypot(*(float(after[axis]) - float(before[axis]) for axis in axes))
+
+
+class SavedFiles:
+    """The files that the simulated controller saves, some of them half at first."""
+
+    def __init__(self, folder: Path, kept: Kept, faults: Faults) -> None:
+        self._folder = folder
+        self._kept = kept
+        self._faults = faults
+
+    def save(self, name: str, content: bytes, end_s: float) -> None:
+        """Save a file that was finished at an experiment time."""
+        path = self._folder / name
+        whole_after_s = self._faults.strikes("half-file")
+        if whole_after_s is None:
+            write_atomic(path, [content])
+        else:
+            write_atomic(_hidden(path), [content])
+            path.write_bytes(content[: len(content) // 2])
+            self._kept["half"] = [str(path), end_s + whole_after_s]
+        self._kept["results"] = [*self._kept["results"], str(path)][-LISTED_RESULTS:]
+
+    def whole_s(self) -> float | None:
+        """Return when a file that is half becomes whole; None: none is."""
+        half = self._kept.get("half")
+        return None if half is None else float(half[1])
+
+    def complete(self) -> None:
+        """Make the file whole that is half."""
+        path = Path(self._kept.pop("half")[0])
+        try:
+            _hidden(path).replace(path)
+        except OSError as error:
+            raise FileError(f"can't be completed: {error}", where=str(path)) from error
 
 
 def _hidden(path: Path) -> Path:

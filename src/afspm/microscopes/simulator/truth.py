@@ -1,4 +1,4 @@
-"""What really was, for judging afterwards: `truth.jsonl` in the folder of the run, never on the wire."""
+"""The truth, for judging afterwards: `truth.jsonl` in the folder of the run, never on the wire."""
 
 from __future__ import annotations
 
