@@ -83,7 +83,7 @@ def delay_per_length_s_m(scan: DriftScan) -> float | None:
 
 
 def row_delay_s(scan: DriftScan, position_m: Array) -> float | None:
-    """Return how long after its middle a scan passes a position of tip coordinates; None if its direction is unknown."""
+    """Return how long after its middle a scan passes a position (tip coordinates); None if its direction is unknown."""
     a = delay_per_length_s_m(scan)
     return None if a is None else a * float(slow_axis(scan) @ (position_m - np.array(scan.region.center_m)))
 

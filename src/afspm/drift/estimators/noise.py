@@ -77,8 +77,8 @@ class FineFilter:
 def independent_values(first: Array, second: Array) -> float:
     """Return how many independent values each pixel brings to the correlation of two images.
 
-    S(P1) S(P2) / S(P1 P2) / n, with the sums S over all n frequencies of their power spectra (Bartlett, J. R. Stat. Soc.
-    Suppl. 8, 27, 1946).
+    S(P1) S(P2) / S(P1 P2) / n, with the sums S over all n frequencies of their power spectra (Bartlett,
+    J. R. Stat. Soc. Suppl. 8, 27, 1946).
     """
     from scipy.fft import fft2
 
@@ -111,11 +111,12 @@ HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it th
 def seen(columns: Array, weight: Array, metric: Array | None) -> Array:
     """Return Q f less what lines explain of it: the product with another image g is f'Qg free of both their lines.
 
-    Generalised least squares row by row: each row has an offset and a tilt of its own, and noise with a memory. A row is
-    scanned in seconds and the next one begins anew (feedback, flattening, drift of the z piezo), so nothing is assumed
-    of the offset and tilt of a row, and the noise within it is white plus 1/f, with covariance C and Q = C^-1. What is
-    left of a row f after the nuisance B = [1, x] is fitted in this metric, f - B (B'QB)^-1 B'Q f, carries all that the
-    row tells (Frisch and Waugh, Econometrica 1, 387, 1933; Aitken, Proc. R. Soc. Edinb. 55, 42, 1936).
+    Generalised least squares row by row: each row has an offset and a tilt of its own, and noise with a memory. A row
+    is scanned in seconds and the next one begins anew (feedback, flattening, drift of the z piezo), so nothing is
+    assumed of the offset and tilt of a row, and the noise within it is white plus 1/f, with covariance C and Q =
+    C^-1. What is left of a row f after the nuisance B = [1, x] is fitted in this metric, f - B (B'QB)^-1 B'Q f,
+    carries all that the row tells (Frisch and Waugh, Econometrica 1, 387, 1933; Aitken, Proc. R. Soc. Edinb. 55, 42,
+    1936).
 
     Args:
         columns: [y, column, x].
