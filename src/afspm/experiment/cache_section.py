@@ -73,7 +73,7 @@ class CacheSettings:
         return tuple(re.split(r"[{}]", rule.envelope)[0] for rule in self.rules if rule.envelope)
 
     def to_settings(self) -> Settings:
-        """In JSON's types; `CacheRule` by its fields."""
+        """Return it in JSON's types; `CacheRule` by its fields."""
         rules = [{k: v for k, v in vars(rule).items() if v is not None} for rule in self.rules]
         return {"rules": rules, "mapping": self.mapping, "history": dict(self.history)}
 

@@ -62,7 +62,7 @@ class Unloadable(Exception):
 
 @contextlib.contextmanager
 def importing_from(folders: Sequence[Path]) -> Iterator[None]:
-    """Modules beside the experiment file can be imported within this block.
+    """Let modules beside the experiment file be imported within this block.
 
     Two experiments may both have a `component.py`: what was imported from the folders is forgotten afterwards.
     """
@@ -133,7 +133,7 @@ def load(path: str) -> Any:
 
 
 def find_module(name: str, folders: Sequence[Path]) -> Any:
-    """The spec of a module that can be imported, also from beside the file; None: there is none."""
+    """Return the spec of a module, also from beside the file; None: there is none."""
     with importing_from(folders):
         try:
             return importlib.util.find_spec(name)
@@ -142,7 +142,7 @@ def find_module(name: str, folders: Sequence[Path]) -> Any:
 
 
 def role_of(component: type) -> Role | None:
-    """Scheduler, translator or component, by what the class is derived from; None: it is none of them."""
+    """Return scheduler, translator or component, by the bases of a class; None: it is none of them."""
     for base in component.__mro__:
         for package, role in _ROLE_BY_BASE:
             if base.__module__ == package or base.__module__.startswith(package + "."):

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 def undistorted(values: Array, region: Region, velocity_m_s: XY, duration_s: float, *, upwards: bool = True) -> Array:
-    """Values on the same grid as they were at the middle of the scan.
+    """Return values on the same grid as they were at the middle of the scan.
 
     Rows are taken one after the other, so what is at the offset S from the centre c when half of the scan is done is
     found at the offset q with S = (1 - v a') q, where v is the velocity and a the vector along the slow axis of length

@@ -1,4 +1,4 @@
-"""What a tip of a given shape feels of a surface: grey dilation, band limit, and the value at any position.
+"""Imaging by a tip of a given shape: grey dilation, band limit, and the value at any position.
 
 The path of the tip's apex over a surface is the grey dilation of the surface by the reflected tip (Villarrubia 1997).
 A convex tip that is a paraboloid first and a cone further out is the infimal convolution of both, so dilating by one
@@ -98,13 +98,13 @@ class Sampler:
 
 
 def across_m(tip: TipState, height_range_m: float) -> float:
-    """How far beside its apex the round part of a tip can touch a surface of that range of heights."""
+    """Return how far beside its apex the round part of a tip can touch a surface of that range of heights."""
     corner = tip.imaging_radius_m / math.tan(math.radians(tip.half_angle_deg))  # beyond, it is the cone that touches
     return min(math.sqrt(2.0 * tip.imaging_radius_m * height_range_m), corner)
 
 
 def reach_m(tip: TipState, height_range_m: float) -> float:
-    """How far beside its apex a tip can touch a surface of that range of heights."""
+    """Return how far beside its apex a tip can touch a surface of that range of heights."""
     across = across_m(tip, height_range_m)
     beyond = max(0.0, height_range_m - across**2 / (2.0 * tip.imaging_radius_m))
     reach = across + beyond * math.tan(math.radians(tip.half_angle_deg))

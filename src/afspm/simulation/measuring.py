@@ -22,7 +22,7 @@ from afspm.simulation.tip import TipState
 
 @dataclass(frozen=True)
 class SignalSettings:
-    """How the sample answers.
+    """The answer of the sample in phase and current.
 
     Attributes:
         dissipation: energy lost to the sample a cycle, as a share of what the cantilever loses itself, mean of both
@@ -80,7 +80,7 @@ _MOST_TAPS = 160  # grid steps that a tip may reach aside: one that reaches furt
 
 @dataclass(frozen=True)
 class Setup:
-    """What stays the same during a scan.
+    """The conditions that stay the same during a scan.
 
     Attributes:
         sample: relief of the sample as it is now, from (x, y, resolution_m).
@@ -109,7 +109,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Felt:
-    """What the tip feels along the lines, by row index, x ascending.
+    """The surface as the tip feels it along the lines, by row index, x ascending.
 
     Attributes:
         height_m: (trace, retrace), each [y, x].

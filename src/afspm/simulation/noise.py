@@ -1,4 +1,4 @@
-"""What the instrument adds to the signals, and the line flattening that it may take away again."""
+"""The noise that the instrument adds to the signals, and the line flattening that it may take away again."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class NoiseSettings:
 def disturbances(
     settings: NoiseSettings, tips: list[TipState], line_s: float, nx: int, random: np.random.Generator
 ) -> Array | None:
-    """What happens between tip and sample besides scanning: scars and debris that jumps; the feedback follows it.
+    """Return scars and jumps of debris, which happen between tip and sample; the feedback follows them.
 
     Args:
         tips: of each line, in the order of time.

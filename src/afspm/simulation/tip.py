@@ -217,7 +217,7 @@ def crash_times(settings: TipChangeSettings, depth_m: float) -> float:
 
 
 def indented_m(tip: TipState, depth_m: float) -> float:
-    """How deep a tip gets into the sample when it is driven `depth_m` beyond the surface.
+    """Return how deep a tip gets into the sample when it is driven `depth_m` beyond the surface.
 
     Simulated, without a source: at first the sample gives way, by as much as was asked for. The deeper, the more it is
     the apex that gives way, and blunts; beyond some three of its radii nothing more is gained. A blunt apex is stiffer.
@@ -227,7 +227,7 @@ def indented_m(tip: TipState, depth_m: float) -> float:
 
 
 def drawn_flaw(settings: TipChangeSettings, random: np.random.Generator) -> str | None:
-    """Which flaw comes next; None when all weights are zero."""
+    """Return the next flaw; None when all weights are zero."""
     weights = np.array([settings.blunt_weight, settings.double_weight, settings.contaminated_weight])
     return str(random.choice(FLAWS, p=weights / weights.sum())) if weights.sum() else None
 

@@ -1,4 +1,4 @@
-"""Setting where to scan."""
+"""What is published at the start, setting where to scan, and moving the probe."""
 
 from __future__ import annotations
 
