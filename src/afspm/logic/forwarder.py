@@ -223,7 +223,6 @@ class Forwarder:
         return job.sent_s + self.timeout_s + self.patience_s
 
     def _next(self, now_s: float) -> Forwarder:
-        """Send the next of those that wait."""
         if self.own:
             return replace(self, own=self.own[1:])._sent(self.own[0], now_s)
         if self.queue:

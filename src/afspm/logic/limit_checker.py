@@ -170,7 +170,6 @@ class LimitChecker:
         return list(dict.fromkeys(value.name for value in values))
 
     def _sensible(self, subject: object) -> list[ParameterValue]:
-        """Return what a subject sets; nothing if it makes no sense."""
         try:
             return values_of(subject, self.limits.parameters)
         except ParameterValueError:
@@ -257,7 +256,6 @@ class LimitChecker:
             )
 
     def _check_scan(self, wanted: ScanParameters, reach: float = _REACH) -> None:
-        """Check the scan as it would be afterwards: a request may give only a part of it."""
         shape, region = wanted.shape, wanted.region
         if isinstance(shape, ShapeChange):
             shape = shape.onto(self.state.position.shape or (1, 1))

@@ -42,7 +42,6 @@ def take_packet(draft: StateDraft, event: PacketIn) -> None:
 
 
 def _published(draft: StateDraft, packet: Packet, header: PacketHeader) -> Publish | None:
-    """Return what to publish; None: it is dropped, or we have had it."""
     env, source_ns = draft.env, packet.time_ns
     if header.message == CONTROL_STATE:
         _log_once(draft, "WARNING", "the translator publishes a ControlState, which is the scheduler's: dropped")

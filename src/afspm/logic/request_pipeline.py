@@ -243,7 +243,6 @@ def _reads_first(draft: StateDraft, event: RequestIn) -> bool:
 
 
 def _was_read(number: int, name: str, draft: StateDraft, response: Response) -> None:
-    """Take one of the values that a request waits for."""
     _forget_unread(name, draft, response)
     if (read := draft.pending.read(number)) is None:
         return  # it was called back
@@ -311,7 +310,6 @@ def _moves_first(draft: StateDraft, event: RequestIn, move: MappedRequest) -> bo
 
 
 def _moved(number: int, draft: StateDraft, response: Response) -> None:
-    """Take the answer to a move before an action."""
     move = draft.pending.move
     if move is None or move.move.number != number:
         return  # the action was called back
@@ -387,7 +385,6 @@ def settle(draft: StateDraft, settled: SettledRequest) -> None:
 
 
 def _settle_own(draft: StateDraft, job: ForwardedRequest, end: ForwardOutcome, response: Response) -> None:
-    """Take the end of a request of the scheduler's own."""
     if not reads(job.request):
         answers.write_down(draft, SCHEDULER, job.request, response, job.heard_s)
     if job.on_answer is None:
@@ -408,7 +405,6 @@ def _settle_late(draft: StateDraft, job: ForwardedRequest, response: Response) -
 
 
 def _see_feedback(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
-    """Reckon with a feedback that a request may have switched off, unless it was refused."""
     feedback = feedback_of(job.request)
     if feedback is None or feedback.on is not False or response.ok:
         return
@@ -451,7 +447,6 @@ def _names_meant(job: ForwardedRequest) -> tuple[str, ...] | None:
 
 
 def _was_not_sent(response: Response) -> bool:
-    """Return whether the translator says that it could not reach the controller, and did nothing."""
     return response.code == ControlResponse.NO_RESPONSE and response.detail is ResponseDetail.NOT_SENT
 
 

@@ -98,7 +98,6 @@ class Replayer:
         self._wake_up.close()
 
     def _due_in_s(self) -> float:
-        """Real seconds until the next packet."""
         if self._next is None:
             return math.inf
         left_ns = (self._next.time_ns or 0) - self._clock.now_ns()

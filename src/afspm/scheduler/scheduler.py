@@ -100,7 +100,6 @@ def _epoch(context: ProcessContext) -> bytes:
 
 
 def _restore(core: SchedulerCore, state: StateFile, log: Path | None) -> None:
-    """Take up the state of before a restart."""
     try:
         if (saved := state.load()) is not None:
             core.restore(saved)

@@ -215,7 +215,6 @@ class SchedulerShell:
         return self._replay
 
     def _deadlines(self, now_s: float) -> None:
-        """See to those that have come, and find the next."""
         self._release(now_s)
         if self._core_due_s() <= now_s:
             self._take(events.Tick())
@@ -223,7 +222,6 @@ class SchedulerShell:
         self._look_at_s = self._core_due_s() if held_s is None else min(held_s, self._core_due_s())
 
     def _core_due_s(self) -> float:
-        """When, in real monotonic time, the core is due."""
         due_s = self._core.deadline_s()
         if (deadline_ns := self._core.deadline_ns()) is not None:
             wait_s = self._clock.real_s((deadline_ns - self._clock.now_ns()) * 1e-9)

@@ -329,7 +329,6 @@ class DriftCore(SchedulerCore):
         return effects
 
     def _late(self, now_s: float, now_ns: int) -> list[Effect]:
-        """Nobody waits for ever: not for a worker that hangs."""
         held = self._gate.held
         if held is None or now_s < held.until_s:
             return []
@@ -367,7 +366,6 @@ class DriftCore(SchedulerCore):
         return self._consequences.give_up(step) if self._waits_for_a_person else []
 
     def _ask_direction(self, now_s: float) -> list[Effect]:
-        """In which direction it scans, where it tells."""
         parameter = Parameter(names.SCAN_DIRECTION)
         request = Request(int(ControlRequest.PARAM), parameter, self._codec.encode(parameter))
         return self.ask_own(request, now_s, lambda response, now_s, now_ns: ())

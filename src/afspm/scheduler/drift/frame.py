@@ -343,7 +343,6 @@ class DriftFrame:
 
 
 def _place_of(request: Request) -> Region | RegionChange | ProbePosition | PositionChange | None:
-    """The place, or the part of one, that a request is about."""
     subject = request.subject
     if request.kind == _SET_SCAN and isinstance(subject, ScanParameters):
         return subject.region
@@ -360,7 +359,6 @@ def _place_of(request: Request) -> Region | RegionChange | ProbePosition | Posit
 
 
 def _names(asked: Any) -> tuple[str, ...]:
-    """The parameters that somebody asked to set."""
     if isinstance(asked, Parameter):
         return (asked.name,)
     if isinstance(asked, ScanParameters):

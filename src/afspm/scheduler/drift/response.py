@@ -193,7 +193,6 @@ class DriftResponse:
 
 
 def _refusal(axis: str, response: Response) -> list[Effect]:
-    """Return what to log where a rate is not taken."""
     if response.ok or response.code == ControlResponse.NOT_FREE:
         return []  # a scan has begun already: it is handed over after the next
     return [Log("ERROR", f"the controller does not take the rate of the drift, {axis}: {response.reason}")]
