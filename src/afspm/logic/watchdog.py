@@ -7,10 +7,11 @@ and left it in a dangerous state: it can't put that right any more, and nobody e
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum
 
 from afspm.logic.arbitration import Cause
+from afspm.logic.frozen import replace
 from afspm.logic.microscope_status import FEEDBACK_OFF, STARTS, STOPS, MicroscopeStatus
 from afspm.model import ControlResponse, ScopeState, names
 
@@ -91,8 +92,8 @@ class SafetyResult(Enum):
     FAILED = "failed"
 
 
-@dataclass(frozen=True, slots=True)
-class TipState:
+@dataclass(frozen=True)
+class RetractState:
     """The part of the watchdog that survives a restart.
 
     Attributes:
@@ -107,7 +108,7 @@ class TipState:
     for_feedback: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Watchdog:
     """The actions that the scheduler itself wants of the microscope.
 
@@ -125,7 +126,7 @@ class Watchdog:
     """
 
     settings: WatchdogSettings = field(default_factory=WatchdogSettings)
-    tip: TipState = TipState()
+    tip: RetractState = RetractState()
     starting: str | None = None
     sent: str | None = None
     attempts: int = 0
@@ -137,7 +138,7 @@ class Watchdog:
     retries: int = 0
     in_haste: bool = False
 
-    def restored(self, tip: TipState) -> Watchdog:
+    def restored(self, tip: RetractState) -> Watchdog:
         """Take up the duty of before a restart: what the microscope was being asked is not known any more."""
         duty = TipDuty.OWED if tip.duty is TipDuty.ASKED else tip.duty
         return replace(self, tip=replace(tip, duty=duty))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Hashable, Iterable
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from afspm import wire
 from afspm.errors import WireError
@@ -30,7 +30,7 @@ from afspm.wire.protocol import LONGEST_ID
 
 if TYPE_CHECKING:
     from afspm.clock import Clock
-    from afspm.logic.arbitration import ArbitrationState
+    from afspm.logic.scheduler_core import SchedulerCore
     from afspm.logic.state import SavedState
     from afspm.scheduler.write_ahead import WriteAhead
     from afspm.transport.rate_limited_log import RateLimitedLog
@@ -43,30 +43,12 @@ them do."""
 _TELL = bytes([RELAY_REQUEST])
 
 
-class Core(Protocol):
-    """A `SchedulerCore`, or what has the same steps; see there."""
-
-    def start(self, now_s: float, now_ns: int) -> list[events.Effect]: ...
-    def step(self, event: events.Input, now_s: float, now_ns: int) -> list[events.Effect]: ...
-    def deadline_s(self) -> float | None: ...
-    def deadline_ns(self) -> int | None: ...
-    def restore(self, saved: SavedState) -> None: ...
-    def restore_cache(self, packets: Iterable[LoggedPacket]) -> None: ...
-    def cached(self) -> Iterable[LoggedPacket]: ...
-    @property
-    def control(self) -> ArbitrationState: ...
-    @property
-    def newest_source_ns(self) -> int: ...
-    @property
-    def leave_at_s(self) -> float: ...
-
-
 class SchedulerShell:
     """One scheduler at work: `start`, then `handle` what `wait` returns until it is `over`."""
 
     def __init__(
         self,
-        core: Core,
+        core: SchedulerCore,
         sockets: SchedulerSockets,
         clock: Clock,
         write_ahead: WriteAhead,
