@@ -51,7 +51,7 @@ def dashboard(
 
 
 def with_dashboard(files: list[Path]) -> Experiment:
-    """The experiment, with a dashboard if its file has none."""
+    """Return the experiment, with a dashboard if its file has none."""
     from afspm.experiment import load
 
     experiment = load(*files)
@@ -59,7 +59,7 @@ def with_dashboard(files: list[Path]) -> Experiment:
 
 
 def resumed_with_dashboard(found: ResumableRun) -> ResumableRun:
-    """The run that is to go on, with a dashboard if it has none."""
+    """Return the run that is to go on, with a dashboard if it has none."""
     return found if _has_dashboard(found.experiment) else found.with_overlay(_overlay())
 
 
@@ -70,7 +70,7 @@ def _has_dashboard(experiment: Experiment) -> bool:
 
 
 def _overlay() -> Path:
-    """The file that is laid over an experiment to give it a dashboard."""
+    """Return the file that is laid over an experiment to give it a dashboard."""
     from afspm import dashboard
 
     return Path(dashboard.__file__).with_name("assets") / "dashboard.toml"
@@ -85,7 +85,7 @@ def _print_password() -> None:
 
 
 def _people_in(file: Path) -> dict[str, str]:
-    """The names and hashes in a file of `--people`, with or without the `people.` that an experiment file needs."""
+    """Return the names and hashes in a file of `--people`, with or without a leading `people.`."""
     import tomllib
 
     from afspm.errors import ConfigError
@@ -101,7 +101,7 @@ def _people_in(file: Path) -> dict[str, str]:
 
 
 def _running_here(where: Path) -> Path | None:
-    """The folder of the run that is meant; None: the file is of one that was started elsewhere."""
+    """Return the folder of the run that is meant; None: the file is of one that was started elsewhere."""
     from afspm.client.connect import find_run
     from afspm.errors import FileError
     from afspm.record.run_json import ENDED, read_run_json
@@ -127,7 +127,7 @@ def _join(folder: Path, settings: dict[str, Any]) -> int:
     from afspm.dashboard import Dashboard
     from afspm.dashboard.joining import join, url_in
     from afspm.exit_codes import ExitCode
-    from afspm.experiment.known import DASHBOARD
+    from afspm.experiment.process_starts import DASHBOARD
     from afspm.record.run_json import read_run_json
 
     url = url_in(read_run_json(folder).get("processes"), folder, DASHBOARD)
@@ -142,7 +142,7 @@ def _join(folder: Path, settings: dict[str, Any]) -> int:
 
 
 def _start_part(file: Path) -> int:
-    """The dashboard of an experiment whose scheduler runs elsewhere, as `afspm run --only` would start it."""
+    """Run the dashboard of an experiment whose scheduler runs elsewhere, as `afspm run --only` would start it."""
     import sys
 
     from afspm.errors import ConfigError

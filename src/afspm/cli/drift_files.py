@@ -19,7 +19,7 @@ from rich.table import Table
 from afspm.clock import NS_PER_S
 from afspm.components.simulated_truth import true_drift
 from afspm.drift.estimators import estimator
-from afspm.drift.offline import against_first, corrected, followed
+from afspm.drift.offline import Stack, against_first, corrected, followed
 from afspm.drift.record import DriftRecord
 from afspm.drift.registration import DriftScan, Registration
 from afspm.drift.trackers import tracker
@@ -72,7 +72,8 @@ def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Pa
     console.print(f"{len(found.scans)} scans of {found.channel} from {begun} on", markup=False)
     analysis = analysed(found.scans, by, following, jobs, aside)
     console.print(as_table(analysis.record))
-    for path in written(found, analysis, truth_m(found, paths), output, aside):
+    truth_m = true_drift(paths[0], found.scans) if len(paths) == 1 else None  # of one simulated run
+    for path in written(found, analysis, truth_m, output, aside):
         console.print(str(path), markup=False, soft_wrap=True)
 
 
@@ -108,11 +109,13 @@ def register_pair(by: str, reference: DriftScan, scan: DriftScan) -> Registratio
 def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int | None, console: Console) -> Analysis:
     """Follow the scans in this process, while others compare each with the first."""
     tracking = tracker(following, estimator(by))
+    wanted = processes(jobs, sum(scan.values.size for scan in scans))
+    others = 1 if wanted == 1 else max(wanted - 1, 2)  # processes that compare; 1 is this one
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as progress, ThreadPoolExecutor(1) as beside:
         track = progress.add_task("followed", total=len(scans))
         pair = progress.add_task("compared with the first", total=len(scans) - 1)
-        work = beside.submit(_pairs, scans, by, _others(scans, jobs), lambda: progress.advance(pair))
+        work = beside.submit(_pairs, scans, by, others, lambda: progress.advance(pair))
         updates = []
         for update in followed(scans, tracking):
             updates.append(update)
@@ -120,12 +123,6 @@ def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int | No
         pairs = work.result()
     record = DriftRecord.of(scans, updates)
     return Analysis(record, pairs, against_first(record, scans, pairs))
-
-
-def _others(scans: Sequence[DriftScan], jobs: int | None) -> int:
-    """Return how many processes compare; 1 is this one."""
-    wanted = processes(jobs, sum(scan.values.size for scan in scans))
-    return 1 if wanted == 1 else max(wanted - 1, 2)
 
 
 def _pairs(scans: Sequence[DriftScan], by: str, jobs: int, done: Callable[[], None]) -> tuple[Registration, ...]:
@@ -138,7 +135,7 @@ def _pairs(scans: Sequence[DriftScan], by: str, jobs: int, done: Callable[[], No
 
 
 def as_table(record: DriftRecord) -> Table:
-    """The record for a person: hours since the first scan, nm, and nm a minute."""
+    """Return the record as a table: hours since the first scan, nm, and nm a minute."""
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("scan", no_wrap=True, max_width=24)
     for name in ("h", "x / nm", "y / nm", "± sd", "nm/min x", "y"):
@@ -147,18 +144,10 @@ def as_table(record: DriftRecord) -> Table:
     hours = (record.time_s - record.time_s[0]) / 3600.0
     for k, key in enumerate(record.keys):
         numbers = (*record.drift_m[k] * NM, record.sd_m[k].max() * NM, *record.rate_m_s[k] * NM_PER_MIN)
+        texts = (f"{value:.2f}" if abs(value) < 1e5 else f"{value:.1e}" for value in numbers)
         accepted = "yes" if record.matched[k] else f"no: {record.reasons[k]}"
-        table.add_row(Path(key).name, f"{hours[k]:.2f}", *(_number(one) for one in numbers), accepted)
+        table.add_row(Path(key).name, f"{hours[k]:.2f}", *texts, accepted)
     return table
-
-
-def _number(value: float) -> str:
-    return f"{value:.2f}" if abs(value) < 1e5 else f"{value:.1e}"
-
-
-def truth_m(found: Series, paths: Sequence[Path]) -> Array | None:
-    """(n, 2) what the drift really was, where the scans are those of one simulated run."""
-    return true_drift(paths[0], found.scans) if len(paths) == 1 else None
 
 
 def written(found: Series, analysis: Analysis, truth: Array | None, folder: Path, console: Console) -> Iterator[Path]:
@@ -172,7 +161,8 @@ def written(found: Series, analysis: Analysis, truth: Array | None, folder: Path
     analysis.estimates.write(folder / "drift_estimates.csv")
     yield folder / "drift_estimates.csv"
     try:
-        yield _stack(found, analysis.record, folder / "drift_stack.nc")
+        _stack(found, analysis.record).write(folder / "drift_stack.nc", channel=found.channel, unit=found.unit)
+        yield folder / "drift_stack.nc"
     except InvalidValue as error:
         console.print(f"no stack: {error}", markup=False, soft_wrap=True)
     try:
@@ -185,10 +175,7 @@ def written(found: Series, analysis: Analysis, truth: Array | None, folder: Path
     yield from album.write(album.DriftRun(found.scans, analysis.record, [part], matched, truth), folder)
 
 
-def _stack(found: Series, record: DriftRecord, path: Path) -> Path:
-    """Only of scans that were matched: where the others lie is a guess."""
+def _stack(found: Series, record: DriftRecord) -> Stack:
+    """Return the stack of the scans that were matched: where the others lie is a guess."""
     which = np.flatnonzero(record.matched)
-    scans = [found.scans[k] for k in which]
-    stack = corrected(scans, record.drift_m[which], record.rate_then_m_s[which])
-    stack.write(path, channel=found.channel, unit=found.unit)
-    return path
+    return corrected([found.scans[k] for k in which], record.drift_m[which], record.rate_then_m_s[which])

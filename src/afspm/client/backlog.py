@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import pickle
 import tempfile
 from collections import deque
 from typing import IO
 
-from afspm.model import Packet
+from afspm.errors import FileError
+from afspm.model import LoggedPacket, Packet
+from afspm.storage.segment import head_of, read_packet
 
 MEMORY_LIMIT_BYTES = 256 << 20
 
@@ -36,7 +37,8 @@ class PacketBacklog:
         if self._file is None:
             self._file = tempfile.TemporaryFile(prefix="afspm-")  # noqa: SIM115 - open for as long as it is needed
         self._file.seek(0, 2)
-        pickle.dump((packet.envelope, bytes(packet.payload), packet.time_ns), self._file)
+        self._file.write(head_of(LoggedPacket(packet, None, 0)))
+        self._file.write(packet.payload)
         self._on_disk += 1
 
     def take(self) -> Packet | None:
@@ -48,12 +50,14 @@ class PacketBacklog:
         if self._file is None:
             return None
         self._file.seek(self._read_at)
-        packet = Packet(*pickle.load(self._file))
+        entry = read_packet(self._file)
+        if entry is None:
+            raise FileError("a packet that waited on disk can't be read", where="the temporary folder")
         self._read_at = self._file.tell()
         self._on_disk -= 1
         if self._on_disk == 0:
             self.close()
-        return packet
+        return entry.packet
 
     def close(self) -> None:
         """Drop everything."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from afspm.client.control_hold import ControlHold
 from afspm.client.link import ExperimentLink
@@ -43,7 +42,7 @@ class CommandRetry:
         self._link = link
         self._control = control
 
-    def ask(self, kind: ControlRequest, subject: Any = None, *, until_s: float | None = None) -> Response:
+    def ask(self, kind: ControlRequest, subject: object = None, *, until_s: float | None = None) -> Response:
         """Ask for a command until it succeeds. Control must be held around it; where it is lost it is waited for.
 
         Not so in an unbroken block: what comes in the tenure after may find the microscope otherwise.
@@ -71,12 +70,12 @@ class CommandRetry:
                     hint="whether it was carried out is not known",
                 )
 
-    def in_control(self, kind: ControlRequest, subject: Any, until_s: float | None) -> Response:
+    def in_control(self, kind: ControlRequest, subject: object, until_s: float | None) -> Response:
         """`ask`, with control held around it."""
         with self._control.hold(until_s=until_s):
             return self.ask(kind, subject, until_s=until_s)
 
-    def read(self, kind: ControlRequest, subject: Any, until_s: float | None) -> Response:
+    def read(self, kind: ControlRequest, subject: object, until_s: float | None) -> Response:
         """Ask for what anybody may know; schedulers of version 1 tell only the holder of control."""
         response = self.send(kind, subject, until_s=until_s)
         if response.code != ControlResponse.NOT_IN_CONTROL:
@@ -84,7 +83,7 @@ class CommandRetry:
         with self._control.hold(until_s=until_s):
             return self.send(kind, subject, until_s=until_s)
 
-    def set(self, kind: ControlRequest, wanted: Any, message: str, until_s: float | None) -> None:
+    def set(self, kind: ControlRequest, wanted: object, message: str, until_s: float | None) -> None:
         """Ask for a setting, and wait until its `message` is published and the tip has stopped moving.
 
         A microscope that publishes nothing, since nothing changed, is not waited for long.
@@ -98,7 +97,7 @@ class CommandRetry:
     def send(
         self,
         kind: ControlRequest,
-        subject: Any = None,
+        subject: object = None,
         *,
         request_id: str = "",
         until_s: float | None = None,

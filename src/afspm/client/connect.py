@@ -6,7 +6,6 @@ import dataclasses
 import json
 import weakref
 from pathlib import Path
-from typing import Any
 
 from afspm.client.link import ExperimentLink
 from afspm.client.scope import Scope
@@ -14,6 +13,7 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError, FileError, NoResponse
 from afspm.launch import Launch, Sockets
 from afspm.model import Frame, ProblemNames
+from afspm.model.snapshot import Plain
 from afspm.process.context import new_session
 from afspm.process.message_types import register_all
 from afspm.record.run_json import LATEST_FILE, RUN_FILE, STATE_DIR, read_run_json, run_json_or_empty
@@ -62,11 +62,11 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
     return scope
 
 
-def guest_facts(launch: Launch) -> dict[str, Any]:
+def guest_facts(launch: Launch) -> Plain:
     """Return the guest of run.json: the launch line of a component, without what is that component's own."""
     sockets = Sockets(subscribe=launch.sockets.subscribe[:1], control=launch.sockets.control)
     guest = dataclasses.replace(launch, name=GUEST, class_="", settings={}, sockets=sockets, envelopes=None)
-    facts: dict[str, Any] = json.loads(guest.to_json())
+    facts: Plain = json.loads(guest.to_json())
     return facts
 
 
@@ -92,7 +92,7 @@ def guest_of(folder: Path, name: str) -> Launch:
     return launch
 
 
-def _keys_in(folder: Path) -> dict[str, Any]:
+def _keys_in(folder: Path) -> Plain:
     """Return the keys of this run's guests; nothing if none were made."""
     from afspm.transport.keys import require_private
 

@@ -14,6 +14,7 @@ from typing import Any
 from afspm import wire
 from afspm.errors import FileError, InvalidValue, WireError
 from afspm.model import LoggedPacket, Packet
+from afspm.model.snapshot import Plain
 from afspm.process.memory import Memory
 from afspm.storage.atomic import OutageLog, write_atomic
 from afspm.storage.segment import head_of, read_packet
@@ -45,16 +46,16 @@ class KeyedResults:
         self._memory = Memory(folder / f"{name}.scope.json" if folder else None)
 
     @property
-    def pending(self) -> dict[str, Any] | None:
+    def pending(self) -> Plain | None:
         """The intent that was written down and not fulfilled: key, plan, attempt, since_ns, interruptions."""
         return self._memory.get("pending")
 
-    def intend(self, intent: dict[str, Any]) -> None:
+    def intend(self, intent: Plain) -> None:
         """Write down what is going to be asked for, before it is."""
         self._memory["pending"] = intent
         self._memory.save()
 
-    def find(self, key: str, plan: dict[str, Any]) -> MeasurementResult | None:
+    def find(self, key: str, plan: Plain) -> MeasurementResult | None:
         """Return the result of an earlier life, or of an earlier call, with the same key.
 
         Raises:
@@ -72,7 +73,7 @@ class KeyedResults:
             )
         return MeasurementResult(things, head["interruptions"])
 
-    def fulfil(self, key: str, plan: dict[str, Any], result: MeasurementResult) -> None:
+    def fulfil(self, key: str, plan: Plain, result: MeasurementResult) -> None:
         """Keep the result; the intent is fulfilled. Where the disk is full, another life measures it again."""
         path = self._path(key)
         if path is not None:
@@ -108,7 +109,7 @@ def check_key(key: str) -> str:
     return key
 
 
-def _read(path: Path) -> tuple[dict[str, Any], list[Any]]:
+def _read(path: Path) -> tuple[Plain, list[Any]]:
     try:
         with path.open("rb") as file:
             packets = [entry.packet for entry in iter(lambda: read_packet(file), None)]

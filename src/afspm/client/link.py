@@ -209,7 +209,7 @@ class ExperimentLink:
         return self.requests.version
 
     def request(
-        self, kind: int, subject: Any = None, *, request_id: str = "", until_s: float | None = None
+        self, kind: int, subject: object = None, *, request_id: str = "", until_s: float | None = None
     ) -> Response:
         """Ask the scheduler and wait for its answer, whatever it is.
 
@@ -248,11 +248,11 @@ class ExperimentLink:
             hint="whether it was carried out is not known",
         )
 
-    def send_only(self, kind: ControlRequest, subject: Any = None) -> None:
+    def send_only(self, kind: ControlRequest, subject: object = None) -> None:
         """Ask without waiting for the answer, for what is done on the way out."""
         self.requests.send_only(kind, subject)
 
-    def tell(self, thing: Any) -> None:
+    def tell(self, thing: object) -> None:
         """Have the scheduler publish something of ours, and don't wait for it."""
         self.requests.tell(thing, self.clock.monotonic_s(), self.request_timeout_s)
 

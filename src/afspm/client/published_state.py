@@ -3,22 +3,37 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any
 
 from afspm.model import ControlState, Feedback, ProbePosition, ScanParameters, ScopeState, ScopeStatus
+
+_ATTRIBUTES = {
+    "ScopeStateMsg": "status",
+    "ControlState": "control",
+    "ScanParameters2d": "scan_parameters",
+    "ZCtrlParameters": "feedback",
+    "ProbePosition": "probe_position",
+}
 
 
 class PublishedState:
     """The newest published states, and how often each was published, so that a caller can wait for the next."""
 
     def __init__(self) -> None:
-        self._newest: dict[str, Any] = {}
-        self._published: Counter[str] = Counter()
+        self.status: ScopeStatus | None = None
+        self.control: ControlState | None = None
+        self.scan_parameters: ScanParameters | None = None
+        self.feedback: Feedback | None = None
+        self.probe_position: ProbePosition | None = None
         self.newest_ns: int | None = None
+        self._published: Counter[str] = Counter()
 
-    def take(self, message: str, thing: Any) -> None:
+    @property
+    def state(self) -> ScopeState:
+        return self.status.state if self.status else ScopeState.UNDEFINED
+
+    def take(self, message: str, thing: object) -> None:
         """`thing` was published as `message`."""
-        self._newest[message] = thing
+        setattr(self, _ATTRIBUTES[message], thing)
         self._published[message] += 1
 
     def take_time(self, time_ns: int | None) -> None:
@@ -29,27 +44,3 @@ class PublishedState:
     def count(self, message: str) -> int:
         """Return how often `message` has been published."""
         return self._published[message]
-
-    @property
-    def status(self) -> ScopeStatus | None:
-        return self._newest.get("ScopeStateMsg")
-
-    @property
-    def state(self) -> ScopeState:
-        return self.status.state if self.status else ScopeState.UNDEFINED
-
-    @property
-    def control(self) -> ControlState | None:
-        return self._newest.get("ControlState")
-
-    @property
-    def scan_parameters(self) -> ScanParameters | None:
-        return self._newest.get("ScanParameters2d")
-
-    @property
-    def feedback(self) -> Feedback | None:
-        return self._newest.get("ZCtrlParameters")
-
-    @property
-    def probe_position(self) -> ProbePosition | None:
-        return self._newest.get("ProbePosition")

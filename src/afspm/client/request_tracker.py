@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 from afspm import wire
 from afspm.logic.sessions import run_of
@@ -46,13 +45,13 @@ class RequestTracker:
         """Take the answer to this request from now on; empty: to none."""
         self._asked, self.answer = request_id, None
 
-    def send_only(self, kind: int, subject: Any = None) -> str:
+    def send_only(self, kind: int, subject: object = None) -> str:
         """Send a request whose answer is not waited for, and return its id."""
         request = Request(kind, subject, id=self.next_id())
         self._send(wire.encode_request(request))
         return request.id
 
-    def tell(self, thing: Any, now_s: float, timeout_s: float) -> None:
+    def tell(self, thing: object, now_s: float, timeout_s: float) -> None:
         """Have the scheduler publish `thing`. Until that is answered, only the newest of each kind waits."""
         if self.version is not wire.Version.OURS:
             return  # its answer could be taken for that to the next request

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from afspm.errors import InvalidValue
 from afspm.formatting import area_text, position_text
 from afspm.model import Frame, Region, Scan, ScanParameters, ScopeState, Spectrum, names
-from afspm.model.snapshot import from_plain, to_plain
+from afspm.model.snapshot import Plain, from_plain, to_plain
 
 XY = tuple[float, float]
 
@@ -46,7 +46,7 @@ class ScanTarget:
     def parameters(self) -> ScanParameters:
         return ScanParameters(self.region, self.shape)
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Plain:
         """Return the target in JSON's types, by which a later life of the component recognises it."""
         return {"what": self.what, **to_plain(self)}
 
@@ -89,7 +89,7 @@ class SpectrumTarget:
     def of(cls, at_m: Any, kind: str | None, frame: Frame) -> SpectrumTarget:
         return cls(None if at_m is None else xy_of(at_m), kind, frame)
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Plain:
         """Return the target in JSON's types, by which a later life of the component recognises it."""
         return {"what": self.what, **to_plain(self)}
 
@@ -113,7 +113,7 @@ class SpectrumTarget:
 Target = ScanTarget | SpectrumTarget
 
 
-def target_from(facts: dict[str, Any]) -> Target:
+def target_from(facts: Plain) -> Target:
     """Return the target that gave these facts."""
     kind = SpectrumTarget if facts["what"] == SpectrumTarget.what else ScanTarget
     target: Target = from_plain(kind, {name: value for name, value in facts.items() if name != "what"})

@@ -11,6 +11,7 @@ from afspm.client.component import Component
 from afspm.components import tip_verdict
 from afspm.components.line_file import LineFile
 from afspm.model import ControlState, Scan, ScopeState, ScopeStatus
+from afspm.model.snapshot import Plain
 from afspm.record.night_record import NightRecord, control_entry, mark_entry, scan_entry
 
 
@@ -93,6 +94,6 @@ class NightPicture(Component):
         time_ns = self.packet.time_ns if self.packet else None
         return self.clock.now_ns() if time_ns is None else time_ns
 
-    def _add(self, entry: dict[str, Any]) -> None:
+    def _add(self, entry: Plain) -> None:
         if self.record.add(entry):
             self._file.append([json.dumps(entry, separators=(",", ":"))])

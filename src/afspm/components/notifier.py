@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from afspm.client.component import Component
 from afspm.components import notifications
@@ -22,6 +22,7 @@ from afspm.errors import ConfigError
 from afspm.formatting import duration_text
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import ControlState, LogLines, ProcessCondition, ProcessStates
+from afspm.model.snapshot import Plain
 from afspm.record.run_json import experiment_name
 from afspm.units import Duration
 
@@ -129,7 +130,7 @@ class Notifier(Component):
                 self._try(waiting)
                 return  # one a tick: in between, what was published is heard
 
-    def _try(self, waiting: dict[str, Any]) -> None:
+    def _try(self, waiting: Plain) -> None:
         key, way = _key(waiting), waiting["way"]
         try:
             self.targets.deliver(Notification(**waiting["notice"]), way)
@@ -146,6 +147,6 @@ class Notifier(Component):
         self._due_s.pop(key, None)
 
 
-def _key(waiting: dict[str, Any]) -> str:
+def _key(waiting: Plain) -> str:
     notice = waiting["notice"]
     return f"{waiting['way']} {notice['what']} {notice['time_ns']} {notice['text']}"

@@ -6,11 +6,12 @@ import logging
 import math
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from afspm.client.component import Component
 from afspm.exit_codes import ExitCode
 from afspm.model import Frame
+from afspm.model.snapshot import Plain
 from afspm.process.priority import step_back
 from afspm.record.run_json import EXPERIMENT_FILE, experiment_name
 from afspm.storage.packet_log import log_folder
@@ -102,7 +103,7 @@ def _about(context: ProcessContext, run_dir: Path, *, scans: bool) -> RecordSett
 
     launch = context.launch
     frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
-    facts: dict[str, Any] = {
+    facts: Plain = {
         "experiment": experiment_name(run_dir),
         "run": run_dir.resolve().name,
         "simulated": launch.simulated,
@@ -112,7 +113,7 @@ def _about(context: ProcessContext, run_dir: Path, *, scans: bool) -> RecordSett
     return RecordSettings(facts, context.problems, frame, measured=scans)
 
 
-def _seeds(file: Path) -> dict[str, Any]:
+def _seeds(file: Path) -> Plain:
     """The seed of each component that has one, as the experiment file says."""
     try:
         said = tomllib.loads(file.read_text(encoding="utf-8"))

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.registration import DriftScan
 from afspm.errors import AfspmError, FileError
+from afspm.model.snapshot import Plain
 from afspm.simulation import World
 
 Array = NDArray[np.float64]
@@ -44,15 +44,15 @@ def true_drift(run_dir: Path, scans: Sequence[DriftScan]) -> Array | None:
     return tip_m - at_first_m
 
 
-def _read(path: Path) -> tuple[dict[str, Any], Array]:
+def _read(path: Path) -> tuple[Plain, Array]:
     """The entry of the moment when the simulated microscope was switched on; and what the controller had followed of
     the drift, (n, 3): time, x, y."""
-    start: dict[str, Any] | None = None
+    start: Plain | None = None
     followed: list[tuple[float, float, float]] = [(0.0, 0.0, 0.0)]
     with path.open(encoding="utf-8") as file:
         for line in file:
             try:
-                entry: dict[str, Any] = json.loads(line)
+                entry: Plain = json.loads(line)
             except ValueError:
                 continue  # cut off by a kill
             if entry["event"] == "start" and start is None:

@@ -16,17 +16,15 @@ Measured on simulated nights (128 x 128 pixels, 8 seeds, slow drift, one scan ju
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
-from typing import Any
 
 import numpy as np
 
 from afspm.components.tip_metrics import LEAST_CONTRAST, Array, TipMetrics, autocorrelation, metrics, slopes
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Region
-from afspm.model.snapshot import from_plain, to_plain
+from afspm.model.snapshot import Plain, from_plain, to_plain
 
 REACH_PX = 32  # how far beside the first the second apex of a double tip is looked for
 MAD_TO_SIGMA = 1.4826  # of normally distributed values
@@ -200,12 +198,12 @@ class TipJudge:
     def has_learnt(self) -> bool:
         return self.reference is not None and len(self.reference.first) >= self.reference_scans
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> Plain:
         """Return what must survive a restart, in JSON's types."""
-        plain: dict[str, Any] = to_plain(self._state, lists=True)
+        plain: Plain = to_plain(self._state, lists=True)
         return plain
 
-    def restore(self, state: Mapping[str, Any]) -> None:
+    def restore(self, state: Plain) -> None:
         """Continue from what `state` returned."""
         self._state = from_plain(JudgeState, state)
 

@@ -43,6 +43,12 @@ class ChannelFrame:
     def complete(self) -> bool:
         return self.time_ns is not None
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ChannelFrame) and self.number == other.number
+
+    def __hash__(self) -> int:
+        return self.number
+
 
 class FrameStore:
     """Keeps frames, of which pictures are made. Not for several threads at once.

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
-from typing import Protocol
 
 from nicegui import events, ui
 
 from afspm.clock import NS_PER_S
 from afspm.dashboard.charts import Chart, spectrum_chart
 from afspm.dashboard.content import NOT_HEARD_OF
+from afspm.dashboard.steering_panel import SteeringPanel
 from afspm.dashboard.watch import Watch
 from afspm.drawing.timeline import tint_class
 from afspm.formatting import duration_text, time_of_day
@@ -134,19 +134,10 @@ def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: 
     return f'<ul class="log">{rows}</ul>'
 
 
-class Restarter(Protocol):
-    """The part of steering that the panel of processes needs."""
-
-    @property
-    def may_steer(self) -> bool: ...
-
-    async def ask_restart(self, name: str) -> None: ...
-
-
 class HealthPanel:
     """A row for each process, which stays while its words change: a button must not move under the finger."""
 
-    def __init__(self, steering: Restarter) -> None:
+    def __init__(self, steering: SteeringPanel) -> None:
         self._steering = steering
         self._rows: dict[str, HealthRow] = {}
         self._nothing = ui.html("Nothing has been heard of processes yet.", sanitize=False).classes("nothing")
@@ -166,7 +157,7 @@ class HealthPanel:
 class HealthRow:
     """The condition of one process, and a button to restart it."""
 
-    def __init__(self, name: str, steering: Restarter) -> None:
+    def __init__(self, name: str, steering: SteeringPanel) -> None:
         with ui.element("div").classes("process").props('role="row"'):
             self._dot = ui.element("span").classes("dot")
             ui.label(name).classes("name").props('role="rowheader"')

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 import threading
-from collections import OrderedDict
 from dataclasses import dataclass
+from functools import lru_cache
 
 from afspm.dashboard.frames import ChannelFrame
 from afspm.drawing.levelling import Array, Levelling, levelled
@@ -74,24 +74,16 @@ class RenderedFrame:
 
 
 class PictureCache:
-    """Draws, from any thread; keeps the newest few pictures."""
+    """Draws, from any thread; keeps the newest few pictures. A frame is known by its number."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._drawn: OrderedDict[tuple[int, Look], RenderedFrame] = OrderedDict()
+        self._drawn = lru_cache(KEPT)(_draw)
 
     def draw(self, frame: ChannelFrame, look: Look) -> RenderedFrame:
         """Return the picture of a frame."""
-        key = (frame.number, look)
         with self._lock:  # two that want the same wait for one; two that want others share a core anyway
-            drawn = self._drawn.get(key)
-            if drawn is None:
-                drawn = self._drawn[key] = _draw(frame, look)
-                while len(self._drawn) > KEPT:
-                    self._drawn.popitem(last=False)
-            else:
-                self._drawn.move_to_end(key)
-            return drawn
+            return self._drawn(frame, look)
 
 
 def _draw(frame: ChannelFrame, look: Look) -> RenderedFrame:

@@ -32,7 +32,7 @@ class ReadyMade:
 def named(
     what: str, spec: str | Mapping[str, Any], ready_made: Mapping[str, ReadyMade], default: str, *arguments: object
 ) -> tuple[object, str]:
-    """What a user asks for, and its name.
+    """Return the part that a user asks for, and its name.
 
     Args:
         what: "estimator" or "tracker", for errors.

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 def followed(scans: Sequence[DriftScan], tracker: Tracker) -> Iterator[Update]:
-    """What the tracker says of each scan, in the order of time."""
+    """Yield what the tracker says of each scan, in the order of time."""
     for scan in scans:
         yield tracker.add(scan)
 

@@ -1,5 +1,7 @@
-"""Which pairs of scans can be compared: how much their regions share, and how alike their resolutions are (paper,
-"Overarching workflow": intersection_ratio and sr_norm)."""
+"""The overlap of regions and the ratio of resolutions, by which pairs are compared and scans are taken again.
+
+Both after the paper, "Overarching workflow": intersection_ratio, sr_norm, f'.
+"""
 
 from __future__ import annotations
 
@@ -37,13 +39,13 @@ def intersection_m(first: Region, second: Region) -> Array:
 
 
 def intersection_area_m2(first: Region, second: Region) -> float:
-    """How much two regions share, m². Raises InvalidValue as `intersection_m` does."""
+    """Return the area that two regions share, m². Raises InvalidValue as `intersection_m` does."""
     polygon = intersection_m(first, second)
     return _area(polygon - polygon[0]) if len(polygon) else 0.0
 
 
 def intersection_ratio(first: Region, second: Region) -> float:
-    """What two regions share, of the smaller of them: 0 to 1. Raises InvalidValue as `intersection_m` does."""
+    """Return the share of the smaller region that both have in common. Raises InvalidValue as `intersection_m` does."""
     smaller_m2 = min(region.size_m[0] * region.size_m[1] for region in (first, second))
     return min(intersection_area_m2(first, second) / smaller_m2, 1.0)
 
@@ -70,14 +72,14 @@ def overlap_center_m(reference: Region, scan: Region, displacement_m: ArrayLike)
 
 
 def overlap_ratio(reference: Region, scan: Region, displacement_m: ArrayLike) -> float:
-    """How much of the smaller one both have seen, if features of the reference are found `displacement_m` further in
-    the scan: 0 to 1. Raises InvalidValue as `intersection_m` does."""
+    """Return the part of the smaller one that both have seen, 0 to 1, if features of the reference are found
+    `displacement_m` further in the scan. Raises InvalidValue as `intersection_m` does."""
     x_m, y_m = np.asarray(displacement_m, dtype=np.float64)
     return intersection_ratio(_moved(reference, x_m, y_m), scan)
 
 
 def sr_norm(first: Region, first_shape: tuple[int, int], second: Region, second_shape: tuple[int, int]) -> float:
-    """How alike two spatial resolutions are: min/max of pixels per length, of the axis where they differ most.
+    """Return the ratio of two spatial resolutions: min/max of pixels per length, of the axis where they differ most.
 
     A pair is good enough where this is at least sr_norm,min (the paper's "<=" is reversed).
 
@@ -99,7 +101,7 @@ def _moved(region: Region, x_m: float, y_m: float) -> Region:
 
 
 def _clipped(polygon: list[XY], start: XY, end: XY) -> list[XY]:
-    """What of a polygon lies left of the line from `start` to `end`."""
+    """Return the part of a polygon left of the line from `start` to `end`."""
     along_x, along_y = end[0] - start[0], end[1] - start[1]
     left = [along_x * (y - start[1]) - along_y * (x - start[0]) for x, y in polygon]
     kept = []
@@ -142,7 +144,7 @@ def too_little_shared(asked: Region, scanned: Region, f_rescan: float = F_RESCAN
 
 
 def too_far_off(asked: Region, scanned: Region, sd_m: float, tolerance_m: float) -> str:
-    """Whether the corner that is furthest off may be further off than is tolerated.
+    """Return why a scan is to be taken again: its furthest corner may be further off than is tolerated.
 
     The paper's rule lets a scan be off by an eighth of its size. Here the user says how much it may be, and what is
     uncertain counts: |residual| + 2 sd > tolerance.

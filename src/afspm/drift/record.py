@@ -121,7 +121,7 @@ class DriftRecord:
 
     @classmethod
     def read(cls, path: Path) -> DriftRecord:
-        """What `write` wrote; further columns are left aside.
+        """Read what `write` wrote; further columns are left aside.
 
         Raises:
             FileError: missing, or not such a table.

@@ -1,4 +1,4 @@
-"""What is registered, and what comes of it: the one interface of all estimators."""
+"""Registration of two scans: the interface of all estimators, and its result."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class DriftScan:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known of a displacement before the scans are looked at.
+    """The displacement that is expected before the scans are looked at.
 
     Attributes:
         mean_m: (2,) expected displacement.

@@ -1,4 +1,4 @@
-"""What drift does to an image while it is taken, and the velocity that two opposite frames tell.
+"""The shear that drift makes in an image while it is taken, and the velocity that two opposite frames tell.
 
 Rows are taken one after the other, so a feature at `p` when half of the scan is done is found at
 x = p + v a e.(x - c), with c the centre, e the direction of the slow axis and a the time per length along it, negative
@@ -83,7 +83,7 @@ def delay_per_length_s_m(scan: DriftScan) -> float | None:
 
 
 def row_delay_s(scan: DriftScan, position_m: Array) -> float | None:
-    """How long after its middle a scan passes a position of tip coordinates; None where its direction is not known."""
+    """Return how long after its middle a scan passes a position (tip coordinates); None if its direction is unknown."""
     a = delay_per_length_s_m(scan)
     return None if a is None else a * float(slow_axis(scan) @ (position_m - np.array(scan.region.center_m)))
 

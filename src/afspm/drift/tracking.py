@@ -1,4 +1,4 @@
-"""What a tracker says and is told: the one interface of all of them."""
+"""The interface of all trackers, and what passes through it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Prediction:
 
 
 class Forecast(Protocol):
-    """What a tracker knows, for whoever asks it at other times: small, immutable, JSON-able, without the scans."""
+    """A tracker's knowledge, to be asked at other times: small, immutable, JSON-able, without the scans."""
 
     def at(self, time_s: float) -> Prediction:
         """The prediction for any time (before the newest scan too: the estimate for the newest scan, moved back)."""
@@ -57,7 +57,7 @@ class Forecast(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """What came of one scan.
+    """The result of one scan.
 
     Attributes:
         key: the scan's.
@@ -97,7 +97,7 @@ class Tracker(Protocol):
 
     @property
     def forecast(self) -> Forecast:
-        """What is known now."""
+        """The knowledge of now."""
         ...
 
     def add(self, scan: DriftScan) -> Update:

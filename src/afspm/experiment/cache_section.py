@@ -22,10 +22,10 @@ from pydantic import Field
 from afspm.errors import AfspmError
 from afspm.experiment import class_loader
 from afspm.experiment.document import Document
-from afspm.experiment.known import WiringClass
 from afspm.experiment.published import length_m, wire_of
 from afspm.experiment.sections import Section, parse
 from afspm.experiment.toml_lines import Settings, Table
+from afspm.experiment.wiring_classes import WiringClass
 from afspm.logic.envelopes import CacheRule, Envelopes
 from afspm.model import PacketHeader
 from afspm.units import Length
@@ -73,7 +73,7 @@ class CacheSettings:
         return tuple(re.split(r"[{}]", rule.envelope)[0] for rule in self.rules if rule.envelope)
 
     def to_settings(self) -> Settings:
-        """In JSON's types; `CacheRule` by its fields."""
+        """Return it in JSON's types; `CacheRule` by its fields."""
         rules = [{k: v for k, v in vars(rule).items() if v is not None} for rule in self.rules]
         return {"rules": rules, "mapping": self.mapping, "history": dict(self.history)}
 

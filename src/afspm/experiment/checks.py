@@ -12,9 +12,9 @@ from afspm.experiment import wiring
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.handlers import check_handlers
 from afspm.experiment.implied_parts import check_notify, is_program
-from afspm.experiment.known import WIRE_SETTINGS
 from afspm.experiment.published import wire_of
 from afspm.experiment.resolution import ResolvedExperiment
+from afspm.experiment.wiring_classes import WIRE_SETTINGS
 from afspm.model import Role, component_of, is_process_name
 from afspm.model.events import LONGEST_PROCESS_NAME, PERSON
 from afspm.transport.network import is_local
@@ -52,7 +52,7 @@ def check(resolved: ResolvedExperiment) -> None:
 
 
 def check_roles(resolved: ResolvedExperiment) -> None:
-    """One scheduler, one translator, and no two names that only differ in upper and lower case."""
+    """Require one scheduler, one translator, and no two names that only differ in upper and lower case."""
     # a class that can't be loaded may be the one that is looked for
     all_loaded = all(process.part.command or process.component for process in resolved.processes.values())
     for role, hint in _MISSING.items():
@@ -71,7 +71,7 @@ def check_roles(resolved: ResolvedExperiment) -> None:
 
 
 def check_names(resolved: ResolvedExperiment) -> None:
-    """A component's name is also that of files, on every system, and of a connection."""
+    """Require names that can be those of files, on every system, and of connections."""
     for name in resolved.processes:
         if not is_process_name(name):
             hint = f"letters, digits, _, - and spaces, at most {LONGEST_PROCESS_NAME} bytes, as in [tip_corrector]"
@@ -79,7 +79,7 @@ def check_names(resolved: ResolvedExperiment) -> None:
 
 
 def check_commands(resolved: ResolvedExperiment) -> None:
-    """The program of a command can be found."""
+    """Find the program of each command."""
     for part in resolved.parts.components:
         if part.command and not is_program(part.command[0], resolved.document.folders[0]):
             what = f"[{part.name}] there is no program {part.command[0]!r}"
@@ -87,7 +87,7 @@ def check_commands(resolved: ResolvedExperiment) -> None:
 
 
 def check_intermediaries(resolved: ResolvedExperiment) -> None:
-    """Each intermediary table of a known kind has settings that the kind knows, and addresses where they belong."""
+    """Check intermediary tables: settings that their kind knows, and addresses where they belong."""
     names = [*resolved.parts.variables, *resolved.parts.intermediaries]
     for name, table in resolved.parts.intermediaries.items():
         kind = wire_of(table)
@@ -109,7 +109,7 @@ def check_intermediaries(resolved: ResolvedExperiment) -> None:
 
 
 def check_addresses(resolved: ResolvedExperiment) -> None:
-    """No address is bound twice; none is open to the network without keys; every connection has somebody at its end."""
+    """Refuse addresses bound twice, open to the network without keys, or connected to and bound by nobody."""
     bound: dict[str, wiring.BoundSocket] = {}
     security = resolved.sections.security
     secure = security.keys is not None or security.insecure
@@ -139,7 +139,7 @@ def check_addresses(resolved: ResolvedExperiment) -> None:
 
 
 def check_self_subscription(resolved: ResolvedExperiment) -> None:
-    """Nobody listens to itself: each packet would be the cause of the next."""
+    """Refuse components that listen to themselves: each packet would be the cause of the next."""
     for name, links in resolved.net.links.items():
         own = resolved.net.slots.get(links.publish or "")
         if own is None or resolved.processes[name].role is not Role.COMPONENT:
@@ -150,7 +150,7 @@ def check_self_subscription(resolved: ResolvedExperiment) -> None:
 
 
 def check_listens_to(resolved: ResolvedExperiment) -> None:
-    """`listens_to` names others that publish."""
+    """Require that `listens_to` names others that publish."""
     publishers = {slot.owner for slot in resolved.net.slots.values() if slot.use == "publish"}
     for name, process in resolved.processes.items():
         wanted = process.part.own.get("listens_to", [])
@@ -166,7 +166,7 @@ def check_listens_to(resolved: ResolvedExperiment) -> None:
 
 
 def check_problems(resolved: ResolvedExperiment) -> None:
-    """Problems named by components exist, and each that is flagged is solved by somebody."""
+    """Require that problems exist, and that each one flagged is solved by somebody."""
     by_hand = resolved.sections.control.solved_by_hand
     solvers = (problem for process in resolved.processes.values() for problem in process.declared.solves)
     solved = {_number(resolved, problem) for problem in (*solvers, *by_hand)}
@@ -195,7 +195,7 @@ def _number(resolved: ResolvedExperiment, problem: str) -> int | None:
 
 
 def check_envelopes(resolved: ResolvedExperiment) -> None:
-    """Every envelope subscribed to is published by somebody."""
+    """Require that every envelope subscribed to is published."""
     processes, made = resolved.processes.values(), resolved.caching.envelopes
     published = {*PUBLISHED, *(e for process in processes for e in process.declared.publishes), *made}
     if any(t.part.command or t.part.settings.get("live_lines_s") for t in resolved.with_role(Role.TRANSLATOR)):
@@ -223,7 +223,7 @@ def _is_published(prefix: str, published: set[str], made: Collection[str]) -> bo
 
 
 def check_controller(resolved: ResolvedExperiment) -> None:
-    """One emulated controller at most, and no other address for its translator."""
+    """Allow one emulated controller, and no other address for its translator."""
     for name in resolved.emulators[1:]:
         what = f"[{name}] is a second emulated controller beside [{resolved.emulators[0]}]"
         resolved.document.error(what, name, hint="one is enough")
@@ -236,7 +236,7 @@ def check_controller(resolved: ResolvedExperiment) -> None:
 
 
 def check_clock(resolved: ResolvedExperiment) -> None:
-    """Only a simulation's time may be other than real."""
+    """Refuse a time other than real where the microscope is not simulated."""
     if not resolved.with_role(Role.TRANSLATOR) or resolved.simulated:
         return
     if (speed := resolved.sections.clock.speed) != 1.0:
@@ -248,7 +248,7 @@ def check_clock(resolved: ResolvedExperiment) -> None:
 
 
 def check_names_of_people(resolved: ResolvedExperiment) -> None:
-    """Roles name components, or people who have a key."""
+    """Require that roles name components, or people who have a key."""
     names, keys, security = set(resolved.processes), resolved.keys_folder, resolved.sections.security
     if keys is not None:
         names |= {file.stem for file in (keys / "public").glob("*.key")}
@@ -282,7 +282,7 @@ def _has_password(resolved: ResolvedExperiment, member: str) -> bool:
 
 
 def check_likely_typos(resolved: ResolvedExperiment) -> None:
-    """A text that is nearly a variable's name was probably meant to be it."""
+    """Warn of texts that are nearly a variable's name."""
     names = [*resolved.parts.variables, *resolved.parts.intermediaries]
     for part in resolved.parts.components:
         for path, text in _texts(part.settings, (part.name,)):
@@ -301,7 +301,7 @@ def _texts(value: Any, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str 
 
 
 def check_needs(resolved: ResolvedExperiment) -> None:
-    """The microscope has the actions and parameters that components say they need, where it tells before it runs."""
+    """Require the actions and parameters that components need, where the microscope tells before it runs."""
     for translator in resolved.with_role(Role.TRANSLATOR):
         has = translator.capabilities()
         if has is None:

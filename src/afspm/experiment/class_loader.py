@@ -15,12 +15,25 @@ from typing import Any
 
 from afspm import plugins
 from afspm.experiment.findings import closest, nearest
-from afspm.experiment.known import SHORT_NAME_PACKAGES
 from afspm.experiment.parts import DECLARED_KEYS
 from afspm.experiment.published import GUIDE
 from afspm.experiment.toml_lines import Table
 from afspm.model import Role
 
+# Where a class named without a module is looked for, in this order.
+SHORT_NAME_PACKAGES = (
+    "afspm.components",
+    "afspm.scheduler",
+    "afspm.microscopes.simulator",
+    "afspm.microscopes.image",
+    "afspm.microscopes.nanonis",
+    "afspm.microscopes.asylum",
+    "afspm.microscopes.gxsm",
+    "afspm.emulators.nanonis",
+    "afspm.emulators.asylum",
+    "afspm.emulators.gxsm",
+    "afspm.dashboard",
+)
 # By where they come from: a class of the user is recognised by what it is derived from.
 _ROLE_BY_BASE = (
     ("afspm.scheduler", Role.SCHEDULER),
@@ -62,7 +75,7 @@ class Unloadable(Exception):
 
 @contextlib.contextmanager
 def importing_from(folders: Sequence[Path]) -> Iterator[None]:
-    """Modules beside the experiment file can be imported within this block.
+    """Let modules beside the experiment file be imported within this block.
 
     Two experiments may both have a `component.py`: what was imported from the folders is forgotten afterwards.
     """
@@ -133,7 +146,7 @@ def load(path: str) -> Any:
 
 
 def find_module(name: str, folders: Sequence[Path]) -> Any:
-    """The spec of a module that can be imported, also from beside the file; None: there is none."""
+    """Return the spec of a module, also from beside the file; None: there is none."""
     with importing_from(folders):
         try:
             return importlib.util.find_spec(name)
@@ -142,7 +155,7 @@ def find_module(name: str, folders: Sequence[Path]) -> Any:
 
 
 def role_of(component: type) -> Role | None:
-    """Scheduler, translator or component, by what the class is derived from; None: it is none of them."""
+    """Return scheduler, translator or component, by the bases of a class; None: it is none of them."""
     for base in component.__mro__:
         for package, role in _ROLE_BY_BASE:
             if base.__module__ == package or base.__module__.startswith(package + "."):

@@ -94,7 +94,7 @@ class Experiment:
         return self.resolved.saying(RECORDS)
 
     def check(self) -> list[Finding]:
-        """Everything that is wrong or doubtful; nothing is started. Errors first, then by line."""
+        """Return everything that is wrong or doubtful: errors first, then by line. Nothing is started."""
         self.resolved  # noqa: B018  (finds what there is to find)
         return self._document.findings.ordered()
 
@@ -162,13 +162,13 @@ class Experiment:
         ]
 
     def simulated(self, only: Collection[str] = (), without: Collection[str] = ()) -> bool:
-        """True if the microscope is simulated for certain, where these parts are started on this computer."""
+        """Return whether the microscope is simulated for certain, where these parts are started here."""
         from afspm.experiment import process_starts
 
         return self.resolved.simulated_with(process_starts.chosen_names(self.resolved, only, without))
 
     def asking(self, names: Collection[str]) -> Launch | None:
-        """A launch line by which those of `names` ask the scheduler where it is started elsewhere; None: nobody can."""
+        """Return a launch line by which `names` ask a scheduler that is started elsewhere; None: nobody can."""
         from afspm.experiment import process_starts
 
         return process_starts.asking(self.resolved, names)
@@ -186,7 +186,7 @@ class Experiment:
         )
 
     def clock(self) -> ExperimentClock:
-        """The clock of a run that begins now, from [clock]."""
+        """Return the clock of a run that begins now, from [clock]."""
         settings = self.resolved.sections.clock
         return ExperimentClock.starting_now(settings.start.timestamp() if settings.start else None, settings.speed)
 

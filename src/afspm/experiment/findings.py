@@ -66,7 +66,7 @@ class Findings:
         return sum(finding.is_error for finding in self.found)
 
     def ordered(self) -> list[Finding]:
-        """Errors first, then in the order of the files' lines."""
+        """Return errors first, then in the order of the files' lines."""
         return sorted(self.found, key=lambda f: (not f.is_error, f.place.file, f.place.line))
 
 

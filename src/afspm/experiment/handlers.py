@@ -18,7 +18,7 @@ _CALLED = ("run", *(name for name in vars(Component) if name.startswith("on_")))
 
 
 def check_handlers(resolved: ResolvedExperiment) -> None:
-    """Methods that look like handlers are called by that name, with what they take."""
+    """Check methods that look like handlers: their names, and the arguments that they take."""
     for process in resolved.with_role(Role.COMPONENT):
         component = process.component
         if component is None or not issubclass(component, Component):

@@ -67,7 +67,7 @@ def targets(section: NotifySection, folder: Path) -> Targets:
 
 
 def check_notify(resolved: ResolvedExperiment) -> None:
-    """[notify] names a way to tell people, and it works."""
+    """Check that [notify] names a way to tell people, and that it works."""
     section = resolved.sections.notify
     if "notify" in resolved.parts.sections and not (section.command or section.webhook):
         resolved.document.error("[notify] nobody is told of anything", "notify", hint="give a `command` or a `webhook`")

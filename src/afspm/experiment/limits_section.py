@@ -235,7 +235,7 @@ def _rate(value: Quantity, unit: str) -> float:
 
 
 def to_settings(limits: ExperimentLimits) -> Settings:
-    """As the scheduler process gets them, in JSON's types; `Limit` and `Region` by their fields."""
+    """Return them as the scheduler gets them, in JSON's types; `Limit` and `Region` by their fields."""
 
     def plain(limit: Limit) -> Settings:
         fields = {key: value for key, value in asdict(limit).items() if value is not None}

@@ -11,10 +11,10 @@ from afspm.errors import AfspmError
 from afspm.experiment import published
 from afspm.experiment.document import Document
 from afspm.experiment.findings import SourceLocation, closest, nearest
-from afspm.experiment.known import WIRE_KEYS
 from afspm.experiment.published import PublishedSetting, wire_of
 from afspm.experiment.toml_lines import Path, Settings, Table
 from afspm.experiment.toml_writer import value as toml
+from afspm.experiment.wiring_classes import WIRE_KEYS
 
 SECTIONS: Final = ("clock", "control", "limits", "problems", "cache", "security", "restart", "record", "notify")
 
@@ -64,7 +64,7 @@ class ExperimentParts:
     """Tables of components that have no counterpart, by their names, as they are in the file."""
 
     def free_name(self, wanted: str) -> str:
-        """A name for a component that is not in the file: `wanted`, with a number behind it where that is taken."""
+        """Return a name for a component that is not in the file: `wanted`, numbered where that is taken."""
         taken = {part.name.casefold() for part in self.components}
         taken |= {name.casefold() for name in (*self.variables, *self.intermediaries)}
         names = itertools.chain([wanted], (f"{wanted}{number}" for number in itertools.count(2)))
@@ -226,7 +226,7 @@ class VariableReferences:
         self.used: set[str] = set()
 
     def expand(self, value: Any, path: Path) -> Any:
-        """`value`, which stands at `path`, with every reference in it replaced, again and again."""
+        """Return `value`, which stands at `path`, with every reference in it replaced, again and again."""
         return self._expand(value, path, ())
 
     def _expand(self, value: Any, path: Path, through: tuple[str, ...]) -> Any:

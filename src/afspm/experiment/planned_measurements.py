@@ -64,7 +64,7 @@ def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) 
 
 
 def refused_actions(limits: ExperimentLimits) -> list[tuple[str, str]]:
-    """The actions of which it is known beforehand that the limits refuse what they set, and why."""
+    """Return the actions whose settings the limits would always refuse, and why."""
     parameters = {name: replace(limit, only=None) for name, limit in _without_changes(limits).parameters.items()}
     guard = LimitChecker(
         replace(limits, parameters=parameters, actions={}, region=None)

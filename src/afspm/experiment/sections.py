@@ -185,7 +185,7 @@ def report(error: Any, path: tuple[str | int, ...], document: Document, known: t
 
 
 def name_of(path: tuple[str | int, ...]) -> str:
-    """("limits", "a", 0) as "[limits] a[0]"."""
+    """Return ("limits", "a", 0) as "[limits] a[0]"."""
     text = ""
     for part in path[1:]:
         text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)

@@ -86,7 +86,7 @@ def default_of(component: type, name: str) -> Any:
 
 
 def listening(component: type, settings: Table) -> Iterator[tuple[str, str, bool]]:
-    """(setting, address, whether keys guard it) of each place at which the component will listen by its settings."""
+    """Yield (setting, address, whether keys guard it) of each place at which a component will listen."""
     everything = {**{name: default_of(component, name) for name in _parameters(component)}, **settings}
     for name, annotation in _annotations(component).items():
         for mark in getattr(annotation, "__metadata__", ()):
@@ -97,7 +97,7 @@ def listening(component: type, settings: Table) -> Iterator[tuple[str, str, bool
 
 
 def jsonable(value: Any, folder: Path) -> Any:
-    """`value` in JSON's own types; a relative path is one beside the experiment file."""
+    """Return `value` in JSON's own types; a relative path is one beside the experiment file."""
     if isinstance(value, Enum):
         return value.value
     if isinstance(value, Path):

@@ -11,7 +11,7 @@ _NARROW, _WIDE = set("iljtfrI.,:;'|!()[]/ -"), set("mwMW@%")
 
 
 def text_width(text: str, size: float, *, bold: bool = False) -> float:
-    """About how wide a text is in a sans-serif font, rather too wide than too narrow."""
+    """Return about the width of a text in a sans-serif font, rather too wide than too narrow."""
     ems = sum(0.34 if c in _NARROW else 0.9 if c in _WIDE else 0.73 if c.isupper() else 0.62 for c in text)
     return ems * size * (1.07 if bold else 1.0)
 
@@ -36,7 +36,7 @@ class Svg:
         dashed: bool = False,
         corner: float = 7,
     ) -> None:
-        """A rectangle with round corners; (x, y) is its top left."""
+        """Draw a rectangle with round corners; (x, y) is its top left."""
         dash = ' stroke-dasharray="5 4"' if dashed else ""
         self._boxes.append(
             f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" rx="{corner:g}" '
@@ -55,7 +55,7 @@ class Svg:
         bold: bool = False,
         halo: bool = False,
     ) -> None:
-        """One line of text on the baseline y; a halo keeps it legible over lines."""
+        """Write one line of text on the baseline y; a halo keeps it legible over lines."""
         weight = ' font-weight="600"' if bold else ""
         shape = f'x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" text-anchor="{anchor}"{weight}'
         if halo:  # a text of its own beneath: not every viewer knows paint-order
@@ -74,7 +74,7 @@ class Svg:
         end: bool = True,
         dashed: bool = False,
     ) -> None:
-        """A line through points with round corners, and an arrow head at its start or end."""
+        """Draw a line through points with round corners, and an arrow head at its start or end."""
         dash = ' stroke-dasharray="2 4"' if dashed else ""
         heads = "".join(
             f' marker-{where}="url(#head-{stroke[1:]})"' for where, wanted in (("start", start), ("end", end)) if wanted

@@ -21,7 +21,7 @@ _NAMED_INSTEAD = "$AFSPM_WEBHOOK"
 
 
 def to_toml(experiment: Experiment, *, secrets: bool = True) -> str:
-    """Variables, sections and components as they are in force. Reads back as the same experiment.
+    """Return variables, sections and components as they are in force; they read back as the same experiment.
 
     Args:
         secrets: else an environment variable is named in place of each, which has to be set where it is read back.

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from afspm.logic.arbitration import Cause
 from afspm.logic.event_log import AnsweredRequest
 from afspm.logic.events import Reply, RequestIn
 from afspm.logic.forwarder import ForwardedRequest
+from afspm.logic.frozen import replace
 from afspm.logic.idempotency_cache import RequestStatus
 from afspm.logic.pending_requests import refused_again
 from afspm.logic.state import StateDraft

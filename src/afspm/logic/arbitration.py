@@ -1,4 +1,4 @@
-"""Who is in control: the whole transition table as data, and the one function that applies it.
+"""The arbitration table: who may control the microscope, as data, and the one function that applies it.
 
 `TABLE` is read from the top: the first row of an event whose condition holds applies, and each event's last row always
 does. Nothing but a row changes who is in control, the mode or the flagged problems.
@@ -7,17 +7,18 @@ does. Nothing but a row changes who is in control, the mode or the flagged probl
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum, auto
 from types import MappingProxyType
 
+from afspm.logic.frozen import replace
 from afspm.model import ControlMode, ControlResponse, ControlState, Problem, ProblemNames, component_of
 
 _NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
 
 
 class ArbitrationEvent(Enum):
-    """What control depends on: the requests, by kind, and two that time brings."""
+    """An event on which control depends: the requests, by kind, and two that time brings."""
 
     REQUEST_CONTROL = "asks for control"
     RELEASE_CONTROL = "gives control back"
@@ -32,7 +33,7 @@ class ArbitrationEvent(Enum):
 
 
 class ControlChange(Enum):
-    """What a row does."""
+    """A change that a row makes."""
 
     GRANT = auto()
     """The asker gets control, to solve the problem it named (or none)."""
@@ -58,7 +59,7 @@ class Cause(Enum):
     ENDED = "the experiment ends"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ArbitrationState:
     """The state that control is in.
 
@@ -82,13 +83,13 @@ class ArbitrationState:
         )
 
     def published(self) -> ControlState:
-        """What all peers are told of it."""
+        """Return the state as all peers are told it."""
         return ControlState(self.mode, self.holder, tuple(sorted(self.problems)))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class RoleTable:
-    """Who may do what is not everybody's. None: everybody may; but nobody may `operate` unless named.
+    """The roles: who may do what not everybody may. None: everybody; but nobody may `operate` unless named.
 
     Who acts for a person ("dashboard:Ada") has the roles of the component and those given to just that person there.
 
@@ -107,15 +108,15 @@ class RoleTable:
     restart: Collection[str] | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Rules:
-    """What the table takes from the experiment file: roles, and the problems there are."""
+    """The part of the experiment file that the table needs: roles, and the known problems."""
 
     roles: RoleTable = RoleTable()
     problems: ProblemNames = field(default_factory=ProblemNames)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ControlInput:
     """An event of `who`; `number` is the problem or mode that it is about."""
 
@@ -124,7 +125,7 @@ class ControlInput:
     number: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Condition:
     """Something that may hold of a state and an ask, with words for it."""
 
@@ -132,7 +133,7 @@ class Condition:
     holds: Callable[[ArbitrationState, ControlInput, Rules], bool]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Transition:
     """One line of the table.
 
@@ -151,7 +152,7 @@ class Transition:
 
 
 def may(role: Collection[str] | None, who: str) -> bool:
-    """Whether `who` has a role."""
+    """Return whether `who` has a role."""
     return role is None or who in role or component_of(who) in role
 
 

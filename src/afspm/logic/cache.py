@@ -1,4 +1,4 @@
-"""What was published lately, for those who come late: ordered, bounded, without doubles."""
+"""The packets published lately, for late joiners: ordered, bounded, without duplicates."""
 
 from __future__ import annotations
 
@@ -130,16 +130,16 @@ class PacketCache:
             self._keep(packet, source_ns, history)
 
     def holds(self, envelope: str, payload: bytes) -> bool:
-        """Whether one of the newest packets of an envelope is just this."""
+        """Return whether one of the newest packets of an envelope is just this."""
         newest = islice(reversed(self._times.get(envelope, ())), _NEWEST)
         return any(self._kept[time_ns].packet.payload == payload for time_ns in newest)
 
     def not_before(self, time_ns: int) -> None:
-        """What is published from here on is after this time."""
+        """Publish nothing from here on with a time before this."""
         self._last_ns = max(self._last_ns, time_ns)
 
     def replay(self, prefixes: Iterable[str], since_ns: int) -> tuple[Packet, ...]:
-        """What is kept under the prefixes and newer than `since_ns`, oldest first over all envelopes."""
+        """Return the packets kept under the prefixes and newer than `since_ns`, oldest first over all envelopes."""
         starts = tuple(prefixes)
         return tuple(
             kept.packet

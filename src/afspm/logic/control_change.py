@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from afspm.logic import answers, safety_commands
 from afspm.logic.arbitration import (
@@ -18,6 +18,7 @@ from afspm.logic.arbitration import (
 from afspm.logic.descriptions import is_routine, said
 from afspm.logic.event_log import control_entries
 from afspm.logic.events import RequestIn
+from afspm.logic.frozen import replace
 from afspm.logic.microscope_status import feedback_of
 from afspm.logic.publishing import publish_control
 from afspm.logic.sessions import token_of
@@ -28,7 +29,7 @@ TRANSLATOR = "translator"
 """Who flags a microscope that is lost: the translator asks for nothing, so it is done in its name."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class _Change:
     """A change of control: by whom, and by which row of the table.
 

@@ -39,7 +39,7 @@ class CoordinateFrame(Protocol):
         ...
 
     def move_before(self, action: str, now_ns: int) -> MappedRequest | None:
-        """What must be set first, so that an action happens where it was meant to; None: nothing."""
+        """Return the request that must come first, so that an action happens where it was meant to; None: none."""
         ...
 
     def carried_out(self, sent: Request, told: Parameter | None, now_ns: int) -> None:
@@ -55,7 +55,7 @@ class CoordinateFrame(Protocol):
         ...
 
     def snapshot(self) -> dict[str, Any]:
-        """What must survive a kill, as plain JSON."""
+        """Return the part that must survive a kill, as plain JSON."""
         ...
 
     def restore(self, state: dict[str, Any]) -> None:

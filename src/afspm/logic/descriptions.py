@@ -1,4 +1,4 @@
-"""What people are told of a change of control, and of what was asked."""
+"""Requests and changes of control in words, for people."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from afspm.model import (
 
 
 def is_routine(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, holder_told: str | None) -> bool:
-    """Whether a change needs no telling: control is given back, or taken once more by who was told to have it last."""
+    """Return whether a change is routine: control is given back, or taken again by the holder logged last."""
     if (after.problems, after.mode, after.ended) != (before.problems, before.mode, before.ended) or after.problems:
         return False
     return ask.event is ArbitrationEvent.RELEASE_CONTROL if after.holder is None else after.holder == holder_told

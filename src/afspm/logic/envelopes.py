@@ -33,7 +33,7 @@ def default_envelope(header: PacketHeader) -> str:
 
 
 def tells(envelope: str, message: str) -> bool:
-    """Whether subscribers can know from the envelope which message is in it: it begins with its name."""
+    """Return whether an envelope begins with the name of its message, as subscribers must know it."""
     return envelope == message or envelope.startswith(f"{message}_")
 
 
@@ -114,7 +114,7 @@ class CacheRule:
 
 
 class Envelopes:
-    """What the experiment file says of envelopes.
+    """The envelopes of the experiment file.
 
     Args:
         rules: tried in their order; then the defaults.
@@ -150,7 +150,7 @@ class Envelopes:
         return (default_envelope(header) if rule is None else rule.name(header)), history
 
     def history(self, message: str) -> int:
-        """How many of a message are kept where no rule says otherwise."""
+        """Return how many of a message are kept where no rule says otherwise."""
         return self._history.get(message, 1)
 
     @staticmethod

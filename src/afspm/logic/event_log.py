@@ -6,11 +6,13 @@ is published.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 from afspm.logic.arbitration import ArbitrationState, ControlInput, Transition
 from afspm.logic.descriptions import asked
+from afspm.logic.frozen import replace
 from afspm.model import (
     CLOCK_REQUEST,
     RELAY_REQUEST,
@@ -40,8 +42,7 @@ SCHEDULER = "scheduler"
 _UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})
 
 
-@dataclass(frozen=True, slots=True)
-class AnsweredRequest:
+class AnsweredRequest(NamedTuple):
     """A request with its answer, not in words yet.
 
     Attributes:
@@ -75,7 +76,7 @@ class AnsweredRequest:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class EventLog:
     """The entries that are still to be published.
 

@@ -1,4 +1,4 @@
-"""What happens to a scheduler, and what it does about it: the inputs and effects of `SchedulerCore`.
+"""The inputs and effects of `SchedulerCore`.
 
 Times are given beside the input: `now_s`, real and monotonic, for timeouts; `now_ns`, the experiment's, for whatever
 means something in the experiment.
@@ -41,7 +41,7 @@ class Greeted:
     user: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class RequestIn:
     """A request came by `connection` from the peer that calls itself `name`.
 
@@ -57,15 +57,15 @@ class RequestIn:
     heard_s: float = -1.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Unreadable:
-    """What came from the peer `name` was no request, and was refused with `response`."""
+    """A message from the peer `name` was no request, and was refused with `response`."""
 
     name: str
     response: Response
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class PacketIn:
     """The translator published a packet."""
 
@@ -107,7 +107,7 @@ class TranslatorCaughtUp:
     """All that the translator published while we were not there has been taken in."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class TranslatorReply:
     """The translator answered the request that was forwarded under `number`."""
 
@@ -173,7 +173,7 @@ Input = (
 # --- effects, to be carried out in the order given --------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Reply:
     """Answer the peer `name`, over `connection` (which is open, and the newest of that name).
 
@@ -189,7 +189,7 @@ class Reply:
     tells_why: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Forward:
     """Send a request to the translator, marked with `number`.
 
@@ -200,7 +200,7 @@ class Forward:
     request: Request
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Publish:
     """Publish a packet to whoever subscribes to its envelope.
 
@@ -214,7 +214,7 @@ class Publish:
     history: int = 1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Replay:
     """Send these packets to one subscriber, in this order, and then that it has caught up."""
 
@@ -222,14 +222,14 @@ class Replay:
     packets: tuple[Packet, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class SaveState:
     """Keep `state` so that it survives a kill, before the effects that follow are carried out."""
 
     state: SavedState
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Log:
     """Tell people. `level` is a name of the logging module: "INFO", "WARNING", "ERROR"."""
 
@@ -237,7 +237,7 @@ class Log:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Kill:
     """The experiment ends: publish the signal KILL, and close.
 

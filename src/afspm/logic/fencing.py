@@ -38,7 +38,7 @@ class Epoch:
 
     @classmethod
     def decode(cls, frame: bytes) -> Epoch | None:
-        """What `encode` gave; None: something else."""
+        """Return what `encode` was given; None: it is something else."""
         found = _EPOCH.fullmatch(frame)
         return None if found is None else cls(found[1].decode(), int(found[2]), found[3] == b"1")
 

@@ -7,12 +7,13 @@ others wait here, where they can still be called back, and a request that waited
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from afspm.logic.coordinate_frame import MappedRequest
 from afspm.logic.events import Forward, RequestIn
+from afspm.logic.frozen import replace
 from afspm.model import ControlResponse, Request, Response, ResponseDetail
 
 if TYPE_CHECKING:
@@ -22,8 +23,7 @@ OwnAnswer = Callable[["StateDraft", Response], None]
 """Called with the answer to a request of the scheduler's own."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ForwardedRequest:
+class ForwardedRequest(NamedTuple):
     """A request for the translator.
 
     Attributes:
@@ -53,8 +53,19 @@ class ForwardedRequest:
     on_answer: OwnAnswer | None = None
 
     @classmethod
-    def of(cls, event: RequestIn, *, command: bool = True) -> ForwardedRequest:
-        return cls(event.name, event.request, command, connection=event.connection, heard_s=event.heard_s)
+    def of(
+        cls,
+        event: RequestIn,
+        *,
+        command: bool = True,
+        deadline_s: float = 0.0,
+        states_seen: int = 0,
+        mapped: MappedRequest | None = None,
+    ) -> ForwardedRequest:
+        return cls(
+            event.name, event.request, command, 0, deadline_s,
+            connection=event.connection, states_seen=states_seen, mapped=mapped, heard_s=event.heard_s,
+        )  # fmt: skip
 
     @property
     def outgoing(self) -> Request:
@@ -72,8 +83,7 @@ class ForwardOutcome(Enum):
     """The true answer, after the client was told that none had come."""
 
 
-@dataclass(frozen=True, slots=True)
-class SettledRequest:
+class SettledRequest(NamedTuple):
     job: ForwardedRequest
     end: ForwardOutcome
     response: Response
@@ -82,7 +92,7 @@ class SettledRequest:
 Settled = tuple[SettledRequest, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Forwarder:
     """The one line to the translator.
 
@@ -126,15 +136,15 @@ class Forwarder:
 
         A request that has a deadline already, since it waited for something else before, keeps it.
         """
-        forwarder, job = self._numbered(job, now_s)
         if not self.up:
-            return forwarder, _not_sent(job, "the translator is not connected")
+            return self, _not_sent(job, "the translator is not connected")
         if self.flight is None:
-            return forwarder._sending(job, now_s), None
+            return self._sent(job, now_s), None
         if len(self.queue) >= self.longest_queue:
-            return forwarder, _not_sent(job, f"{self.longest_queue} requests wait for the translator already")
+            return self, _not_sent(job, f"{self.longest_queue} requests wait for the translator already")
+        job = job._replace(number=self.number + 1, deadline_s=job.deadline_s or now_s + self.timeout_s)
         queue = sorted((*self.queue, job), key=lambda waiting: waiting.deadline_s)
-        return replace(forwarder, queue=tuple(queue)), None
+        return replace(self, number=job.number, queue=tuple(queue)), None
 
     def ask_own(
         self, request: Request, now_s: float, on_answer: OwnAnswer | None = None, mapped: MappedRequest | None = None
@@ -142,11 +152,14 @@ class Forwarder:
         """Send a request of the scheduler's own before all that wait. None: the translator is not connected."""
         if not self.up:
             return self, None
-        own = ForwardedRequest("", request, command=True, heard_s=now_s, on_answer=on_answer, mapped=mapped)
-        forwarder, job = self._numbered(own, now_s)
+        number, deadline_s = self.number + 1, now_s + self.timeout_s
+        job = ForwardedRequest(
+            "", request, command=True, number=number, deadline_s=deadline_s,
+            mapped=mapped, heard_s=now_s, on_answer=on_answer,
+        )  # fmt: skip
         if self.flight is None:
-            return forwarder._sending(job, now_s), job
-        return replace(forwarder, own=(*self.own, job)), job
+            return self._sent(job, now_s), job
+        return replace(self, number=number, own=(*self.own, job)), job
 
     def answered(self, number: int, response: Response, now_s: float) -> tuple[Forwarder, SettledRequest | None]:
         """Take an answer of the translator. None: it belongs to no request that is open."""
@@ -164,7 +177,7 @@ class Forwarder:
         """Answer those that have waited too long."""
         settled, flight = list[SettledRequest](), self.flight
         if flight is not None and not flight.answered and now_s >= flight.deadline_s:
-            flight = replace(flight, answered=True)
+            flight = flight._replace(answered=True)
             settled.append(_unknown(flight, f"the translator did not answer within {self.timeout_s:g} s"))
         late = [job for job in (*self.own, *self.queue) if now_s >= job.deadline_s]
         settled += [_not_sent(job, f"the translator was busy for {self.timeout_s:g} s") for job in late]
@@ -184,7 +197,7 @@ class Forwarder:
         job = self.flight
         if job is None or job.client != client or job.request.id != request_id:
             return None
-        return replace(self, flight=replace(job, answered=False, deadline_s=now_s + self.timeout_s))
+        return replace(self, flight=job._replace(answered=False, deadline_s=now_s + self.timeout_s))
 
     def called_back(self, which: Callable[[ForwardedRequest], bool]) -> tuple[Forwarder, list[ForwardedRequest]]:
         """Take back requests that wait and have not been sent; the caller answers them."""
@@ -198,13 +211,12 @@ class Forwarder:
             times.append(self._patience_ends_s(self.flight) if self.flight.answered else self.flight.deadline_s)
         return min(times, default=None)
 
-    def _numbered(self, job: ForwardedRequest, now_s: float) -> tuple[Forwarder, ForwardedRequest]:
-        number, deadline_s = self.number + 1, job.deadline_s or now_s + self.timeout_s
-        return replace(self, number=number), replace(job, number=number, deadline_s=deadline_s)
-
-    def _sending(self, job: ForwardedRequest, now_s: float) -> Forwarder:
-        forward = Forward(job.number, job.outgoing)
-        return replace(self, flight=replace(job, sent_s=now_s), outbox=(*self.outbox, forward))
+    def _sent(self, job: ForwardedRequest, now_s: float) -> Forwarder:
+        """Send a request; one that waited has its number and deadline already."""
+        number, deadline_s = job.number or self.number + 1, job.deadline_s or now_s + self.timeout_s
+        flight = job._replace(number=number, deadline_s=deadline_s, sent_s=now_s)
+        outbox = (*self.outbox, Forward(number, job.outgoing))
+        return replace(self, number=max(number, self.number), flight=flight, outbox=outbox)
 
     def _patience_ends_s(self, job: ForwardedRequest) -> float:
         assert job.sent_s is not None
@@ -213,9 +225,9 @@ class Forwarder:
     def _next(self, now_s: float) -> Forwarder:
         """Send the next of those that wait."""
         if self.own:
-            return replace(self, own=self.own[1:])._sending(self.own[0], now_s)
+            return replace(self, own=self.own[1:])._sent(self.own[0], now_s)
         if self.queue:
-            return replace(self, queue=self.queue[1:])._sending(self.queue[0], now_s)
+            return replace(self, queue=self.queue[1:])._sent(self.queue[0], now_s)
         return replace(self, flight=None)
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+from afspm.logic.frozen import replace
 from afspm.logic.sessions import SessionTable
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Lease:
     """The idle time of the holder while the microscope is free, in experiment time: a simulated night decides alike.
 
@@ -39,7 +40,7 @@ class Lease:
         return self.idle_since_ns + self.lease_ns
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class HolderTimeout:
     """The grace period of a holder that is gone: it may only have lost its connection, or be started again.
 

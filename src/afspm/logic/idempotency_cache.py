@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum, auto
 
+from afspm.logic.frozen import replace
 from afspm.model import ControlResponse, Request, Response
 
 _SENT_REMEMBERED = 100
@@ -21,16 +22,20 @@ class RequestStatus(Enum):
     """It was sent and nobody knows whether it was carried out."""
 
 
+_Outcomes = Mapping[str, tuple[int, RequestStatus | Response]]
+_NONE: tuple[_Outcomes, _Outcomes] = ({}, {})
+_PART = 8  # a part of those remembered is new, and copied with each
 SentAction = tuple[str, str, int]
 """An action that was sent: client, request id, fingerprint."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class IdempotencyCache:
     """The status or answer of the latest request ids of each client.
 
     Attributes:
         per_client: most ids remembered of a client.
+        table: of each client the older ids and the latest.
         clients: most clients.
         sent_actions: those that only we know of, kept over a restart. A translator of version 1 would do them again;
             one of ours would not, but for an action that was done already the microscope must not be moved.
@@ -41,11 +46,12 @@ class IdempotencyCache:
     clients: int = 256
     sent_actions: tuple[SentAction, ...] = ()
     ids_known: bool | None = None
-    table: Mapping[str, Mapping[str, tuple[int, RequestStatus | Response]]] = field(default_factory=dict)
+    table: Mapping[str, tuple[_Outcomes, _Outcomes]] = field(default_factory=dict)
 
     def look_up(self, client: str, request: Request) -> RequestStatus | Response | None:
         """Return the status or answer of an id; None: it is new, or long forgotten, or there is none."""
-        entry = self.table.get(client, {}).get(request.id) if request.id else None
+        older, latest = self.table.get(client, _NONE)
+        entry = latest.get(request.id) or older.get(request.id) if request.id else None
         if entry is None:
             return None
         if entry[0] != fingerprint(request):
@@ -58,9 +64,9 @@ class IdempotencyCache:
 
     def forgotten(self, client: str, request: Request) -> IdempotencyCache:
         """Forget a request that was not carried out: it may be tried anew."""
-        of_client = dict(self.table.get(client, {}))
-        of_client.pop(request.id, None)
-        return replace(self, table={**self.table, client: of_client})
+        parts = self.table.get(client, _NONE)
+        older, latest = ({id_: one for id_, one in part.items() if id_ != request.id} for part in parts)
+        return replace(self, table={**self.table, client: (older, latest)})
 
     def sent(self, client: str, request: Request) -> IdempotencyCache:
         """Remember an action over a restart."""
@@ -84,11 +90,11 @@ class IdempotencyCache:
 
     def _with(self, client: str, request_id: str, print_: int, outcome: RequestStatus | Response) -> IdempotencyCache:
         table = dict(self.table)
-        of_client = dict(table.pop(client, {}))  # the client heard last is last
-        of_client[request_id] = (print_, outcome)
-        if len(of_client) > self.per_client:
-            del of_client[next(iter(of_client))]
-        table[client] = of_client
+        older, latest = table.pop(client, ({}, {}))  # the client heard last is last
+        latest = {**latest, request_id: (print_, outcome)}
+        if len(latest) * _PART > self.per_client:  # few are copied each time
+            older, latest = dict([*{**older, **latest}.items()][-self.per_client :]), {}
+        table[client] = older, latest
         if len(table) > self.clients:
             del table[next(iter(table))]
         return replace(self, table=table)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from afspm.logic.events import RequestIn
+from afspm.logic.frozen import replace
 from afspm.logic.supervisor_registry import OVER
 from afspm.model import ControlResponse, ProcessState, ResponseDetail
 
@@ -20,7 +21,7 @@ _MOST_KEPT = 1000
 _OTHERS = ("scheduler", "translator")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class StartupBarrier:
     """Holds back who is in control, and requests that may change it, until old packets have been caught up with.
 
@@ -73,7 +74,7 @@ class StartupBarrier:
 KeptAnswer = tuple[RequestIn, ControlResponse, str, ResponseDetail]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ExperimentEnd:
     """The end of the experiment, which waits for the tip to be out of danger.
 

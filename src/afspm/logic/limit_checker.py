@@ -5,11 +5,13 @@ Nothing is clamped. A refusal names the parameter, the value, the limit and wher
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Collection
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from afspm.errors import InvalidValue
+from afspm.logic.frozen import replace
 from afspm.logic.limit_state import LastUse, LimitState, Usage
 from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.logic.parameter_values import ParameterValue, ParameterValueError, numbers, values_of
@@ -144,7 +146,10 @@ class LimitChecker:
         for name, value in values:
             if name in self.limits.bounded:
                 usage = usage.learn(name, value, now_ns, was_read=was_read)
-        return replace(self, state=LimitState(usage, position.learn(subject)))
+        position = position.learn(subject)
+        if usage is self.state.usage and position is self.state.position:
+            return self
+        return replace(self, state=LimitState(usage, position))
 
     def _using(self, usage: Usage) -> LimitChecker:
         return self if usage is self.state.usage else replace(self, state=replace(self.state, usage=usage))
@@ -204,7 +209,7 @@ class LimitChecker:
                 self._check_value(name, value, limit, now_ns)
 
     def _set_by(self, request: Request) -> Collection[object]:
-        """What a request sets: its subject, or for an action what the microscope does as that."""
+        """Return what a request sets: its subject, or for an action what the microscope does as that."""
         if request.kind == ControlRequest.ACTION:
             return self.limits.sets.get(str(request.subject), ())
         return () if is_get(request) else (request.subject,)
@@ -252,7 +257,7 @@ class LimitChecker:
             )
 
     def _check_scan(self, wanted: ScanParameters, reach: float = _REACH) -> None:
-        """What is checked is the scan as it would be afterwards: a request may give only a part of it."""
+        """Check the scan as it would be afterwards: a request may give only a part of it."""
         shape, region = wanted.shape, wanted.region
         if isinstance(shape, ShapeChange):
             shape = shape.onto(self.state.position.shape or (1, 1))
@@ -320,11 +325,11 @@ def _param_error(reason: str) -> _Breach:
 
 def _inside(allowed: Region, xy_m: XY, reach: float) -> bool:
     grown = (allowed.size_m[0] * (1 + reach), allowed.size_m[1] * (1 + reach))
-    return replace(allowed, size_m=grown).contains(xy_m)
+    return dataclasses.replace(allowed, size_m=grown).contains(xy_m)
 
 
 def is_get(request: Request) -> bool:
-    """Whether a parameter is asked for, not set."""
+    """Return whether a parameter is asked for, not set."""
     return isinstance(request.subject, Parameter) and request.subject.value is None
 
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TypeVar
 
+from afspm.logic.frozen import replace
 from afspm.logic.positions import KnownPosition
 
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class KnownValue:
     """A value in force.
 
@@ -25,7 +26,7 @@ class KnownValue:
     origin: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class LastUse:
     """A use of a parameter or action, and the id of the request; empty: it had none."""
 
@@ -38,7 +39,7 @@ class LastUse:
         return bool(request_id) and (self.who, self.request_id) == (who, request_id)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Usage:
     """Values and uses, by name. Kept over a restart: a scheduler that was killed must not allow anything sooner.
 
@@ -84,7 +85,7 @@ class Usage:
         return replace(self, sent=_without(self.sent, name)) if is_it else self
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class LimitState:
     """All that requests are checked against beside the limits themselves."""
 

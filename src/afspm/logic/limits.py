@@ -11,7 +11,7 @@ from afspm.model import Parameter, Region
 
 @dataclass(frozen=True)
 class Limit:
-    """What is allowed of one parameter or action. None: no such limit.
+    """The limit of one parameter or action. None: no such limit.
 
     Attributes:
         low, high: the range, in `unit`, both allowed.
@@ -35,12 +35,12 @@ class Limit:
 
     @property
     def bounds_changes(self) -> bool:
-        """Whether what is allowed depends on the value in force."""
+        """True where the value in force matters."""
         return self.step is not None or self.rate_per_s is not None
 
     @property
     def is_of_a_number(self) -> bool:
-        """Whether the parameter can't be a text."""
+        """True where the parameter can't be a text."""
         return self.bounds_changes or self.low is not None or self.high is not None
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+from afspm.logic.frozen import replace
 from afspm.model import Feedback, Parameter, Request, ScopeState, names
 
 FEEDBACK_OFF = "feedback-off"
@@ -16,7 +17,7 @@ STARTS = {names.START_SCAN: names.STOP_SCAN, names.START_SPEC: names.STOP_SPEC}
 _OFF = names.OFF_WORDS | {"0.0"}  # a translator that is not ours may take a number
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class TipRisk:
     """The part of the status that endangers the tip; it survives a restart.
 
@@ -31,7 +32,7 @@ class TipRisk:
     tip_away: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class MicroscopeStatus:
     """Everything that is known of the microscope's activity.
 

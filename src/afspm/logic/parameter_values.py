@@ -15,7 +15,7 @@ from afspm.units import convert
 
 
 class ParameterValue(NamedTuple):
-    """What a parameter is set to: a number in SI, or in the unit of its limit; None: a text or a switch."""
+    """A value to set: a number in SI, or in the unit of its limit; None: a text or a switch."""
 
     name: str
     number: float | None
@@ -58,6 +58,14 @@ def values_of(subject: object, limits: Mapping[str, Limit]) -> list[ParameterVal
 def numbers(values: list[ParameterValue]) -> list[tuple[str, float]]:
     """Those that are numbers."""
     return [(name, number) for name, number in values if number is not None]
+
+
+def number_of(parameter: Parameter) -> float | None:
+    """Return the value of a single parameter in SI; None if it is not a finite number of the right kind."""
+    try:
+        return _number(parameter, parameter.value or "", None)
+    except ParameterValueError:
+        return None
 
 
 def _number(parameter: Parameter, text: str, limit: Limit | None) -> float | None:

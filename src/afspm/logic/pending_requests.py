@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from afspm.logic.events import RequestIn
 from afspm.logic.forwarder import ForwardedRequest
+from afspm.logic.frozen import replace
 from afspm.logic.microscope_status import MicroscopeStatus
 from afspm.model import ScopeState, ScopeStatus
 
@@ -15,7 +16,7 @@ SETTLED_WITHIN_S = 2.0
 _UNCLEAR_S = 0.5  # real; the closing of a connection is seen within milliseconds
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class PendingRead:
     """A request that waits for the values its limits depend on.
 
@@ -31,7 +32,7 @@ class PendingRead:
     deadline_s: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class PrePositioner:
     """An action whose place has moved in the microscope's coordinates: it waits until the microscope was moved there.
 
@@ -65,7 +66,7 @@ class PrePositioner:
         return is_free or now_s >= self.settled_at_s
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class PendingRequests:
     """All that wait.
 

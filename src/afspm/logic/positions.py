@@ -64,7 +64,7 @@ class KnownPosition:
 
 
 def changes_by(values: Iterable[tuple[str, float]]) -> list[PositionChange | ScanParameters]:
-    """How single parameters, set together, move the probe and the scan.
+    """Return how single parameters, set together, move the probe and the scan.
 
     Raises:
         InvalidValue: a number of pixels that is none.

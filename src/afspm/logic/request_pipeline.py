@@ -7,7 +7,6 @@ every request gets an answer.
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from functools import partial
 
 from afspm.logic import answers, control_change, publishing, safety_commands
@@ -16,6 +15,7 @@ from afspm.logic.coordinate_frame import MappedRequest
 from afspm.logic.event_log import SCHEDULER
 from afspm.logic.events import Reply, RequestIn
 from afspm.logic.forwarder import ForwardedRequest, ForwardOutcome, OwnAnswer, SettledRequest
+from afspm.logic.frozen import replace
 from afspm.logic.idempotency_cache import RequestStatus
 from afspm.logic.limit_checker import is_get
 from afspm.logic.microscope_status import feedback_of
@@ -54,7 +54,7 @@ _CONTROL_EVENTS = {
 def handle(draft: StateDraft, event: RequestIn) -> None:
     """Take a request through its stages, as far as it gets without waiting."""
     if event.heard_s < 0.0:
-        event = replace(event, heard_s=draft.now_s)
+        event.heard_s = draft.now_s
     if admit(draft, event) and authorise(draft, event):
         pass_on(draft, event)
 
@@ -178,8 +178,8 @@ def check_limits(draft: StateDraft, event: RequestIn, deadline_s: float = 0.0) -
             answers.refuse(draft, event, outgoing)
             return None
         mapped = outgoing
-    job = ForwardedRequest.of(event, command=not reads(request))
-    job = replace(job, mapped=mapped, deadline_s=deadline_s, states_seen=draft.microscope.states_seen)
+    states_seen, command = draft.microscope.states_seen, not reads(request)
+    job = ForwardedRequest.of(event, command=command, deadline_s=deadline_s, states_seen=states_seen, mapped=mapped)
     if not job.command:
         return job
     if (why := _tip_comes_first(draft)) is not None:
@@ -330,9 +330,8 @@ def act_when_moved(draft: StateDraft) -> None:
         return
     draft.pending = replace(draft.pending, move=None)
     if _is_in_place(draft, move.event):  # if not, it was moved by somebody else meanwhile
-        job = ForwardedRequest.of(move.event)
-        states_seen = draft.microscope.states_seen
-        forward(draft, replace(job, deadline_s=move.move.deadline_s, states_seen=states_seen))
+        states_seen, deadline_s = draft.microscope.states_seen, move.move.deadline_s
+        forward(draft, ForwardedRequest.of(move.event, deadline_s=deadline_s, states_seen=states_seen))
 
 
 # --- 4. forwarded: it is with the translator, or waits for its turn -------------------------------------------------

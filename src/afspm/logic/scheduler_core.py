@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from typing import Any
 
 from afspm.logic import answers, control_change, packet_intake, publishing, request_pipeline, safety_commands
@@ -35,6 +34,7 @@ from afspm.logic.events import (
     TranslatorUp,
     Unreadable,
 )
+from afspm.logic.frozen import replace
 from afspm.logic.microscope_status import STOPS
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.state import Environment, SavedState, SchedulerState, StateDraft, restored_state, saved_state
@@ -165,7 +165,7 @@ class SchedulerCore:
 
     @property
     def control(self) -> ArbitrationState:
-        """Who is in control, for what, and who flagged which problem."""
+        """The state of control: its holder, for which problem, and who flagged which."""
         return self.state.control
 
     @property

@@ -18,9 +18,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import TypeVar
+
+from afspm.logic.frozen import replace
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -40,7 +42,7 @@ class Hearing(Enum):
     """The same, but the two may be one: hear it again when the other's connection closes, or a moment later."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class _Session:
     token: str | None
     connection: int | None
@@ -69,7 +71,7 @@ def run_of(name: str, request_id: str) -> str:
     return run if dash and _RUN.fullmatch(run) else ""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class SessionTable:
     """The names in use.
 

@@ -1,4 +1,4 @@
-"""What the experiment file says of a scheduler."""
+"""The settings of a scheduler, from the experiment file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from afspm.logic.watchdog import WatchdogSettings
 
 @dataclass(frozen=True)
 class SchedulerSettings:
-    """How a scheduler decides.
+    """The settings of a scheduler's decisions.
 
     Attributes:
         rules: roles and problems.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields
 
 from afspm.logic.arbitration import ArbitrationState
 from afspm.logic.cache import PacketCache
@@ -12,6 +12,7 @@ from afspm.logic.coordinate_frame import CoordinateFrame
 from afspm.logic.event_log import EventLog
 from afspm.logic.events import Codec, Effect, Log, SaveState
 from afspm.logic.forwarder import Forwarder
+from afspm.logic.frozen import replace
 from afspm.logic.holder_timeout import HolderTimeout, Lease
 from afspm.logic.idempotency_cache import IdempotencyCache, SentAction
 from afspm.logic.lifecycle import ExperimentEnd, StartupBarrier
@@ -28,7 +29,7 @@ KIND, VERSION = "scheduler", 1
 """Of snapshots of `SavedState`."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class SavedState:
     """The state that survives a restart.
 
@@ -57,7 +58,7 @@ class SavedState:
         return replace(self, control=replace(self.control, holder=None, solving=0), granted_to=None)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class SchedulerState:
     """All that a scheduler decides by, but for the packets in its cache.
 
@@ -119,9 +120,9 @@ class SchedulerState:
         return min((due_s for due_s in dues if due_s is not None), default=None)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Environment:
-    """What a step needs beside the state.
+    """Everything that a step needs beside the state.
 
     Attributes:
         cache: the packets published lately; the one part that is changed in place, since it holds up to all memory that
@@ -135,9 +136,8 @@ class Environment:
     frame: CoordinateFrame | None = None
 
 
-@dataclass(slots=True)
 class StateParts:
-    """The parts of a state, each to be replaced."""
+    """The parts of a state while a step replaces them, one after the other."""
 
     control: ArbitrationState
     lease: Lease
@@ -156,7 +156,7 @@ class StateParts:
     logged: frozenset[str]
 
 
-PARTS = tuple(StateParts.__slots__)
+_PARTS = tuple(one.name for one in fields(SchedulerState))
 
 
 class StateDraft(StateParts):
@@ -168,13 +168,12 @@ class StateDraft(StateParts):
     """
 
     def __init__(self, state: SchedulerState, env: Environment, now_s: float, now_ns: int) -> None:
-        for part in PARTS:
-            setattr(self, part, getattr(state, part))
+        self.__dict__.update(state.__dict__)
         self.env = env
         self.now_s = now_s
         self.now_ns = now_ns
         self.effects: list[Effect] = []
-        self._before = state.saved_parts()
+        self._before = state
         self._is_to_be_saved = False
 
     def save(self) -> None:
@@ -192,8 +191,9 @@ class StateDraft(StateParts):
     def finish(self) -> tuple[SchedulerState, list[Effect]]:
         """Return the new state and the effects: first of all it is saved, and requests are sent last."""
         self.send_forwards()
-        state = SchedulerState(*(getattr(self, part) for part in PARTS))
-        if self._is_to_be_saved or state.saved_parts() != self._before:
+        parts = self.__dict__
+        state = replace(self._before, **{name: parts[name] for name in _PARTS})
+        if self._is_to_be_saved or state.saved_parts() != self._before.saved_parts():
             self.effects.insert(0, SaveState(saved_state(state, self.env)))
         return state, self.effects
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from afspm.formatting import duration_text
 from afspm.logic.events import Codec, RequestIn
+from afspm.logic.frozen import replace
 from afspm.model import (
     LogLines,
     ProcessCondition,
@@ -33,7 +34,7 @@ OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
 """Conditions of a process that does not run and is not started again."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class KnownSupervisor:
     """A supervisor; `told_s` is None for one that was known before a restart of ours.
 
@@ -50,7 +51,7 @@ class KnownSupervisor:
     states: tuple[ProcessState, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class SavedSupervisor:
     """The part of a supervisor that survives a restart of ours."""
 
@@ -59,7 +60,7 @@ class SavedSupervisor:
     over: Mapping[str, int]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class SupervisorRegistry:
     """The supervisors by the names they ask under; the one heard of last is last."""
 
@@ -142,7 +143,7 @@ class SupervisorRegistry:
         return replace(self, supervisors=dict([*others, (name, newest)][-_MOST:]))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Announcement:
     """Something that a process wants to be published.
 

@@ -7,10 +7,11 @@ and left it in a dangerous state: it can't put that right any more, and nobody e
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum
 
 from afspm.logic.arbitration import Cause
+from afspm.logic.frozen import replace
 from afspm.logic.microscope_status import FEEDBACK_OFF, STARTS, STOPS, MicroscopeStatus
 from afspm.model import ControlResponse, ScopeState, names
 
@@ -91,7 +92,7 @@ class SafetyResult(Enum):
     FAILED = "failed"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class TipState:
     """The part of the watchdog that survives a restart.
 
@@ -107,7 +108,7 @@ class TipState:
     for_feedback: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Watchdog:
     """The actions that the scheduler itself wants of the microscope.
 

@@ -2,19 +2,6 @@
 
 from __future__ import annotations
 
-from afspm.model.enums import (
-    CLOCK_REQUEST,
-    OTHER_RUN_RESPONSE,
-    RELAY_REQUEST,
-    RESTART_REQUEST,
-    ControlMode,
-    ControlRequest,
-    ControlResponse,
-    Problem,
-    RescanKind,
-    ScopeState,
-    request_name,
-)
 from afspm.model.events import (
     ControlEvent,
     JournalEntries,
@@ -32,12 +19,34 @@ from afspm.model.events import (
 )
 from afspm.model.geometry import Frame, Region, RegionChange
 from afspm.model.packet import LoggedPacket, Packet, PacketHeader
-from afspm.model.problems import ProblemNames
-from afspm.model.requests import HAS_ENDED, Parameter, Request, Response, ResponseDetail
+from afspm.model.problems import Problem, ProblemNames
+from afspm.model.requests import (
+    CLOCK_REQUEST,
+    HAS_ENDED,
+    OTHER_RUN_RESPONSE,
+    RELAY_REQUEST,
+    RESTART_REQUEST,
+    ControlRequest,
+    ControlResponse,
+    Parameter,
+    Request,
+    RescanKind,
+    Response,
+    ResponseDetail,
+    request_name,
+)
 from afspm.model.scan import Scan, ScanParameters, ScanSet, ShapeChange
 from afspm.model.scan_lines import ScanLines
 from afspm.model.spectrum import Spectrum
-from afspm.model.state import ControlState, Feedback, PositionChange, ProbePosition, ScopeStatus
+from afspm.model.state import (
+    ControlMode,
+    ControlState,
+    Feedback,
+    PositionChange,
+    ProbePosition,
+    ScopeState,
+    ScopeStatus,
+)
 
 __all__ = [
     "CLOCK_REQUEST",

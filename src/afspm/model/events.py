@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 
-from afspm.model.enums import ControlMode
+from afspm.model.state import ControlMode
 
 PERSON = ":"
 """Between a component and the person that it acts for: "dashboard:Ada"."""
@@ -21,7 +21,7 @@ def is_process_name(name: str) -> bool:
 
 
 def component_of(who: str) -> str:
-    """The component in whose name something was asked; the same without a person."""
+    """Return the component in whose name something was asked, without the person."""
     return who.partition(PERSON)[0]
 
 

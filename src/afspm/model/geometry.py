@@ -72,7 +72,7 @@ class Region:
 
     @classmethod
     def from_top_left(cls, top_left_m: XY, size_m: XY, angle_rad: float = 0.0, frame: Frame = Frame.TIP) -> Region:
-        """From the corner of smallest x and y of the unrotated rectangle, as the wire has it."""
+        """Return a region by the corner of smallest x and y of the unrotated rectangle, as the wire has it."""
         center_m = (top_left_m[0] + size_m[0] / 2, top_left_m[1] + size_m[1] / 2)
         return cls(center_m, size_m, angle_rad, frame)
 
@@ -95,7 +95,7 @@ class Region:
         return bool(abs(cos * x + sin * y) <= self.size_m[0] / 2 and abs(cos * y - sin * x) <= self.size_m[1] / 2)
 
     def pixels_m(self, shape: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """x and y of every pixel of an array of `shape` (ny, nx), each an array of that shape, in m."""
+        """Return x and y of every pixel of an array of `shape` (ny, nx), each an array of that shape, in m."""
         import numpy as np
 
         ny, nx = shape
@@ -125,7 +125,7 @@ class RegionChange:
     angle_rad: float | None = None
 
     def onto(self, region: Region) -> Region:
-        """`region` with what is given here changed.
+        """Return `region` with what is given here changed.
 
         Raises:
             InvalidValue: that is no region.

@@ -26,18 +26,7 @@ _MAD: Final = 1.4826
 
 
 def levelled(values: Floats, order: int = 1, fit: str = "least-squares", quantile: float = 0.5) -> Floats:
-    """Return the values without the polynomial surface that fits them best.
-
-    Args:
-        values: [y, x]; NaN where nothing was measured.
-        order: 0 for a height, 1 for a plane, 2 and 3 for curved surfaces.
-        fit: "least-squares", or one that outliers such as particles and steps do not lead astray: "huber",
-            "theil-sen" (medians of many small fits), "ransac" (the most pixels that agree), "quantile".
-        quantile: of "quantile": which part of the pixels lies below the surface; a small one finds a substrate.
-
-    Raises:
-        InvalidValue: there is no such fit or order, or too little was measured.
-    """
+    """Return values [y, x], NaN where nothing was measured, without a polynomial surface; see `Scan.levelled`."""
     if fit not in FITS:
         raise InvalidValue(f"there is no fit {fit!r}", hint=f"one of {', '.join(sorted(FITS))}")
     if order not in range(4) or not 0.0 < quantile < 1.0:

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator, Mapping
+from enum import IntEnum
 
 from afspm.errors import InvalidValue
-from afspm.model.enums import Problem
 
 HIGHEST_PROBLEM = 255  # a problem travels as one byte
+
+
+class Problem(IntEnum):
+    """Problems of an experiment. Experiment files name more of them, with numbers above these."""
+
+    NONE = 0
+    TIP_SHAPE_CHANGED = 1
+    DEVICE_MALFUNCTION = 2
+    FEEDBACK_NON_OPTIMAL = 3
+    THERMAL_DRIFT = 4
 
 
 class ProblemNames(Mapping[str, int]):

@@ -6,10 +6,74 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
-from afspm.model.enums import ControlResponse
-
 HAS_ENDED = "the experiment has ended"
 """The reason of every refusal after the end."""
+
+
+class ControlRequest(IntEnum):
+    """The requests to scheduler and translator."""
+
+    UNDEFINED = 0
+    ACTION = 1
+    PARAM = 2
+    SET_SCAN_PARAMS = 3
+    SET_ZCTRL_PARAMS = 4
+    SET_PROBE_POS = 5
+    REQUEST_CTRL = 6
+    RELEASE_CTRL = 7
+    ADD_EXP_PRBLM = 8
+    RMV_EXP_PRBLM = 9
+    SET_CONTROL_MODE = 10
+    END_EXPERIMENT = 11
+    ACTION_SUPPORT = 12
+
+
+CLOCK_REQUEST = 101
+"""A request of ours, not in version 1: what time it is in the experiment."""
+RELAY_REQUEST = 102
+"""A request of ours, not in version 1: a supervisor has something to publish; its answer are orders to it."""
+RESTART_REQUEST = 103
+"""A request of ours, not in version 1: a process is to be started anew; its subject is the process's name."""
+
+OTHER_RUN_RESPONSE = 100
+"""A response of ours, not in version 1, and only to those who named their run: it is not that of the scheduler."""
+
+_OURS = {CLOCK_REQUEST: "CLOCK", RELAY_REQUEST: "TELL", RESTART_REQUEST: "RESTART"}
+
+
+def request_name(kind: int) -> str:
+    """Return a request in words."""
+    known = next((request.name for request in ControlRequest if request == kind), None)
+    return known or _OURS.get(kind, f"request {kind}")
+
+
+class ControlResponse(IntEnum):
+    """The answers to a request."""
+
+    SUCCESS = 0
+    FAILURE = 1
+    CMD_NOT_SUPPORTED = 2
+    NO_RESPONSE = 3
+    ALREADY_UNDER_CONTROL = 4
+    WRONG_CONTROL_MODE = 5
+    NOT_IN_CONTROL = 6
+    NOT_FREE = 7
+    PARAM_NOT_SUPPORTED = 8
+    PARAM_ERROR = 9
+    WRONG_EXP_PROBLEM = 10
+    ACTION_NOT_SUPPORTED = 11
+    ACTION_ERROR = 12
+
+
+class RescanKind(IntEnum):
+    """Requests to a Rescanner; a message of ours."""
+
+    AGAIN = 1
+    """The same region."""
+    OPPOSITE = 2
+    """In the other direction of the slow axis."""
+    SEARCH = 3
+    """A wider region, until the sample is found."""
 
 
 @dataclass(frozen=True, slots=True)

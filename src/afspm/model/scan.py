@@ -26,7 +26,7 @@ class ShapeChange:
     columns: int | None = None
 
     def onto(self, shape: tuple[int, int]) -> tuple[int, int]:
-        """`shape` with what is given here changed."""
+        """Return `shape` with what is given here changed."""
         return (
             shape[0] if self.rows is None else self.rows,
             shape[1] if self.columns is None else self.columns,
@@ -145,7 +145,7 @@ class Scan:
         return int(np.isnan(self.values).all(axis=1).sum())
 
     def undistorted(self, velocity_m_s: XY, duration_s: float, *, upwards: bool = True) -> Scan:
-        """As it would have been at the middle of its acquisition, without the drift meanwhile (needs scipy).
+        """Return the scan as at the middle of its acquisition, without the drift meanwhile (needs scipy).
 
         Args:
             velocity_m_s: (x, y) of the sample under the tip, e.g. from an up frame followed by a down frame
@@ -219,7 +219,7 @@ class Scan:
         return from_sidpy(dataset)
 
     def to_xarray(self) -> xarray.DataArray:
-        """As an xarray DataArray with coordinates in m (needs the extra `xarray`).
+        """Return an xarray DataArray with coordinates in m (needs the extra `xarray`).
 
         The coordinates x and y are those of the unrotated rectangle; `angle_rad` is in the attributes. NaN where no
         values came.

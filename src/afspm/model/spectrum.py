@@ -62,7 +62,7 @@ class Spectrum:
         return self.values[:, self.names.index(name)]
 
     def to_xarray(self) -> xarray.Dataset:
-        """As an xarray Dataset over the first variable (needs the extra `xarray`)."""
+        """Return an xarray Dataset over the first variable (needs the extra `xarray`)."""
         import xarray
 
         swept, *rest = self.names

@@ -3,9 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
-from afspm.model.enums import ControlMode, ScopeState
 from afspm.model.geometry import XY
+
+
+class ScopeState(IntEnum):
+    """The states of a microscope."""
+
+    UNDEFINED = 0
+    MOVING = 1
+    SCANNING = 2
+    FREE = 3
+    INTERRUPTED = 4
+    COARSE_MOTOR = 5
+    BUSY_PARAM = 6
+    SPEC = 7
+
+
+class ControlMode(IntEnum):
+    """Components control the microscope (AUTOMATED), or only the person at it (MANUAL)."""
+
+    UNDEFINED = 0
+    MANUAL = 1
+    AUTOMATED = 2
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from afspm.record.journal import SCHEDULER
 from afspm.record.nexus import FileProvenance
 from afspm.record.provenance import ControlAtStart
 from afspm.record.scan_assembler import Assembled, AssembledScan, AssembledSpectrum
-from afspm.storage import atomic
+from afspm.storage.atomic import FileBatch, replace_file
 from afspm.wire.values import without_values
 
 SCANS, SPECTRA = "scans", "spectra"
@@ -41,6 +41,7 @@ class MeasuredFiles:
         self._journal = journal
         self._facts = facts
         self._problems = problems
+        self._batch = FileBatch(PART)
         for kind in (SCANS, SPECTRA):
             for half in (folder / kind).glob(f"*{SUFFIX}{PART}"):  # of a process that was killed
                 half.unlink(missing_ok=True)
@@ -53,6 +54,18 @@ class MeasuredFiles:
             self._write_scan(taken)
         else:
             self._write_interrupted(taken, taken.interrupted_ns)
+
+    def finish(self) -> None:
+        """Have all files on the disk, under their names. Raises OSError."""
+        self._batch.finish()
+
+    def discard(self) -> None:
+        """Remove the files that were written since `finish`."""
+        self._batch.discard()
+
+    def close(self) -> None:
+        """Write no more."""
+        self._batch.close()
 
     # --- scans ---
 
@@ -108,7 +121,7 @@ class MeasuredFiles:
             facts["drift"] = mapping
         at = FileProvenance(time_ns, stood.began_ns, facts, header_of(filename, self._folder))
         if scans:
-            write_synced(self._folder / name, nexus.encode_scan(scans, at))
+            self._batch.write(self._folder / name, nexus.encode_scan(scans, at))
         region, shape = (scans[0].region, scans[0].shape) if scans else (None, (None, None))
         place = (None,) * 5 if region is None else (*region.center_m, *region.size_m, region.angle_rad)
         frame = None if region is None else region.frame.value
@@ -124,6 +137,7 @@ class MeasuredFiles:
         """Channels that came after the file was written: the recorder was killed in between."""
         from afspm.files import read
 
+        self._batch.finish()  # it may be one of these
         content = read(path)
         there = {scan.channel for scan in content.scans}
         if new.keys() <= there:
@@ -131,7 +145,7 @@ class MeasuredFiles:
         scans = [*content.scans, *(scan for channel, scan in new.items() if channel not in there)]
         about = nexus.facts_of(path)
         at = FileProvenance(about["time_ns"], about["began_ns"], about, header_of(scans[0].filename, self._folder))
-        write_synced(path, nexus.encode_scan(scans, at))
+        self._batch.write(path, nexus.encode_scan(scans, at))
         channels = json.dumps([[scan.channel, scan.unit] for scan in scans], ensure_ascii=False)
         self._journal.execute("UPDATE scans SET channels = ? WHERE number = ?", (channels, number))
 
@@ -164,7 +178,7 @@ class MeasuredFiles:
             number, name = self._next(SPECTRA, time_ns)
             facts = {**self._facts, **stood.facts(self._problems), "number": number}
             at = FileProvenance(time_ns, stood.began_ns, facts, header_of(spectrum.filename, self._folder))
-            write_synced(self._folder / name, nexus.encode_spectrum(spectrum, at))
+            self._batch.write(self._folder / name, nexus.encode_spectrum(spectrum, at))
             place = (None, None) if spectrum.position_m is None else spectrum.position_m
             names, units = (json.dumps(texts, ensure_ascii=False) for texts in (spectrum.names, spectrum.units))
             self._journal.execute(
@@ -234,7 +248,7 @@ def header_of(filename: str, folder: Path) -> Mapping[str, Any]:
 
 def write_synced(path: Path, data: bytes) -> None:
     """Write a file so that it is there as a whole or not at all, after a power cut too. Raises OSError."""
-    atomic.replace_file(path, [data], aside=path.with_name(path.name + PART))
+    replace_file(path, [data], aside=path.with_name(path.name + PART))
 
 
 def _stamp(time_ns: int) -> str:

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from afspm.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM, colour_map
 from afspm.formatting import period_text, time_of_day
 from afspm.model import names
-from afspm.record.night_record import BAD, NightMark, NightRecord, Shot, Span
+from afspm.record.night_record import BAD, NightMark, NightRecord, Shot
+from afspm.record.timeline import Span
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -242,7 +243,7 @@ def _episodes(record: NightRecord) -> list[Span]:
         if merged and (merged[-1].end_ns is None or span.start_ns <= merged[-1].end_ns):
             last = merged[-1]
             end = None if span.end_ns is None or last.end_ns is None else max(last.end_ns, span.end_ns)
-            merged[-1] = Span(last.what, last.start_ns, end)
+            merged[-1] = Span(last.label, last.start_ns, end)
         else:
             merged.append(span)
     return merged

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,19 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.model import ControlMode, ControlState, Scan
+from afspm.record.timeline import Span, Timeline
 
 THUMBNAIL_PX = 64
 BAD = 0.0
 """The score of a scan that was judged to show a bad tip."""
-
-
-@dataclass(frozen=True)
-class Span:
-    """Something that was so from one time to another; end_ns None: it still is."""
-
-    what: str
-    start_ns: int
-    end_ns: int | None
 
 
 @dataclass(frozen=True)
@@ -128,32 +120,25 @@ class NightRecord:
 
     def control_spans(self, holder: str) -> list[Span]:
         """When a component was in control."""
-        return self._spans(holder, lambda state: state.holder == holder)
+        return self._spans(lambda state: state.holder == holder, holder)
 
     def problem_spans(self, problem: int) -> list[Span]:
         """When a problem was flagged."""
-        return self._spans(str(problem), lambda state: problem in state.problems)
+        return self._spans(lambda state: problem in state.problems)
 
     def manual_spans(self) -> list[Span]:
         """When a person had it."""
-        return self._spans("manual", lambda state: state.mode is ControlMode.MANUAL)
+        return self._spans(lambda state: state.mode is ControlMode.MANUAL)
 
     def verdict(self, shot: Shot) -> float | None:
         """What was thought of a scan; None if nobody said."""
         return next((m.score for m in reversed(self.marks) if m.of_ns == shot.time_ns), None)
 
-    def _spans(self, what: str, holds: Any) -> list[Span]:
-        spans: list[Span] = []
-        since: int | None = None
+    def _spans(self, holds: Callable[[ControlState], bool], label: str = "") -> list[Span]:
+        timeline = Timeline()
         for time_ns, state in sorted_by_time(self.control):
-            if holds(state) and since is None:
-                since = time_ns
-            elif not holds(state) and since is not None:
-                spans.append(Span(what, since, time_ns))
-                since = None
-        if since is not None:
-            spans.append(Span(what, since, None))
-        return spans
+            timeline.change(label if holds(state) else None, time_ns)
+        return list(timeline.spans)
 
 
 def sorted_by_time(control: list[tuple[int, ControlState]]) -> list[tuple[int, ControlState]]:

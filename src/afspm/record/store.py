@@ -142,6 +142,7 @@ class RecordStore:
 
     def close(self) -> None:
         """Safe to repeat."""
+        self._files.close()
         self._journal.close()
 
     @contextmanager
@@ -150,8 +151,10 @@ class RecordStore:
         self._journal.execute("BEGIN IMMEDIATE")
         try:
             yield
+            self._files.finish()
             self._journal.execute("COMMIT")
         except BaseException:
+            self._files.discard()
             self._gathering, self._newest_ns = gathering, newest_ns
             with suppress(sqlite3.Error):  # a full disk may have rolled it back already
                 self._journal.execute("ROLLBACK")

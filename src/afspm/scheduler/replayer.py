@@ -80,7 +80,7 @@ class Replayer:
         self._wake_up.post()
 
     def wakeup_fileno(self) -> int:
-        """What may be written to so that `run` looks whether it is to stop."""
+        """Return a file descriptor: a write to it makes `run` look whether it is to stop."""
         return self._wake_up.writer_fileno()
 
     def _end(self) -> None:

@@ -2,53 +2,26 @@
 
 from __future__ import annotations
 
-import logging
 import threading
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from afspm.clock import Clock
 from afspm.errors import FileError
 from afspm.exit_codes import ExitCode
-from afspm.launch import Launch
 from afspm.logic.fencing import Epoch
 from afspm.logic.scheduler_core import SchedulerCore
 from afspm.logic.settings import SchedulerSettings
-from afspm.model import ProblemNames
+from afspm.process.context import ProcessContext
 from afspm.scheduler.settings import scheduler_settings
-from afspm.scheduler.shell import Core, SchedulerShell
+from afspm.scheduler.shell import SchedulerShell
 from afspm.scheduler.state_file import StateFile
 from afspm.scheduler.wire_codec import WireCodec
 from afspm.scheduler.write_ahead import WriteAhead
 from afspm.storage.packet_log import PacketLog, cached_packets, log_folder
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.scheduler_sockets import SchedulerSockets
-
-
-class SchedulerActivity(Protocol):
-    """The part of `process.context.ProcessActivity` that is needed here."""
-
-    def step(self) -> AbstractContextManager[None]: ...
-
-
-class SchedulerContext(Protocol):
-    """The part of `process.context.ProcessContext` that is needed here."""
-
-    @property
-    def launch(self) -> Launch: ...
-    @property
-    def clock(self) -> Clock: ...
-    @property
-    def log(self) -> logging.Logger: ...
-    @property
-    def activity(self) -> SchedulerActivity: ...
-    @property
-    def problems(self) -> ProblemNames: ...
-    @property
-    def when_stopping(self) -> Callable[[Callable[[], None]], None]: ...
 
 
 class Scheduler:
@@ -73,7 +46,7 @@ class Scheduler:
         self._limits = limits or {}
         self._cache = cache or {}
 
-    def run_process(self, context: SchedulerContext) -> int:
+    def run_process(self, context: ProcessContext) -> int:
         """Run until the experiment ends or we are told to stop; returns an exit code.
 
         Raises:
@@ -107,29 +80,27 @@ class Scheduler:
             shell.close()
         return ExitCode.ENDED if shell.ended else ExitCode.ORPHAN
 
-    def _settings(self, context: SchedulerContext) -> SchedulerSettings:
+    def _settings(self, context: ProcessContext) -> SchedulerSettings:
         settings = scheduler_settings(
             self._control, self._limits, self._cache, context.problems, context.launch.request_timeout_s
         )
         launch = context.launch
         return replace(settings, clock=dict(launch.clock), run=launch.run, simulated=launch.simulated)
 
-    def _core(self, context: SchedulerContext) -> Core:
-        """The decisions."""
+    def _core(self, context: ProcessContext) -> SchedulerCore:
         return SchedulerCore(self._settings(context), WireCodec())
 
-    def _shell(self, core: Core, sockets: SchedulerSockets, *others: Any) -> SchedulerShell:
-        """What is around them."""
+    def _shell(self, core: SchedulerCore, sockets: SchedulerSockets, *others: Any) -> SchedulerShell:
         return SchedulerShell(core, sockets, *others)
 
 
-def _epoch(context: SchedulerContext) -> bytes:
+def _epoch(context: ProcessContext) -> bytes:
     launch = context.launch
     return Epoch(launch.run, context.clock.now_ns(), launch.simulated).encode() if launch.run else b""
 
 
-def _restore(core: Core, state: StateFile, log: Path | None) -> None:
-    """What was in force before a restart."""
+def _restore(core: SchedulerCore, state: StateFile, log: Path | None) -> None:
+    """Take up the state of before a restart."""
     try:
         if (saved := state.load()) is not None:
             core.restore(saved)

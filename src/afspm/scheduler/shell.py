@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Hashable, Iterable
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from afspm import wire
 from afspm.errors import WireError
@@ -21,16 +21,16 @@ from afspm.model import (
     Response,
     ResponseDetail,
 )
-from afspm.transport.hold_back import STATE, HoldBack
 from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
+from afspm.transport.state_delay import StateDelay
 from afspm.transport.translator_link import LinkReply, LinkUp
 from afspm.wire.protocol import LONGEST_ID
 
 if TYPE_CHECKING:
     from afspm.clock import Clock
-    from afspm.logic.arbitration import ArbitrationState
+    from afspm.logic.scheduler_core import SchedulerCore
     from afspm.logic.state import SavedState
     from afspm.scheduler.write_ahead import WriteAhead
     from afspm.transport.rate_limited_log import RateLimitedLog
@@ -43,30 +43,12 @@ them do."""
 _TELL = bytes([RELAY_REQUEST])
 
 
-class Core(Protocol):
-    """A `SchedulerCore`, or what has the same steps; see there."""
-
-    def start(self, now_s: float, now_ns: int) -> list[events.Effect]: ...
-    def step(self, event: events.Input, now_s: float, now_ns: int) -> list[events.Effect]: ...
-    def deadline_s(self) -> float | None: ...
-    def deadline_ns(self) -> int | None: ...
-    def restore(self, saved: SavedState) -> None: ...
-    def restore_cache(self, packets: Iterable[LoggedPacket]) -> None: ...
-    def cached(self) -> Iterable[LoggedPacket]: ...
-    @property
-    def control(self) -> ArbitrationState: ...
-    @property
-    def newest_source_ns(self) -> int: ...
-    @property
-    def leave_at_s(self) -> float: ...
-
-
 class SchedulerShell:
     """One scheduler at work: `start`, then `handle` what `wait` returns until it is `over`."""
 
     def __init__(
         self,
-        core: Core,
+        core: SchedulerCore,
         sockets: SchedulerSockets,
         clock: Clock,
         write_ahead: WriteAhead,
@@ -80,7 +62,7 @@ class SchedulerShell:
         self._warnings = warnings
         self._log = log
         self._replay: tuple[Packet, ...] = ()
-        self._hold_back = HoldBack()
+        self._state_delay = StateDelay()
         self._look_at_s = 0.0  # at the deadlines, in real monotonic time
         self.ended = False
         self._tip_is_safe = True
@@ -237,7 +219,7 @@ class SchedulerShell:
         self._release(now_s)
         if self._core_due_s() <= now_s:
             self._take(events.Tick())
-        held_s = self._hold_back.due_s
+        held_s = self._state_delay.due_s
         self._look_at_s = self._core_due_s() if held_s is None else min(held_s, self._core_due_s())
 
     def _core_due_s(self) -> float:
@@ -281,13 +263,13 @@ class SchedulerShell:
 
     def _publish(self, packet: Packet) -> None:
         publisher, now_s = self._sockets.publisher, self._clock.monotonic_s()
-        for one in self._hold_back.take(packet, now_s, wanted=publisher.has_plain_subscriber(STATE)):
+        for one in self._state_delay.take(packet, now_s, wanted=publisher.has_plain_subscriber(wire.Topic.SCOPE_STATE)):
             publisher.publish(one)
-        if self._hold_back.due_s is not None:
-            self._look_at_s = min(self._look_at_s, self._hold_back.due_s)
+        if self._state_delay.due_s is not None:
+            self._look_at_s = min(self._look_at_s, self._state_delay.due_s)
 
     def _release(self, now_s: float = math.inf) -> None:
-        for packet in self._hold_back.release(now_s):
+        for packet in self._state_delay.release(now_s):
             self._sockets.publisher.publish(packet)
 
     def _write_down(self, effects: list[events.Effect]) -> None:

@@ -1,4 +1,4 @@
-"""What the scheduler must not forget when it is killed: a small file of JSON lines, of which the last holds."""
+"""The state that survives a kill: a small file of JSON lines, of which the last holds."""
 
 from __future__ import annotations
 

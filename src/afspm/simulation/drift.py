@@ -27,7 +27,7 @@ _FASTEST_EXPANSION_PER_S = 1e-4  # beyond any sample, and twelve days of it are 
 
 @dataclass(frozen=True)
 class Relaxation:
-    """What is left of a change of temperature or of an approach: total_m * (1 - exp(-t / time_s))."""
+    """The effect that is left of a change of temperature or of an approach: total_m * (1 - exp(-t / time_s))."""
 
     total_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     time_s: float = 3600.0

@@ -22,7 +22,10 @@ from afspm.simulation.settings import check, one_of
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """The sensor of the mode "frequency-shift".
+    """The sensor of the mode "frequency-shift": it oscillates near the sample, whose attraction shifts its resonance.
+
+    Of a sphere that is attracted by van der Waals forces, with any amplitude A, a distance d from the sample at the
+    nearest point of its way: shift = -f H R / (6 k (d (d + 2 A))^(3/2)) (Giessibl 1997).
 
     Attributes:
         resonance_hz: far from the sample.
@@ -75,7 +78,7 @@ _GROWN = 10.0  # e-foldings in one step, after which nothing is left but the sat
 
 @dataclass(frozen=True)
 class FeedbackSettings:
-    """What is in force until it is set otherwise, and the loop's hardware.
+    """The settings in force until they are set otherwise, and the loop's hardware.
 
     Attributes:
         mode: "amplitude" (tapping; the setpoint is an amplitude in V), "current" (tunnelling; in A) or
@@ -152,12 +155,12 @@ class Loop:
 
     @property
     def engages(self) -> bool:
-        """Whether the setpoint can be met at all: an amplitude above the free one never is."""
+        """True if the setpoint can be met at all: an amplitude above the free one never is."""
         return self.settings.mode != "amplitude" or self.setpoint < self.settings.free_amplitude_v
 
     @property
     def force(self) -> float:
-        """How hard tip and sample press on each other; 1 at a gentle setpoint, 0 when they never touch."""
+        """The force with which tip and sample press on each other; 1 at a gentle setpoint, 0 when they never touch."""
         s = self.settings
         if s.mode == "current":
             return math.log1p(self.setpoint / 50e-12) / math.log(2.0)
@@ -210,7 +213,7 @@ class Loop:
         return result
 
     def amplitude_v(self, gap_m: Array) -> Array:
-        """What the detector shows; gap is z less the height at which the setpoint is met."""
+        """Return what the detector shows; gap is z less the height at which the setpoint is met."""
         s = self.settings
         return np.clip(self.setpoint + gap_m / s.sensitivity_m_per_v, 0.0, s.free_amplitude_v)
 
@@ -221,7 +224,7 @@ class Loop:
 
     @property
     def oscillates(self) -> bool:
-        """Whether the gains are beyond the limit of stability."""
+        """True if the gains are beyond the limit of stability."""
         return self._damping <= 0.0 or self._inertia <= 0.0
 
     @property

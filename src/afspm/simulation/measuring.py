@@ -17,12 +17,12 @@ from afspm.simulation.noise import NoiseSettings, disturbances, flattened, heigh
 from afspm.simulation.scanning import Course, ScannerSettings
 from afspm.simulation.settings import check
 from afspm.simulation.surfaces import Relief
-from afspm.simulation.tip import TipState
+from afspm.simulation.tip import TipShape
 
 
 @dataclass(frozen=True)
 class SignalSettings:
-    """How the sample answers.
+    """The answer of the sample in phase and current.
 
     Attributes:
         dissipation: energy lost to the sample a cycle, as a share of what the cantilever loses itself, mean of both
@@ -70,7 +70,7 @@ def current_a(settings: SignalSettings, loop: Loop, gap_m: Array, material: Arra
 
 
 Channels = dict[str, tuple[str, Array]]
-TipTimes = Sequence[tuple[float, TipState]]
+TipTimes = Sequence[tuple[float, TipShape]]
 """(since when, tip), the first not later than the scan's start."""
 
 _POINTS = 1_400_000  # of the grid, if oversampling is left to us
@@ -80,7 +80,7 @@ _MOST_TAPS = 160  # grid steps that a tip may reach aside: one that reaches furt
 
 @dataclass(frozen=True)
 class Setup:
-    """What stays the same during a scan.
+    """The conditions that stay the same during a scan.
 
     Attributes:
         sample: relief of the sample as it is now, from (x, y, resolution_m).
@@ -109,7 +109,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Felt:
-    """What the tip feels along the lines, by row index, x ascending.
+    """The surface as the tip feels it along the lines, by row index, x ascending.
 
     Attributes:
         height_m: (trace, retrace), each [y, x].
@@ -248,7 +248,7 @@ def _rows_of_grid(grid: SampleGrid, y: Array, margin_m: float) -> tuple[SampleGr
     return grid.rows(start, stop), start, stop
 
 
-def _tip_of_lines(course: Course, tips: TipTimes) -> list[TipState]:
+def _tip_of_lines(course: Course, tips: TipTimes) -> list[TipShape]:
     """The tip at the start of each line, in the order of time."""
     starts = course.start_s + np.arange(course.shape[0]) * course.line_s
     index = np.searchsorted([since for since, _ in tips], starts, side="right") - 1

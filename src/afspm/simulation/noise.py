@@ -1,4 +1,4 @@
-"""What the instrument adds to the signals, and the line flattening that it may take away again."""
+"""The noise that the instrument adds to the signals, and the line flattening that it may take away again."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from afspm.simulation.fields import Array
 from afspm.simulation.settings import check
-from afspm.simulation.tip import TipState
+from afspm.simulation.tip import TipShape
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ class NoiseSettings:
 
 
 def disturbances(
-    settings: NoiseSettings, tips: list[TipState], line_s: float, nx: int, random: np.random.Generator
+    settings: NoiseSettings, tips: list[TipShape], line_s: float, nx: int, random: np.random.Generator
 ) -> Array | None:
-    """What happens between tip and sample besides scanning: scars and debris that jumps; the feedback follows it.
+    """Return scars and jumps of debris, which happen between tip and sample; the feedback follows them.
 
     Args:
         tips: of each line, in the order of time.

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from afspm.errors import FileError
-from afspm.storage.disk import SYNCER, sync_file, sync_folder
+from afspm.storage.disk import SYNCER, DiskTask, DiskThread, sync_file, sync_folder
 
 T = TypeVar("T")
 
@@ -82,6 +82,57 @@ def write_atomic(path: Path, parts: Iterable[bytes | memoryview], *, synced: boo
         replace_file(path, parts, synced=synced)
     except OSError as error:
         raise FileError(f"can't be written: {error}", where=str(path)) from error
+
+
+class FileBatch:
+    """New files that get their names together; each is synced in a thread while the next is made.
+
+    Args:
+        suffix: of a file that has not got its name yet.
+    """
+
+    def __init__(self, suffix: str) -> None:
+        self._suffix = suffix
+        self._disk = DiskThread()
+        self._files: list[tuple[DiskTask, Path, Path]] = []
+
+    def write(self, path: Path, data: bytes) -> None:
+        """Write a file under another name. Raises OSError."""
+        path.parent.mkdir(exist_ok=True)
+        aside = path.with_name(path.name + self._suffix)
+        with aside.open("wb") as file:
+            file.write(data)
+            descriptor = os.dup(file.fileno())
+        self._files.append((self._disk.submit(lambda: _sync_and_close(descriptor)), aside, path))
+
+    def finish(self) -> None:
+        """Give all files their names, once they are on the disk; then these are, too. Raises OSError."""
+        for task, aside, path in self._files:
+            task.wait()
+            _rename(aside, path)
+        for folder in {path.parent for _, _, path in self._files}:
+            sync_folder(folder)
+        self._files.clear()
+
+    def discard(self) -> None:
+        """Remove the files that have no name yet."""
+        for task, aside, _ in self._files:
+            with contextlib.suppress(OSError):
+                task.wait()
+            with contextlib.suppress(OSError):
+                aside.unlink(missing_ok=True)
+        self._files.clear()
+
+    def close(self) -> None:
+        """End the thread. Safe to repeat."""
+        self._disk.close(0.0)
+
+
+def _sync_and_close(descriptor: int) -> None:
+    try:
+        sync_file(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 class OutageLog:

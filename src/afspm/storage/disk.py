@@ -38,7 +38,7 @@ class DiskBacklogFull(DiskTimeout):
     """So much waits for the disk that this is never written."""
 
 
-class _Task:
+class DiskTask:
     """Something to do; `done` is held until it is."""
 
     __slots__ = ("done", "error", "size", "work")
@@ -49,6 +49,12 @@ class _Task:
         self.error: Exception | None = None
         self.done = threading.Lock()
         self.done.acquire()
+
+    def wait(self) -> None:
+        """Wait until it is done, however long that takes. Raises what `work` raised."""
+        with self.done:
+            if self.error is not None:
+                raise self.error
 
 
 class DiskThread:
@@ -62,7 +68,7 @@ class DiskThread:
         self.hangs = False
         self._deadline_s = deadline_s
         self._most_bytes = most_bytes
-        self._tasks: queue.SimpleQueue[_Task | None] = queue.SimpleQueue()
+        self._tasks: queue.SimpleQueue[DiskTask | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._bytes = self._count = 0
         self._thread: threading.Thread | None = None
@@ -85,7 +91,7 @@ class DiskThread:
         if task.error is not None:
             raise task.error
 
-    def submit(self, work: Callable[[], object], size: int = 0) -> _Task:
+    def submit(self, work: Callable[[], object], size: int = 0) -> DiskTask:
         """Have something done, and wait for nothing. Raises DiskBacklogFull."""
         with self._lock:
             if self._count and (self._bytes + size > self._most_bytes or self._count >= MOST_TASKS):
@@ -96,7 +102,7 @@ class DiskThread:
         if self._thread is None:
             self._thread = threading.Thread(target=self._work, name="disk", daemon=True)
             self._thread.start()
-        task = _Task(work, size)
+        task = DiskTask(work, size)
         self._tasks.put(task)
         return task
 

@@ -38,7 +38,7 @@ class KeyHandout:
 
     @contextmanager
     def laid_down(self, folder: Path) -> Iterator[None]:
-        """While in the block, who may read the run's folder finds the guests' key in it, unless its disk fails."""
+        """Keep the guests' key in the run's folder while in the block, unless its disk fails."""
         file = folder / STATE_DIR / GUEST_KEYS
         if self.guest is not None:
             text = json.dumps(self.guest).encode()

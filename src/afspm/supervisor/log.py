@@ -86,7 +86,7 @@ class RunLog:
         self._widest = max(map(len, (LOGGED_AS, *names)))
 
     def write(self, name: str, level: int, text: str) -> None:
-        """One line of the process `name`; `level` is that of `logging`."""
+        """Write one line of the process `name`; `level` is that of `logging`."""
         wall_ns = self._wall.now_ns()
         stamp = f"{day_and_time(wall_ns)}.{wall_ns // 1_000_000 % 1000:03d}{self._experiment_time()}"
         self._file.add(stamp, f"{name:{self._widest}}", level, text)
@@ -135,7 +135,7 @@ class _Shown:
         self._thread.start()
 
     def add(self, time: str, name: str, level: int, text: str) -> None:
-        """A line; where too many wait, the oldest is left out."""
+        """Append a line; where too many wait, the oldest is dropped."""
         with self._changed:
             self._lines.append((time, name, level, text))
             self._changed.notify()
@@ -156,7 +156,7 @@ class _Shown:
             self._finish()
 
     def hangs(self, longer_than_s: float) -> bool:
-        """True while one line takes longer than this."""
+        """Return whether one line takes longer than this."""
         since_s = self._busy_since_s
         return since_s is not None and CLOCK.monotonic_s() - since_s > longer_than_s
 

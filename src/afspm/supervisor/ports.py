@@ -42,7 +42,7 @@ class FreePorts:
         self._random = random.Random()
 
     def take(self) -> int:
-        """A port that was free just now.
+        """Return a port that was free just now.
 
         Raises:
             OSError: none is to be had.

@@ -63,7 +63,7 @@ class Task:
 
 
 def from_start(start: ProcessStart) -> Task:
-    """A task of what the experiment file says: Python classes by our host, other languages by our guard."""
+    """Return the task of a process: Python classes run in our host, other languages under our guard."""
     # -P: modules are those beside the experiment file, and never what happens to lie where the run was started
     python = (sys.executable, "-P", "-m")
     ours = (*python, GUARD, "--", *start.command) if start.command else (*python, HOST)

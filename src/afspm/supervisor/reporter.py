@@ -272,7 +272,7 @@ def reporter_of(
     run: str = "",
     keys: Mapping[str, Any] | None = None,
 ) -> Reporter | None:
-    """One for what is started here; None where the scheduler can't be asked, or is perhaps none of ours.
+    """Return a reporter for what is started here; None where the scheduler can't be asked, or may not be ours.
 
     Args:
         keys: that were made for it; None: the file says where they are, or there are none.

@@ -62,14 +62,14 @@ class ResumableRun:
         return replace(self, experiment=experiment, added=(*self.added, *added))
 
     def options(self, options: RunOptions) -> RunOptions:
-        """With the processes that it had on this computer, and those that were added now."""
+        """Return the options with the processes that it had on this computer, and those that were added now."""
         names = self.experiment.component_names  # without what was added in an earlier life
         only, without = ([name for name in self.facts.get(which, ()) if name in names] for which in (ONLY, WITHOUT))
         return replace(options, only=(*only, *self.added) if only else (), without=tuple(without))
 
 
 def find(where: Path) -> ResumableRun:
-    """The run that is meant: by its folder, or that of all runs (the newest is meant), or the experiment file.
+    """Return the run that is meant by its folder, that of all runs (the newest), or the experiment file.
 
     Raises:
         FileError: there is no run, or what is needed of it can't be read.
@@ -122,7 +122,7 @@ def _clock_after(facts: dict[str, Any], folder: Path) -> ExperimentClock:
 
 
 def last_seen_ns(folder: Path) -> int:
-    """The last time in the experiment that anything of the run's folder knows of; 0 if nothing does."""
+    """Return the last experiment time that anything in the run's folder knows of; 0 if nothing does."""
     seen = [0]
     state = folder / STATE_DIR
     seen += [entry.packet.time_ns or 0 for entry in logged_packets(log_folder(state))]

@@ -137,7 +137,7 @@ def go(
 
 
 def addresses_of(starts: Sequence[ProcessStart]) -> dict[str, str]:
-    """The addresses that are bound here, with the names of who will."""
+    """Return the addresses that are bound here, with the names of their processes."""
     return {
         address: start.launch.name
         for start in starts
@@ -271,5 +271,5 @@ def _require_real_time(clock: ExperimentClock, experiment: Experiment) -> None:
 
 
 def now() -> datetime:
-    """Real time, with the zone of this computer."""
+    """Return real time, with the zone of this computer."""
     return datetime.fromtimestamp(ExperimentClock.real().now_s()).astimezone()

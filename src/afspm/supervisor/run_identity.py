@@ -35,7 +35,7 @@ class RunIdentity:
 
 
 def new_identity() -> str:
-    """An identity that no other run has."""
+    """Return an identity that no other run has."""
     return os.urandom(8).hex()
 
 

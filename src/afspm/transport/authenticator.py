@@ -1,4 +1,4 @@
-"""Who is let in: the handler of ZeroMQ's authentication protocol (ZAP, RFC 27) for CURVE keys."""
+"""The handler of ZeroMQ's authentication protocol (ZAP, RFC 27) for CURVE keys."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _ADDRESS = "inproc://zeromq.zap.01"
 class Authenticator:
     """Answers, in a thread of its own, whether the owner of a key may connect, and what the owner's name is.
 
-    The name then is the "User-Id" of each message that comes by the connection. Whoever is given a key while the
-    experiment runs is let in, too: when an unknown one knocks, the folder of keys is looked at if it has changed.
+    The name then is the "User-Id" of each message that comes by the connection. A key that is made while the experiment
+    runs is let in, too: when an unknown one comes, the folder of keys is read again if it has changed.
     """
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], keys: Keys) -> None:
@@ -45,7 +45,7 @@ class Authenticator:
         self._socket.close()
 
     def answer(self, request: Sequence[bytes]) -> list[bytes]:
-        """The reply to one request of the protocol: 200 and the name, or 400 and no name."""
+        """Return the reply to one request of the protocol: 200 and the name, or 400 and no name."""
         version, request_id, domain, _address, _identity, mechanism, *credentials = [*request, *[b""] * 7][:7]
         known = version == b"1.0" and domain == DOMAIN and mechanism == b"CURVE" and len(request) == 7
         name = self._name_of(credentials[0]) if known else None
@@ -55,11 +55,11 @@ class Authenticator:
 
     def _name_of(self, key: bytes) -> bytes | None:
         if key not in self._names:
-            self._look_again()
+            self._read_again()
         return self._names.get(key)
 
-    def _look_again(self) -> None:
-        """What was known stays as it was: no new file gives a key another name."""
+    def _read_again(self) -> None:
+        """Read the folder again. No new file gives a known key another name."""
         folder = self._keys.folder
         if folder is None:
             return
@@ -69,7 +69,7 @@ class Authenticator:
                 return
             found = {z85.decode(key): name.encode() for key, name in public_keys(folder, self._keys.name).items()}
         except (OSError, ConfigError, ValueError):
-            return  # one that is just being written: whoever knocks next has it looked at again
+            return  # one that is just being written: it is read again when the next peer connects
         self._names, self._read_ns = {**found, **self._names}, changed_ns
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Whole messages to and from sockets, without copying what is large."""
+"""Messages to and from sockets, each whole, without copying what is large."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Heartbeats: a thread in every process that says it is alive and for how long it has been busy, and who listens."""
+"""Heartbeats: a thread in every process says that it is alive and for how long it has been busy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from afspm.wire import BEAT, CLOSING
 
 
 class Heartbeat(NamedTuple):
-    """What one beat said.
+    """One beat.
 
     Attributes:
         name: of the process.
@@ -36,17 +36,17 @@ class Heartbeat(NamedTuple):
 class HeartbeatSender:
     """Beats from a thread of its own, so that a process that is busy is not taken for dead.
 
-    The first beat goes out as soon as somebody listens.
+    The first beat goes out as soon as there is a listener.
 
     Args:
         address: the listener's.
         period_s: real seconds between beats.
         step_age_s: for how long the current step has been running; called in the thread.
         longest_step_s: how long a step may take; called in the thread.
-        token: of the launch line, by which the listener knows that it is we who beat.
+        token: of the launch line, by which the listener knows that the beat is ours.
 
     Attributes:
-        heard: set as soon as somebody listens: what is beaten from then on arrives.
+        heard: set as soon as there is a listener: beats from then on arrive.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class HeartbeatSender:
 
 @dataclass
 class _Expected:
-    """Whose beats come at one address, and what they have to show."""
+    """The process that beats at one address, and the token that proves it."""
 
     name: str
     token: bytes
@@ -127,7 +127,7 @@ class HeartbeatListener:
     def listen(
         self, name: str, address: str = "tcp://127.0.0.1:0", *, token: str = "", needs_token: bool = False
     ) -> str:
-        """Begin to listen to the process `name`; returns the address to give to it.
+        """Begin to listen to the process `name`, and return the address to give to it.
 
         Args:
             token: to be given to it, too.
@@ -141,7 +141,7 @@ class HeartbeatListener:
         return bound
 
     def poll(self, timeout_s: float | None) -> list[Heartbeat]:
-        """The beats that have come; waits up to `timeout_s` real seconds (None: as long as it takes)."""
+        """Return the beats that have come; waits up to `timeout_s` real seconds (None: as long as it takes)."""
         found = []
         for ready, _ in self._poller.poll(milliseconds(timeout_s)):
             expected = None if isinstance(ready, int) else self._expected.get(ready)
@@ -165,7 +165,7 @@ def _is_by(expected: _Expected, frames: list[bytes]) -> bool:
 
 
 def read_beat(name: str, frames: list[bytes]) -> Heartbeat | None:
-    """A beat of ours or of version 1 (one frame); None if it is neither."""
+    """Return a beat of ours or of version 1 (one frame); None if it is neither."""
     if not frames or frames[0] not in (BEAT, CLOSING):
         return None
     ages = [_seconds(frame) for frame in frames[1:3]]

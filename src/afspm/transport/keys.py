@@ -24,7 +24,7 @@ from afspm.errors import ConfigError
 from afspm.model import component_of
 
 GUEST = "guest"
-"""Whose key notebooks and commands of the terminal have, where keys are made for a run; it is good for other names."""
+"""The owner of the key that notebooks and terminal commands use where keys are made for a run; good for other names."""
 MARK = b"\0"
 """Between a name and what nobody else knows of its owner's identity."""
 _NAME = re.compile(r"[A-Za-z0-9_. +-]{1,100}")
@@ -33,7 +33,7 @@ _ENTRY = re.compile(r'^\s*(public-key|secret-key)\s*=\s*"([^"]{40})"\s*$', re.MU
 
 @dataclass(frozen=True)
 class Keys:
-    """What a process needs to prove who it is and to know the others.
+    """A process's proof of who it is, and the keys of the others.
 
     Attributes:
         name: whose keys these are.
@@ -56,7 +56,7 @@ class Keys:
     guards: bool = True
 
     def server_key(self, address: str) -> bytes | None:
-        """The public key that whoever binds `address` must have; None: the connection is plain."""
+        """Return the public key that the owner of `address` must have; None: the connection is plain."""
         name = self.servers.get(address)
         if name is None and not self.everywhere:
             return None
@@ -77,9 +77,9 @@ class Keys:
         return self.everywhere or (requests and self.guards)
 
     def routing_id(self, name: str) -> bytes:
-        """The identity of a socket that asks in a name: the same in every life, and known to nobody else.
+        """Return the identity of a socket that asks in a name: the same in every life, and secret.
 
-        By a bare name anybody who is let in could take the answers of another.
+        By a bare name every peer that is let in could take the answers of another.
         """
         mark = hmac.digest(self.secret, name.encode(), "sha256").hex()[:16]
         return name.encode() + MARK + mark.encode()
@@ -90,7 +90,7 @@ class Keys:
         return component if user == GUEST and component not in self.peers.values() else user
 
     def as_launch(self) -> dict[str, Any]:
-        """As it is handed over in a launch line, see `from_launch`."""
+        """Return the entries of a launch line, see `from_launch`."""
         return {
             "name": self.name,
             "public": self.public.decode(),
@@ -104,7 +104,7 @@ class Keys:
 
 
 def load(folder: str | Path, name: str, servers: Mapping[str, str] | None = None) -> Keys:
-    """The keys of the component `name` out of the folder that `generate` made.
+    """Return the keys of the component `name` out of the folder that `generate` made.
 
     Raises:
         ConfigError: no such folder or key, a file that is no certificate, or a secret that others may read.
@@ -138,15 +138,15 @@ def require_private(file: Path) -> None:
 
 
 def public_keys(folder: Path, name: str) -> dict[bytes, str]:
-    """The public keys in a folder, with the names of their owners; read for `name`. Raises ConfigError, as `load`."""
+    """Return the public keys in a folder, with the names of their owners; read for `name`. Raises ConfigError."""
     files = sorted(folder.glob("*.key"))
     return {_read(file, name)["public-key"]: file.name.removesuffix(".key") for file in files}
 
 
 def from_launch(name: str, entries: Mapping[str, Any] | None) -> Keys | None:
-    """The keys that a launch line hands over (`Keys.as_launch`), or speaks of, for those who join.
+    """Return the keys that a launch line hands over (`Keys.as_launch`), or names, for programs that join.
 
-    Whoever acts for a person ("dashboard:Ada") does so with the key of the component.
+    A component that acts for a person ("dashboard:Ada") does so with its own key.
 
     Args:
         entries: what `as_launch` returns; or `{"folder": …, "<address>": "<name of who binds it>", …}`.
@@ -172,7 +172,7 @@ def from_launch(name: str, entries: Mapping[str, Any] | None) -> Keys | None:
 
 
 def pair() -> tuple[bytes, bytes]:
-    """A new pair, public and secret."""
+    """Return a new pair, public and secret."""
     return zmq.curve_keypair()
 
 

@@ -49,7 +49,7 @@ class WakeUp(Generic[T]):
             self._writer.send(b"\0")
 
     def take(self) -> list[T]:
-        """What was posted since the last call, oldest first. What comes meanwhile waits for the next."""
+        """Return the items posted since the last call, oldest first; later ones wait for the next call."""
         with contextlib.suppress(BlockingIOError, OSError):
             while len(self._reader.recv(4096)) == 4096:
                 pass

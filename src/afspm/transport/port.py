@@ -1,4 +1,4 @@
-"""What a component sees of the network: packets come in, requests and packets go out.
+"""A component's access to the network: packets come in, requests and packets go out.
 
 No socket library is named here, so that the in-memory network of `afspm.testing` can stand in for the
 real one.
@@ -49,7 +49,7 @@ class Killed:
 
 @dataclass(frozen=True, slots=True)
 class ParentGone:
-    """Whoever started this process has gone or wants it to stop: close."""
+    """The parent process has gone or wants this one to stop: close."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class Port(Protocol):
         """
 
     def poll(self, timeout_s: float | None) -> list[Incoming]:
-        """All that has arrived, in order; waits up to `timeout_s` real seconds (None: as long as it takes).
+        """Return all that has arrived, in order; waits up to `timeout_s` real seconds (None: as long as it takes).
 
         Returns early after `wake_up`.
         """
@@ -140,7 +140,7 @@ class ServerPort(Protocol):
         """The clock of the experiment."""
 
     def poll(self, timeout_s: float | None) -> list[Served]:
-        """What has arrived, in order: at most one request, which `reply` has to answer before another comes.
+        """Return what has arrived, in order: at most one request, which `reply` has to answer before another comes.
 
         Waits up to `timeout_s` real seconds (None: as long as it takes); returns early after `wake_up`.
         """
@@ -152,7 +152,7 @@ class ServerPort(Protocol):
         """
 
     def is_connected(self, connection: bytes) -> bool:
-        """Whether the connection of a scheduler that told its epoch is still there."""
+        """Return whether the connection of a scheduler that told its epoch is still there."""
 
     def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:
         """Publish; the time is the experiment's, made strictly increasing.

@@ -1,4 +1,4 @@
-"""What a publisher keeps for those who join later, and how a subscriber asks to be sent it alone.
+"""The packets that a publisher keeps for late joiners, and the marker by which a subscriber asks for them.
 
 A subscriber of ours subscribes to a marker, a topic of its own that also says what it wants:
 
@@ -34,7 +34,7 @@ FIRST_BYTES = tuple(bytes([n]) for n in (*range(0x20, 0x7F), *range(0xC2, 0xF5))
 
 
 class Marker(NamedTuple):
-    """What a subscriber asks for.
+    """A subscriber's request for a replay.
 
     Attributes:
         topic: what its replay is published under.

@@ -204,7 +204,7 @@ class Router:
 
 
 def _name(identity: bytes) -> str:
-    """What a peer calls itself; the socket gives others an identity that begins with a zero byte."""
+    """The peer's own name; the socket gives peers without one an identity that begins with a zero byte."""
     if identity.startswith(b"\0"):
         return ""
     try:

@@ -47,8 +47,8 @@ class TcpInfo(NamedTuple):
 
 
 @dataclass(slots=True)
-class Backlog:
-    """What waits of one connection: `taken` of the received bytes are accounted for, and so is `sent` at `acked`."""
+class ConnectionBacklog:
+    """The bytes that wait on one connection: `taken` of the received ones are accounted for, and `sent` at `acked`."""
 
     now_s: float
     taken: float = 0.0
@@ -93,7 +93,7 @@ class TcpGuard:
     def __init__(self, most_unread: int = MOST_UNREAD_BYTES, most_unsent: int = MOST_UNSENT_BYTES) -> None:
         self._most_unread, self._most_unsent = most_unread, most_unsent
         self._port = 0
-        self._backlogs: dict[int, Backlog] = {}
+        self._backlogs: dict[int, ConnectionBacklog] = {}
         self._replayed: dict[int, int] = {}
         self._heard: set[int] = set()
         self._settled: set[int] = set()
@@ -111,7 +111,7 @@ class TcpGuard:
     def opened(self, descriptor: int) -> None:
         """A peer has connected."""
         with self._lock:
-            backlog = self._backlogs[descriptor] = Backlog(time.monotonic())
+            backlog = self._backlogs[descriptor] = ConnectionBacklog(time.monotonic())
             self._replayed[descriptor] = 0
             if (info := tcp_info(descriptor)) is not None:
                 backlog.acked, backlog.sent = info.acked, self._published
@@ -122,7 +122,7 @@ class TcpGuard:
             self._backlogs.pop(descriptor, None)
 
     def heard(self, descriptor: int) -> None:
-        """Whole messages were taken of a connection."""
+        """Note that whole messages were taken of a connection."""
         self._heard.add(descriptor)
 
     def settle(self) -> None:
@@ -162,7 +162,7 @@ class TcpGuard:
                 if info is not None and (why := self._excess(descriptor, backlog, info, now_s, descriptor in settled)):
                     _disconnect(descriptor, self._port, why)
 
-    def _excess(self, descriptor: int, backlog: Backlog, info: TcpInfo, now_s: float, settled: bool) -> str:
+    def _excess(self, descriptor: int, backlog: ConnectionBacklog, info: TcpInfo, now_s: float, settled: bool) -> str:
         unread = backlog.unread(info.received, now_s, settled=settled and self._most_unread > MOST_SUBSCRIBED_BYTES)
         if unread > self._most_unread or backlog.is_unfinished():
             return f"{unread >> 10} kB of what it sent are unread or unfinished"

@@ -97,7 +97,7 @@ class TranslatorLink:
 
 
 def _parted(frames: list[bytes]) -> tuple[list[bytes], list[bytes]]:
-    """What stands before the first empty frame, and behind it; both are empty where there is none."""
+    """The frames before the first empty one, and those behind it; both are empty where there is none."""
     if b"" not in frames[1:]:
         return [], []
     at = frames.index(b"", 1)

@@ -24,7 +24,7 @@ _VALUES_OF_DATA = 5
 
 
 def encode(thing: Any) -> tuple[str, bytes]:
-    """A model object, or any message, as (name of the message, bytes).
+    """Return a model object, or any message, as (name of the message, bytes).
 
     Raises:
         InvalidValue: it is neither.
@@ -38,7 +38,7 @@ def encode(thing: Any) -> tuple[str, bytes]:
 
 
 def decode(name: str, payload: Buffer) -> Any:
-    """The message `name` as a model object, where there is one for it, else as the generated message itself.
+    """Return the message `name` as a model object, where there is one for it, else as the generated message itself.
 
     A scan's values are a view of `payload`.
 
@@ -53,7 +53,7 @@ def decode(name: str, payload: Buffer) -> Any:
 
 
 def header(name: str, payload: Buffer) -> model.PacketHeader:
-    """What the envelope of a message may depend on; its values are not touched.
+    """Return the facts that the envelope of a message may depend on; its values are not touched.
 
     Raises:
         WireError: the bytes are no such message.
@@ -189,7 +189,7 @@ def _decode_spectrum(payload: Buffer) -> model.Spectrum:
 
 
 def by_point(payload: Buffer) -> bytes:
-    """A Spec1d whose values came variable after variable, with its values point by point, as they should be.
+    """Return a Spec1d whose values came variable after variable with its values point by point.
 
     Raises:
         WireError: the bytes are no Spec1d.

@@ -36,7 +36,7 @@ def spatial_to_wire(region: model.Region | model.RegionChange) -> scan_pb2.Spati
 
 
 def spatial_from_wire(spatial: scan_pb2.SpatialAspects) -> model.RegionChange | None:
-    """What the message says of the region, in SI; None if nothing.
+    """Return the region of a message, as far as it is given, in SI; None if nothing is.
 
     Raises:
         UnitError: a unit that is none of length or angle.
@@ -59,7 +59,7 @@ def spatial_from_wire(spatial: scan_pb2.SpatialAspects) -> model.RegionChange | 
 
 
 def whole_region(change: model.RegionChange | None) -> model.Region | None:
-    """The region, if the message gives all of it; an angle that is not given is zero.
+    """Return the region, if the message gives all of it; an angle that is not given is zero.
 
     Raises:
         InvalidValue: it is none.
@@ -132,7 +132,7 @@ def position_from_wire(message: spectroscopy_pb2.ProbePosition) -> model.ProbePo
 def position_change_from_wire(
     message: spectroscopy_pb2.ProbePosition,
 ) -> model.ProbePosition | model.PositionChange:
-    """What a request says of the position: a PositionChange where that is only x or only y.
+    """Return the position of a request: a PositionChange where it gives only x or only y.
 
     Raises:
         InvalidValue: it says neither, or a coordinate is not finite.

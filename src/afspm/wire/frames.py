@@ -38,7 +38,7 @@ def encode_time(time_ns: int) -> bytes:
 
 
 def decode_time(frame: Buffer) -> int:
-    """The time in the third frame of a packet, ns since the Unix epoch.
+    """Return the time in the third frame of a packet, ns since the Unix epoch.
 
     Raises:
         WireError: it is none.
@@ -58,7 +58,7 @@ def encode_packet(packet: Packet) -> list[Buffer]:
 
 
 def decode_packet(frames: Sequence[Buffer]) -> Packet:
-    """A packet of two or three frames; its message is not looked into.
+    """Return a packet of two or three frames; its message is not decoded.
 
     Raises:
         WireError: it is none.
@@ -82,7 +82,7 @@ def encode_request(request: Request) -> list[bytes]:
 
 
 def encode_subject(subject: Any) -> bytes:
-    """What a request is about, in bytes: one byte for a number, an ActionMsg for text, else the model object's."""
+    """Return a request's subject in bytes: one byte for a number, an ActionMsg for text, else the model object's."""
     if subject is None:
         return b""
     if isinstance(subject, int):
@@ -100,7 +100,7 @@ _action_message = lru_cache(256)(_new_action_message)
 
 
 def decode_request(frames: Sequence[Buffer]) -> Request:
-    """A request of one to three frames.
+    """Return a request of one to three frames.
 
     Raises:
         WireError: it is none, with the `response` to answer: REP_CMD_NOT_SUPPORTED for a number that is unknown,
@@ -142,7 +142,7 @@ def encode_response(response: Response) -> list[bytes]:
 
 
 def encode_answer(response: Response, asked: int) -> list[bytes]:
-    """A response as its peer reads it: who asked without an id is of version 1.
+    """Return a response as its peer reads it: one that asked without an id is of version 1.
 
     Args:
         asked: the number of the request that is answered.
@@ -152,7 +152,7 @@ def encode_answer(response: Response, asked: int) -> list[bytes]:
 
 
 def decode_response(frames: Sequence[Buffer]) -> Response:
-    """A response of one to five frames; what a newer peer appends is not looked at.
+    """Return a response of one to five frames; frames that a newer peer appends are ignored.
 
     Raises:
         WireError: it is none.
@@ -168,7 +168,7 @@ def decode_response(frames: Sequence[Buffer]) -> Response:
 
 
 def decode_parameter(payload: Buffer) -> Parameter:
-    """The object of a successful REQ_PARAM: the value in force.
+    """Return the object of a successful REQ_PARAM: the value in force.
 
     Raises:
         WireError: it is none.

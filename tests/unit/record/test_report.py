@@ -15,7 +15,7 @@ import pytest
 from afspm import model, wire
 from afspm.errors import FileError
 from afspm.model import ControlMode, ControlState, ProcessCondition, ScopeState
-from afspm.record.report import REPORT_FILE, pictures, story, time_line, write
+from afspm.record.report import REPORT_FILE, page, pictures, story, write
 from afspm.record.run import open_run
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.record.timeline import Span
@@ -278,7 +278,7 @@ def test_what_can_not_be_told_apart_is_one_bar(run: Path) -> None:
     for k in range(20_000):  # in an hour: several for each pixel
         begin = night.start_ns + k * 180_000_000
         night.overview.states.spans.append(Span("scanning", begin, begin + 100_000_000))
-    assert time_line.draw(night).count("<span") < 1000
+    assert page._timeline(night).count("<span") < 1000
 
 
 def test_a_run_of_which_nothing_is_recorded_has_a_report(tmp_path: Path) -> None:

@@ -179,13 +179,15 @@ def test_a_scheduler_of_version_1_that_passes_the_question_on_is_not_taken_for_o
 ) -> None:
     server = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=None))
     ours, theirs = plain(zmq.DEALER), plain(zmq.REQ)
-    for socket, frames in ((ours, [b"", *QUESTION]), (theirs, [*QUESTION])):
+    for socket in (ours, theirs):
         socket.connect(server.serve_address)
-        socket.send_multipart(frames)
     asked: list[Any] = []
+    ours.send_multipart([b"", *QUESTION])
+    until(lambda: ours.poll(0), (server, asked))
+    assert ours.recv_multipart() == [b"", *ANSWER]
+    theirs.send_multipart([*QUESTION])
     until(lambda: asked, (server, asked))
     assert [one.frames for one in asked] == [[*QUESTION]]
-    assert ours.recv_multipart() == [b"", *ANSWER]
 
 
 def test_a_plain_sub_to_everything_does_not_see_the_replay_for_one_of_ours(open_: Any, plain: Any, until: Any) -> None:

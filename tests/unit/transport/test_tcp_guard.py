@@ -15,7 +15,7 @@ from afspm.transport import tcp_guard
 from afspm.transport.network import Network
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.router import PeerAsked, Router
-from afspm.transport.tcp_guard import MOST_UNREAD_BYTES, UNFINISHED_BYTES, UNFINISHED_S, Backlog, TcpInfo
+from afspm.transport.tcp_guard import MOST_UNREAD_BYTES, UNFINISHED_BYTES, UNFINISHED_S, ConnectionBacklog, TcpInfo
 from afspm.transport.zmq_server import ZmqServerPort
 
 ANY = "tcp://127.0.0.1:0"
@@ -23,20 +23,20 @@ CLOCK = ExperimentClock.real()
 
 
 def test_what_is_taken_waits_no_more_however_much_it_is() -> None:
-    peer = Backlog(0.0)
+    peer = ConnectionBacklog(0.0)
     for step in range(1, 100):
         assert peer.unread(step * MOST_UNREAD_BYTES, 0.1 * step, settled=True) == 0
 
 
 def test_what_is_not_taken_waits() -> None:
-    peer = Backlog(0.0)
+    peer = ConnectionBacklog(0.0)
     assert peer.unread(MOST_UNREAD_BYTES, 0.0, settled=True) == 0
     assert peer.unread(3 * MOST_UNREAD_BYTES, 0.0, settled=False) == 2 * MOST_UNREAD_BYTES
 
 
 @pytest.mark.parametrize(("received", "unfinished"), [(2 * UNFINISHED_BYTES, True), (UNFINISHED_BYTES // 2, False)])
 def test_a_message_that_is_large_has_to_be_finished_in_time(received: int, unfinished: bool) -> None:
-    peer = Backlog(0.0)
+    peer = ConnectionBacklog(0.0)
     peer.unread(received, 0.1, settled=False)
     peer.unread(received, UNFINISHED_S, settled=False)
     assert not peer.is_unfinished()
@@ -45,14 +45,14 @@ def test_a_message_that_is_large_has_to_be_finished_in_time(received: int, unfin
 
 
 def test_heartbeats_of_a_night_are_no_unfinished_message() -> None:
-    peer = Backlog(0.0)
+    peer = ConnectionBacklog(0.0)
     for second in range(2, 12 * 3600, 2):
         assert peer.unread(second * 20, float(second), settled=False) < 100
         assert not peer.is_unfinished()
 
 
 def test_what_a_subscriber_has_not_acknowledged_waits_for_it_until_all_has_arrived() -> None:
-    peer = Backlog(0.0)
+    peer = ConnectionBacklog(0.0)
     assert peer.unsent(TcpInfo(acked=100, received=0, all_arrived=True), sent=5000) == 0
     assert peer.unsent(TcpInfo(acked=1100, received=0, all_arrived=False), sent=9000) == 3000
     assert peer.unsent(TcpInfo(acked=4100, received=0, all_arrived=True), sent=9000) == 0

@@ -1,4 +1,4 @@
-"""Whether two scans do show the same place: an estimate is always found, also where there is none."""
+"""Acceptance of a match: an estimate is always found, also where the scans show different places."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class MatchEvidence:
 
 @dataclass(frozen=True)
 class AcceptanceLimits:
-    """What a match must reach. Set by what true and wrong pairs of the benchmark reach.
+    """The limits that a match must reach. Set by what true and wrong pairs of the benchmark reach.
 
     Attributes:
         overlap, overlap_expected: least part of the smaller scan; the latter where there is a prior.
@@ -98,7 +98,7 @@ class AcceptanceLimits:
         return cls(**table)
 
     def reason(self, found: MatchEvidence, *, expected: bool) -> str:
-        """Why a match is refused, in words; empty if it isn't."""
+        """Return why a match is refused, in words; empty if it is accepted."""
         overlap = self.overlap_expected if expected else self.overlap
         if found.correlation < self.correlation or found.information < self.information:
             return f"no common features (correlation {found.correlation:.2f}, {found.information:.0f} nats in common)"

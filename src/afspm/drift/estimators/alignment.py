@@ -1,4 +1,4 @@
-"""Gauss-Newton on the sum of squares of what is left of the difference of two images."""
+"""Alignment of two images by Gauss-Newton steps, its covariance, and its average over plausible shears."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SETTLED_PX = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Believed:
-    """What is known of theta before: its mean and inverse covariance, (8,) and (8, 8)."""
+    """The prior of theta: its mean and inverse covariance, (8,) and (8, 8)."""
 
     mean: Array
     precision: Array
@@ -105,8 +105,11 @@ def _round(pair: WarpedPair, theta: Array, believed: Believed, seen_through: Fin
 
 
 def _signal(gradient: Both, noise: Array, known: NDArray[np.bool_]) -> tuple[Both, Both, Both]:
-    """What of a gradient is signal, what of noise would come through with it, and that noise. Its rows are flattened
-    first: the step from one row to the next holds the offsets of both, and a patch can't tell them from a feature."""
+    """Return the signal of a gradient, what of noise would come through with it, and that noise.
+
+    Rows are flattened first: the step from one row to the next holds the offsets of both, and a patch can't tell them
+    from a feature.
+    """
     nx, ny = (without_lines(derivative(noise, axis), known) for axis in (1, 0))
     x, through_x = denoised(flatten_rows(gradient[0], known), nx)
     y, through_y = denoised(flatten_rows(gradient[1], known), ny)
@@ -181,7 +184,7 @@ def of_drift(sd: float) -> Array:
 
 
 def shear_models(drift: float | None, aspect: float) -> list[Array]:
-    """What the linear map of pixel coordinates may be: covariances of it.
+    """Return the models of shear: covariances of the linear map of pixel coordinates.
 
     Args:
         drift: displacement per length along y; None: not known, so all are tried.

@@ -140,7 +140,7 @@ def _deviations(shifts_px: Array, grid: CommonGrid, prior: Prior) -> Array:
 
 
 def _top(c: Array, at: tuple[np.intp, ...]) -> Array:
-    """How far (x, y) from a peak the top of the parabola through its neighbours is; at most half a pixel."""
+    """Return how far (x, y) from a peak the top of the parabola through its neighbours is; at most half a pixel."""
     offset = np.zeros(2)
     for axis, size in enumerate(c.shape):
         if not 0 < at[axis] < size - 1:
@@ -154,8 +154,8 @@ def _top(c: Array, at: tuple[np.intp, ...]) -> Array:
 
 
 def _covariance_px2(first: Image, found: _Peak) -> Array:
-    """What is not alike as noise against the slopes of the overlap (the Cramér-Rao bound for white noise, times the
-    area over which it was smoothed), and what no noise explains."""
+    """Return the covariance: what is not alike as noise against the slopes of the overlap (the Cramér-Rao bound for
+    white noise, times the area over which it was smoothed), and what no noise explains."""
     smooth = _smooth(first)
     down, right = np.gradient(smooth)
     slopes = np.stack([right, down])[:, first.known]

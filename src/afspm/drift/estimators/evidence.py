@@ -1,4 +1,4 @@
-"""Whether so many matches can agree by chance, and how sure they are of the displacement.
+"""The evidence of matched features: can so many agree by chance, and how sure are they of the displacement?
 
 Against chance their number counts; against a periodic surface that no other displacement has nearly as many; against
 one feature that happens to look alike that they lie in several places.
@@ -48,13 +48,13 @@ class ConsensusEvidence:
 
     @property
     def radius_m(self) -> float:
-        """How far a pair may lie from the transform and still agree with it."""
+        """The distance from the transform at which a pair still agrees with it."""
         return max(self.consensus.radius, _RADIUS_PX * self.pixel_m)
 
 
 @dataclass(frozen=True)
 class Standards:
-    """What is asked of the evidence; see `Features`."""
+    """The standards that evidence must meet; see `Features`."""
 
     false_alarms: float
     inlier_share: float
@@ -134,7 +134,7 @@ def _log10_false_alarms(evidence: ConsensusEvidence, reference: Region, prior: P
 
 
 def _second(evidence: ConsensusEvidence, standards: Standards) -> float:
-    """How many of the others agree on one other displacement, for each that agrees on the best."""
+    """Return how many of the others agree on one other displacement, for each that agrees on the best."""
     transform, radius_m = evidence.consensus.transform, evidence.radius_m
     far = ((transform(evidence.a) - evidence.b) ** 2).sum(axis=1) > (2.0 * radius_m) ** 2
     search = Search(FORMS["translation"], standards.iterations, 1.0, np.random.default_rng(standards.seed))
@@ -143,7 +143,7 @@ def _second(evidence: ConsensusEvidence, standards: Standards) -> float:
 
 
 def _places(points: Array, reach_m: float) -> int:
-    """How many squares of that size hold points (n, 2)."""
+    """Return the number of squares of that size that hold points (n, 2)."""
     return len(np.unique(np.floor(points / reach_m).astype(np.int64), axis=0))
 
 

@@ -30,7 +30,7 @@ GATE = 25.0  # squared standard deviations from what is expected, beyond which n
 
 @dataclass(frozen=True)
 class Features:
-    """What all estimators by features share; `Brief`, `Orb` and `Sift` are the kinds.
+    """The base of all estimators by features; `Brief`, `Orb` and `Sift` are the kinds.
 
     Attributes:
         transform: "translation", "euclidean", "similarity" or "affine".

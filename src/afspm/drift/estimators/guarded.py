@@ -41,7 +41,7 @@ def _copied(scan: DriftScan) -> DriftScan:
 
 
 def _wrong(found: object) -> str:
-    """What makes a result unusable; empty for nothing."""
+    """Return what makes a result unusable; empty for nothing."""
     if not isinstance(found, Registration):
         return f"its result is a {type(found).__name__} and no Registration"
     arrays = {
@@ -65,7 +65,7 @@ def _wrong(found: object) -> str:
 
 
 def _wrong_linear(seen: object) -> str:
-    """What makes a linear part with its covariance unusable; empty for nothing, and for None."""
+    """Return what makes a linear part with its covariance unusable; empty for nothing, and for None."""
     if seen is None:
         return ""
     if not isinstance(seen, LinearSeen):

@@ -1,4 +1,4 @@
-"""What is registered of a scan: its rows flattened, what was measured marked, and what holds nothing refused."""
+"""Images to register: scans with flattened rows on a common pixel grid; scans that hold nothing are refused."""
 
 from __future__ import annotations
 

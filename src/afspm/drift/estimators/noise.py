@@ -1,4 +1,4 @@
-"""Power spectra of images, and the filter that the fine alignment sees them through."""
+"""Noise of images: power spectra and the filter made of them, noise along rows, and shrinking of noisy gradients."""
 
 from __future__ import annotations
 
@@ -68,15 +68,18 @@ class FineFilter:
         return filtered
 
     def along_rows(self, frequency: Array) -> Array:
-        """What it makes of the power of noise that each row has by itself, at frequencies along the rows."""
+        """Return what the filter makes of the power of each row's own noise, at frequencies along the rows."""
         across = (np.arange(64) + 0.5) / 128
         power: Array = np.mean(self.at(np.hypot(frequency[:, None], across)) ** 2, axis=1)
         return power
 
 
 def independent_values(first: Array, second: Array) -> float:
-    """How many independent values each pixel brings to the correlation of two images: S(P1) S(P2) / S(P1 P2) / n, with
-    the sums S over all n frequencies of their power spectra (Bartlett, J. R. Stat. Soc. Suppl. 8, 27, 1946)."""
+    """Return how many independent values each pixel brings to the correlation of two images.
+
+    S(P1) S(P2) / S(P1 P2) / n, with the sums S over all n frequencies of their power spectra (Bartlett,
+    J. R. Stat. Soc. Suppl. 8, 27, 1946).
+    """
     from scipy.fft import fft2
 
     shape = tuple(np.maximum(first.shape, second.shape).tolist())
@@ -106,7 +109,14 @@ HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it th
 
 
 def seen(columns: Array, weight: Array, metric: Array | None) -> Array:
-    """Q f less what lines explain of it, so that the product with another image g is f'Qg free of both their lines.
+    """Return Q f less what lines explain of it: the product with another image g is f'Qg free of both their lines.
+
+    Generalised least squares row by row: each row has an offset and a tilt of its own, and noise with a memory. A row
+    is scanned in seconds and the next one begins anew (feedback, flattening, drift of the z piezo), so nothing is
+    assumed of the offset and tilt of a row, and the noise within it is white plus 1/f, with covariance C and Q =
+    C^-1. What is left of a row f after the nuisance B = [1, x] is fitted in this metric, f - B (B'QB)^-1 B'Q f,
+    carries all that the row tells (Frisch and Waugh, Econometrica 1, 387, 1933; Aitken, Proc. R. Soc. Edinb. 55, 42,
+    1936).
 
     Args:
         columns: [y, column, x].

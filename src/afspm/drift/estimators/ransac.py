@@ -157,7 +157,7 @@ class Search:
 
 
 def consensus(a: Array, b: Array, transform: Transform | None, radius: float) -> Consensus | None:
-    """Who agrees with a transform."""
+    """Return the pairs that agree with a transform."""
     if transform is None:
         return None
     return Consensus(transform, _squares(a, b, transform) <= radius**2, radius)
@@ -184,7 +184,7 @@ def tightened(
 
 
 def log10_false_alarms(pairs: int, inliers: int, sample: int, chance: float) -> float:
-    """How many consensuses as large are expected among pairs that have nothing in common, as a power of ten.
+    """Return how many consensuses as large are expected among pairs that have nothing in common, as a power of ten.
 
     A contrario (Moisan and Stival 2004): (n - s) C(n, k) C(k, s) p^(k - s).
 

@@ -1,4 +1,4 @@
-"""What is known before the scans are looked at, in pixels."""
+"""Search for the displacement: candidates by normalised cross-correlation, and the likeliest of them."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ class RunPart:
 
 @dataclass(frozen=True, eq=False)
 class DriftRun:
-    """What there is to draw of a run of n scans.
+    """The material for the figures of a run of n scans.
 
     Attributes:
         scans: in the order of time.
@@ -105,7 +105,6 @@ def _named(name: str, part: RunPart) -> str:
 
 
 def _left_over(run: DriftRun, part: RunPart) -> Array | None:
-    """What the displacements of a part truly were."""
     if run.truth_m is None:
         return None
     truth, centers = (array[part.start : part.stop] for array in (run.truth_m, run.record.center_m))

@@ -122,7 +122,7 @@ def _arrow(ax: Axes, pair: ScanPair) -> None:
 
 
 def draw_estimates(record: DriftRecord, *, title: str = "", truth_m: Array | None = None) -> Figure:
-    """How far the features lie from where they were in the first scan, against time.
+    """Draw how far the features lie from where they were in the first scan, against time.
 
     Args:
         record: of the pairs; `matched` says which were accepted.

@@ -1,4 +1,4 @@
-"""What the figures share: sizes, colours that everybody can tell apart, units on the axes."""
+"""The style of the figures: sizes, colours that everybody can tell apart, units on the axes."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def tracker(spec: str | Table[str, Any] = DEFAULT, estimator: Estimator | None =
 
 
 def forecast_from_dict(table: Table[str, Any]) -> Forecast:
-    """What `Forecast.to_dict` made, of any of our trackers.
+    """Return the forecast that `Forecast.to_dict` was asked of, of any of our trackers.
 
     Raises:
         InvalidValue: something else.

@@ -29,7 +29,7 @@ _LIKE = 1.2  # a second surprise may differ from the first by so much of it: a n
 
 @dataclass(eq=False)
 class BankState:
-    """What a tracker knows from scan to scan: all that is saved.
+    """The knowledge of a tracker from scan to scan: all that is saved.
 
     Attributes:
         filters: None before the first scan.
@@ -204,14 +204,14 @@ class BankTracker:
         return self._with_velocity(filters, found.time_s, velocity, found.by_shear_covariance)
 
     def _is_blind(self, newest: NewestScan) -> bool:
-        """Whether it is too uncertain where to look, against each of the scans that it can be compared with."""
+        """True if it is too uncertain where to look, against each of the scans that it can be compared with."""
         kept = self._references.kept
         comparable = self._references.candidates(newest.scan, *_drifts(newest.filters), anywhere=True)
         spreads = (newest.expected(number, kept[number])[1] for number in comparable)
         return min((np.linalg.eigvalsh(one)[-1] for one in spreads), default=0.0) > self._limit_m(newest.scan) ** 2
 
     def _tried(self, newest: NewestScan, *, anywhere: bool) -> dict[int, Registration]:
-        """What the estimator says of the scan and each reference, by its number, the best first."""
+        """Return what the estimator says of the scan and each reference, by its number, the best first."""
         kept, filters = self._references.kept, newest.filters
         widening = self._settings.widening * 4.0 ** min(self._state.unmatched, self._settings.lost_after)
         tried = {}
@@ -226,7 +226,7 @@ class BankTracker:
         return tried
 
     def _compared(self, newest: NewestScan, tried: Table[int, Registration]) -> Comparison | None:
-        """What was found, by the references that agree; those adrift count only where there is no other."""
+        """Return what was found, by the references that agree; those adrift count only where there is no other."""
         kept, inflation = self._references.kept, self._settings.inflation
         measured = [
             PairMeasurement.of(newest, number, kept[number], found, inflation)
@@ -237,7 +237,7 @@ class BankTracker:
         return Comparison(agreeing(firm or measured, newest.filters), newest.filters) if measured else None
 
     def _believed(self, newest: NewestScan, found: Comparison | None, *, anywhere: bool) -> Comparison | None:
-        """What is taken in of that: a surprise only where everything is possible, or after another one like it."""
+        """Return what is believed of that: a surprise only where everything is possible, or after another like it."""
         state = self._state
         before, state.doubted_m = state.doubted_m, None
         if found is None or found.surprise <= self._settings.doubt:
@@ -301,7 +301,7 @@ class BankTracker:
         return filters.widened(self._limit_m(scan), self._settings.start_velocity_sd_m_s, scans=adrift)
 
     def _proves(self, number: int) -> bool:
-        """Whether what is registered with a reference has a place by that."""
+        """True if what is registered with a reference has a place by that."""
         return not (self._state.proven and self._references.kept[number].adrift)
 
     def _vouch(self, newest: NewestScan, found: Table[int, Registration]) -> None:

@@ -34,7 +34,7 @@ class Models:
     walk_m2_s: float
 
     def over(self, step_s: float) -> tuple[Array, Array]:
-        """What a time does to a state (x, y, v_x, v_y): transition (n, 4, 4) and covariance gained (n, 4, 4).
+        """Return what a time does to a state (x, y, v_x, v_y): transition (n, 4, 4) and covariance gained (n, 4, 4).
 
         A negative time goes back in a straight line, and gains as much.
         """

@@ -1,4 +1,4 @@
-"""What a bank of filters knows, without the scans."""
+"""The forecast of a bank of filters: its knowledge, without the scans."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class BankForecast:
 
     @classmethod
     def of(cls, filters: Filters, compensation: Compensation, straight: Mapping | None = None) -> BankForecast:
-        """What these filters know."""
+        """Return the forecast of these filters."""
         likely = filters.weight >= _LEAST_WEIGHT
         models = filters.models
         return cls(

@@ -28,7 +28,7 @@ _ALIKE = 0.05  # by which part the courses of two scans may differ if drift is t
 
 @dataclass(frozen=True, eq=False)
 class ObservationModel:
-    """How d depends on the state.
+    """The observation model: how d depends on the state.
 
     Attributes:
         number: of the reference.
@@ -104,7 +104,7 @@ class NewestScan:
         return mean + link.offset_m, covariance + link.noise_m2
 
     def prior(self, number: int, reference: ReferenceScan, widening: float) -> Prior:
-        """What an estimator is told to expect: half a pixel wider, so that it looks around."""
+        """Return what an estimator is told to expect: half a pixel wider, so that it looks around."""
         mean, covariance = self.expected(number, reference)
         half_px_m = max(*self.scan.pixel_m, *reference.scan.pixel_m) / 2
         covariance = widening * covariance + np.eye(2) * half_px_m**2
@@ -117,7 +117,7 @@ class NewestScan:
 
 
 def _sheared_alike(first: DriftScan, second: DriftScan) -> bool:
-    """Whether the same drift shears both alike: rows in the same direction, at about the same pace."""
+    """True if the same drift shears both alike: rows in the same direction, at about the same pace."""
     one, other = delay_per_length_s_m(first), delay_per_length_s_m(second)
     if one is None or other is None:
         return False
@@ -127,7 +127,7 @@ def _sheared_alike(first: DriftScan, second: DriftScan) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class PairMeasurement:
-    """What an estimator found.
+    """The result of an estimator as a measurement.
 
     Attributes:
         pair_noise_m2, scan_noise_m2: (2, 2) what of its error is the pair's, and what the location error of the scan.

@@ -121,7 +121,7 @@ class PlacedScan:
 
 @dataclass(eq=False)
 class PaperState:
-    """What a tracker knows from scan to scan.
+    """The knowledge of a tracker from scan to scan.
 
     Attributes:
         forecast: with the newest scan.

@@ -1,4 +1,4 @@
-"""Which scans are kept to compare later ones with, and which of them one is compared with."""
+"""The scans that are kept to compare later ones with, and which of them one is compared with."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ReferenceScan:
 
 @dataclass(frozen=True)
 class Choice:
-    """How references are kept and chosen.
+    """The settings by which references are kept and chosen.
 
     Attributes:
         compared: at most so many references for each scan.
@@ -116,7 +116,7 @@ class ReferenceScans:
             self.kept[number] = replace(self.kept[number], adrift=False)
 
     def needs_anchor(self, scan: DriftScan, drift_m: Array, drifts_m: Array) -> bool:
-        """Whether no anchor stands for what a scan has seen."""
+        """True if no anchor stands for what a scan has seen."""
         return not any(
             kept.anchor
             and _alike(kept.scan, scan) >= 0.5

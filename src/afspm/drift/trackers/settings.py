@@ -1,4 +1,4 @@
-"""What the default tracker takes drift to be, and when it is content."""
+"""The settings of the default tracker."""
 
 from __future__ import annotations
 

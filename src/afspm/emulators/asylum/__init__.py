@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 from afspm.emulators.asylum import wire
-from afspm.emulators.asylum.controller import FAULT_KINDS, AsylumController
+from afspm.emulators.asylum.controller import FAULT_KINDS, AsylumController, AsylumSettings
 from afspm.emulators.asylum.functions import AsylumFunctions, DialogOpen
 from afspm.emulators.asylum.server import QueuedCall, XopServer
 from afspm.emulators.asylum.values import IgorValues
@@ -85,32 +85,18 @@ class AsylumEmulator(Emulator):
         super().__init__(**settings)
         if procedures not in PROCEDURES:
             raise ConfigError(f"{procedures!r}", where="procedures", hint=" or ".join(PROCEDURES))
-        self._idle_s = idle_s
-        self._start_s = start_s
-        self._file_s = file_s
-        self._save_path = save_path
-        self._base_name = base_name
-        self._procedures = procedures
-        self._has_status = has_status
-        self._image_open = image_open
-        self._saves_partial = saves_partial
+        self._settings = AsylumSettings(
+            idle_s, start_s, file_s, save_path, base_name, procedures, has_status, image_open, saves_partial
+        )
 
     def open(self) -> str:
         """Bind the XOP's socket."""
         self._server = XopServer(self.port, self.woken, self.log)
         # "C:Users:Me:"; where there are no drives it begins with a colon
-        path = self._save_path or f"{self.folder.drive.rstrip(':')}:{':'.join(self.folder.parts[1:])}:"
-        texts = {"SaveImage": path, "SaveForce": path, "BaseName": self._base_name}
-        self.controller = AsylumController(
-            self.rig,
-            self.faults,
-            IgorValues(texts),
-            self.folder,
-            start_s=self._start_s,
-            file_s=self._file_s,
-            saves_partial=self._saves_partial,
-            log=self.log,
-        )
+        path = self._settings.save_path or f"{self.folder.drive.rstrip(':')}:{':'.join(self.folder.parts[1:])}:"
+        texts = {"SaveImage": path, "SaveForce": path, "BaseName": self._settings.base_name}
+        values = IgorValues(texts)
+        self.controller = AsylumController(self.rig, self.faults, values, self.folder, self._settings, self.log)
         self._functions = self.functions()
         self._delayed: deque[DelayedMessage] = deque()
         self._idle_at_s = -math.inf
@@ -124,14 +110,7 @@ class AsylumEmulator(Emulator):
 
     def functions(self) -> dict[str, wire.IgorFunction]:
         """Return the functions that a client may call, by name in lower case."""
-        software = AsylumFunctions(
-            self.controller,
-            self.clock.now_s,
-            self._procedures,
-            has_status=self._has_status,
-            image_open=self._image_open,
-        )
-        return software.table()
+        return AsylumFunctions(self.controller, self.clock.now_s, self._settings).table()
 
     def serve(self, timeout_s: float) -> None:
         """Take requests, and do one of what was asked if Igor is idle."""
@@ -139,7 +118,7 @@ class AsylumEmulator(Emulator):
             timeout_s = min(timeout_s, max(0.0, self._idle_at_s - self.clock.monotonic_s()))
         self._server.poll(timeout_s, locked=self._locked())
         while self._server.queue and not self._busy() and self.clock.monotonic_s() >= self._idle_at_s:
-            self._idle_at_s = self.clock.monotonic_s() + self._idle_s
+            self._idle_at_s = self.clock.monotonic_s() + self._settings.idle_s
             self._carry_out(self._server.queue.popleft())
             self.controller.advance(self.clock.now_s())
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -41,14 +41,26 @@ _INTEGRAL_GAIN: Final = 150.0
 """What Asylum's gain of 1 is to the simulated feedback, in 1/s."""
 
 
+@dataclass(frozen=True)
+class AsylumSettings:
+    """The settings of the emulated software, as `AsylumEmulator` takes them."""
+
+    idle_s: float
+    start_s: float
+    file_s: float
+    save_path: str
+    base_name: str
+    procedures: str
+    has_status: bool
+    image_open: bool
+    saves_partial: bool
+
+
 class AsylumController:
     """The software.
 
     Args:
         folder: that files go to, whatever the texts call it.
-        start_s: how long the ramp to the first line takes.
-        file_s: how long after the end a file begins to appear; the other half of it comes as much later.
-        saves_partial: whether an image is saved that was broken off.
     """
 
     def __init__(
@@ -57,19 +69,14 @@ class AsylumController:
         faults: Faults,
         values: IgorValues,
         folder: Path,
-        *,
-        start_s: float,
-        file_s: float,
-        saves_partial: bool,
+        settings: AsylumSettings,
         log: logging.Logger,
     ) -> None:
         self.rig = rig
         self.faults = faults
         self.values = values
         self._folder = folder
-        self._start_s = start_s
-        self._file_s = file_s
-        self._saves_partial = saves_partial
+        self._settings = settings
         self._log = log
         self._disk = files.PendingWrites()
         self._starts_at_s = math.inf
@@ -138,7 +145,7 @@ class AsylumController:
         self.values.settle()
         self.rig.stop_spectrum()
         self.rig.engaged = True
-        self._starts_at_s = now_s + self._start_s
+        self._starts_at_s = now_s + self._settings.start_s
 
     def stop(self, now_s: float) -> None:
         """Stop everything, the feedback too, and withdraw the tip."""
@@ -224,7 +231,7 @@ class AsylumController:
         self._starts_at_s = math.inf
         self.values.put("ScanStatus", 0)
         scan = self.rig.scan
-        if running and self._saves_partial and scan is not None:
+        if running and self._settings.saves_partial and scan is not None:
             self._save("SaveImage", now_s, lambda name: files.image(name, scan, self.values, now_s))
 
     # --- force curves ---
@@ -294,8 +301,8 @@ class AsylumController:
         name = f"{self._base_name()}{suffix:04d}"
         late = faults.strikes("late-file", now_s)
         half = faults.strikes("half-file", now_s)
-        at_s = now_s + self._file_s + (late.duration_s if late else 0.0)
-        rest_at_s = at_s + self._file_s + (half.duration_s if half else 0.0)
+        at_s = now_s + self._settings.file_s + (late.duration_s if late else 0.0)
+        rest_at_s = at_s + self._settings.file_s + (half.duration_s if half else 0.0)
         self._disk.save(self._folder / f"{name}.ibw", made(name), at_s, rest_at_s)
         self.values.put("BaseSuffix", suffix + 1)
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from afspm.emulators.asylum.controller import AsylumController
+from afspm.emulators.asylum.controller import AsylumController, AsylumSettings
 from afspm.emulators.asylum.wire import CallFailed, IgorFunction
 
 ABORTED: Final = 107
@@ -23,28 +23,12 @@ class DialogOpen(Exception):
 
 
 class AsylumFunctions:
-    """Asylum's functions.
+    """Asylum's functions, and those of the procedures that the settings include."""
 
-    Args:
-        procedures: what is included besides: "afspm", "spots" (only what concerns spots and names) or "none".
-        has_status: whether there is ARGetStatus.
-        image_open: whether a window shows an image, on which spots are.
-    """
-
-    def __init__(
-        self,
-        controller: AsylumController,
-        now_s: Callable[[], float],
-        procedures: str,
-        *,
-        has_status: bool,
-        image_open: bool,
-    ) -> None:
+    def __init__(self, controller: AsylumController, now_s: Callable[[], float], settings: AsylumSettings) -> None:
         self._controller = controller
         self._now_s = now_s
-        self._procedures = procedures
-        self._has_status = has_status
-        self._image_open = image_open
+        self._settings = settings
 
     def table(self) -> dict[str, IgorFunction]:
         """Return the functions by name in lower case, since Igor ignores case."""
@@ -60,11 +44,11 @@ class AsylumFunctions:
             "SimpleEngageMe": IgorFunction(self._engage, "s"),
             "ARCheckSuffix": IgorFunction(self._check_suffix),
         }
-        if self._has_status:
+        if self._settings.has_status:
             table["ARGetStatus"] = IgorFunction(self._status)
-        if self._procedures != "none":
+        if self._settings.procedures != "none":
             table |= self._spots()
-        if self._procedures == "afspm":
+        if self._settings.procedures == "afspm":
             table |= self._afspm()
         return {name.lower(): function for name, function in table.items()}
 
@@ -107,7 +91,7 @@ class AsylumFunctions:
         return 0.0
 
     def _look(self, names: str) -> str:
-        status = self._status() if self._has_status else math.nan
+        status = self._status() if self._settings.has_status else math.nan
         found = [status, *(self._get(name) for name in names.split(";") if name)]
         return "".join(f"{value:.15g};" for value in found)
 
@@ -142,7 +126,7 @@ class AsylumFunctions:
         return 1.0
 
     def _go_to_spot(self) -> float:
-        if not self._image_open:
+        if not self._settings.image_open:
             raise DialogOpen("there is no image with spots", 0.0)
         self._controller.go_to_spot(self._now_s())
         return 0.0

@@ -83,12 +83,12 @@ class GxsmEmulator(Emulator):
         ):
             if value not in known:
                 raise ConfigError(f"{value!r}", where=name, hint=f"there are {', '.join(map(str, known))}")
-        self._version, self._card, self._transport = version, card, transport
+        self._settings = program.GxsmSettings(
+            version, card, user_unit, decimal_comma, auto_save, probe_auto_save, reach_m
+        )
+        self._transport = transport
         self._script = Path(script) if script else SCRIPT
         self._block_name, self._process = block or f"emulated_gxsm4_{os.urandom(8).hex()}", process
-        self._user_unit, self._decimal_comma = user_unit, decimal_comma
-        self._auto_save, self._probe_auto_save = auto_save, probe_auto_save
-        self._reach_m = reach_m
         self._feedback_actions = tuple(feedback_actions)
         self.unanswered: deque[ScriptCall] = deque()
         self.silent = False
@@ -98,21 +98,10 @@ class GxsmEmulator(Emulator):
 
     def open(self) -> str:
         """Run the script in the console, or open the shared memory."""
-        files.prepare(self._version)
+        files.prepare(self._settings.version)
         self.silent = False
         self.unanswered.clear()
-        self.program = GxsmProgram(
-            self.rig,
-            self.faults,
-            self.clock,
-            self.folder,
-            version=self._version,
-            card=self._card,
-            user_unit=self._user_unit,
-            decimal_comma=self._decimal_comma,
-            reach_m=self._reach_m,
-        )
-        self.program.auto_save, self.program.probe_auto_save = self._auto_save, self._probe_auto_save
+        self.program = GxsmProgram(self.rig, self.faults, self.clock, self.folder, self._settings)
         self._calls = GxsmFunctions(self.program, self._feedback_actions)
         if self._transport == "shm":
             self._block = SharedMemoryBlock(

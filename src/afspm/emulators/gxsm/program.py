@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -50,13 +50,21 @@ _MIXERS: Final = {
 _COLUMNS: Final = {"Bias": "Bias-mon", "Z": "Z-mon", "Current": "CurrentSim1"}
 
 
-class GxsmProgram:
-    """GXSM.
+@dataclass(frozen=True)
+class GxsmSettings:
+    """The settings of the emulated program, as `GxsmEmulator` takes them."""
 
-    Args:
-        version: 3 or 4.
-        card: of `CARDS`: what the hardware is.
-        reach_m: of the scanner, from its centre.
+    version: int
+    card: str
+    user_unit: str
+    decimal_comma: bool
+    auto_save: bool
+    probe_auto_save: bool
+    reach_m: float
+
+
+class GxsmProgram:
+    """The program.
 
     Attributes:
         auto_save: of scans; probe_auto_save of spectra.
@@ -66,26 +74,16 @@ class GxsmProgram:
         repeats: a scan is followed by the next.
     """
 
-    def __init__(
-        self,
-        rig: Rig,
-        faults: Faults,
-        clock: Clock,
-        folder: Path,
-        *,
-        version: int,
-        card: str,
-        user_unit: str,
-        decimal_comma: bool,
-        reach_m: float,
-    ) -> None:
+    def __init__(self, rig: Rig, faults: Faults, clock: Clock, folder: Path, settings: GxsmSettings) -> None:
         self.rig, self.faults, self.clock, self.folder = rig, faults, clock, folder
-        self.version, self.card = version, card
+        self.version, self.card = version, card = settings.version, settings.card
         self.dialogs: list[str] = []
         self.behind_s = 0.0
         self.repeats = False
-        self.entries = GxsmEntries(version, user_unit, decimal_comma=decimal_comma, dialogs=self.dialogs.append)
-        self.auto_save, self.probe_auto_save = True, True
+        self.entries = GxsmEntries(
+            version, settings.user_unit, decimal_comma=settings.decimal_comma, dialogs=self.dialogs.append
+        )
+        self.auto_save, self.probe_auto_save = settings.auto_save, settings.probe_auto_save
         known = SIMULATED_3 if (version, card) == (3, "simulator") else CHANNELS[version]
         self.channels: list[GxsmChannel] = [one for one in known if one.source in rig.channels]
         self.saving = GxsmFileWriter(folder, faults)
@@ -99,7 +97,7 @@ class GxsmProgram:
         self._memory: dict[GxsmChannel, np.ndarray] = {}
         self._own: list[Path] = []
         self._curves = 0
-        for ref, entry in lengths(reach_m / ANGSTROM_M, self._told).items():
+        for ref, entry in lengths(settings.reach_m / ANGSTROM_M, self._told).items():
             self.entries.add(ref, entry)
         for ref, entry in self._of_hardware().items():
             self.entries.add(ref, entry)

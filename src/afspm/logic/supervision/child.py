@@ -119,7 +119,7 @@ class ChildWatch:
         return self._start(now_s)
 
     def beat(self, beat: HeartbeatReport, now_s: float) -> list[ChildEffect]:
-        """A heartbeat came."""
+        """Take in a heartbeat."""
         if self._liveness is None:
             return []
         if beat.closing:
@@ -129,12 +129,12 @@ class ChildWatch:
         return self.tick(now_s)
 
     def waits(self, now_s: float) -> None:
-        """It is there, and may not begin yet."""
+        """Count the time of its start from now: it is there, and may not begin yet."""
         if self._liveness is not None:
             self._liveness.waits(now_s)
 
     def exited(self, code: int, now_s: float, how: str = "") -> list[ChildEffect]:
-        """It ended, with an exit code or, below zero, by a signal; `how` says it for people."""
+        """Take in its end, by an exit code or, below zero, a signal; `how` says it for people."""
         how = how or f"exit code {code}"
         phase, self._liveness = self.phase, None
         if phase in (ChildPhase.STOPPING, ChildPhase.DONE):
@@ -149,7 +149,7 @@ class ChildWatch:
         return self._failed(now_s, how)
 
     def start_failed(self, why: str, now_s: float) -> list[ChildEffect]:
-        """There is no process: the command is missing, the computer has no memory left …"""
+        """Take in that there is no process: the command is missing, the computer has no memory left …"""
         self._liveness = None
         if self.phase is ChildPhase.STOPPING:
             self.phase = ChildPhase.DONE
@@ -157,7 +157,7 @@ class ChildWatch:
         return self._failed(now_s, f"could not be started: {why}")
 
     def restart(self, now_s: float) -> list[ChildEffect]:
-        """Somebody wants it to be started anew, whatever it does now. That is no failure: it costs no restart."""
+        """Start it anew by order, whatever it does now. That is no failure: it costs no restart."""
         if self.phase is ChildPhase.STOPPING:
             return []
         said = ChildLog("INFO", "is started anew, as ordered")
@@ -168,7 +168,7 @@ class ChildWatch:
         return [said, *self._start(now_s)]
 
     def stop(self, now_s: float) -> list[ChildEffect]:
-        """Its end is wanted, and the caller has asked it to. Nothing is restarted any more."""
+        """Restart it no more: its end is wanted, and the caller has asked it to."""
         if self.phase in (ChildPhase.RUNNING, ChildPhase.KILLING):
             self.phase = ChildPhase.STOPPING
         elif self.phase in (ChildPhase.IDLE, ChildPhase.WAITING):
@@ -176,7 +176,7 @@ class ChildWatch:
         return []
 
     def tick(self, now_s: float, *, works: bool | None = None) -> list[ChildEffect]:
-        """Time has passed.
+        """Take in that time has passed.
 
         Args:
             works: whether the process was seen to work lately, though it does not beat; None: that is not known.
@@ -194,7 +194,7 @@ class ChildWatch:
         return [ChildLog("WARNING", f"killed: {why}"), KillChild(why)]
 
     def deadline_s(self) -> float | None:
-        """When `tick` is due at the latest; None: it is not."""
+        """Return when `tick` is due at the latest; None: it is not."""
         if self.phase is ChildPhase.WAITING:
             return self._again_s
         if self.phase is ChildPhase.RUNNING and self._liveness is not None:

@@ -67,7 +67,7 @@ class Liveness:
         self._frozen = False
 
     def beat(self, now_s: float, step_age_s: float = 0.0, longest_step_s: float | None = None) -> None:
-        """A beat came, with for how long the current step has been running and how long one may.
+        """Take in a beat, with the age of the current step, and how long one may take.
 
         Also after it was said that it closes, which then was not so, or not said by it.
         """
@@ -78,12 +78,12 @@ class Liveness:
         self._deadline_s = now_s + self._policy.silence_s
 
     def waits(self, now_s: float) -> None:
-        """It may not begin yet: the time that its start may take counts from now."""
+        """Count the time that its start may take from now: it may not begin yet."""
         if self._vital is ProcessHealth.STARTING:
             self._deadline_s = now_s + self._policy.start_s
 
     def closing(self, now_s: float) -> None:
-        """It says that it is closing on purpose."""
+        """Take in that it is closing on purpose."""
         self._vital = ProcessHealth.NOT_CLOSING
         self._deadline_s = now_s + self._policy.closing_s
 
@@ -111,7 +111,7 @@ class Liveness:
         )
 
     def next_check_s(self) -> float:
-        """When to check at the latest."""
+        """Return when to check at the latest."""
         next_s = self._checked_s + self._policy.beat_period_s
         # a deadline that has passed was seen: it works on without beating
         is_due = not self._has_no_deadline and self._deadline_s > self._checked_s

@@ -35,7 +35,7 @@ class RestartBudget:
         self._row = 0
 
     def failed(self, now_s: float, lived_s: float) -> float | None:
-        """It crashed after `lived_s`. Returns how long to wait before it is started again; None: give it up."""
+        """Take in a crash after `lived_s`; return how long to wait before the next start. None: give it up."""
         policy = self._policy
         while self._times_s and now_s - self._times_s[0] >= policy.window_s:
             self._times_s.popleft()

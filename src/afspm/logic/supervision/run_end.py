@@ -74,7 +74,7 @@ class RunEnd:
         return cls(why, text, ask_s, ask_s + KILL_AFTER_S, latest_s=now_s + FAREWELL_S)
 
     def hurried(self, now_s: float) -> RunEnd:
-        """Somebody wants it to be over: those not asked yet are, those that were are killed."""
+        """Return the end in haste: those not asked yet are, those that were are killed."""
         if self.last in (EndStep.KILL, EndStep.LEAVE):
             return self
         if self.last is None and self.why is not EndReason.STOPPED:
@@ -82,7 +82,7 @@ class RunEnd:
         return replace(self, kill_s=now_s, last=EndStep.ASK, in_haste=True)
 
     def deadline_s(self) -> float | None:
-        """When `step` has something to do next; None: never again."""
+        """Return when `step` has something to do next; None: never again."""
         match self.last:
             case None:
                 return self.ask_s

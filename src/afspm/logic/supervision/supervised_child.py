@@ -50,7 +50,7 @@ class ChildLife:
         return self.beat is not None and self.beat.closing
 
     def overdue_s(self, liveness: LivenessPolicy) -> float | None:
-        """When its next beat is so late that the operating system is asked what it does; None: never."""
+        """Return when its next beat is so late that the operating system is asked what it does; None: never."""
         return None if self.beat is None or self.beat.closing else self.beat_s + liveness.silence_s / 2.0
 
     def is_overdue(self, now_s: float, liveness: LivenessPolicy) -> bool:

@@ -113,7 +113,7 @@ class SupervisorCore:
         return self.ending is None or self.children[name].rescued
 
     def deadline_s(self) -> float | None:
-        """When `TimePassed` is due at the latest; None: it is not."""
+        """Return when `TimePassed` is due at the latest; None: it is not."""
         if self.ending is not None:
             found = [self.ending.deadline_s()]
         else:

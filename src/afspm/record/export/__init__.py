@@ -2,6 +2,97 @@
 
 from __future__ import annotations
 
-from afspm.record.export.exporting import FORMATS, chosen, export
+import importlib.util
+import re
+from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
+from pathlib import Path
+
+from afspm.errors import FileError, InvalidValue
+from afspm.record.measured_files import write_synced
+from afspm.record.run import Run
+from afspm.record.tables import ScanRow, SpectrumRow
 
 __all__ = ["FORMATS", "chosen", "export"]
+
+FORMATS = {"gwy": "gwyddion", "nc": "netcdf", "png": "png", "csv": "tables"}
+"""By suffix, the module of this package; its `write(run, row)` yields the ends of names and contents of files."""
+
+Writer = Callable[[Run, ScanRow | SpectrumRow], Iterator[tuple[str, bytes]]]
+
+
+def export(
+    run: Run, to: str, folder: Path, scans: str | None = None, tell: Callable[[str], None] | None = None
+) -> Iterator[Path]:
+    """Write a run in another format, and yield each file as it is there.
+
+    Args:
+        to: one of `FORMATS`.
+        folder: made if it is not there.
+        scans: numbers of scans, as for `chosen`; None: all scans and spectra.
+        tell: is told what is left out, and why; None: a file of the record that is damaged is an error.
+
+    Raises:
+        InvalidValue: there is no such format, or no such scan.
+        FileError: a file can't be read or written, or what it needs is not installed.
+    """
+    if to not in FORMATS:
+        raise InvalidValue(f"there is no format {to!r}", hint=f"one of {', '.join(FORMATS)}")
+    wanted = list(run.scans) if scans is None else chosen(list(run.scans), scans)
+    for row in wanted:
+        if not row.file and tell is not None:
+            tell(f"scan {row.number} was interrupted before anything of it was seen")
+    spectra = list(run.spectra) if scans is None else []
+    wanted = [row for row in wanted if row.file]
+    if to == "png" and importlib.util.find_spec("matplotlib") is None:
+        raise FileError("pictures need matplotlib", hint='pip install "afspm[plot]"')
+    module = import_module(f"afspm.record.export.{FORMATS[to]}")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in module.tables(run, wanted, spectra) if to == "csv" else ():
+            yield _written(folder / name, content)
+        yield from _one_by_one(module.write, run, [*wanted, *spectra], folder, tell)
+    except OSError as error:
+        raise FileError(f"can't be written: {error}", where=str(folder)) from error
+
+
+def _one_by_one(
+    write: Writer, run: Run, rows: Sequence[ScanRow | SpectrumRow], folder: Path, tell: Callable[[str], None] | None
+) -> Iterator[Path]:
+    """A file that is damaged costs what is in it, and not all the others."""
+    for row in rows:
+        try:
+            for end, content in write(run, row):
+                yield _written(folder / f"{Path(row.file).stem}{end}", content)
+        except FileError as error:
+            if tell is None:
+                raise
+            tell(str(error))
+
+
+def _written(path: Path, content: bytes) -> Path:
+    write_synced(path, content)
+    return path
+
+
+def chosen(rows: list[ScanRow], numbers: str) -> list[ScanRow]:
+    """The scans that are meant by "3", "1-5,8" or "7-" (from 7 on).
+
+    Raises:
+        InvalidValue: that is no list of numbers, or one of them is none of a scan.
+    """
+    by_number = {row.number: row for row in rows}
+    last = max(by_number, default=0)
+    wanted: list[int] = []
+    for part in numbers.split(","):
+        match = re.fullmatch(r"\s*(\d+)\s*(-\s*(\d*))?\s*", part)
+        if match is None:
+            raise InvalidValue(f"{part!r} is no number of a scan", hint="e.g. 3, 1-5,8 or 7-")
+        first = int(match[1])
+        until = int(match[3] or last) if match[2] else first
+        if first not in by_number or until not in by_number or until < first:
+            raise InvalidValue(f"there is no scan {part.strip()}", hint=f"there are 1 to {last}")
+        wanted += range(first, until + 1)
+    if missing := [number for number in wanted if number not in by_number]:
+        raise InvalidValue(f"there is no scan {missing[0]}", hint=f"there are 1 to {last}")
+    return [by_number[number] for number in dict.fromkeys(wanted)]

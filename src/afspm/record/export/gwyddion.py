@@ -12,15 +12,12 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.model import Scan, Spectrum
-from afspm.record.export.file_names import stem
-from afspm.record.measured_files import write_synced
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 
@@ -29,18 +26,13 @@ Item = tuple[str, str, Any]
 """The name, the type (Gwyddion's letter) and the value of a component."""
 
 
-def write(run: Run, row: ScanRow | SpectrumRow, folder: Path) -> Iterator[Path]:
-    """A file for each scan and each spectrum."""
-    said, target = _said(run.about(row)), folder / f"{stem(row.file)}.gwy"
+def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
+    """Yield the file of a scan or spectrum, with the end of its name."""
+    meta = _meta(run.about(row))
     if isinstance(row, ScanRow):
-        yield _written(target, scan_file(list(run.scan(row).values()), said))
+        yield ".gwy", scan_file(list(run.scan(row).values()), meta)
     else:
-        yield _written(target, spectrum_file(run.spectrum(row), said))
-
-
-def _written(path: Path, data: bytes) -> Path:
-    write_synced(path, data)
-    return path
+        yield ".gwy", spectrum_file(run.spectrum(row), meta)
 
 
 def scan_file(scans: Sequence[Scan], meta: Mapping[str, str]) -> bytes:
@@ -140,7 +132,7 @@ def _typical(values: NDArray[np.float64]) -> float:
     return float(np.median(known)) if known.size else 0.0
 
 
-def _said(about: Mapping[str, Any]) -> dict[str, str]:
+def _meta(about: Mapping[str, Any]) -> dict[str, str]:
     """What is known of a measurement as Gwyddion shows it: names and texts."""
     said = {}
     for name, value in about.items():

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from afspm.files.netcdf import Attributes, Variable, encoded
 from afspm.model import ScanSet, Spectrum
-from afspm.record.export.file_names import stem
-from afspm.record.measured_files import write_synced
 from afspm.record.nexus import field_names
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
@@ -21,18 +18,13 @@ _RENAMED = {"mode": "control_mode", "filename": "controller_file"}
 """scipy's reader, which xarray uses, has attributes of its own by these names."""
 
 
-def write(run: Run, row: ScanRow | SpectrumRow, folder: Path) -> Iterator[Path]:
-    """A file for each scan and each spectrum."""
-    about, target = run.about(row), folder / f"{stem(row.file)}.nc"
+def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
+    """Yield the file of a scan or spectrum, with the end of its name."""
+    about = run.about(row)
     if isinstance(row, ScanRow):
-        yield _written(target, scan_file(run.scan(row), about))
+        yield ".nc", scan_file(run.scan(row), about)
     else:
-        yield _written(target, spectrum_file(run.spectrum(row), about))
-
-
-def _written(path: Path, data: bytes) -> Path:
-    write_synced(path, data)
-    return path
+        yield ".nc", spectrum_file(run.spectrum(row), about)
 
 
 def scan_file(scans: ScanSet, about: Mapping[str, Any]) -> bytes:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import math
+import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +13,6 @@ import numpy as np
 from afspm.clock import iso_utc
 from afspm.formatting import scale
 from afspm.model import Scan, Spectrum
-from afspm.record.export.file_names import plain, stem
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 
@@ -22,16 +22,17 @@ if TYPE_CHECKING:
 _DPI = 150
 
 
-def write(run: Run, row: ScanRow | SpectrumRow, folder: Path) -> Iterator[Path]:
-    """A picture for each channel of a scan, or for a spectrum. Needs matplotlib."""
+def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
+    """Yield a picture for each channel of a scan, or of a spectrum, with the end of its name. Needs matplotlib."""
     time = f"{iso_utc(row.time_ns)[:19].replace('T', ' ')} UTC"
     if isinstance(row, ScanRow):
         for channel, scan in run.scan(row).items():
             title = _title(run, f"{channel}, {time}", row.interrupted)
-            yield _saved(scan_figure(scan, title), folder / f"{stem(row.file)}_{plain(channel)}.png")
+            plain = re.sub(r"[^\w.-]+", "_", channel).strip("_") or "channel"
+            yield f"_{plain}.png", _image(scan_figure(scan, title))
     else:
         title = _title(run, f"{row.kind}, {time}", interrupted=False)
-        yield _saved(spectrum_figure(run.spectrum(row), title), folder / f"{stem(row.file)}.png")
+        yield ".png", _image(spectrum_figure(run.spectrum(row), title))
 
 
 def scan_figure(scan: Scan, title: str) -> Figure:
@@ -75,9 +76,10 @@ def spectrum_figure(spectrum: Spectrum, title: str) -> Figure:
     return figure
 
 
-def _saved(figure: Figure, path: Path) -> Path:
-    figure.savefig(path, dpi=_DPI)
-    return path
+def _image(figure: Figure) -> bytes:
+    image = io.BytesIO()
+    figure.savefig(image, dpi=_DPI, format="png")
+    return image.getvalue()
 
 
 def _title(run: Run, text: str, interrupted: bool) -> str:

@@ -5,27 +5,24 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from typing import Any
 
 from afspm.clock import iso_utc
-from afspm.record.export.file_names import stem
-from afspm.record.measured_files import write_synced
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow, Table
 
 
-def write(run: Run, row: ScanRow | SpectrumRow, folder: Path) -> Iterator[Path]:
-    """A file for each spectrum."""
+def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
+    """Yield the curves of a spectrum, with the end of the file's name."""
     if isinstance(row, SpectrumRow):
         spectrum = run.spectrum(row)
         header = [f"{name} [{unit}]" for name, unit in zip(spectrum.names, spectrum.units, strict=True)]
-        yield _written(folder / f"{stem(row.file)}.csv", header, spectrum.values.tolist())
+        yield ".csv", _csv(header, spectrum.values.tolist())
 
 
-def write_tables(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow], folder: Path) -> Iterator[Path]:
-    """A table of each kind."""
-    tables: dict[str, Table[Any]] = {
+def tables(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow]) -> Iterator[tuple[str, bytes]]:
+    """Yield a table of each kind, with the name of its file."""
+    by_name: dict[str, Table[Any]] = {
         "scans": Table(scans, ScanRow),
         "spectra": Table(spectra, SpectrumRow),
         "journal": run.journal,
@@ -36,14 +33,10 @@ def write_tables(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow], fol
         "drift": run.drift,
         "log": run.log,
     }
-    for name, table in tables.items():
+    for name, table in by_name.items():
         columns = table.columns()
         rows = zip(*(_told(column, values) for column, values in columns.items()), strict=True)
-        yield _written(folder / f"{name}.csv", [_named(column) for column in columns], rows)
-
-
-def _named(column: str) -> str:
-    return column.removesuffix("_ns") if column.endswith("_ns") else column
+        yield f"{name}.csv", _csv([column.removesuffix("_ns") for column in columns], rows)
 
 
 def _told(column: str, values: list[Any]) -> list[Any]:
@@ -53,10 +46,9 @@ def _told(column: str, values: list[Any]) -> list[Any]:
     return ["" if value is None else value for value in values]
 
 
-def _written(path: Path, header: list[str], rows: Iterable[Iterable[Any]]) -> Path:
+def _csv(header: list[str], rows: Iterable[Iterable[Any]]) -> bytes:
     text = io.StringIO(newline="")
     writer = csv.writer(text)
     writer.writerow(header)
     writer.writerows(rows)
-    write_synced(path, text.getvalue().encode())
-    return path
+    return text.getvalue().encode()

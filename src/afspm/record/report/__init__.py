@@ -2,6 +2,36 @@
 
 from __future__ import annotations
 
-from afspm.record.report.writing import REPORT_FILE, write
+from pathlib import Path
+
+from afspm.errors import FileError
+from afspm.record.report import page, pictures, story
+from afspm.record.run import open_run
+from afspm.storage.atomic import replace_file
 
 __all__ = ["REPORT_FILE", "write"]
+
+REPORT_FILE = "report.html"
+
+
+def write(folder: str | Path) -> Path:
+    """Write `report.html` and the figures that are not there yet; returns the file.
+
+    Needs the extra `record`; the figures need `plot`.
+
+    Args:
+        folder: of a run, which may still go on; or of all runs: its newest is meant.
+
+    Raises:
+        FileError: there is no record, or the report can't be written.
+    """
+    with open_run(folder) as run:
+        told = story.read(run)
+        shown = pictures.smalls(run, told.scans)
+        target = run.folder / REPORT_FILE
+        try:
+            pictures.draw(run, told, shown)
+            replace_file(target, [page.html(told, shown, pictures.figures(run.folder)).encode()], synced=False)
+        except OSError as error:
+            raise FileError(f"can't be written: {error.strerror or error}", where=str(target)) from error
+    return target

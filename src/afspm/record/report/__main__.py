@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from afspm.errors import AfspmError
-from afspm.record.report.writing import write
+from afspm.record.report import write
 
 try:
     write(sys.argv[1])

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+from afspm.drawing.timeline import TimelineRow
 from afspm.model import JournalEntry, ProcessCondition, ScopeState, names
 from afspm.record.overview import Overview, ProcessRestart
 from afspm.record.run import Run
@@ -13,6 +14,7 @@ from afspm.record.run_lock import describe_state
 from afspm.record.tables import ScanRow
 from afspm.record.timeline import Span, Timeline
 
+COLOURS = 5  # of those in control, in turn: the classes c0 to c4 of the page
 MOST_ROWS = 200
 _PROCESS_TROUBLE = frozenset({ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.GIVEN_UP})
 
@@ -164,3 +166,36 @@ def in_trouble(lane: Timeline) -> list[Span]:
     """When a process was not well."""
     labels = {condition.name.lower().replace("_", " ") for condition in _PROCESS_TROUBLE}
     return [span for span in lane.spans if span.label in labels]
+
+
+def colours(story: RunStory) -> dict[str, str]:
+    """Return the class of each component that was in control."""
+    holders = dict.fromkeys(span.label for span in story.overview.controls.spans)
+    return {holder: f"c{number % COLOURS}" for number, holder in enumerate(holders)}
+
+
+def timeline_rows(story: RunStory) -> Iterator[TimelineRow]:
+    """Yield a row for each in control, mode, problem, state, and process that was not well."""
+    seen = story.overview
+    for holder, style in colours(story).items():
+        yield _row(holder, style, (span for span in seen.controls.spans if span.label == holder))
+    manual = [span for span in seen.modes.spans if span.label == "manual"]
+    if manual:
+        yield _row("MANUAL", "manual", manual)
+    for lane in seen.problem_timelines.values():
+        if lane.spans:
+            yield _row(lane.spans[0].label, "problem", lane.spans)
+    for label in dict.fromkeys(span.label for span in seen.states.spans):
+        if label not in ("free", "undefined"):
+            style = "problem" if label == "interrupted" else "state"
+            yield _row(states_in_words(label), style, (span for span in seen.states.spans if span.label == label))
+    for name, lane in seen.process_timelines.items():
+        if trouble := in_trouble(lane):
+            yield _row(f"{name} not well", "problem", trouble)
+    again = [Span(f"{one.name} started again: {one.last_exit}", one.time_ns, one.time_ns) for one in story.restarts]
+    if again:
+        yield _row("restarts", "problem", again)
+
+
+def _row(name: str, style: str, spans: Iterable[Span]) -> TimelineRow:
+    return TimelineRow(name, spans, lambda _: style)

@@ -1,3 +1,3 @@
-"""What makes a scheduler drift compensated: a frame, a gate for scans, and a worker that registers them."""
+"""Drift compensation for a scheduler: a coordinate frame, a gate for scans, and a worker that registers them."""
 
 from __future__ import annotations

@@ -9,7 +9,6 @@ from typing import Any
 
 from afspm.drift.mapping import Mapping
 from afspm.errors import AfspmError
-from afspm.logic.arbitration import ArbitrationState
 from afspm.logic.events import (
     Announced,
     Effect,
@@ -27,7 +26,6 @@ from afspm.logic.settings import SchedulerSettings
 from afspm.logic.state import SavedState
 from afspm.model import (
     ControlRequest,
-    ControlState,
     Frame,
     LoggedPacket,
     Packet,
@@ -55,7 +53,7 @@ from afspm.scheduler.drift.messages import (
 from afspm.scheduler.drift.positions import is_same
 from afspm.scheduler.drift.response import DriftResponse, Step
 from afspm.scheduler.drift.scan_gate import HeldScan, Matrix, ScanGate
-from afspm.scheduler.drift.scan_start import ScanStartTracker
+from afspm.scheduler.drift.scan_timing import ScanStartTracker
 from afspm.scheduler.drift.settings import DriftCompensationSettings
 from afspm.units import same_kind
 
@@ -67,8 +65,8 @@ _MOST_ENDS = 4
 """After so many ends in a row, without a scan registered between them, it is not started again."""
 
 
-class DriftCore:
-    """Has the same steps as a `SchedulerCore`, which does all that is not about drift.
+class DriftCore(SchedulerCore):
+    """A `SchedulerCore` that follows drift.
 
     Scans are held back until the worker has registered them; then everything that came after them follows. What the
     worker says is an input, too: `said`.
@@ -88,11 +86,11 @@ class DriftCore:
         self.knowledge = CurrentForecast(drift)
         self.frame = DriftFrame(codec, self.knowledge.mapping_at)
         self.frame.beside = self._kept
-        self.core = SchedulerCore(settings, codec, self.frame)
+        super().__init__(settings, codec, self.frame)
         self._settings = drift
         self._codec = codec
         self._worker = worker
-        self._consequences = DriftResponse(drift, self.core, codec, self.frame, self.knowledge, worker, name)
+        self._consequences = DriftResponse(drift, self, codec, self.frame, self.knowledge, worker, name)
         self._gate = ScanGate()
         self._jobs: dict[str, ScanJob] = {}
         self._beginning = ScanStartTracker()
@@ -108,7 +106,7 @@ class DriftCore:
         if self.knowledge.start_s is None:
             self.knowledge.start_s = now_ns * 1e-9
         self._worker.start()
-        return self.core.start(now_s, now_ns)
+        return super().start(now_s, now_ns)
 
     def step(self, event: Input, now_s: float, now_ns: int) -> list[Effect]:
         if isinstance(event, PacketIn):
@@ -121,7 +119,7 @@ class DriftCore:
             return []
         if held is not None and isinstance(event, RequestIn) and event.request.kind == ControlRequest.END_EXPERIMENT:
             effects = self._publish_as_predicted(held, now_s, now_ns)  # what was measured, before the end
-        effects += self.core.step(event, now_s, now_ns)
+        effects += super().step(event, now_s, now_ns)
         if self._waits_for_a_person and not self._consequences.is_given_up:
             self._waits_for_a_person, self._ends = False, 0
             self._worker.start()
@@ -146,20 +144,14 @@ class DriftCore:
     def deadline_s(self) -> float | None:
         held = self._gate.held
         due_s = (
-            self.core.deadline_s(),
+            super().deadline_s(),
             None if held is None else held.until_s,
             self._following[0][0] if self._following else None,
         )
         return min((one_s for one_s in due_s if one_s is not None), default=None)
 
-    def deadline_ns(self) -> int | None:
-        return self.core.deadline_ns()
-
-    def snapshot(self) -> SavedState:
-        return self.core.snapshot()
-
     def restore(self, saved: SavedState) -> None:
-        self.core.restore(saved)
+        super().restore(saved)
         kept = self.frame.restored
         if kept:
             self.knowledge.restore(kept["knowledge"])
@@ -169,29 +161,10 @@ class DriftCore:
 
     def restore_cache(self, packets: Iterable[LoggedPacket]) -> None:
         entries = list(packets)
-        self.core.restore_cache(entries)
+        super().restore_cache(entries)
         for packet, source_ns, _ in entries:
             if packet.envelope == "ScopeStateMsg":
                 self._note_state(packet.payload, packet.time_ns if source_ns is None else source_ns)
-
-    @property
-    def leave_at_s(self) -> float:
-        return self.core.leave_at_s
-
-    def cached(self) -> Iterable[LoggedPacket]:
-        return self.core.cached()
-
-    @property
-    def newest_source_ns(self) -> int:
-        return self.core.newest_source_ns
-
-    @property
-    def control(self) -> ArbitrationState:
-        return self.core.control
-
-    @property
-    def control_state(self) -> ControlState:
-        return self.core.control_state
 
     def _kept(self) -> dict[str, Any]:
         return {
@@ -211,17 +184,17 @@ class DriftCore:
         if message == "ScopeStateMsg":
             self._note_state(event.packet.payload, event.packet.time_ns)
         if message != "Scan2d":
-            return self.core.step(event, now_s, now_ns)
+            return super().step(event, now_s, now_ns)
         scan = self._codec.decode_packet(message, event.packet.payload)
         if not isinstance(scan, Scan) or not scan.values.size:
-            return self.core.step(event, now_s, now_ns)
+            return super().step(event, now_s, now_ns)
         key = scan_key(scan, event.packet)
         if self._gate.is_settled(key):
-            return self.core.step(self._relocated(event, scan, self._gate.mapping_of(key)), now_s, now_ns)
+            return super().step(self._relocated(event, scan, self._gate.mapping_of(key)), now_s, now_ns)
         self._beginning.scan_came()
         until_s = now_s + self._settings.longest_registration
         self._gate.hold(HeldScan(key, self._middle_s(scan, event, now_ns), until_s))
-        self.core.put_off(until_s)
+        self.put_off(until_s)
         self._gate.keep(event)
         return self._look_at(event, now_s, now_ns)
 
@@ -321,18 +294,18 @@ class DriftCore:
         correcting = self.knowledge.corrects(now_ns * 1e-9)
         payload = self._codec.encode_mapping(said, job, correcting=correcting)
         before_ns = self._gate.next_ns() if is_awaited else None
-        effects += self.core.step(Announced(MAPPING, payload, before_ns), now_s, now_ns)
+        effects += super().step(Announced(MAPPING, payload, before_ns), now_s, now_ns)
         if is_awaited:
             effects += self._release(now_s, now_ns)
         self._following.append((now_s, lambda step, now_ns: self._consequences.of(said, job, step, now_ns)))
         return effects + self._consequences.hand_over(now_s, now_ns)
 
     def _follow(self, now_s: float, now_ns: int) -> list[Effect]:
-        """What follows from a scan that was published: a step of its own, since it may change who is in control."""
+        """Do what follows from a published scan: a step of its own, since it may change who is in control."""
         _, following = self._following.popleft()
-        if self.core.control.ended:
+        if self.control.ended:
             return []
-        effects = following(lambda event: self.core.step(event, now_s, now_ns), now_ns)
+        effects = following(lambda event: SchedulerCore.step(self, event, now_s, now_ns), now_ns)
         return [*effects, SaveState(self.snapshot())]
 
     def _learn(self, forecast: dict[str, Any] | None) -> list[Effect]:
@@ -412,12 +385,11 @@ class DriftCore:
         """In which direction it scans, where it tells."""
         parameter = Parameter(names.SCAN_DIRECTION)
         request = Request(int(ControlRequest.PARAM), parameter, self._codec.encode(parameter))
-        return self.core.ask_own(request, now_s, lambda response, now_s, now_ns: ())
+        return self.ask_own(request, now_s, lambda response, now_s, now_ns: ())
 
 
 def scan_key(scan: Scan, packet: Packet) -> str:
-    """What all channels of a scan share, and no other scan has: its time, since some controllers write a file for each
-    channel; the file where there is no time."""
+    """Return a key that all channels of a scan share, and no other scan has."""
     if scan.time_ns is None and scan.filename:
         return scan.filename
     return f"at {packet.time_ns if scan.time_ns is None else scan.time_ns} ns"

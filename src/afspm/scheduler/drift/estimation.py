@@ -1,4 +1,4 @@
-"""What the worker does: registers scans one after the other, and remembers what came of the last ones.
+"""The worker's task: register scans one after the other, and remember the last answers.
 
 A scan that it is asked for again, since it or the scheduler was killed, is answered from memory: no tracker may take a
 scan twice, and no scan has two mappings.
@@ -48,7 +48,7 @@ class Estimation:
         self._answers = OrderedDict((one["key"], Registered(**one)) for one in state["answers"])
 
     def register(self, scan: DriftScan, asked: Region | None = None) -> Registered:
-        """What a scan tells.
+        """Register a scan.
 
         Args:
             asked: the region that was meant, in sample coordinates.

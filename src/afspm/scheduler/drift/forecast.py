@@ -1,4 +1,4 @@
-"""What is known of the drift: the forecast by which everything is mapped, until more is known."""
+"""The forecast of the drift, by which everything is mapped until more is known."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class CurrentForecast:
         return None if self._forecast is None else self._forecast.at(time_s)
 
     def corrects(self, time_s: float) -> bool:
-        """Whether components are given sample coordinates at a time."""
+        """Return whether components are given sample coordinates at a time."""
         since_s = 0.0 if self.start_s is None else time_s - self.start_s
         return self._settings.correct and since_s >= self._settings.correct_after
 

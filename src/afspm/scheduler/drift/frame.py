@@ -11,6 +11,7 @@ from typing import Any
 from afspm.drift.mapping import Mapping
 from afspm.errors import AfspmError, InvalidValue
 from afspm.logic.coordinate_frame import MappedRequest
+from afspm.logic.parameter_values import number_of
 from afspm.logic.positions import PROBE_CHANGES, REGION_CHANGES, scan_values
 from afspm.model import (
     ControlRequest,
@@ -27,9 +28,16 @@ from afspm.model import (
     ScanParameters,
     names,
 )
-from afspm.scheduler.drift.parameters import number_of, told_as, value_in
-from afspm.scheduler.drift.positions import PlaceCodec, PositionPair, TargetPosition, away_m, is_same
-from afspm.scheduler.drift.scan_durations import ScanDurations
+from afspm.scheduler.drift.positions import (
+    PlaceCodec,
+    PositionPair,
+    TargetPosition,
+    away_m,
+    is_same,
+    told_as,
+    value_in,
+)
+from afspm.scheduler.drift.scan_timing import ScanDurations
 
 MOVES_PX = 0.01
 """A region that lies this far off in the tip's coordinates is set again before it is scanned."""
@@ -47,7 +55,7 @@ MappingAt = Callable[[float], Mapping | None]
 
 @dataclass(frozen=True)
 class _Remembered:
-    """What a request with an id was mapped to."""
+    """The mapped form of a request with an id."""
 
     kind: int
     place: PositionPair[Any]
@@ -324,7 +332,7 @@ class DriftFrame:
             self._remembered[str(key)] = _Remembered(int(kind), place, base64.b64decode(payload))
 
     def _place(self, kind: int, said: str, sent: str) -> PositionPair[Any]:
-        """What `PositionPair.to_list` wrote. Raises ValueError if it is no such place."""
+        """Read what `PositionPair.to_list` wrote. Raises ValueError if it is no such place."""
         parts = [base64.b64decode(part) for part in (said, sent)]
         sample, tip = (self._codec.decode_packet(_MESSAGES[kind], part) for part in parts)
         if isinstance(sample, ScanParameters) and isinstance(tip, ScanParameters):

@@ -1,4 +1,4 @@
-"""What is told of drift: to and from the worker, and to the components."""
+"""Messages about drift: to and from the worker, and to the components."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Matrix = list[list[float]]
 
 @dataclass(frozen=True)
 class Registered:
-    """What came of a scan.
+    """The result of a registration.
 
     Attributes:
         key: of the scan.
@@ -105,7 +105,7 @@ class Worker(Protocol):
 
 @dataclass(frozen=True)
 class RescanWanted:
-    """What the Rescanner is asked for.
+    """A wish to the Rescanner.
 
     Attributes:
         said: the ScanParameters2d of the region, in the coordinates of components.

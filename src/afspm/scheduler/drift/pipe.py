@@ -1,4 +1,4 @@
-"""What scheduler and worker say to each other: a line of JSON, and an array where there is one, through a pipe."""
+"""The pipe between scheduler and worker: a line of JSON, and an array where there is one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is in force at the microscope, in both coordinates: what was asked for, and what it was set to."""
+"""The places in force at the microscope, in both coordinates: as asked for, and as set."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
 from afspm.logic.events import Codec
-from afspm.model import ProbePosition, Region
+from afspm.model import Parameter, ProbePosition, Region, names
+from afspm.model.names import BASE_PARAMETERS
+from afspm.units import convert
 
 P = TypeVar("P", bound=Region | ProbePosition)
 
@@ -18,6 +20,13 @@ SAME = 1e-3
 SAME_PLACE_M = 1e-9
 
 _CANDIDATES = 8
+_VALUES = {
+    names.SCAN_TOP_LEFT_X: lambda region: region.top_left_m[0],
+    names.SCAN_TOP_LEFT_Y: lambda region: region.top_left_m[1],
+    names.SCAN_SIZE_X: lambda region: region.size_m[0],
+    names.SCAN_SIZE_Y: lambda region: region.size_m[1],
+    names.SCAN_ANGLE: lambda region: region.angle_rad,
+}
 
 
 class PlaceCodec(Codec, Protocol):
@@ -87,6 +96,23 @@ def away_m(a: Region | ProbePosition, b: Region | ProbePosition) -> float:
 
 
 def is_same(a: Region | ProbePosition, b: Region | ProbePosition) -> bool:
-    """Whether two places are one but for rounding."""
+    """Return whether two places are one but for rounding."""
     near_m = SAME * math.hypot(*a.size_m) if isinstance(a, Region) else SAME_PLACE_M
     return away_m(a, b) <= near_m
+
+
+def value_in(name: str, region: Region) -> float:
+    """Return the value of a parameter in a region, in SI."""
+    return float(_VALUES[name](region))
+
+
+def told_as(name: str, value: float, told: Parameter | None) -> Parameter:
+    """A value in SI in the unit in which the microscope told its own."""
+    unit = _unit(told or Parameter(name))
+    # 15 digits: what was set as 0.1 nm is told as 0.1, not as 0.09999999999999999
+    return Parameter(name, f"{convert(value, BASE_PARAMETERS[name] or '', unit):.15g}", unit)
+
+
+def _unit(parameter: Parameter) -> str:
+    # without a unit an angle is in degrees on the wire, everything else in SI
+    return parameter.unit or ("deg" if parameter.name == names.SCAN_ANGLE else BASE_PARAMETERS[parameter.name] or "")

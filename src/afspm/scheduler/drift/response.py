@@ -1,4 +1,4 @@
-"""What follows from what a scan has told of the drift: flags, scans to be taken again, a rate handed over."""
+"""The response to a registered scan: flags, scans to be taken again, a rate handed over."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class DriftResponse:
         self._given_m_s = [0.0, 0.0]
 
     def of(self, registered: Registered, job: ScanJob, step: Step, now_ns: int) -> list[Effect]:
-        """What is done after a scan was published. What a person scans is followed, and not scanned again."""
+        """Respond to a scan after it was published. A person's scan is followed, and not scanned again."""
         self._unregistered = 0
         if not self._knowledge.corrects(now_ns * 1e-9):
             self._started = True  # until it is corrected there is time enough to learn the velocity
@@ -80,7 +80,7 @@ class DriftResponse:
         return effects
 
     def unregistered(self, why: str, step: Step, now_ns: int) -> list[Effect]:
-        """What is done after a scan was published as predicted, since it could not be registered."""
+        """Respond to a scan that was published as predicted, since it could not be registered."""
         if not self._knowledge.corrects(now_ns * 1e-9) or self._core.control.mode is ControlMode.MANUAL:
             return []
         self._unregistered += 1
@@ -95,7 +95,7 @@ class DriftResponse:
 
     @property
     def is_given_up(self) -> bool:
-        """Whether that problem is still there."""
+        """True while that problem is flagged."""
         return _MALFUNCTION in self._core.control.problems
 
     def _lost(self, why: str, step: Step, now_ns: int) -> list[Effect]:
@@ -193,7 +193,7 @@ class DriftResponse:
 
 
 def _refusal(axis: str, response: Response) -> list[Effect]:
-    """What is told where a rate is not taken."""
+    """Return what to log where a rate is not taken."""
     if response.ok or response.code == ControlResponse.NOT_FREE:
         return []  # a scan has begun already: it is handed over after the next
     return [Log("ERROR", f"the controller does not take the rate of the drift, {axis}: {response.reason}")]

@@ -8,17 +8,19 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from afspm.errors import ConfigError
 from afspm.model import Frame
+from afspm.process.context import ProcessContext
 from afspm.scheduler.drift.codec import DriftWireCodec
 from afspm.scheduler.drift.core import MAPPING, DriftCore
 from afspm.scheduler.drift.messages import Forecasted
 from afspm.scheduler.drift.response import RESCAN
 from afspm.scheduler.drift.settings import DriftCompensationSettings
 from afspm.scheduler.drift.worker_process import DriftWorkerProcess
-from afspm.scheduler.scheduler import Scheduler, SchedulerContext
-from afspm.scheduler.shell import Core, SchedulerShell
+from afspm.scheduler.scheduler import Scheduler
+from afspm.scheduler.shell import SchedulerShell
 from afspm.transport.scheduler_sockets import SchedulerSockets
 
 if TYPE_CHECKING:
+    from afspm.logic.scheduler_core import SchedulerCore
     from afspm.transport.scheduler_sockets import Source
 
 
@@ -60,7 +62,7 @@ class DriftCompensatedScheduler(Scheduler):
             self.needs_parameters = (compensate.x, compensate.y)
 
     def check(self) -> None:
-        """Whether estimator and tracker can be made, and do what is asked of them. Raises ConfigError if not."""
+        """Make estimator and tracker once, and check that they do what is asked. Raises ConfigError if not."""
         from afspm.drift.estimators import estimator
         from afspm.drift.trackers import tracker
 
@@ -72,14 +74,14 @@ class DriftCompensatedScheduler(Scheduler):
                 hint='tracker = "bank", or leave compensate out',
             )
 
-    def _core(self, context: SchedulerContext) -> Core:
+    def _core(self, context: ProcessContext) -> SchedulerCore:
         launch = context.launch
         file = Path(launch.state_dir) / f"{launch.name}.drift.npz" if launch.state_dir else None
         self._registrar = DriftWorkerProcess(self.drift, file, context.log)
         self._registrar.late = context.clock.late
         return DriftCore(self._settings(context), self.drift, DriftWireCodec(), self._registrar, launch.name)
 
-    def _shell(self, core: Core, sockets: SchedulerSockets, *others: Any) -> SchedulerShell:
+    def _shell(self, core: SchedulerCore, sockets: SchedulerSockets, *others: Any) -> SchedulerShell:
         assert isinstance(core, DriftCore)
         self._registrar.wake = sockets.wake_up
         return DriftShell(self._registrar, core, sockets, *others)

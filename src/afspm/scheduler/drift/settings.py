@@ -48,7 +48,7 @@ class Compensate:
 
 @dataclass(frozen=True)
 class DriftCompensationSettings:
-    """How drift is followed and corrected.
+    """The settings by which drift is followed and corrected.
 
     Attributes:
         estimator, tracker: a name, or a table with the name as its `class` and the settings of it.

@@ -72,7 +72,7 @@ class DriftWorkerProcess:
         self._orders.put(({"do": "compensated", "time_s": time_s, "velocity_m_s": velocity_m_s}, None))
 
     def said(self) -> list[WorkerSaid]:
-        """What the worker has said since the last call, oldest first; of a former one nothing counts."""
+        """Return the worker's messages since the last call, oldest first; those of a former worker are dropped."""
         said = []
         while self._said:
             life, event = self._said.popleft()
@@ -81,7 +81,7 @@ class DriftWorkerProcess:
         return said
 
     def caught_up(self) -> None:
-        """What the worker has said of scans is done."""
+        """Let simulated time pass again: the worker's messages about scans are handled."""
         self._late.close()
 
     def close(self) -> None:

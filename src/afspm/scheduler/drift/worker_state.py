@@ -41,7 +41,7 @@ class WorkerStateFile:
         write_atomic(self.path, [file.getbuffer()], synced=True)
 
     def load(self) -> dict[str, Any] | None:
-        """What was saved last; None if nothing was.
+        """Return what was saved last; None if nothing was.
 
         Raises:
             FileError: it can't be read.

@@ -1,4 +1,4 @@
-"""Flat terraces between meandering steps, as of graphite, calcite or strontium titanate; rough ground; a flat one."""
+"""Irregular surfaces: terraces between meandering steps, rough and flat ground, strewn nanoparticles."""
 
 from __future__ import annotations
 

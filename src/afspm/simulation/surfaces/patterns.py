@@ -1,4 +1,4 @@
-"""A hexagonal lattice with defects, atoms or molecules."""
+"""Regular surfaces: a hexagonal lattice with defects, and the stamper that compact discs are pressed with."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Lattice:
 
 
 def _contrast_left(pixels_a_constant: float) -> float:
-    """How much of the corrugation is left when a pixel averages over this part of the lattice constant."""
+    """Return how much of the corrugation is left when a pixel averages over this part of the lattice constant."""
     return float(np.clip(2.0 * (1.0 - pixels_a_constant), 0.0, 1.0))
 
 
@@ -130,7 +130,7 @@ class Stamper:
         return Relief(height_m, np.asarray(0.35 + 0.3 * bump))
 
     def _inside_m(self, seed: int, track: int, along: Array, offset: Array) -> Array:
-        """How far inside a bump of this track each position lies; negative outside. Ends are round."""
+        """Return how far inside a bump of this track each position lies; negative outside. Ends are round."""
         shift = float(chance.uniform(seed, track)[()]) * _FRAME
         bits = along / self.bit_m + shift
         first, last = int(np.floor(bits.min() / _FRAME)) - 1, int(np.floor(bits.max() / _FRAME)) + 1

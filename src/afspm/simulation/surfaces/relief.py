@@ -1,4 +1,4 @@
-"""What a surface is asked for, and what the kinds of surface share."""
+"""The interface of all surfaces, and what the kinds of surface share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a translator does what the wire format says: checked from outside, operation by operation.
+"""Conformance suite for translators: each operation of the wire format, checked from outside.
 
 `afspm test-translator experiment.toml` starts translator and scheduler as real processes, or joins running ones, and
 asks for everything that a component could ask for. The same as pytest items, one for each check:

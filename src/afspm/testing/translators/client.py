@@ -1,4 +1,4 @@
-"""`CheckClient`: asks what a component could ask, through the scheduler, and hears what is published."""
+"""The client that asks what a component could ask, through the scheduler, and observes what is published."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Observations:
         return len(self.all)
 
     def since(self, mark: int) -> list[Observation]:
-        """What came after `mark`."""
+        """Return what came after `mark`."""
         return self.all[mark:]
 
     def newest(self, kind: type[T]) -> T | None:
@@ -93,7 +93,7 @@ class Observations:
         return next((one.thing for one in reversed(self.all) if isinstance(one.thing, kind)), None)
 
     def has_state(self, state: ScopeState, mark: int) -> bool:
-        """Whether it was said after `mark`."""
+        """True if it was published after `mark`."""
         return any(one.state is state for one in self.all[mark:])
 
     def at_s(self, state: ScopeState, mark: int) -> float | None:
@@ -103,7 +103,7 @@ class Observations:
 
 
 def told(heard: Iterable[Observation]) -> str:
-    """What was heard, for a person."""
+    """Return the observations as text."""
     return ", ".join(map(str, heard)) or "nothing"
 
 
@@ -252,7 +252,7 @@ class CheckClient:
 
     @property
     def state(self) -> ScopeState:
-        """What the microscope has said last."""
+        """The microscope's newest state."""
         newest = self.observations.newest(ScopeStatus)
         return ScopeState.UNDEFINED if newest is None else newest.state
 
@@ -300,7 +300,7 @@ class CheckClient:
                 return
 
     def real_s(self, experiment_s: float) -> float:
-        """How long that may last in real time: never less than it takes to be noticed."""
+        """Return the longest real time for that: never less than it takes to be noticed."""
         return self.clock.real_s(experiment_s) + NOTICED_S
 
     def come_to_rest(self) -> None:

@@ -39,7 +39,7 @@ class FrameSetting:
     shape: tuple[int, int]
 
     def request(self, support: Support) -> ScanParameters:
-        """What to ask for; without the angle, where the microscope has none."""
+        """Return the request for it; without the angle, where the microscope has none."""
         (left, low), (width, height) = self.region.top_left_m, self.region.size_m
         angle = self.region.angle_rad if support.has(names.SCAN_ANGLE) else None
         return ScanParameters(RegionChange(left, low, width, height, angle), self.shape)

@@ -98,7 +98,7 @@ class CheckItem(pytest.Item):
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
-    """What is supported and what is not."""
+    """Print what is supported and what is not."""
     from rich.console import Console
 
     from afspm.testing.translators.report import show_end

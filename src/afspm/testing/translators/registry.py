@@ -1,4 +1,4 @@
-"""What a check says: nothing if all is well, else what was expected and what came, in one line."""
+"""The checks, in order, and their verdicts: nothing, or what was expected and what came, in one line."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def expect(holds: object, expected: str, came: str) -> None:
 
 
 def near(a: float, b: float, relative: float = 1e-3, absolute: float = 0.0) -> bool:
-    """Whether two numbers are the same to a controller's precision."""
+    """True if two numbers are the same to a controller's precision."""
     return math.isclose(a, b, rel_tol=relative, abs_tol=absolute)
 
 

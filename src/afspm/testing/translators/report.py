@@ -1,4 +1,4 @@
-"""What came of all checks, as text and as JSON."""
+"""The report of all checks, as text and as JSON."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from afspm.testing.translators.support import Support
 
 
 class CheckOutcome(Enum):
-    """What came of one check."""
+    """The outcome of one check."""
 
     PASSED = "passed"
     FAILED = "failed"
@@ -65,7 +65,7 @@ class CheckReport:
 
     @property
     def passed(self) -> bool:
-        """Whether nothing was wrong; what is not supported is no fault."""
+        """True if nothing was wrong; what is not supported is no fault."""
         return bool(self.results) and not (self.failed or self.lost or self.unrestored or self.support.errors)
 
     @property
@@ -113,7 +113,7 @@ _NAME_WIDTH = 29
 
 
 def show_beginning(report: CheckReport, console: Console) -> None:
-    """What is checked, before it is."""
+    """Print what will be checked."""
     told = report.support.controller or "its controller does not tell its version"
     simulated = " SIMULATED" if report.simulated else ""
     console.print(Text.assemble((report.translator, "bold"), f": {told}", (simulated, "bold yellow")), soft_wrap=True)

@@ -1,4 +1,4 @@
-"""Does the checks one after the other, and puts everything back."""
+"""The run of all checks: one after the other, and then every setting is put back."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LAST = (names.SCAN_SPEED, names.MOVE_SPEED)
 
 @dataclass(frozen=True)
 class SettingsBefore:
-    """What was in force."""
+    """The settings that were in force before the checks."""
 
     frame: ScanParameters | None
     feedback: Feedback | None
@@ -62,7 +62,7 @@ class SettingsBefore:
         return wrong
 
     def _put_back_together(self, client: CheckClient, wrong: list[str]) -> None:
-        """What is told together is set together, lest it passes through what can't be."""
+        """Set together what is published together, or it would pass through states that can't be."""
         observations = client.observations
         settings = (
             (ControlRequest.SET_SCAN_PARAMS, observations.newest(ScanParameters), self.frame, self._frame()),
@@ -83,7 +83,7 @@ class SettingsBefore:
                 client.settled(mark)
 
     def _frame(self) -> ScanParameters | None:
-        """What to ask for to have it again: of the angle nothing, where there is none."""
+        """Return the request for the first frame, without the angle where there is none."""
         before = self.frame
         if before is not None and isinstance(before.region, Region) and isinstance(before.shape, tuple):
             return FrameSetting(before.region, before.shape).request(self.support)
@@ -102,7 +102,7 @@ class SettingsBefore:
 
 
 def _changed(before: Feedback | None, now: Feedback | None) -> Feedback:
-    """What is to be put back of it: some may only be read."""
+    """Return the fields to put back: some may only be read."""
     fields = {} if before is None else vars(before)
     return Feedback(**{name: value for name, value in fields.items() if now is None or value != getattr(now, name)})
 
@@ -160,7 +160,7 @@ def do(check: Check, kit: CheckMeasurements) -> CheckResult:
 
 @contextmanager
 def restored(session: CheckSession, report: CheckReport) -> Iterator[CheckMeasurements]:
-    """What is in force when the block begins is so again at its end, however that comes."""
+    """Put back at the end of the block, however it ends, the settings of its beginning."""
     kit = CheckMeasurements(
         session.client, session.support, session.options.frame_m, excused=session.excused, complaints=session.complaints
     )

@@ -57,7 +57,7 @@ class Tester(Component):
 
 @dataclass(frozen=True)
 class CheckOptions:
-    """How to check.
+    """The options of a pass.
 
     Attributes:
         files: the experiment file, and those laid over it.
@@ -79,7 +79,7 @@ class CheckOptions:
 
 @dataclass
 class CheckSession:
-    """What is there to check.
+    """The translator to check, and the connection to it.
 
     Attributes:
         support: what the microscope has.
@@ -219,7 +219,7 @@ def _starts(
 
 
 def _left_out(experiment: Experiment, options: CheckOptions) -> list[str]:
-    """What is not started: all but translator, scheduler and emulated controller, and what runs already."""
+    """Return the parts not to start: all but translator, scheduler and emulated controller, and what runs already."""
     resolved = experiment.resolved
     wanted = {part.name for role in (Role.TRANSLATOR, Role.SCHEDULER) for part in resolved.with_role(role)}
     wanted |= {*resolved.emulators, NAME}
@@ -276,7 +276,7 @@ def _now() -> datetime:
 
 
 def _logger(log: RunLog) -> logging.Logger:
-    """What the connection itself has to say goes into the run's log, too."""
+    """Return a logger that writes what the connection says into the run's log."""
     logger = logging.Logger("afspm.translator_test")
 
     class Writing(logging.Handler):

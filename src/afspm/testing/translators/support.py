@@ -1,4 +1,4 @@
-"""What a microscope has of the generic actions and parameters, asked over the wire."""
+"""The generic actions and parameters that a microscope supports, asked over the wire."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PARAMETERS = (*names.BASE_PARAMETERS, *names.EXTENSION_PARAMETERS, names.DRIFT_R
 
 @dataclass
 class Support:
-    """What there is, by generic name.
+    """The supported actions and parameters, by generic name.
 
     Attributes:
         actions: whether it is supported; None if the microscope does not say.
@@ -40,7 +40,7 @@ class Support:
         return [name for name in needs if not known.get(name)]
 
     def has(self, *wanted: str) -> bool:
-        """Whether it has all of these."""
+        """True if the microscope has all of these."""
         return not self.missing(wanted)
 
     @property

@@ -20,7 +20,7 @@ _STEP = 1.02
 
 
 def in_force(kit: CheckMeasurements) -> Feedback:
-    """What was published last."""
+    """Return the newest feedback."""
     feedback = kit.client.observations.newest(Feedback)
     if feedback is None and not any(map(kit.support.has, _NUMBERS.values())):
         raise Skipped("the microscope tells nothing of a feedback")

@@ -1,4 +1,4 @@
-"""Setting where to scan."""
+"""Where the microscope scans: what is published at the start, setting the frame, and moving the probe."""
 
 from __future__ import annotations
 

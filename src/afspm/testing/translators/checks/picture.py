@@ -1,4 +1,8 @@
-"""Where scans say they were taken is where they were: details fit into a larger scan, if there is a sample to see."""
+"""Where scans say they were taken is where they were: details fit into a larger scan, if there is a sample to see.
+
+A larger scan is compared with details of it. Both are made from the same wrong idea of the axes, if there is one: so
+each idea is tried on both.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +38,7 @@ Idea = Callable[[ScanPicture], ScanPicture]
 
 
 def ideas(angle_rad: float) -> dict[str, Idea]:
-    """What may be wrong with the axes of a translator, in words; `angle_rad` is that of the larger scan."""
+    """Return what may be wrong with the axes of a translator, in words; `angle_rad` is that of the larger scan."""
 
     def turned_back(picture: ScanPicture) -> ScanPicture:
         return replace(picture, region=replace(picture.region, angle_rad=2 * angle_rad - picture.region.angle_rad))
@@ -121,7 +125,7 @@ def _at(picture: ScanPicture, x_m: Array, y_m: Array) -> tuple[Array, NDArray[np
 
 
 def _level(inside: NDArray[np.bool_], *pictures: Array) -> Array:
-    """What of them is inside, each without its plane: no sample lies quite flat."""
+    """Return what of them is inside, each without its plane: no sample lies quite flat."""
     rows, columns = np.nonzero(inside)
     plane = np.stack([rows, columns, np.ones(len(rows))], axis=1).astype(float)
     found = np.stack([values[inside] for values in pictures], axis=1)

@@ -1,4 +1,4 @@
-"""What has to be refused: unknown names, values that can't be, places out of reach."""
+"""Refusals: unknown names, impossible values, places out of reach, and all that would disturb a scan."""
 
 from __future__ import annotations
 

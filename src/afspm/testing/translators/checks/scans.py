@@ -1,4 +1,4 @@
-"""A scan that is taken to its end."""
+"""Scans: broken off, and taken to their end."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def asked_to_stop(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeStat
 
 
 def require_broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> list[Observation]:
-    """What is published from the beginning on of what was stopped, once its states have been found right."""
+    """Return all that was published of what was stopped, once its states have been found right."""
     client = kit.client
     client.wait_state(ScopeState.INTERRUPTED, mark)
     client.wait_state(ScopeState.FREE, mark, client.real_s(60.0))

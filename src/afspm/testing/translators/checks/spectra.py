@@ -33,7 +33,7 @@ def cancel(kit: CheckMeasurements) -> None:
 
 
 def _was_over(kit: CheckMeasurements, mark: int, answered_s: float) -> bool:
-    """Whether a spectrum came to its end by itself, all in order, before anybody had stopped it."""
+    """True if a spectrum came to its end by itself, all in order, before anybody had stopped it."""
     client = kit.client
     heard = client.settled(mark)
     ended_s = client.observations.at_s(ScopeState.FREE, mark)

@@ -37,7 +37,7 @@ class MyScope(Driver):
         self.controller = PretendController(self.clock, self.run_dir / "scans")
 
     def status(self) -> ScopeStatus:
-        """What the controller is doing now."""
+        """Return what the controller is doing now."""
         return ScopeStatus(ScopeState.SCANNING if self.controller.is_scanning() else ScopeState.FREE)
 
     def get(self, vendor: str) -> Value:

@@ -1,4 +1,4 @@
-"""A microscope that is free again is told so a moment later to peers that look at its last state alone."""
+"""Delays "free" after a passing state, for peers of version 1, which look only at the last state that has come."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ from collections import deque
 
 from afspm.errors import WireError
 from afspm.model import Packet, ScopeState
-from afspm.wire import decode, message_of
+from afspm.wire import Topic, decode, message_of
 
-HOLD_S = 0.1
-"""Real time that a passing state lasts at least: components of version 1 take in what has come, then look once."""
+DELAY_S = 0.1
+"""Real time that a passing state lasts at least."""
 _PASSING = (ScopeState.MOVING, ScopeState.INTERRUPTED)
-STATE = "ScopeStateMsg"
 
 
-class HoldBack:
-    """Keeps back SS_FREE after a passing state, and in order whatever comes after it.
+class StateDelay:
+    """Keeps SS_FREE back after a passing state, and in order whatever comes after it.
 
     Attributes:
-        due_s: when, in real monotonic time, what is kept goes out; None: nothing is kept.
+        due_s: when, in real monotonic time, the kept packets go out; None: there are none.
     """
 
     def __init__(self) -> None:
@@ -27,13 +26,13 @@ class HoldBack:
         self._kept: deque[Packet] = deque()
 
     def take(self, packet: Packet, now_s: float, *, wanted: bool) -> list[Packet]:
-        """A packet that is to be published; returns what goes out now.
+        """Take a packet that is to be published; return those that go out now.
 
         Args:
-            wanted: whether there are peers for which a state is kept back.
+            wanted: whether there are peers for which a state is delayed.
         """
         state = _state(packet)
-        ends_s = None if self._passing_s is None else self._passing_s + HOLD_S
+        ends_s = None if self._passing_s is None else self._passing_s + DELAY_S
         if state is not None:
             self._passing_s = now_s if state in _PASSING else None
         if self.due_s is None and state is ScopeState.FREE and wanted and ends_s is not None and now_s < ends_s:
@@ -44,7 +43,7 @@ class HoldBack:
         return []
 
     def release(self, now_s: float = float("inf")) -> list[Packet]:
-        """What has been kept for long enough, oldest first; without a time: all."""
+        """Return the packets that were kept for long enough, oldest first; without a time: all."""
         if self.due_s is None or now_s < self.due_s:
             return []
         self.due_s = None
@@ -54,7 +53,7 @@ class HoldBack:
 
 def _state(packet: Packet) -> ScopeState | None:
     """The state that a packet tells; None: it tells none."""
-    if not packet.envelope.startswith(STATE):
+    if not packet.envelope.startswith(Topic.SCOPE_STATE):
         return None
     try:
         state: ScopeState = decode(message_of(packet.envelope), packet.payload).state

@@ -1,0 +1,20 @@
+"""`replace` for the frozen parts of the scheduler's state: as that of dataclasses, and many times as fast."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any, TypeVar
+
+T = TypeVar("T")
+
+if TYPE_CHECKING:
+    from dataclasses import replace as replace  # so that names and types of its arguments are checked
+else:
+
+    def replace(part: T, /, **changes: Any) -> T:
+        """Return a copy of a dataclass without `__post_init__`, with some fields changed."""
+        if not hasattr(part, "__dict__"):
+            return dataclasses.replace(part, **changes)
+        copy = object.__new__(type(part))
+        copy.__dict__.update(part.__dict__, **changes)
+        return copy
