@@ -127,7 +127,7 @@ def _join(folder: Path, settings: dict[str, Any]) -> int:
     from afspm.dashboard import Dashboard
     from afspm.dashboard.joining import join, url_in
     from afspm.exit_codes import ExitCode
-    from afspm.experiment.known import DASHBOARD
+    from afspm.experiment.process_starts import DASHBOARD
     from afspm.record.run_json import read_run_json
 
     url = url_in(read_run_json(folder).get("processes"), folder, DASHBOARD)

@@ -11,32 +11,20 @@ from fastapi.staticfiles import StaticFiles
 from nicegui import app as nicegui
 from nicegui import ui
 
-from afspm.dashboard.access import Access, Visitor, is_loopback
-from afspm.dashboard.actions import Steering
+from afspm.dashboard.access import Visitor, is_loopback
 from afspm.dashboard.archive import Archive
-from afspm.dashboard.content import Contents
 from afspm.dashboard.live import Live
 from afspm.dashboard.page import ASSETS, Page, Services
 from afspm.dashboard.sign_in import VISITOR, AsgiApp, Guard, add_sign_in
-from afspm.dashboard.watch import Audience, Bell, Watch
-from afspm.model import Region
+from afspm.dashboard.watch import Bell
 
 
 def application(
-    watch: Watch,
-    steering: Steering,
-    access: Access,
-    archive: Archive,
-    *,
-    title: str,
-    limits: Region | None,
-    simulated: bool,
-    host: str,
-    encrypted: bool,
+    services: Services, archive: Archive, *, host: str, encrypted: bool
 ) -> tuple[AsgiApp, Callable[[float], None]]:
     """Return the application, made once a process, and what waits until all pages know the end, within seconds."""
-    bell, audience = Bell(), Audience()
-    watch.on_change(bell.ring)
+    bell, access, title = Bell(), services.access, services.title
+    services.watch.on_change(bell.ring)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -45,10 +33,9 @@ def application(
 
     app = FastAPI(lifespan=lifespan, openapi_url=None)
     add_sign_in(app, access, title, encrypted=encrypted, only_here=is_loopback(host))
-    live = Live(watch, bell, archive)
+    live = Live(services.watch, bell, archive)
     live.add_to(app)
     app.mount("/assets", StaticFiles(directory=ASSETS))
-    services = Services(watch, Contents(watch, limits), steering, audience, access, title, simulated)
 
     def page() -> None:
         request = ui.context.client.request
@@ -58,7 +45,7 @@ def application(
     ui.run_with(app, root=page, title=title, show_welcome_message=False, tailwind=False, reconnect_timeout=10.0)
 
     def wait_told(within_s: float) -> None:
-        audience.wait_told(within_s)
+        services.audience.wait_told(within_s)
         live.close()
 
     return Guard(app, access, host), wait_told

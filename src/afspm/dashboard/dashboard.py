@@ -13,7 +13,7 @@ from afspm.dashboard.access import Access, is_loopback
 from afspm.dashboard.archive import Archive, allowed_region
 from afspm.dashboard.server import USUAL_PORT, PageServer, listening, url_of
 from afspm.dashboard.sessions import Sessions
-from afspm.dashboard.watch import Watch
+from afspm.dashboard.watch import Audience, Watch
 from afspm.errors import ConfigError
 from afspm.process.priority import step_back
 from afspm.record.run_json import experiment_name
@@ -70,6 +70,8 @@ class Dashboard(Component):
     def on_start(self) -> None:
         from afspm.dashboard.actions import Steering
         from afspm.dashboard.application import application
+        from afspm.dashboard.content import Contents
+        from afspm.dashboard.page import Services
 
         launch = self._context.launch
         state_dir = Path(launch.state_dir) if launch.state_dir else None
@@ -81,17 +83,17 @@ class Dashboard(Component):
         problems = self._context.problems
         self._watch = Watch(self.clock, problems, archive.past(problems), lambda: cut_off_message(self.run_dir))
         self._steering = Steering(launch, self.clock, self._watch, access)
-        app, self._wait_told = application(
+        services = Services(
             self._watch,
+            Contents(self._watch, allowed_region(self.run_dir)),
             self._steering,
+            Audience(),
             access,
-            archive,
-            title=experiment_name(self.run_dir, "afspm"),
-            limits=allowed_region(self.run_dir),
-            simulated=self.simulated,
-            host=self._host,
-            encrypted=self._certificate is not None,
+            experiment_name(self.run_dir, "afspm"),
+            self.simulated,
         )
+        encrypted = self._certificate is not None
+        app, self._wait_told = application(services, archive, host=self._host, encrypted=encrypted)
         self._server = PageServer(app, bound, self._certificate, self._certificate_key)
         self._server.start()
         self._say_where(bound.getsockname()[1])

@@ -38,6 +38,20 @@ class Occupied:
         return now_s < self.end_s
 
 
+@dataclass(frozen=True)
+class Move(Occupied):
+    """The probe moves."""
+
+    from_m: tuple[float, float]
+    to_m: tuple[float, float]
+
+    def probe_at(self, now_s: float) -> tuple[float, float]:
+        """Return the position on the way."""
+        part = (now_s - self.start_s) / (self.end_s - self.start_s)
+        (x0, y0), (x1, y1) = self.from_m, self.to_m
+        return x0 + part * (x1 - x0), y0 + part * (y1 - y0)
+
+
 @dataclass
 class ScanActivity:
     """A scan that was started: with the values that were in force then, whatever is changed later.

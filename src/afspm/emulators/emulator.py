@@ -173,7 +173,7 @@ class Emulator(ABC):
         self.faults = Faults(self._faults, self.fault_kinds, clock.now_s())
         folder.mkdir(parents=True, exist_ok=True)
         self.woken = WakeUp()
-        self.rig.wake, self.rig.log = self.woken.post, log
+        self.rig.drawing.wake, self.rig.drawing.log = self.woken.post, log
         try:
             listening(self.open())
             while not self._stop.is_set() and clock.monotonic_s() < self._leave_at_s:

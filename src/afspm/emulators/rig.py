@@ -6,36 +6,23 @@ its own. Lengths in m in tip coordinates, angles in rad counter-clockwise, times
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Callable, Mapping
-from concurrent.futures import Future, wait
-from threading import Thread
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from afspm.clock import Clock
-from afspm.emulators.activities import (
-    RETRACE,
-    NoValues,
-    Occupied,
-    ScanActivity,
-    ScanValues,
-    SpectrumActivity,
-    ValuesInAir,
-    noise_in_air,
-)
+from afspm.emulators.activities import RETRACE, Move, Occupied, ScanActivity, SpectrumActivity, noise_in_air
+from afspm.emulators.scan_drawing import ScanDrawing
 from afspm.errors import AfspmError, InvalidValue
 from afspm.model import Feedback, Region
 from afspm.simulation import World
-from afspm.simulation.feedback import Loop
-from afspm.simulation.scanning import Course
+from afspm.simulation.feedback import FeedbackSettings
 
 Doing = ScanActivity | SpectrumActivity | Occupied
 _MOST_AVERAGED = 32  # of more sweeps the noise is no less
 _FASTEST_DRIFT_M_S = 1e-6
-_SMALLEST_M, _LARGEST_M, _LONGEST_PIXEL = 1e-12, 200e-6, 1e4
 _FEW = (2, 2)  # pixels: enough to see which channels there are
 
 
@@ -45,25 +32,43 @@ class RigBusy(AfspmError):
     code = "rig-busy"
 
 
-class Rig:
-    """The instrument. It does one thing at a time. For one thread at a time.
-
-    Args:
-        world_settings: `surface`, `tip`, `drift` … of the simulated world, as of the Simulator.
-        seed: everything that is left to chance follows from it.
-        background: pictures are worked out while the scan lasts, so that nobody waits for them; False: at its start.
+class InstrumentSetup:
+    """The settings in force.
 
     Attributes:
         region, shape, line_s, upwards: of the next scan: the frame, (rows, columns), seconds of a line there and back,
             and whether it begins with the smallest y.
-        feedback, bias_v, slope: in force; `slope` is the compensation of tilt, (x, y).
+        slope: compensation of tilt, (x, y).
         move_speed_m_s: of the probe outside of scans.
-        approach_s: how long coming to the sample or leaving it takes.
+        approach_s: duration of an approach or a withdrawal.
+    """
+
+    def __init__(self, feedback: FeedbackSettings) -> None:
+        self.region = Region((0.0, 0.0), (1e-6, 1e-6))
+        self.shape = (128, 128)
+        self.line_s = 1.0
+        self.upwards = True
+        self.feedback = Feedback(feedback.on, feedback.proportional_gain, feedback.integral_gain, feedback.setpoint)
+        self.bias_v = 0.1
+        self.slope = (0.0, 0.0)
+        self.move_speed_m_s = 5e-6
+        self.approach_s = 1.0
+
+
+class Rig:
+    """A simulated instrument, which does one thing at a time. For one thread at a time.
+
+    Args:
+        world_settings: `surface`, `tip`, `drift` … of the simulated world, as of the Simulator.
+        seed: everything that is left to chance follows from it.
+        background: compute the values of a scan while it lasts; False: at its start.
+
+    Attributes:
+        setup: the settings in force.
+        drawing: of scans.
         engaged: whether the tip is at the sample; if not, all that is measured is noise.
         scan, spectrum: the last one that was started, also when it is over; None before the first.
-        wake: called, from any thread, when something ends that no time was known for.
-        log: told of errors that nobody foresaw.
-        world: the physics, for whoever judges what came of it (`world.truth`).
+        world: the physics, with its ground truth (`world.truth`).
     """
 
     def __init__(self, world_settings: Mapping[str, Any], seed: int, clock: Clock, *, background: bool = True) -> None:
@@ -73,25 +78,14 @@ class Rig:
         # its channels are known from a few pixels of a world that nothing happens to
         few = World.from_settings(world_settings, seed, 0.0).scan(Region((0.0, 0.0), (1e-9, 1e-9)), _FEW, 1.0, 0.0)
         self._units = {name: unit for name, (unit, _) in few.channels().items()}
-        loop = self.world.settings.feedback
-        self.region = Region((0.0, 0.0), (1e-6, 1e-6))
-        self.shape = (128, 128)
-        self.line_s = 1.0
-        self.upwards = True
-        self.feedback = Feedback(loop.on, loop.proportional_gain, loop.integral_gain, loop.setpoint)
-        self.bias_v = 0.1
-        self.slope = (0.0, 0.0)
-        self.move_speed_m_s = 5e-6
-        self.approach_s = 1.0
+        self.setup = InstrumentSetup(self.world.settings.feedback)
+        self.drawing = ScanDrawing(self.world, self._units, seed, background=background)
         self.engaged = True
         self.scan: ScanActivity | None = None
         self.spectrum: SpectrumActivity | None = None
-        self.wake: Callable[[], None] = lambda: None
-        self.log = logging.getLogger(__name__)
-        self._background = background
         self._doing: Doing | None = None
-        self._probe_m = self._came_from_m = (0.0, 0.0)
-        self._scans = self._spectra = 0
+        self._probe_m = (0.0, 0.0)
+        self._spectra = 0
         self._noise = np.random.default_rng((seed, 3))
         self._signals: Mapping[str, float] = {}
 
@@ -121,10 +115,8 @@ class Rig:
         doing = self._doing
         if isinstance(doing, ScanActivity) and doing.running(now_s):
             return doing.tip_m(now_s)
-        if isinstance(doing, Occupied) and doing.what == "move" and doing.running(now_s):
-            part = (now_s - doing.start_s) / (doing.end_s - doing.start_s)
-            (x0, y0), (x1, y1) = self._came_from_m, self._probe_m
-            return x0 + part * (x1 - x0), y0 + part * (y1 - y0)
+        if isinstance(doing, Move) and doing.running(now_s):
+            return doing.probe_at(now_s)
         return self._probe_m
 
     def signals(self, now_s: float) -> Mapping[str, float]:
@@ -134,13 +126,13 @@ class Rig:
             return self._noise_alone()
         if scan is not None and scan.drawing and self._signals:
             return self._signals  # the world is one thread's at a time
-        self._wait_for_picture()
+        self.drawing.wait()
         if scan is not None and scan is self._doing and scan.running(now_s):
             self._signals = scan.signals(now_s)
         else:
             try:
                 self._signals = self.world.at_rest(
-                    place, now_s, self.feedback, self.bias_v, slope=self.slope, random=self._noise
+                    place, now_s, self.setup.feedback, self.setup.bias_v, slope=self.setup.slope, random=self._noise
                 )
             except InvalidValue:  # nothing is met with such a feedback
                 self._signals = self._noise_alone()
@@ -152,7 +144,7 @@ class Rig:
 
     def hold(self, z_m: float) -> None:
         """Leave z there while the feedback is off. Raises InvalidValue."""
-        self._wait_for_picture()
+        self.drawing.wait()
         self.world.hold(z_m)
 
     @property
@@ -169,24 +161,12 @@ class Rig:
             RigBusy. InvalidValue: what is in force can't be scanned.
         """
         now_s = self._free_now_s()
-        drawn: Future[ScanValues] = Future()
+        setup = self.setup
+        number = 1 if self.scan is None else self.scan.number + 1
         scan = ScanActivity(
-            self._scans + 1,
-            self.region,
-            self.shape,
-            now_s,
-            self.line_s,
-            self.upwards,
-            self.feedback,
-            self.bias_v,
-            _drawn=drawn,
+            number, setup.region, setup.shape, now_s, setup.line_s, setup.upwards, setup.feedback, setup.bias_v
         )
-        draw = self._drawer(scan)
-        if self._background:
-            self._in_background(draw, scan)
-        else:
-            drawn.set_result(draw())
-        self._scans += 1
+        self.drawing.start(scan, setup.slope, engaged=self.engaged)
         self.scan = self._doing = scan
         return scan
 
@@ -203,7 +183,7 @@ class Rig:
         """
         now_s = self._free_now_s()
         taken = [
-            self.world.spectrum(kind, self._probe_m, now_s, self.feedback, self.bias_v)
+            self.world.spectrum(kind, self._probe_m, now_s, self.setup.feedback, self.setup.bias_v)
             for _ in range(max(1, min(sweeps, _MOST_AVERAGED)))
         ]
         names, units, _ = taken[0]
@@ -238,9 +218,9 @@ class Rig:
         now_s = self.clock.now_s()
         if self.doing(now_s) != "move":
             self._free_now_s()
-        came_from_m = self.probe_at(now_s)
-        self._came_from_m, self._probe_m = came_from_m, (float(xy_m[0]), float(xy_m[1]))
-        self._doing = Occupied("move", now_s, now_s + math.dist(came_from_m, self._probe_m) / self.move_speed_m_s)
+        from_m, self._probe_m = self.probe_at(now_s), (float(xy_m[0]), float(xy_m[1]))
+        end_s = now_s + math.dist(from_m, self._probe_m) / self.setup.move_speed_m_s
+        self._doing = Move("move", now_s, end_s, from_m, self._probe_m)
 
     def stop_move(self) -> None:
         """Stay where the tip is on its way."""
@@ -262,7 +242,7 @@ class Rig:
 
     def pulsed(self, voltage_v: float, duration_s: float) -> str:
         """As `pulse`, of one that is over: somebody has set the bias, and put it back."""
-        self._wait_for_picture()
+        self.drawing.wait()
         if not self.engaged or duration_s <= 0.0:
             return "unchanged"
         return self.world.pulse(voltage_v, duration_s, self.clock.now_s(), self._probe_m)
@@ -284,14 +264,14 @@ class Rig:
         """
         if not max(map(abs, velocity_m_per_s)) <= _FASTEST_DRIFT_M_S:
             raise InvalidValue(f"a drift of {velocity_m_per_s} m/s", hint=f"at most {_FASTEST_DRIFT_M_S} m/s")
-        self._wait_for_picture()
+        self.drawing.wait()
         self.world.compensate(velocity_m_per_s, self.clock.now_s())
 
     def engage(self) -> None:
         """Bring the tip to the sample."""
         self._free_now_s()
         self.engaged = True
-        self.occupy("approach", self.approach_s)
+        self.occupy("approach", self.setup.approach_s)
 
     def withdraw(self) -> None:
         """Take the tip away from the sample, whatever is going on."""
@@ -299,7 +279,7 @@ class Rig:
         self.stop_spectrum()
         self.engaged = False
         self._doing = None
-        self.occupy("approach", self.approach_s)
+        self.occupy("approach", self.setup.approach_s)
 
     def occupy(self, what: str, lasts_s: float) -> None:
         """Be busy with anything else for so long. Raises RigBusy, InvalidValue."""
@@ -310,64 +290,13 @@ class Rig:
     # -- inside
 
     def _free_now_s(self) -> float:
-        """The time. Raises RigBusy."""
+        """Return the time. Raises RigBusy."""
         now_s = self.clock.now_s()
         doing = self.doing(now_s)
         if doing:
             raise RigBusy(f"the instrument is busy with a {doing}")
-        self._wait_for_picture()
+        self.drawing.wait()
         return now_s
-
-    def _wait_for_picture(self) -> None:
-        """The world is one thread's at a time."""
-        if self.scan is not None:
-            wait([self.scan._drawn])
-
-    def _drawer(self, scan: ScanActivity) -> Callable[[], ScanValues]:
-        _scannable(scan)
-        direction, slope = ("up" if scan.upwards else "down"), self.slope
-        course = Course(scan.region, scan.shape, scan.line_s, scan.start_s, direction)
-        Loop.of(self.world.settings.feedback, scan.feedback)
-        _finite("bias and slope", scan.bias_v, *slope)
-        if not self.engaged:
-            air = ValuesInAir(self._units, course, (self.seed, 1, scan.number))
-            return lambda: air
-        return lambda: self.world.scan(
-            scan.region,
-            scan.shape,
-            scan.line_s,
-            scan.start_s,
-            scan.feedback,
-            scan.bias_v,
-            direction=direction,
-            slope=slope,
-        )
-
-    def _in_background(self, draw: Callable[[], ScanValues], scan: ScanActivity) -> None:
-        def work() -> None:
-            try:
-                drawn = draw()
-            except Exception:
-                self.log.exception("scan %d can't be simulated: it was broken off", scan.number)
-                drawn, scan.stopped_s = NoValues(self._units, scan.shape), scan.start_s
-            scan._drawn.set_result(drawn)
-            self.wake()
-
-        # not an executor's thread: those are waited for when the process ends
-        Thread(target=work, daemon=True, name="simulated scan").start()
-
-
-def _scannable(scan: ScanActivity) -> None:
-    """Raises InvalidValue: no scanner has such a frame; simulating it takes minutes, or more memory than there is."""
-    pixels = [size_m / count for size_m, count in zip(scan.region.size_m, scan.shape[::-1], strict=True)]
-    reach = all(_SMALLEST_M <= size_m <= _LARGEST_M for size_m in scan.region.size_m)
-    if not (reach and max(pixels) <= _LONGEST_PIXEL * min(pixels)):
-        raise InvalidValue(
-            f"a frame of {scan.region.size_m} m with {scan.shape[1]} x {scan.shape[0]} pixels can't be simulated",
-            hint=f"{_SMALLEST_M} to {_LARGEST_M} m, pixels less than {_LONGEST_PIXEL:g} times as long as wide",
-        )
-    if scan.start_s + scan.shape[0] * scan.line_s <= scan.start_s:
-        raise InvalidValue(f"a line of {scan.line_s} s can't be simulated", hint="a time that is not nothing")
 
 
 def _finite(what: str, *values: float) -> None:

@@ -22,10 +22,10 @@ from pydantic import Field
 from afspm.errors import AfspmError
 from afspm.experiment import class_loader
 from afspm.experiment.document import Document
-from afspm.experiment.known import WiringClass
 from afspm.experiment.published import length_m, wire_of
 from afspm.experiment.sections import Section, parse
 from afspm.experiment.toml_lines import Settings, Table
+from afspm.experiment.wiring_classes import WiringClass
 from afspm.logic.envelopes import CacheRule, Envelopes
 from afspm.model import PacketHeader
 from afspm.units import Length

@@ -12,9 +12,9 @@ from afspm.experiment import wiring
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.handlers import check_handlers
 from afspm.experiment.implied_parts import check_notify, is_program
-from afspm.experiment.known import WIRE_SETTINGS
 from afspm.experiment.published import wire_of
 from afspm.experiment.resolution import ResolvedExperiment
+from afspm.experiment.wiring_classes import WIRE_SETTINGS
 from afspm.model import Role, component_of, is_process_name
 from afspm.model.events import LONGEST_PROCESS_NAME, PERSON
 from afspm.transport.network import is_local

@@ -15,12 +15,25 @@ from typing import Any
 
 from afspm import plugins
 from afspm.experiment.findings import closest, nearest
-from afspm.experiment.known import SHORT_NAME_PACKAGES
 from afspm.experiment.parts import DECLARED_KEYS
 from afspm.experiment.published import GUIDE
 from afspm.experiment.toml_lines import Table
 from afspm.model import Role
 
+# Where a class named without a module is looked for, in this order.
+SHORT_NAME_PACKAGES = (
+    "afspm.components",
+    "afspm.scheduler",
+    "afspm.microscopes.simulator",
+    "afspm.microscopes.image",
+    "afspm.microscopes.nanonis",
+    "afspm.microscopes.asylum",
+    "afspm.microscopes.gxsm",
+    "afspm.emulators.nanonis",
+    "afspm.emulators.asylum",
+    "afspm.emulators.gxsm",
+    "afspm.dashboard",
+)
 # By where they come from: a class of the user is recognised by what it is derived from.
 _ROLE_BY_BASE = (
     ("afspm.scheduler", Role.SCHEDULER),

@@ -11,10 +11,10 @@ from afspm.errors import AfspmError
 from afspm.experiment import published
 from afspm.experiment.document import Document
 from afspm.experiment.findings import SourceLocation, closest, nearest
-from afspm.experiment.known import WIRE_KEYS
 from afspm.experiment.published import PublishedSetting, wire_of
 from afspm.experiment.toml_lines import Path, Settings, Table
 from afspm.experiment.toml_writer import value as toml
+from afspm.experiment.wiring_classes import WIRE_KEYS
 
 SECTIONS: Final = ("clock", "control", "limits", "problems", "cache", "security", "restart", "record", "notify")
 

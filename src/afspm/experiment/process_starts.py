@@ -12,7 +12,6 @@ from afspm.errors import ConfigError
 from afspm.experiment import limits_section
 from afspm.experiment.experiment import ProcessStart
 from afspm.experiment.findings import nearest
-from afspm.experiment.known import DASHBOARD, DASHBOARD_PASSWORD
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.toml_writer import SECRET
 from afspm.experiment.wiring import ProcessSockets
@@ -24,6 +23,10 @@ from afspm.model import Frame, Role
 if TYPE_CHECKING:
     from afspm.experiment.resolution import ResolvedExperiment, ResolvedProcess
 
+DASHBOARD = "dashboard"
+"""The name under which `afspm dashboard` joins a run."""
+DASHBOARD_PASSWORD = "AFSPM_DASHBOARD_PASSWORD"
+"""The environment variable that only dashboards get."""
 _ORDER = (Role.TRANSLATOR, Role.SCHEDULER, Role.COMPONENT)
 
 

@@ -8,8 +8,8 @@ from typing import Any, Final
 
 from afspm import units
 from afspm.errors import AfspmError, InvalidValue
-from afspm.experiment.known import PUBLISHED_WIRES, SHORT_WIRE_CLASSES, WIRE_CLASSES, WiringClass
 from afspm.experiment.toml_lines import Settings, Table
+from afspm.experiment.wiring_classes import PUBLISHED_WIRES, SHORT_WIRE_CLASSES, WIRE_CLASSES, WiringClass
 from afspm.logic.envelopes import default_envelope
 from afspm.model import PacketHeader
 

@@ -9,12 +9,12 @@ from afspm import units
 from afspm.addresses import is_address
 from afspm.errors import UnitError
 from afspm.experiment.findings import SourceLocation
-from afspm.experiment.known import WIRE_KEYS, WiringClass
 from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.published import INSTEAD, envelope, last, wire_of
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.toml_writer import dumps
 from afspm.experiment.toml_writer import value as toml
+from afspm.experiment.wiring_classes import WIRE_KEYS, WiringClass
 from afspm.model import Role
 from afspm.transport.network import is_local
 

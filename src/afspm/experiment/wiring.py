@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 from afspm.addresses import hint_on, is_address
 from afspm.experiment.document import Document
 from afspm.experiment.findings import SourceLocation
-from afspm.experiment.known import WIRE_KEYS, WiringClass
 from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.published import wire_of
 from afspm.experiment.toml_lines import Settings, Table
+from afspm.experiment.wiring_classes import WIRE_KEYS, WiringClass
 from afspm.model import Role
 
 if TYPE_CHECKING:

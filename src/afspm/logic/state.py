@@ -23,7 +23,7 @@ from afspm.logic.pending_requests import PendingRequests
 from afspm.logic.sessions import SessionTable
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.supervisor_registry import SavedSupervisor, SupervisorRegistry
-from afspm.logic.watchdog import TipState, Watchdog
+from afspm.logic.watchdog import RetractState, Watchdog
 
 KIND, VERSION = "scheduler", 1
 """Of snapshots of `SavedState`."""
@@ -46,7 +46,7 @@ class SavedState:
     sessions: Mapping[str, str] = field(default_factory=dict)
     sent_actions: tuple[SentAction, ...] = ()
     limits: LimitState = field(default_factory=LimitState)
-    tip: TipState = field(default_factory=TipState)
+    tip: RetractState = field(default_factory=RetractState)
     tip_risk: TipRisk = field(default_factory=TipRisk)
     supervisors: Mapping[str, SavedSupervisor] = field(default_factory=dict)
     last_ns: int = 0

@@ -93,7 +93,7 @@ class SafetyResult(Enum):
 
 
 @dataclass(frozen=True)
-class TipState:
+class RetractState:
     """The part of the watchdog that survives a restart.
 
     Attributes:
@@ -126,7 +126,7 @@ class Watchdog:
     """
 
     settings: WatchdogSettings = field(default_factory=WatchdogSettings)
-    tip: TipState = TipState()
+    tip: RetractState = RetractState()
     starting: str | None = None
     sent: str | None = None
     attempts: int = 0
@@ -138,7 +138,7 @@ class Watchdog:
     retries: int = 0
     in_haste: bool = False
 
-    def restored(self, tip: TipState) -> Watchdog:
+    def restored(self, tip: RetractState) -> Watchdog:
         """Take up the duty of before a restart: what the microscope was being asked is not known any more."""
         duty = TipDuty.OWED if tip.duty is TipDuty.ASKED else tip.duty
         return replace(self, tip=replace(tip, duty=duty))

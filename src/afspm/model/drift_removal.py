@@ -18,16 +18,8 @@ def undistorted(values: Array, region: Region, velocity_m_s: XY, duration_s: flo
 
     Rows are taken one after the other, so what is at the offset S from the centre c when half of the scan is done is
     found at the offset q with S = (1 - v a') q, where v is the velocity and a the vector along the slow axis of length
-    duration / height, negative when scanning down. Cubic splines between pixels; NaN where nothing was measured.
-
-    Args:
-        values: [y, x].
-        velocity_m_s: of the sample, in the coordinates of the region.
-        duration_s: from the first to the last row.
-        upwards: whether small y was scanned first.
-
-    Raises:
-        InvalidValue: what is not finite, or a sample that moves as fast along the slow axis as rows are taken.
+    duration / height, negative when scanning down. Cubic splines between pixels; NaN where nothing was measured. The
+    arguments are those of `Scan.undistorted`.
     """
     ny, nx = values.shape
     along_m, across_m = _per_scan_m(region, velocity_m_s, duration_s, upwards=upwards)

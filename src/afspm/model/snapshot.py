@@ -6,6 +6,7 @@ types of the fields say what is read: nothing in a snapshot names code.
 
 from __future__ import annotations
 
+import sys
 import types
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -13,8 +14,6 @@ from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
-
-import numpy as np
 
 from afspm.errors import InvalidValue
 
@@ -48,16 +47,22 @@ def restored(type_: type[T], plain: Mapping[str, Any], kind: str, version: int) 
     return made
 
 
+def _numpy() -> Any:
+    """The module, if it is loaded: without it there are no arrays, and most processes need none."""
+    return sys.modules.get("numpy")
+
+
 def to_plain(value: Any, *, lists: bool = False) -> Any:
     """Return dataclasses, enums, collections and arrays as plain data."""
     if isinstance(value, Enum):
         return value.value
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: to_plain(getattr(value, field.name), lists=lists) for field in fields(value) if field.init}
-    if isinstance(value, np.ndarray):
-        return value.tolist() if lists else value
-    if isinstance(value, np.generic):
-        return value.item()
+    if (np := _numpy()) is not None:
+        if isinstance(value, np.ndarray):
+            return value.tolist() if lists else value
+        if isinstance(value, np.generic):
+            return value.item()
     if isinstance(value, Mapping):
         return [[to_plain(key, lists=lists), to_plain(one, lists=lists)] for key, one in value.items()]
     if isinstance(value, list | tuple | deque):
@@ -79,7 +84,7 @@ def from_plain(type_: Any, plain: Any) -> Any:
         return plain
     if origin in (Union, types.UnionType):
         return _from_union(arguments, plain)
-    if origin is np.ndarray:
+    if (np := _numpy()) is not None and origin is np.ndarray:
         if not isinstance(plain, np.ndarray | list):
             raise TypeError(f"{plain!r} is no array")
         return np.asarray(plain, dtype=get_args(arguments[1])[0])

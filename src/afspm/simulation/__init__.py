@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from afspm.simulation.scanning import SimulatedScan
 from afspm.simulation.surfaces.picture import READERS, Heightmap
-from afspm.simulation.tip import TipState
+from afspm.simulation.tip import TipShape
 from afspm.simulation.world import World, WorldSettings
 
-__all__ = ["READERS", "Heightmap", "SimulatedScan", "TipState", "World", "WorldSettings"]
+__all__ = ["READERS", "Heightmap", "SimulatedScan", "TipShape", "World", "WorldSettings"]

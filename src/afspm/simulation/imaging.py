@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.simulation.fields import Array, bspline_weights
-from afspm.simulation.tip import TipState
+from afspm.simulation.tip import TipShape
 
 Single = NDArray[np.float32]
 _SPLINE_VARIANCE = 1.0 / 3.0  # of the cubic B-spline as a blur, in samples squared
@@ -97,13 +97,13 @@ class Sampler:
         return np.asarray(lower * (1 - self._v) + upper * self._v)
 
 
-def across_m(tip: TipState, height_range_m: float) -> float:
+def across_m(tip: TipShape, height_range_m: float) -> float:
     """Return how far beside its apex the round part of a tip can touch a surface of that range of heights."""
     corner = tip.imaging_radius_m / math.tan(math.radians(tip.half_angle_deg))  # beyond, it is the cone that touches
     return min(math.sqrt(2.0 * tip.imaging_radius_m * height_range_m), corner)
 
 
-def reach_m(tip: TipState, height_range_m: float) -> float:
+def reach_m(tip: TipShape, height_range_m: float) -> float:
     """Return how far beside its apex a tip can touch a surface of that range of heights."""
     across = across_m(tip, height_range_m)
     beyond = max(0.0, height_range_m - across**2 / (2.0 * tip.imaging_radius_m))
@@ -111,7 +111,7 @@ def reach_m(tip: TipState, height_range_m: float) -> float:
     return reach + (math.hypot(*tip.second_apex_m[:2]) if tip.second_apex_m else 0.0)
 
 
-def felt(height_m: Array, grid: SampleGrid, tip: TipState, blur_steps: tuple[float, float]) -> tuple[Single, float]:
+def felt(height_m: Array, grid: SampleGrid, tip: TipShape, blur_steps: tuple[float, float]) -> tuple[Single, float]:
     """The apex's path over a surface, on the same grid, band limited.
 
     Args:
@@ -131,7 +131,7 @@ def felt(height_m: Array, grid: SampleGrid, tip: TipState, blur_steps: tuple[flo
     return path, offset
 
 
-def _dilated(surface: Single, grid: SampleGrid, tip: TipState) -> Single:
+def _dilated(surface: Single, grid: SampleGrid, tip: TipShape) -> Single:
     height_range = float(np.ptp(surface))
     slope = 1.0 / math.tan(math.radians(tip.half_angle_deg))
     radius = tip.imaging_radius_m

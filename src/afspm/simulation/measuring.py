@@ -17,7 +17,7 @@ from afspm.simulation.noise import NoiseSettings, disturbances, flattened, heigh
 from afspm.simulation.scanning import Course, ScannerSettings
 from afspm.simulation.settings import check
 from afspm.simulation.surfaces import Relief
-from afspm.simulation.tip import TipState
+from afspm.simulation.tip import TipShape
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def current_a(settings: SignalSettings, loop: Loop, gap_m: Array, material: Arra
 
 
 Channels = dict[str, tuple[str, Array]]
-TipTimes = Sequence[tuple[float, TipState]]
+TipTimes = Sequence[tuple[float, TipShape]]
 """(since when, tip), the first not later than the scan's start."""
 
 _POINTS = 1_400_000  # of the grid, if oversampling is left to us
@@ -248,7 +248,7 @@ def _rows_of_grid(grid: SampleGrid, y: Array, margin_m: float) -> tuple[SampleGr
     return grid.rows(start, stop), start, stop
 
 
-def _tip_of_lines(course: Course, tips: TipTimes) -> list[TipState]:
+def _tip_of_lines(course: Course, tips: TipTimes) -> list[TipShape]:
     """The tip at the start of each line, in the order of time."""
     starts = course.start_s + np.arange(course.shape[0]) * course.line_s
     index = np.searchsorted([since for since, _ in tips], starts, side="right") - 1

@@ -8,7 +8,7 @@ import numpy as np
 
 from afspm.simulation.fields import Array
 from afspm.simulation.settings import check
-from afspm.simulation.tip import TipState
+from afspm.simulation.tip import TipShape
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class NoiseSettings:
 
 
 def disturbances(
-    settings: NoiseSettings, tips: list[TipState], line_s: float, nx: int, random: np.random.Generator
+    settings: NoiseSettings, tips: list[TipShape], line_s: float, nx: int, random: np.random.Generator
 ) -> Array | None:
     """Return scars and jumps of debris, which happen between tip and sample; the feedback follows them.
 

@@ -10,7 +10,7 @@ import numpy as np
 from afspm.simulation.feedback import Loop
 from afspm.simulation.fields import Array
 from afspm.simulation.settings import check
-from afspm.simulation.tip import TipState
+from afspm.simulation.tip import TipShape
 
 KINDS = ("IV", "force")
 Curves = tuple[tuple[str, ...], tuple[str, ...], Array]
@@ -79,7 +79,7 @@ class ForceSettings:
 
 
 def current_voltage(
-    settings: IVSettings, tip: TipState, material: float, bias_v: float, loop: Loop, random: np.random.Generator
+    settings: IVSettings, tip: TipShape, material: float, bias_v: float, loop: Loop, random: np.random.Generator
 ) -> Curves:
     """I(V), forth and back, and dI/dV as a lock-in shows it.
 
@@ -108,7 +108,7 @@ def current_voltage(
     return ("Bias", "Current", "Current Retrace", "dI/dV"), ("V", "A", "A", "S"), np.stack([bias, *sweeps, lock_in], 1)
 
 
-def force_distance(settings: ForceSettings, tip: TipState, material: float, random: np.random.Generator) -> Curves:
+def force_distance(settings: ForceSettings, tip: TipShape, material: float, random: np.random.Generator) -> Curves:
     """Deflection and force against the piezo's extension, approach and retract, zero where the tip first touches.
 
     Contact after Derjaguin, Muller and Toporov, van der Waals attraction before it. Quasi-static: the cantilever
@@ -146,7 +146,7 @@ def _sample_density(settings: IVSettings, energy: Array, material: float) -> Arr
     return np.asarray((1.0 - share) * bands + share * metal + 1e-3)
 
 
-def _tip_density(tip: TipState, energy: Array) -> Array:
+def _tip_density(tip: TipShape, energy: Array) -> Array:
     """Flat for a clean metal; a state of its own where something sticks to it, a slope where it is deformed."""
     density = np.ones_like(energy)
     if tip.debris_m:
@@ -156,7 +156,7 @@ def _tip_density(tip: TipState, energy: Array) -> Array:
     return density
 
 
-def _through_preamplifier(settings: IVSettings, clean: Array, tip: TipState, random: np.random.Generator) -> Array:
+def _through_preamplifier(settings: IVSettings, clean: Array, tip: TipShape, random: np.random.Generator) -> Array:
     share = settings.relative_noise * (4.0 if tip.debris_m else 1.0)
     noisy = clean * (1.0 + share * random.standard_normal(len(clean)))
     noisy += settings.noise_a * random.standard_normal(len(clean))

@@ -15,7 +15,7 @@ CONDITIONS = ("sharp", *FLAWS)
 
 
 @dataclass(frozen=True)
-class TipState:
+class TipShape:
     """One shape of the tip.
 
     Attributes:
@@ -138,7 +138,7 @@ class TipChange:
 
     t_s: float
     cause: str
-    tip: TipState
+    tip: TipShape
 
 
 class TipMaker:
@@ -147,17 +147,17 @@ class TipMaker:
     def __init__(self, settings: TipSettings) -> None:
         self._s = settings
 
-    def first(self, random: np.random.Generator) -> TipState:
+    def first(self, random: np.random.Generator) -> TipShape:
         """The tip that the experiment starts with: as in the settings, exactly, and perhaps with a flaw."""
-        sharp = TipState(self._s.radius_m, self._s.half_angle_deg)
+        sharp = TipShape(self._s.radius_m, self._s.half_angle_deg)
         return sharp if self._s.condition == "sharp" else self.changed(sharp, self._s.condition, random)
 
-    def changed(self, tip: TipState, condition: str, random: np.random.Generator) -> TipState:
+    def changed(self, tip: TipShape, condition: str, random: np.random.Generator) -> TipShape:
         """The tip after it became sharp, blunt, double or contaminated; flaws it had stay unless it is sharp now."""
         s, radius = self._s, self._s.radius_m
         length = tip.length_m + s.length_jump_radii * radius * float(random.normal())
         if condition == "sharp":
-            return TipState(radius * self._about(0.4, random), s.half_angle_deg, length_m=length)
+            return TipShape(radius * self._about(0.4, random), s.half_angle_deg, length_m=length)
         flaws = tuple(sorted({*tip.flaws, condition}))
         worse = replace(tip, flaws=flaws, length_m=length)
         if condition == "blunt":
@@ -216,7 +216,7 @@ def crash_times(settings: TipChangeSettings, depth_m: float) -> float:
     return depth_m / settings.crash_depth_m
 
 
-def indented_m(tip: TipState, depth_m: float) -> float:
+def indented_m(tip: TipShape, depth_m: float) -> float:
     """Return how deep a tip gets into the sample when it is driven `depth_m` beyond the surface.
 
     Simulated, without a source: at first the sample gives way, by as much as was asked for. The deeper, the more it is
@@ -264,7 +264,7 @@ class SimulatedTip:
         self.scheduled_until_s = start_s
         self.advance(start_s)
 
-    def at(self, t_s: float) -> TipState:
+    def at(self, t_s: float) -> TipShape:
         """Return the tip at a time."""
         return next((c.tip for c in reversed(self.history) if c.t_s <= t_s), self.history[0].tip)
 

@@ -33,7 +33,7 @@ from afspm.simulation.tip import (
     TipChange,
     TipChangeSettings,
     TipSettings,
-    TipState,
+    TipShape,
     indented_m,
 )
 
@@ -325,7 +325,7 @@ class World:
         return self.sample.drift.at(t_s)
 
     @property
-    def tip(self) -> TipState:
+    def tip(self) -> TipShape:
         """The tip after all that has been asked for so far."""
         return self._tip.history[-1].tip
 

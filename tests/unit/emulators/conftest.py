@@ -37,6 +37,6 @@ def clock() -> FakeClock:
 @pytest.fixture
 def rig(clock: FakeClock) -> Rig:
     rig = Rig({}, seed=3, clock=clock, background=False)
-    rig.shape = (8, 16)
-    rig.line_s = 0.5
+    rig.setup.shape = (8, 16)
+    rig.setup.line_s = 0.5
     return rig

@@ -27,7 +27,7 @@ def test_a_scan_takes_its_time_and_its_lines_come_one_by_one(rig: Rig, clock: An
 
 
 def test_lines_not_taken_yet_are_missing_on_the_side_it_has_not_reached(rig: Rig) -> None:
-    rig.upwards = False
+    rig.setup.upwards = False
     scan = rig.start_scan()
     unit, height = scan.channels(1001.0)["Height"]
     assert unit == "m"
@@ -37,14 +37,14 @@ def test_lines_not_taken_yet_are_missing_on_the_side_it_has_not_reached(rig: Rig
 
 
 def test_it_is_the_same_world_as_the_simulators(rig: Rig) -> None:
-    theirs = World.from_settings({}, 3, 1000.0).scan(rig.region, (8, 16), 0.5, 1000.0, rig.feedback, 0.1)
+    theirs = World.from_settings({}, 3, 1000.0).scan(rig.setup.region, (8, 16), 0.5, 1000.0, rig.setup.feedback, 0.1)
     ours = rig.start_scan()
     assert np.array_equal(ours.channels()["Height"][1], theirs.channels()["Height"][1])
 
 
 def test_what_is_changed_during_a_scan_is_for_the_next(rig: Rig) -> None:
     scan = rig.start_scan()
-    rig.region, rig.shape = Region((1e-6, 0.0), (2e-6, 1e-6)), (4, 4)
+    rig.setup.region, rig.setup.shape = Region((1e-6, 0.0), (2e-6, 1e-6)), (4, 4)
     assert scan.region == Region((0.0, 0.0), (1e-6, 1e-6))
     assert scan.channels()["Height"][1].shape == (8, 16)
 
@@ -77,7 +77,7 @@ def test_a_pause_puts_the_end_off(rig: Rig) -> None:
 
 
 def test_what_can_not_be_scanned_is_refused_at_once(rig: Rig) -> None:
-    rig.line_s = 0.0
+    rig.setup.line_s = 0.0
     with pytest.raises(InvalidValue, match="line"):
         rig.start_scan()
     assert not rig.busy(1000.0)
@@ -91,7 +91,7 @@ def test_one_thing_at_a_time(rig: Rig) -> None:
 
 
 def test_a_move_takes_as_long_as_the_way_is(rig: Rig, clock: Any) -> None:
-    rig.move_speed_m_s = 1e-6
+    rig.setup.move_speed_m_s = 1e-6
     rig.move_probe((3e-6, 4e-6))
     clock.t_s = 1002.5
     assert rig.probe_at(1002.5) == pytest.approx((1.5e-6, 2e-6))
@@ -102,7 +102,7 @@ def test_a_move_takes_as_long_as_the_way_is(rig: Rig, clock: Any) -> None:
 
 
 def test_a_move_can_be_stopped_on_the_way(rig: Rig, clock: Any) -> None:
-    rig.move_speed_m_s = 1e-6
+    rig.setup.move_speed_m_s = 1e-6
     rig.move_probe((4e-6, 0.0))
     clock.t_s = 1001.0
     rig.stop_move()
@@ -148,7 +148,7 @@ def test_withdrawing_ends_whatever_is_going_on(rig: Rig, clock: Any) -> None:
 
 
 def test_the_tip_goes_to_and_fro_along_a_turned_line(rig: Rig) -> None:
-    rig.region = Region((1e-6, 2e-6), (2e-6, 1e-6), math.pi / 2)
+    rig.setup.region = Region((1e-6, 2e-6), (2e-6, 1e-6), math.pi / 2)
     rig.start_scan()
     # turned by 90 degrees the fast axis runs along +y, the slow one along -x
     assert rig.probe_at(1000.0) == pytest.approx((1.5e-6, 1e-6))
@@ -172,10 +172,10 @@ def test_pulses_and_crashes_happen_to_the_world(rig: Rig, clock: Any) -> None:
 def test_a_picture_drawn_in_the_background_is_the_same_and_wakes_the_emulator(clock: Any) -> None:
     woken = []
     at_once, meanwhile = (Rig({}, 3, clock, background=background) for background in (False, True))
-    meanwhile.wake = lambda: woken.append(True)
+    meanwhile.drawing.wake = lambda: woken.append(True)
     heights = []
     for rig in (at_once, meanwhile):
-        rig.shape = (8, 16)
+        rig.setup.shape = (8, 16)
         heights.append(rig.start_scan().channels()["Height"][1])
     assert np.array_equal(*heights)
     meanwhile.stop_scan()
@@ -189,17 +189,17 @@ def test_it_follows_the_sample_with_the_velocity_that_it_is_told(rig: Rig, clock
     clock.t_s = 1100.0
     ours = rig.start_scan().channels()["Height"][1]
     world = World.from_settings({}, 3, 1000.0)
-    world.scan(rig.region, (8, 16), 0.5, 1000.0, rig.feedback, 0.1)
+    world.scan(rig.setup.region, (8, 16), 0.5, 1000.0, rig.setup.feedback, 0.1)
     world.compensate((2e-9, -1e-9), 1000.0)
-    theirs = world.scan(rig.region, (8, 16), 0.5, 1100.0, rig.feedback, 0.1)
+    theirs = world.scan(rig.setup.region, (8, 16), 0.5, 1100.0, rig.setup.feedback, 0.1)
     assert np.array_equal(ours, theirs.channels()["Height"][1])
     world.compensate((0.0, 0.0), 1200.0)
-    elsewhere = world.scan(rig.region, (8, 16), 0.5, 1300.0, rig.feedback, 0.1).channels()["Height"][1]
+    elsewhere = world.scan(rig.setup.region, (8, 16), 0.5, 1300.0, rig.setup.feedback, 0.1).channels()["Height"][1]
     assert np.corrcoef(ours.ravel(), elsewhere.ravel())[0, 1] < 0.999
 
 
 def test_a_tip_at_rest_shows_what_a_scan_shows_there_and_looking_changes_nothing(rig: Rig, clock: Any) -> None:
-    rig.region, rig.shape = Region((30e-9, -20e-9), (10e-9, 10e-9)), (9, 9)
+    rig.setup.region, rig.setup.shape = Region((30e-9, -20e-9), (10e-9, 10e-9)), (9, 9)
     rig.move_probe((30e-9, -20e-9))
     clock.t_s += 10.0
     shown = [rig.signals(clock.t_s) for _ in range(20)]
@@ -211,18 +211,18 @@ def test_a_tip_at_rest_shows_what_a_scan_shows_there_and_looking_changes_nothing
         near = scanned[name][1][3:6, 3:6]
         assert abs(values.mean() - near.mean()) < 5 * near.std() + 3 * values.std()
     unseen = World.from_settings({}, 3, 1000.0)
-    unseen.scan(rig.region, (9, 9), 0.5, clock.t_s, rig.feedback, 0.1)
+    unseen.scan(rig.setup.region, (9, 9), 0.5, clock.t_s, rig.setup.feedback, 0.1)
     assert rig.world.state() == unseen.state()
 
 
 def test_signals_follow_the_lines_of_a_scan_and_are_noise_without_a_sample(rig: Rig, clock: Any) -> None:
     scan = rig.start_scan()
     picture = scan.channels()
-    clock.t_s = scan.start_s + 2 * rig.line_s + rig.line_s * 0.25 * 1.01
+    clock.t_s = scan.start_s + 2 * rig.setup.line_s + rig.setup.line_s * 0.25 * 1.01
     assert rig.signals(clock.t_s)["Height"] == picture["Height"][1][2, 8]
-    clock.t_s = scan.start_s + 2 * rig.line_s + rig.line_s * 0.999
+    clock.t_s = scan.start_s + 2 * rig.setup.line_s + rig.setup.line_s * 0.999
     assert rig.signals(clock.t_s)["Height"] == picture["Height Retrace"][1][2, 0]
-    rig.feedback = replace(rig.feedback, setpoint=-1.0)
+    rig.setup.feedback = replace(rig.setup.feedback, setpoint=-1.0)
     clock.t_s = scan.end_s + 1.0
     assert abs(rig.signals(clock.t_s)["Current"]) < 1e-13, "no feedback, no contact"
     rig.withdraw()
@@ -232,7 +232,7 @@ def test_signals_follow_the_lines_of_a_scan_and_are_noise_without_a_sample(rig: 
 def test_with_the_feedback_off_the_current_follows_where_z_is_held(clock: Any) -> None:
     rig = Rig({"feedback": {"mode": "current", "setpoint": 1e-10}}, 3, clock)
     z_m = np.mean([rig.signals(clock.t_s)["Height"] for _ in range(50)])
-    rig.feedback = replace(rig.feedback, on=False)
+    rig.setup.feedback = replace(rig.setup.feedback, on=False)
     rig.hold(float(z_m))
     at = float(np.mean([rig.signals(clock.t_s)["Current"] for _ in range(50)]))
     rig.hold(float(z_m) + 0.1e-9)
@@ -246,7 +246,7 @@ def sensor(clock: Any) -> Rig:
     """An instrument with an oscillating sensor, on flat ground."""
     settings = {"feedback": {"mode": "frequency-shift", "setpoint": -20.0}, "noise": {"scar_probability": 0.0}}
     rig = Rig(settings, 3, clock, background=False)
-    rig.region, rig.shape = Region((30e-9, -20e-9), (10e-9, 10e-9)), (9, 9)
+    rig.setup.region, rig.setup.shape = Region((30e-9, -20e-9), (10e-9, 10e-9)), (9, 9)
     rig.move_probe((30e-9, -20e-9))
     clock.t_s += 10.0
     return rig
@@ -258,7 +258,7 @@ def _shift_hz(rig: Rig, clock: Any) -> float:
 
 def test_a_sensor_at_rest_shows_the_frequency_shift_of_the_picture_and_of_the_setpoint(sensor: Rig, clock: Any) -> None:
     for setpoint_hz in (-20.0, -5.0):
-        sensor.feedback = replace(sensor.feedback, setpoint=setpoint_hz)
+        sensor.setup.feedback = replace(sensor.setup.feedback, setpoint=setpoint_hz)
         unit, picture_hz = sensor.start_scan().channels()["Frequency Shift"]
         clock.t_s += 100.0
         assert unit == "Hz"
@@ -268,7 +268,7 @@ def test_a_sensor_at_rest_shows_the_frequency_shift_of_the_picture_and_of_the_se
 
 def test_a_sensor_that_is_lifted_shows_what_is_left_of_the_attraction(sensor: Rig, clock: Any) -> None:
     z_m = float(np.mean([sensor.signals(clock.t_s)["Height"] for _ in range(400)]))
-    sensor.feedback = replace(sensor.feedback, on=False)
+    sensor.setup.feedback = replace(sensor.setup.feedback, on=False)
     shifts_hz = []
     for lift_m in (0.0, 1e-9, 1e-6):
         sensor.hold(z_m + lift_m)
@@ -284,7 +284,7 @@ def test_a_scan_that_can_not_be_simulated_is_one_broken_off(
     rig: Rig, clock: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     rig = Rig({}, 3, clock)
-    rig.shape = (16, 16)
+    rig.setup.shape = (16, 16)
 
     def fails(*_: Any, **__: Any) -> None:
         raise MemoryError
@@ -300,8 +300,8 @@ def test_a_scan_that_can_not_be_simulated_is_one_broken_off(
 
 def test_what_makes_no_sense_is_refused_before_anything_begins(rig: Rig, clock: Any) -> None:
     for change in (
-        {"feedback": replace(rig.feedback, setpoint=-1.0)},
-        {"feedback": replace(rig.feedback, integral_gain=-1.0)},
+        {"feedback": replace(rig.setup.feedback, setpoint=-1.0)},
+        {"feedback": replace(rig.setup.feedback, integral_gain=-1.0)},
         {"slope": (math.nan, 0.0)},
         {"bias_v": math.inf},
         {"line_s": 0.0},
@@ -310,13 +310,13 @@ def test_what_makes_no_sense_is_refused_before_anything_begins(rig: Rig, clock: 
         {"region": Region((0.0, 0.0), (1.0, 1.0))},
         {"region": Region((0.0, 0.0), (1e-11, 1e-4))},
     ):
-        before = {name: getattr(rig, name) for name in change}
+        before = {name: getattr(rig.setup, name) for name in change}
         for name, value in change.items():
-            setattr(rig, name, value)
+            setattr(rig.setup, name, value)
         with pytest.raises(InvalidValue):
             rig.start_scan()
         for name, value in before.items():
-            setattr(rig, name, value)
+            setattr(rig.setup, name, value)
     rig.engaged = False
     for begin in (
         lambda: rig.move_probe((math.nan, 0.0)),

@@ -44,7 +44,7 @@ class Tiny(Emulator):
         if self.faults.strikes("no-reply", now_s):
             return
         if asked == "scan":
-            self.rig.shape, self.rig.line_s = (2, 2), 10.0
+            self.rig.setup.shape, self.rig.setup.line_s = (2, 2), 10.0
             self.rig.start_scan()
         assert self._client is not None
         self._client.sendall(f"{self.release} {self.rig.doing(now_s)}\n".encode())

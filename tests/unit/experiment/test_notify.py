@@ -8,7 +8,7 @@ import pytest
 
 from afspm.dashboard.access import PASSWORD
 from afspm.experiment import Experiment
-from afspm.experiment.known import DASHBOARD_PASSWORD
+from afspm.experiment.process_starts import DASHBOARD_PASSWORD
 
 from .conftest import Write, errors, only_error
 

@@ -8,8 +8,8 @@ import pytest
 from pydantic import BaseModel
 
 from afspm.experiment import cache_section, limits_section, sections
-from afspm.experiment.known import WIRE_KEYS, WIRE_SETTINGS, WiringClass
 from afspm.experiment.parts import DECLARED_KEYS, OWN_KEYS, SECTIONS
+from afspm.experiment.wiring_classes import WIRE_KEYS, WIRE_SETTINGS, WiringClass
 
 PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "experiment-file.md").read_text(encoding="utf-8")
 MODELS = [

@@ -8,7 +8,7 @@ import pytest
 from afspm.model import Region
 from afspm.simulation import World
 from afspm.simulation.noise import NoiseSettings, disturbances, flattened, height_noise, one_over_f
-from afspm.simulation.tip import TipState
+from afspm.simulation.tip import TipShape
 
 SILENT = {"white_m": 0.0, "one_over_f_m": 0.0, "line_offset_m": 0.0, "scar_probability": 0.0}
 
@@ -39,7 +39,7 @@ def test_hum_has_its_frequency() -> None:
 
 
 def test_scars_and_debris_disturb_stretches_of_lines() -> None:
-    clean, dirty = TipState(8e-9, 18.0), TipState(8e-9, 18.0, debris_m=12e-9, flaws=("contaminated",))
+    clean, dirty = TipShape(8e-9, 18.0), TipShape(8e-9, 18.0, debris_m=12e-9, flaws=("contaminated",))
     quiet = NoiseSettings(scar_probability=0.0)
     assert disturbances(quiet, [clean] * 100, 1.0, 64, np.random.default_rng(1)) is None
     scars = disturbances(NoiseSettings(scar_probability=0.1), [clean] * 500, 1.0, 64, np.random.default_rng(1))

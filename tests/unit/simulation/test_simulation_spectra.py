@@ -10,20 +10,20 @@ import pytest
 
 from afspm.errors import InvalidValue
 from afspm.model import Feedback
-from afspm.simulation import TipState, World
+from afspm.simulation import TipShape, World
 from afspm.simulation.feedback import FeedbackSettings, Loop
 from afspm.simulation.spectra import ForceSettings, IVSettings, current_voltage, force_distance
 
 TAPPING = Loop.of(FeedbackSettings(), None)
-SHARP = TipState(10e-9, 18.0)
+SHARP = TipShape(10e-9, 18.0)
 
 
-def iv(material: float, tip: TipState = SHARP, **settings: Any) -> np.ndarray:
+def iv(material: float, tip: TipShape = SHARP, **settings: Any) -> np.ndarray:
     quiet = IVSettings(**{"noise_a": 0.0, "relative_noise": 0.0, **settings})
     return current_voltage(quiet, tip, material, 0.1, TAPPING, np.random.default_rng(0))[2]
 
 
-def force(material: float, tip: TipState = SHARP, **settings: Any) -> np.ndarray:
+def force(material: float, tip: TipShape = SHARP, **settings: Any) -> np.ndarray:
     quiet = ForceSettings(**{"noise_m": 0.0, "points": 4000, **settings})
     return force_distance(quiet, tip, material, np.random.default_rng(0))[2]
 
@@ -45,7 +45,7 @@ def test_a_semiconductor_has_a_gap_where_a_metal_has_none() -> None:
 
 
 def test_the_tip_shows_in_the_curve() -> None:
-    dirty = TipState(10e-9, 18.0, debris_m=5e-9, flaws=("contaminated",))
+    dirty = TipShape(10e-9, 18.0, debris_m=5e-9, flaws=("contaminated",))
     clean, odd = iv(1.0), iv(1.0, dirty)
     state = np.abs(clean[:, 0] - 0.62).argmin()
     assert odd[state, 3] / odd[-1, 3] > 1.5 * clean[state, 3] / clean[-1, 3]
@@ -66,7 +66,7 @@ def test_noise_and_saturation_of_the_amplifier() -> None:
 
 def test_pulling_off_takes_the_adhesion_of_the_radius() -> None:
     for radius in (10e-9, 40e-9):
-        curve = force(1.0, TipState(radius, 18.0), range_m=400e-9)
+        curve = force(1.0, TipShape(radius, 18.0), range_m=400e-9)
         assert curve[:, 4].min() == pytest.approx(-4 * math.pi * radius * 0.03, rel=0.03)
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 from collections.abc import Callable
 
+import psutil
 import pytest
 
 from afspm.supervisor.activity_monitor import LEAST_SHARE, ActivityMonitor, ActivitySample, of_process
@@ -84,3 +86,16 @@ def test_what_the_system_says_of_ourselves() -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc")
 def test_of_who_is_not_there_nothing_is_seen() -> None:
     assert of_process(2**22 + 1) is None
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere threads are no processes")
+def test_the_state_of_each_thread_is_seen() -> None:
+    over = threading.Event()
+    thread = threading.Thread(target=over.wait)
+    thread.start()
+    try:
+        states = {psutil.Process(one.id).status() for one in psutil.Process().threads()}
+    finally:
+        over.set()
+        thread.join()
+    assert psutil.STATUS_SLEEPING in states, "it waits, and for no disk"

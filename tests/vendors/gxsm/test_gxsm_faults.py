@@ -172,7 +172,7 @@ def test_a_decimal_comma_is_refused_before_anything_is_set(bench: Make) -> None:
     peer.until(UNDEFINED)
     assert peer.set(names.TIP_BIAS_VOLTAGE, 0.25).code == ControlResponse.NO_RESPONSE
     made.until_said("start it with LC_NUMERIC=C")
-    assert made.emulator.program.entries["dsp-fbs-bias"] == made.emulator.rig.bias_v == 0.1
+    assert made.emulator.program.entries["dsp-fbs-bias"] == made.emulator.rig.setup.bias_v == 0.1
 
 
 def test_what_gxsm_does_not_take_is_refused_though_it_says_0(bench: Make) -> None:

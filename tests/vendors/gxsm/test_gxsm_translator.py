@@ -225,8 +225,8 @@ def test_feedback_is_set_and_its_switch_can_only_be_read(bench: Make) -> None:
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(proportional_gain=0.25, setpoint=0.5)).ok
     heard = peer.until(lambda one: isinstance(one, Feedback))
     assert (heard[-1].on, heard[-1].proportional_gain, heard[-1].setpoint) == (True, 0.25, 0.5)
-    assert made.emulator.rig.feedback.proportional_gain == 0.25
-    assert made.emulator.rig.feedback.integral_gain == pytest.approx(1500.0), "as it was"
+    assert made.emulator.rig.setup.feedback.proportional_gain == 0.25
+    assert made.emulator.rig.setup.feedback.integral_gain == pytest.approx(1500.0), "as it was"
     assert peer.get("x-feedback-on") == "true"
     response = peer.set("x-feedback-on", False)
     assert response.code == ControlResponse.PARAM_ERROR
@@ -234,7 +234,7 @@ def test_feedback_is_set_and_its_switch_can_only_be_read(bench: Make) -> None:
     # peers send back the whole message that was published, with one part changed
     again = replace(heard[-1], proportional_gain=0.5)
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, again).ok
-    assert made.emulator.rig.feedback.proportional_gain == 0.5
+    assert made.emulator.rig.setup.feedback.proportional_gain == 0.5
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, replace(again, on=False)).code == ControlResponse.PARAM_ERROR
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True)).ok
 
@@ -246,9 +246,9 @@ def test_the_feedback_is_switched_where_gxsm_has_actions_for_it(bench: Make) -> 
     assert peer.set("x-feedback-on", False).ok
     heard = peer.until(lambda one: isinstance(one, Feedback))
     assert heard[-1].on is False
-    assert made.emulator.rig.feedback.on is False
+    assert made.emulator.rig.setup.feedback.on is False
     assert peer.set("x-feedback-on", True).ok
-    assert made.emulator.rig.feedback.on
+    assert made.emulator.rig.setup.feedback.on
 
 
 def test_the_feedback_is_not_switched_by_actions_that_this_gxsm_lacks(bench: Make) -> None:
@@ -285,10 +285,10 @@ def test_a_pulse_of_a_translator_that_was_killed_is_ended_by_the_next(bench: Mak
     ready(peer)
     assert peer.set(names.PULSE_DURATION, 60).ok
     assert peer.act(names.PULSE).ok
-    assert made.emulator.rig.bias_v == 4.0
+    assert made.emulator.rig.setup.bias_v == 4.0
     made.kill()
     made.start().until(FREE)
-    assert made.emulator.rig.bias_v == 0.1
+    assert made.emulator.rig.setup.bias_v == 0.1
 
 
 def test_a_crash_is_what_the_experiment_file_says(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:

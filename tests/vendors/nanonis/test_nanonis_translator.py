@@ -190,10 +190,10 @@ def test_feedback_is_set_switched_off_and_on(bench: Make) -> None:
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False, proportional_gain=0.25, setpoint=0.5)).ok
     heard = peer.until(lambda one: isinstance(one, Feedback))
     assert (heard[-1].on, heard[-1].proportional_gain, heard[-1].setpoint) == (False, 0.25, 0.5)
-    assert made.emulator.rig.feedback.on is False
-    assert made.emulator.rig.feedback.integral_gain == pytest.approx(1500.0), "P alone changes T, and I stays"
+    assert made.emulator.rig.setup.feedback.on is False
+    assert made.emulator.rig.setup.feedback.integral_gain == pytest.approx(1500.0), "P alone changes T, and I stays"
     assert peer.set("x-feedback-on", True).ok
-    assert made.emulator.rig.feedback.on is True
+    assert made.emulator.rig.setup.feedback.on is True
     response = peer.set(names.ZCTRL_PGAIN, 0)
     assert response.code == ControlResponse.PARAM_ERROR
     assert "I = P / T" in response.reason
@@ -207,7 +207,7 @@ def test_feedback_is_switched_on_only_once_the_rest_of_it_is_set(bench: Make, mo
     plain = software.z_controller.switch
 
     def switch(now_s: float, *, on: bool, **settings: float) -> None:
-        switched_with.append((on, software.core.rig.feedback.setpoint))
+        switched_with.append((on, software.core.rig.setup.feedback.setpoint))
         plain(now_s, on=on, **settings)
 
     assert peer.set(names.ZCTRL_SETPOINT, 0.25).ok

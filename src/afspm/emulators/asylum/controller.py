@@ -158,11 +158,11 @@ class AsylumController:
     def engage(self) -> None:
         """Bring the tip to the sample, once it has finished going away."""
         self._engages = True
-        self.rig.feedback = replace(self.rig.feedback, on=True)
+        self.rig.setup.feedback = replace(self.rig.setup.feedback, on=True)
 
     def feedback_off(self) -> None:
         """The tip stays where it is."""
-        self.rig.feedback = replace(self.rig.feedback, on=False)
+        self.rig.setup.feedback = replace(self.rig.setup.feedback, on=False)
 
     def abandon(self) -> None:
         """Stop whatever goes on, as an error that nobody foresaw ended it."""
@@ -196,19 +196,19 @@ class AsylumController:
 
     def _start(self) -> None:
         values, rig = self.values, self.rig
-        rig.region = self._frame()
-        rig.shape = (round(values.get("ScanLines")), round(values.get("ScanPoints")))
-        rig.line_s = 1.0 / values.get("ScanRate")
-        rig.upwards = not values.get("ScanDown")
-        rig.bias_v = values.get("TipVoltage")
-        rig.feedback = replace(
-            rig.feedback,
+        rig.setup.region = self._frame()
+        rig.setup.shape = (round(values.get("ScanLines")), round(values.get("ScanPoints")))
+        rig.setup.line_s = 1.0 / values.get("ScanRate")
+        rig.setup.upwards = not values.get("ScanDown")
+        rig.setup.bias_v = values.get("TipVoltage")
+        rig.setup.feedback = replace(
+            rig.setup.feedback,
             on=True,
             integral_gain=_INTEGRAL_GAIN * values.get("IntegralGain"),
             setpoint=values.get("AmplitudeSetpointVolts"),
         )
         rig.start_scan()
-        self._image = rig.region
+        self._image = rig.setup.region
 
     def _frame(self) -> Region:
         center = (self.values.get("XOffset"), self.values.get("YOffset"))

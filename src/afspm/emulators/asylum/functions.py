@@ -142,7 +142,7 @@ class AsylumFunctions:
         return 0.0
 
     def _feedback_on(self) -> float:
-        return float(self._controller.rig.engaged and bool(self._controller.rig.feedback.on))
+        return float(self._controller.rig.engaged and bool(self._controller.rig.setup.feedback.on))
 
     # --- spots ---
 

@@ -155,7 +155,7 @@ class GxsmFunctions:
     def _do(self, name: str) -> None:
         program, rig = self._program, self._program.rig
         if name in self._feedback_actions:
-            rig.feedback = replace(rig.feedback, on=name == self._feedback_actions[0])
+            rig.setup.feedback = replace(rig.setup.feedback, on=name == self._feedback_actions[0])
         elif name.startswith("CHECK-") and name.removeprefix("CHECK-") in _MODES[program.card]:
             program.probe_auto_save = True
         elif name == "DSP_VP_ABORT_EXECUTE":
@@ -209,7 +209,7 @@ class GxsmFunctions:
         doing, scan = program.rig.doing(now_s), program.rig.scan
         scanning = doing == "scan" and scan is not None and now_s >= scan.start_s + SHOWS_S
         paused, probing = scanning and scan is not None and scan.paused, doing == "spectrum"
-        feedback = bool(program.rig.feedback.on)
+        feedback = bool(program.rig.setup.feedback.on)
         if program.card == "RPSPMC":
             ended = not (scanning or probing) and scan is not None
             return feedback + 2 * (scanning or probing) + 4 * paused + 16 * ended

@@ -108,8 +108,8 @@ class GxsmProgram:
         return lambda _: None
 
     def _of_hardware(self) -> dict[str, GxsmEntry]:
-        rig, loop = self.rig, self.rig.feedback
-        bias = GxsmEntry(rig.bias_v, -10.0, 10.0, "V", told=self._bias)
+        rig, loop = self.rig, self.rig.setup.feedback
+        bias = GxsmEntry(rig.setup.bias_v, -10.0, 10.0, "V", told=self._bias)
         if self.card == "simulator":
             speed = GxsmEntry(1.0, 0.01, 4000.0, "px/s", "{:.2f}")
             return {"sim-stm-speed": speed, "sim-stm-bias": bias, **(simulated_3() if self.version == 3 else {})}
@@ -117,14 +117,16 @@ class GxsmProgram:
         def fed_back(name: str, factor: float = 1.0) -> Callable[[float], None]:
             def told(value: float) -> None:
                 changed: dict[str, Any] = {name: value * factor}
-                rig.feedback = replace(rig.feedback, **changed)
+                rig.setup.feedback = replace(rig.setup.feedback, **changed)
 
             return told
 
         def sloped(axis: int) -> Callable[[float], None]:
-            return lambda value: setattr(rig, "slope", (*rig.slope[:axis], value, *rig.slope[axis + 1 :]))
+            return lambda value: setattr(
+                rig.setup, "slope", (*rig.setup.slope[:axis], value, *rig.setup.slope[axis + 1 :])
+            )
 
-        speed = GxsmEntry(2e4, 1e-3, 1e7, told=lambda value: setattr(rig, "move_speed_m_s", value * ANGSTROM_M))
+        speed = GxsmEntry(2e4, 1e-3, 1e7, told=lambda value: setattr(rig.setup, "move_speed_m_s", value * ANGSTROM_M))
         mixer, unit, factor = _MIXERS.get(rig.world.settings.feedback.mode, _MIXER)
         setpoint = GxsmEntry((loop.setpoint or 0.0) / factor, -1e3, 1e3, unit, told=fed_back("setpoint", factor))
         found = {
@@ -151,8 +153,8 @@ class GxsmProgram:
         """Another bias; one that was in force for a short while has been a pulse."""
         now_s = self.clock.now_s()
         if now_s - self._bias_since_s < _PULSE_S:
-            self.rig.pulsed(self.rig.bias_v, now_s - self._bias_since_s)
-        self.rig.bias_v, self._bias_since_s = value, now_s
+            self.rig.pulsed(self.rig.setup.bias_v, now_s - self._bias_since_s)
+        self.rig.setup.bias_v, self._bias_since_s = value, now_s
 
     # --- what happens by itself ---
 
@@ -182,13 +184,13 @@ class GxsmProgram:
             return
         entries, columns, rows = self.entries, int(self.entries["PointsX"]), int(self.entries["PointsY"])
         region = self.frame()
-        self.rig.region, self.rig.shape, self.rig.upwards = region, (rows, columns), False
+        self.rig.setup.region, self.rig.setup.shape, self.rig.setup.upwards = region, (rows, columns), False
         if self.card == "simulator":
             # it turns its picture the other way than the frame
-            self.rig.region = replace(region, angle_rad=-region.angle_rad)
-            self.rig.line_s = _PIXELS_S + len(self.channels) * columns / entries["sim-stm-speed"]
+            self.rig.setup.region = replace(region, angle_rad=-region.angle_rad)
+            self.rig.setup.line_s = _PIXELS_S + len(self.channels) * columns / entries["sim-stm-speed"]
         else:
-            self.rig.line_s = 2.0 * entries["RangeX"] / entries["dsp-fbs-scan-speed-scan"]
+            self.rig.setup.line_s = 2.0 * entries["RangeX"] / entries["dsp-fbs-scan-speed-scan"]
         try:
             started = self.rig.start_scan()
         except InvalidValue as error:
@@ -335,7 +337,7 @@ class GxsmProgram:
             path = self._curve_path()
         offset = self.entries["OffsetX"], self.entries["OffsetY"]
         version = "00.03" if self.card == "RPSPMC" else "00.02"
-        saved = files.GxsmSpectrumFile(str(path), self.columns(curve), now_s, offset, self.rig.bias_v, version)
+        saved = files.GxsmSpectrumFile(str(path), self.columns(curve), now_s, offset, self.rig.setup.bias_v, version)
         self.saving.write([(path, files.vpdata(saved))], now_s)
 
     def _curve_path(self) -> Path:

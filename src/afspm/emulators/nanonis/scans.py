@@ -157,10 +157,10 @@ class ScanModule:
         x, y, width, height, clockwise_deg = self.frame
         rig = self._core.rig
         size_m = (width * (self.pixels - 1) / self.pixels, height * max(self.lines - 1, 1) / self.lines)
-        rig.region = Region((x, y), size_m, -math.radians(clockwise_deg))
-        rig.shape = (self.lines, self.pixels)
+        rig.setup.region = Region((x, y), size_m, -math.radians(clockwise_deg))
+        rig.setup.shape = (self.lines, self.pixels)
         forward_s, backward_s = self.speed[2:4]
-        rig.line_s, rig.upwards = forward_s + backward_s, upwards
+        rig.setup.line_s, rig.setup.upwards = forward_s + backward_s, upwards
         scan = rig.start_scan()
         self.running = self.last = StartedScan(scan, self.frame, (forward_s, backward_s), list(self.channels))
 

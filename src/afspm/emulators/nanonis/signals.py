@@ -48,7 +48,7 @@ class Signals:
         rig = self._core.rig
         shown = rig.signals(now_s)
         values = {CHANNELS[name]: value for name, value in shown.items() if name in CHANNELS}
-        values |= {CHANNELS["Height"]: self._z_m(shown["Height"]), _BIAS: rig.bias_v}
+        values |= {CHANNELS["Height"]: self._z_m(shown["Height"]), _BIAS: rig.setup.bias_v}
         return [values.get(index, 0.0) for index in indexes]
 
     def z_m(self, now_s: float) -> float:

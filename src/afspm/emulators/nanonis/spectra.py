@@ -125,7 +125,7 @@ class SpectroscopyModules:
             "Y (m)": number(y),
             "Z (m)": number(0.0),
             "Start time": files.moment(curve.start_s),
-            "Bias>Bias (V)": number(self._core.rig.bias_v),
+            "Bias>Bias (V)": number(self._core.rig.setup.bias_v),
         }
 
     # --- functions ---

@@ -30,7 +30,7 @@ class ZController:
 
     def __init__(self, core: NanonisCore, scans: ScanModule, signals: Signals) -> None:
         self._core, self._scans, self._signals = core, scans, signals
-        self.state = "on" if core.rig.feedback.on else "off"
+        self.state = "on" if core.rig.setup.feedback.on else "off"
         self.pulse_holds = True
         self._follows_s = 0.0
 
@@ -49,10 +49,10 @@ class ZController:
         rig = self._core.rig
         self.state = "on" if on else "off"
         self._follows_s = now_s + (0.0 if on else off_delay_s)
-        if not on and rig.feedback.on and rig.engaged and self._scans.running is None:
+        if not on and rig.setup.feedback.on and rig.engaged and self._scans.running is None:
             lift_m = (*self._core.registers.get("ZCtrl.TipLift"), 0.0)[0]
             rig.hold(float(np.mean([self._signals.z_m(now_s) for _ in range(_Z_AVERAGED)])) + lift_m)
-        rig.feedback = replace(rig.feedback, on=on)
+        rig.setup.feedback = replace(rig.setup.feedback, on=on)
         if on:
             rig.engaged = True
 
@@ -103,24 +103,24 @@ class ZController:
 
     @answers("ZCtrl.SetpntSet")
     def _set_setpoint(self, setpoint: float) -> Answer:
-        self._core.rig.feedback = replace(self._core.rig.feedback, setpoint=setpoint)
+        self._core.rig.setup.feedback = replace(self._core.rig.setup.feedback, setpoint=setpoint)
         return ()
 
     @answers("ZCtrl.SetpntGet")
     def _get_setpoint(self) -> Answer:
-        return (self._core.rig.feedback.setpoint or 0.0,)
+        return (self._core.rig.setup.feedback.setpoint or 0.0,)
 
     @answers("ZCtrl.GainSet")
     def _set_gain(self, proportional: float, time_s: float, integral: float) -> Answer:
         """Set P and T; I = P / T."""
         integral = proportional / time_s if time_s > 0.0 else integral
         rig = self._core.rig
-        rig.feedback = replace(rig.feedback, proportional_gain=proportional, integral_gain=integral)
+        rig.setup.feedback = replace(rig.setup.feedback, proportional_gain=proportional, integral_gain=integral)
         return ()
 
     @answers("ZCtrl.GainGet")
     def _get_gain(self) -> Answer:
-        feedback = self._core.rig.feedback
+        feedback = self._core.rig.setup.feedback
         proportional, integral = feedback.proportional_gain or 0.0, feedback.integral_gain or 0.0
         return proportional, proportional / integral if integral else math.inf, integral
 
@@ -135,7 +135,7 @@ class ZController:
             rig = self._core.rig
             rig.withdraw()
             self.state = "off"
-            rig.feedback = replace(rig.feedback, on=False)
+            rig.setup.feedback = replace(rig.setup.feedback, on=False)
         return self._core.until_free(wait, timeout_ms)
 
     @answers("AutoApproach.Open")
@@ -164,7 +164,7 @@ class TipModules:
 
     def __init__(self, core: NanonisCore, scans: ScanModule, z_controller: ZController) -> None:
         self._core, self._scans, self._z_controller = core, scans, z_controller
-        self._has_own_speed, self._own_speed_m_s = True, core.rig.move_speed_m_s
+        self._has_own_speed, self._own_speed_m_s = True, core.rig.setup.move_speed_m_s
         self._motor_m, self._motor_walk = (0.0, 0.0, 0.0), (0, 0, 0.0)
 
     # --- position ---
@@ -174,7 +174,7 @@ class TipModules:
         if self._scans.running is not None:
             raise FunctionRefused("the tip can't be moved while it scans")
         rig = self._core.rig
-        rig.move_speed_m_s = self._own_speed_m_s if self._has_own_speed else self._scans.speed[0]
+        rig.setup.move_speed_m_s = self._own_speed_m_s if self._has_own_speed else self._scans.speed[0]
         reach_x, reach_y = self._core.range_m[0] / 2, self._core.range_m[1] / 2
         rig.move_probe((float(np.clip(x, -reach_x, reach_x)), float(np.clip(y, -reach_y, reach_y))))
         return self._core.until_free(wait)
@@ -205,17 +205,17 @@ class TipModules:
     def _set_bias(self, bias_v: float) -> Answer:
         if not abs(bias_v) <= 10.0:
             raise FunctionRefused("the bias is limited to 10 V")
-        self._core.rig.bias_v = bias_v
+        self._core.rig.setup.bias_v = bias_v
         return ()
 
     @answers("Bias.Get")
     def _get_bias(self) -> Answer:
-        return (self._core.rig.bias_v,)
+        return (self._core.rig.setup.bias_v,)
 
     @answers("Bias.Pulse")
     def _pulse(self, wait: int, width_s: float, bias_v: float, hold: int, absolute: int) -> Answer:
         relative = 1
-        self._core.rig.pulse(bias_v + (self._core.rig.bias_v if absolute == relative else 0.0), width_s)
+        self._core.rig.pulse(bias_v + (self._core.rig.setup.bias_v if absolute == relative else 0.0), width_s)
         if hold:
             self._z_controller.pulse_holds = hold == 1
         return self._core.until_free(wait)
@@ -239,7 +239,7 @@ class TipModules:
         if not max(abs(x_deg), abs(y_deg)) < _STEEPEST_DEG:
             raise FunctionRefused("that is no tilt")
         self._core.registers.put("Piezo.Tilt", x_deg, y_deg)
-        self._core.rig.slope = (math.tan(math.radians(x_deg)), math.tan(math.radians(y_deg)))
+        self._core.rig.setup.slope = (math.tan(math.radians(x_deg)), math.tan(math.radians(y_deg)))
         return ()
 
     @answers("Piezo.RangeGet")

@@ -190,7 +190,7 @@ class DriftCore(SchedulerCore):
             return super().step(event, now_s, now_ns)
         key = scan_key(scan, event.packet)
         if self._gate.is_settled(key):
-            return super().step(self._relocated(event, scan, self._gate.mapping_of(key)), now_s, now_ns)
+            return super().step(_relocated(event, scan, self._gate.mapping_of(key), self._codec), now_s, now_ns)
         self._beginning.scan_came()
         until_s = now_s + self._settings.longest_registration
         self._gate.hold(HeldScan(key, self._middle_s(scan, event, now_ns), until_s))
@@ -231,7 +231,7 @@ class DriftCore(SchedulerCore):
         return effects + self._give_up(key, why, now_s, now_ns)
 
     def _register(self, held: HeldScan, scan: Scan, event: PacketIn, now_ns: int) -> None:
-        end_s = self._end_s(scan, event, now_ns)
+        end_s = _end_s(scan, event, now_ns)
         start_s, upwards = 2 * held.middle_s - end_s, None
         begun = self._beginning.of_scan(end_s)
         if begun is not None and not begun.was_paused:
@@ -251,31 +251,16 @@ class DriftCore(SchedulerCore):
 
     def _middle_s(self, scan: Scan, event: PacketIn, now_ns: int) -> float:
         """Between when it began and its own end, so that a file that comes late biases nothing."""
-        end_s = self._end_s(scan, event, now_ns)
+        end_s = _end_s(scan, event, now_ns)
         begun = self._beginning.of_scan(end_s)
         if begun is not None:
             return (begun.time_s + end_s) / 2
         return end_s - self.frame.durations.expected_s(scan.shape, scan.region.size_m) / 2
 
-    def _end_s(self, scan: Scan, event: PacketIn, now_ns: int) -> float:
-        time_ns = scan.time_ns if scan.time_ns is not None else event.packet.time_ns
-        return (now_ns if time_ns is None else time_ns) * 1e-9
-
     def _note_state(self, payload: bytes | memoryview, time_ns: int | None) -> None:
         status = self._codec.decode_packet("ScopeStateMsg", payload)
         if isinstance(status, ScopeStatus) and time_ns is not None:
             self._beginning.state(status, time_ns * 1e-9, self.frame.upwards)
-
-    def _relocated(self, event: PacketIn, scan: Scan, matrix: Matrix | None) -> PacketIn:
-        if matrix is None:
-            return event
-        region = Mapping(matrix).to_sample(scan.region)  # type: ignore[arg-type]
-        said = self._codec.encode(ScanParameters(region))
-        packet, header = event.packet, event.header
-        payload = self._codec.relocated("Scan2d", packet.payload, said)
-        size_m = region.size_m if header.size_m is not None else None
-        moved = PacketHeader(header.message, header.channel, size_m, header.kind, header.time_ns)
-        return PacketIn(Packet(packet.envelope, payload, packet.time_ns), moved)
 
     # --- what comes of a scan ---
 
@@ -393,3 +378,19 @@ def scan_key(scan: Scan, packet: Packet) -> str:
     if scan.time_ns is None and scan.filename:
         return scan.filename
     return f"at {packet.time_ns if scan.time_ns is None else scan.time_ns} ns"
+
+
+def _end_s(scan: Scan, event: PacketIn, now_ns: int) -> float:
+    time_ns = scan.time_ns if scan.time_ns is not None else event.packet.time_ns
+    return (now_ns if time_ns is None else time_ns) * 1e-9
+
+
+def _relocated(event: PacketIn, scan: Scan, matrix: Matrix | None, codec: DriftCodec) -> PacketIn:
+    if matrix is None:
+        return event
+    region = Mapping(matrix).to_sample(scan.region)  # type: ignore[arg-type]
+    packet, header = event.packet, event.header
+    payload = codec.relocated("Scan2d", packet.payload, codec.encode(ScanParameters(region)))
+    size_m = region.size_m if header.size_m is not None else None
+    moved = PacketHeader(header.message, header.channel, size_m, header.kind, header.time_ns)
+    return PacketIn(Packet(packet.envelope, payload, packet.time_ns), moved)

@@ -1,4 +1,4 @@
-"""What is published at the start, setting where to scan, and moving the probe."""
+"""Where the microscope scans: what is published at the start, setting the frame, and moving the probe."""
 
 from __future__ import annotations
 

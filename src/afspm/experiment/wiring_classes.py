@@ -1,4 +1,4 @@
-"""Names that the experiment file may use for what is in afspm already: the paper's form, and short ones of ours."""
+"""The classes of the paper's form that say where sockets are, and the keys by which components name them."""
 
 from __future__ import annotations
 
@@ -84,23 +84,3 @@ WIRE_KEYS: Final[dict[str, tuple[WiringClass, ...]]] = {
     "pubsubcache": (WiringClass.CACHE,),
     "router": (WiringClass.ROUTER,),
 }
-
-DASHBOARD: Final = "dashboard"
-"""The name under which `afspm dashboard` joins a run."""
-DASHBOARD_PASSWORD: Final = "AFSPM_DASHBOARD_PASSWORD"
-"""The environment variable that only dashboards get."""
-
-# Where a class named without a module is looked for, in this order.
-SHORT_NAME_PACKAGES: Final[tuple[str, ...]] = (
-    "afspm.components",
-    "afspm.scheduler",
-    "afspm.microscopes.simulator",
-    "afspm.microscopes.image",
-    "afspm.microscopes.nanonis",
-    "afspm.microscopes.asylum",
-    "afspm.microscopes.gxsm",
-    "afspm.emulators.nanonis",
-    "afspm.emulators.asylum",
-    "afspm.emulators.gxsm",
-    "afspm.dashboard",
-)
