@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 from afspm import wire
@@ -184,15 +183,6 @@ class ExperimentLink:
         key = object()
         self._listeners[key] = listener
         return lambda: self._listeners.pop(key, None) and None
-
-    @contextmanager
-    def listening(self, listener: Listener) -> Iterator[None]:
-        """`listen` while in the block."""
-        forget = self.listen(listener)
-        try:
-            yield
-        finally:
-            forget()
 
     # --- asking ---
 

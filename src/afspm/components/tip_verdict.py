@@ -1,4 +1,4 @@
-"""What a judge of scans tells others: the places it looked at, each with a score, as a message of the contract."""
+"""The verdict on a scan as a message of the contract: the places looked at, each with a score."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ GOOD, UNCLEAR = 1.0, 0.5
 
 
 def verdict_message(scan: Scan, score: float) -> Any:
-    """A `SpatialROIWithScoreList` with one place: that of the scan, whose time and channel it carries."""
+    """Return a `SpatialROIWithScoreList` with one place: that of the scan, whose time and channel it carries."""
     message: Any = wire.message_type(MESSAGE)(channel=scan.channel)
     if scan.time_ns is not None:
         message.timestamp.FromNanoseconds(scan.time_ns)
@@ -29,7 +29,7 @@ def verdict_message(scan: Scan, score: float) -> Any:
 
 
 def read_verdict(message: Any) -> tuple[int, float] | None:
-    """(time of the scan in ns, score) of such a message; None if it says nothing of a scan."""
+    """Return (time of the scan in ns, score) of such a message; None if it says nothing of a scan."""
     if not message.spatials or not message.HasField("timestamp"):
         return None
     return message.timestamp.ToNanoseconds(), float(message.spatials[0].score)

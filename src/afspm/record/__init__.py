@@ -1,1 +1,1 @@
-"""What is kept of an experiment: its journal, its measurements as files, and what can be made of them."""
+"""The record of an experiment: its journal, its measurements as files, and what is made of them."""

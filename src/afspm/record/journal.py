@@ -104,12 +104,12 @@ def read_only(path: PurePath) -> str:
 
 
 def is_damage(error: sqlite3.DatabaseError) -> bool:
-    """Whether it says that the file is damaged; others say that the disk is full, or that we made a mistake."""
+    """Return whether an error says that the file is damaged, and not that the disk is full."""
     return type(error) is sqlite3.DatabaseError
 
 
 def damaged(path: Path, error: Exception) -> FileError:
-    """What to say of a journal that can't be read."""
+    """Return the error to raise for a journal that can't be read."""
     return error if isinstance(error, FileError) else FileError(f"is damaged: {error}", where=str(path))
 
 

@@ -86,7 +86,7 @@ class MeasuredFiles:
         self._insert_scan_packets(taken, number)
 
     def _known(self, new: Mapping[str, Scan], measured_ns: int) -> tuple[int, str] | None:
-        """The number and file of the scan that these are channels of, if it is there: none came out of another file."""
+        """Return number and file of the recorded scan that these are channels of; None if there is none."""
         rows = self._journal.execute(
             "SELECT number, file FROM scans WHERE time_ns = ? AND NOT interrupted ORDER BY number", (measured_ns,)
         )
@@ -97,7 +97,7 @@ class MeasuredFiles:
         return None
 
     def _channels(self, number: int) -> Iterator[tuple[str, str]]:
-        """Channels of a scan that is there, and the controller's files that they came out of."""
+        """Yield the channels of a recorded scan, with the controller's files that they came from."""
         rows = self._journal.execute("SELECT payload FROM packets WHERE scan = ? AND message = 'Scan2d'", (number,))
         for (payload,) in rows:
             message: Any = wire.message_type("Scan2d").FromString(payload)
@@ -134,7 +134,7 @@ class MeasuredFiles:
         return number
 
     def _add_channels(self, number: int, path: Path, new: Mapping[str, Scan]) -> None:
-        """Channels that came after the file was written: the recorder was killed in between."""
+        """Add channels that came after the file was written, since the recorder was killed in between."""
         from afspm.files import read
 
         self._batch.finish()  # it may be one of these
@@ -193,7 +193,7 @@ class MeasuredFiles:
     # --- both ---
 
     def _next(self, kind: str, time_ns: int) -> tuple[int, str]:
-        """The next number, and the file of that number, from the run folder."""
+        """Return the next number and its file, relative to the run folder."""
         number = int(self._journal.execute(f"SELECT coalesce(max(number), 0) + 1 FROM {kind}").fetchone()[0])
         name = f"{kind}/{_stamp(time_ns)}-{number:05d}{SUFFIX}"
         for orphan in (self._folder / kind).glob(f"{_stamp(time_ns)}-*{SUFFIX}"):
@@ -219,7 +219,7 @@ def insert_packet(
     spectrum: int | None = None,
     rows: tuple[str | None, int | None, int | None] = (None, None, None),
 ) -> None:
-    """A row for a packet.
+    """Insert the row of a packet.
 
     Args:
         payload: what of it is kept here; its values are in the file of `scan` or `spectrum`.
@@ -232,7 +232,7 @@ def insert_packet(
 
 
 def header_of(filename: str, folder: Path) -> Mapping[str, Any]:
-    """What the controller's own file says of a measurement; empty if it is on another computer, or can't be read."""
+    """Return the header of the controller's own file; empty if it is on another computer, or can't be read."""
     from afspm.files import read
 
     path = folder / filename if filename else folder
@@ -252,5 +252,5 @@ def write_synced(path: Path, data: bytes) -> None:
 
 
 def _stamp(time_ns: int) -> str:
-    """As it may stand in the name of a file."""
+    """Return a time as it may stand in the name of a file."""
     return iso_utc(time_ns).replace("-", "").replace(":", "")

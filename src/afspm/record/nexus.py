@@ -37,7 +37,7 @@ _SHOWN = ("in_control", "mode", "interrupted", "number", "run")
 
 @dataclass(frozen=True)
 class FileProvenance:
-    """How things stood, as far as that is known.
+    """The provenance that is written into a file, as far as it is known.
 
     Attributes:
         time_ns: when it was finished; began_ns: when it began.
@@ -115,7 +115,7 @@ def encode_spectrum(spectrum: Spectrum, circumstances: FileProvenance) -> bytes:
 
 
 def facts_of(path: Path) -> dict[str, Any]:
-    """What was noted in a file beside its values. Raises FileError: it is damaged."""
+    """Return what a file says beside its values. Raises FileError: it is damaged."""
     with hdf5.opened(path) as file:
         return about_of(file)
 
@@ -185,7 +185,7 @@ def _values(group: Any, name: str, values: Array | float, unit: str, long_name: 
 
 
 def field_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
-    """Names that NeXus allows, all different; the real ones are in `long_name`."""
+    """Return names that NeXus allows, all different; the real ones are in `long_name`."""
     found, used = [], set(taken)
     for name in names:
         plain = re.sub(r"[^a-z0-9_]+", "_", name.lower()).strip("_") or "value"
@@ -201,14 +201,14 @@ def field_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
 
 @cache
 def afspm_version() -> str:
-    """The version of this program."""
+    """Return the version of this program."""
     from importlib.metadata import version
 
     return version("afspm")
 
 
 def _plain(value: Any) -> Any:
-    """What a reader of a vendor's file made that JSON does not know."""
+    """Return a value of a vendor's header in JSON's types."""
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, np.ndarray):

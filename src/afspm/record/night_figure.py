@@ -145,7 +145,7 @@ def _bands(
     *,
     names_too: bool,
 ) -> None:
-    """A lane for each that was in control, and one for each problem; time in ns."""
+    """Draw a lane for each holder and each problem; time in ns."""
     labels: list[str] = []
     for lane, holder in enumerate(record.holders):
         _lane(ax, lane, record.control_spans(holder), limits, facecolor=colours[holder])
@@ -180,7 +180,7 @@ def _lane(ax: Axes, lane: int, spans: Sequence[Span], limits: tuple[int, int], *
 
 
 def flagged_by(record: NightRecord, span: Span) -> str:
-    """Who thought badly of a scan just when a problem was flagged; empty if nobody said so."""
+    """Return the component that judged a scan bad when a problem was flagged; empty if none did."""
     near = [m for m in record.marks if m.score == BAD and abs(m.time_ns - span.start_ns) < AROUND_NS / 4]
     return min(near, key=lambda m: abs(m.time_ns - span.start_ns)).by if near else ""
 
@@ -215,7 +215,7 @@ def _legend(ax: Axes) -> None:
 
 
 def _minutes(ax: Axes, span: Span, record: NightRecord) -> None:
-    """Minutes from the moment that the problem was flagged."""
+    """Count the minutes from when the problem was flagged."""
     low, high = ax.get_xlim()
     minute = 60e9
     span_min = (high - low) / minute
@@ -236,7 +236,7 @@ def _step(span: float, steps: Sequence[float], *, most: int) -> float:
 
 
 def _episodes(record: NightRecord) -> list[Span]:
-    """From a problem flagged until none is."""
+    """Return the spans from a problem flagged until none is."""
     spans = sorted((s for p in record.problems for s in record.problem_spans(p)), key=lambda s: s.start_ns)
     merged: list[Span] = []
     for span in spans:

@@ -92,46 +92,46 @@ class NightRecord:
 
     @property
     def start_ns(self) -> int:
-        """When the first thing happened: the first scan, or the first control."""
+        """Return the time of the first scan or the first control state."""
         times = [shot.start_ns or shot.time_ns for shot in self.shots] + [t for t, s in self.control if s.holder]
         return min(times, default=self.end_ns)
 
     @property
     def scans(self) -> int:
-        """How many there were."""
+        """Return how many scans there were."""
         return len(self.shots) if self.scans_taken is None else self.scans_taken
 
     @property
     def holders(self) -> list[str]:
-        """All who were in control, in the order in which they came."""
+        """Return all holders in the order in which they came."""
         return list(dict.fromkeys(state.holder for _, state in sorted_by_time(self.control) if state.holder))
 
     @property
     def problems(self) -> list[int]:
-        """All that were flagged, in the order in which they came."""
+        """Return all problems in the order in which they were flagged."""
         return list(dict.fromkeys(p for _, state in sorted_by_time(self.control) for p in state.problems))
 
     def holder_of(self, shot: Shot) -> str | None:
-        """Who was in control when a scan began; of one whose beginning was not seen, when it ended."""
+        """Return the holder when a scan began; if that was not seen, when it ended."""
         if shot.start_ns is not None:
             return shot.holder
         before = [state for time_ns, state in sorted_by_time(self.control) if time_ns < shot.time_ns]
         return before[-1].holder if before else None
 
     def control_spans(self, holder: str) -> list[Span]:
-        """When a component was in control."""
+        """Return the spans in which a component was in control."""
         return self._spans(lambda state: state.holder == holder, holder)
 
     def problem_spans(self, problem: int) -> list[Span]:
-        """When a problem was flagged."""
+        """Return the spans in which a problem was flagged."""
         return self._spans(lambda state: problem in state.problems)
 
     def manual_spans(self) -> list[Span]:
-        """When a person had it."""
+        """Return the spans of manual mode."""
         return self._spans(lambda state: state.mode is ControlMode.MANUAL)
 
     def verdict(self, shot: Shot) -> float | None:
-        """What was thought of a scan; None if nobody said."""
+        """Return the score of a scan; None if it was not judged."""
         return next((m.score for m in reversed(self.marks) if m.of_ns == shot.time_ns), None)
 
     def _spans(self, holds: Callable[[ControlState], bool], label: str = "") -> list[Span]:

@@ -102,7 +102,7 @@ class SpectrumSummary:
 
 @dataclass(frozen=True, slots=True)
 class DriftPoint:
-    """What was known of drift after one scan.
+    """The drift after one scan.
 
     Attributes:
         translation_m: (x, y) displacement of the sample under the tip since the start, in tip coordinates.
@@ -296,7 +296,7 @@ class Overview:
                 lane.change(None, time_ns)
 
     def _flagger(self, number: int, time_ns: int) -> str:
-        """Who asked for a problem to be flagged just before."""
+        """Return the component that asked for a problem to be flagged just before."""
         for entry in reversed(self.entries):
             if entry.time_ns < time_ns - SOON_NS:
                 break
@@ -319,7 +319,7 @@ class Overview:
                     lane.name_last(entry.who)
 
     def _take_change(self, entry: JournalEntry) -> None:
-        """Control, mode or problems changed: who comes late was not there when it did, and has it from the journal."""
+        """Take a change from the journal, which a late joiner has not seen as a state."""
         match entry.event:
             case ControlEvent.CONTROL_GAINED:
                 self.controls.change(entry.who, entry.time_ns)

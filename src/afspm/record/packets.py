@@ -1,4 +1,4 @@
-"""What was published, out of the record again: whole, or without the values that are in files."""
+"""Packets read back from the record: whole, or without the values that are in files."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def packets(
     messages: Sequence[str] | None,
     tell: Callable[[str], None] | None,
 ) -> Iterator[Packet]:
-    """Packets of the scheduler as they were published, oldest first."""
+    """Yield packets of the scheduler as they were published, oldest first."""
     values = _Values(query, folder)
     for time_ns, envelope, message, payload, *place in _rows(query, since_ns, messages):
         try:
@@ -67,7 +67,7 @@ def without_reading_files(
 
 
 def _rows(query: Query, since_ns: int, messages: Sequence[str] | None) -> Iterator[Any]:
-    """Some at a time, so that a reader that takes its time holds up nobody, and what is written meanwhile comes too."""
+    """Read some rows at a time, so that a slow reader blocks no writer and sees what is written meanwhile."""
     wanted = "" if messages is None else f" AND message IN ({', '.join('?' * len(messages))})"
     sql = f"SELECT {_COLUMNS} FROM packets WHERE source = ? AND (time_ns, envelope) > (?, ?){wanted}"
     sql += f" ORDER BY time_ns, envelope LIMIT {_AT_ONCE}"

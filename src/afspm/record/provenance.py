@@ -1,4 +1,4 @@
-"""How things stood when something was measured, found in the journal: what was published before says it."""
+"""The provenance of a measurement, found in the journal among what was published before it."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _BACK = 20
 
 @dataclass(frozen=True)
 class ControlAtStart:
-    """How things stood when a measurement began; None: not known."""
+    """Control and feedback when a measurement began; None: not known."""
 
     began_ns: int | None
     control: ControlState | None
     feedback: Feedback | None
 
     def facts(self, problems: ProblemNames) -> dict[str, Any]:
-        """In JSON's types, by names that people know."""
+        """Return it in JSON's types, by names that people know."""
         facts: dict[str, Any] = {}
         if self.control is not None:
             facts |= {
@@ -45,7 +45,7 @@ class ControlAtStart:
 def control_at_start(
     journal: sqlite3.Connection, time_ns: int, doing: ScopeState, measured_ns: int | None = None
 ) -> ControlAtStart:
-    """How things stood when that began which was published at `time_ns`, and finished at `measured_ns`."""
+    """Return control and feedback at the start of what was published at `time_ns` and finished at `measured_ns`."""
     began_ns = _began(journal, time_ns, doing)
     if began_ns is not None and measured_ns is not None and began_ns > measured_ns:
         began_ns = None  # its beginning was not seen: this is when a microscope that was started anew told of it
@@ -61,7 +61,7 @@ def control_at_start(
 def drift(
     journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filenames: Collection[str]
 ) -> dict[str, Any] | None:
-    """The mapping between tip and sample coordinates that a scan gave, which is published before it; None: none.
+    """Return the drift mapping that was published just before a scan; None if there was none.
 
     Args:
         filenames: of the channels of the scan.
@@ -87,7 +87,7 @@ def drift(
 
 
 def last_state(journal: sqlite3.Connection) -> ScopeState:
-    """What the microscope was doing by the last packet of the journal."""
+    """Return the microscope's last state in the journal."""
     status = _last(journal, "ScopeStateMsg", 2**63 - 1)
     return status.state if isinstance(status, ScopeStatus) else ScopeState.UNDEFINED
 

@@ -52,7 +52,7 @@ def open_run(path: str | Path = "runs") -> Run:
 
 
 class Run:
-    """What is kept of a run. Everything is read when it is asked for: of a run that goes on, the newest.
+    """The record of a run. Everything is read when you ask for it, so of a run that goes on you get the newest.
 
     Attributes:
         folder: of the run.
@@ -66,16 +66,16 @@ class Run:
 
     @property
     def scans(self) -> Table[ScanRow]:
-        """One row for each scan, those that were interrupted too, in the order in which they were recorded."""
+        """Return one row for each scan, also of interrupted ones, in the order in which they were recorded."""
         return Table(map(_scan_row, self._query("SELECT * FROM scans ORDER BY number")), ScanRow)
 
     @property
     def spectra(self) -> Table[SpectrumRow]:
-        """One row for each spectrum, in the order in which they were recorded."""
+        """Return one row for each spectrum, in the order in which they were recorded."""
         return Table(map(_spectrum_row, self._query("SELECT * FROM spectra ORDER BY number")), SpectrumRow)
 
     def scan(self, index: int | ScanRow) -> ScanSet:
-        """All channels of a scan: by its place in `scans` (-1: the last), or by its row.
+        """Return all channels of a scan: by its place in `scans` (-1: the last), or by its row.
 
         Raises:
             FileError: its file is missing or damaged, or it was interrupted before anything of it was seen.
@@ -85,13 +85,13 @@ class Run:
         return ScanSet(self._content(row.file, f"scan {row.number}").scans)
 
     def spectrum(self, index: int | SpectrumRow) -> Spectrum:
-        """A spectrum: by its place in `spectra` (-1: the last), or by its row. Raises as `scan`."""
+        """Return a spectrum: by its place in `spectra` (-1: the last), or by its row. Raises as `scan`."""
         row = index if isinstance(index, SpectrumRow) else self._row("spectra", index, _spectrum_row)
         spectrum: Spectrum = self._content(row.file, f"spectrum {row.number}").spectra[0]
         return spectrum
 
     def about(self, row: ScanRow | SpectrumRow) -> dict[str, Any]:
-        """What its file says beside the values: drift, feedback, the controller's header … Raises as `scan`."""
+        """Return what its file says beside the values: drift, feedback, the controller's header … Raises as `scan`."""
         header: dict[str, Any] = dict(self._content(row.file, f"number {row.number}").header)
         return header
 
@@ -99,19 +99,19 @@ class Run:
 
     @property
     def journal(self) -> Table[JournalEntry]:
-        """Requests with their answers, changes of control, orders; oldest first."""
+        """Return requests with their answers, changes of control and orders; oldest first."""
         rows = self._query("SELECT * FROM entries ORDER BY time_ns, rowid")
         return Table((JournalEntry(*row) for row in rows), JournalEntry)
 
     @property
     def refusals(self) -> Table[JournalEntry]:
-        """Requests that were not carried out, with the reasons."""
+        """Return the requests that were refused, with the reasons."""
         rows = self._query("SELECT * FROM entries WHERE response > 0 ORDER BY time_ns, rowid")
         return Table((JournalEntry(*row) for row in rows), JournalEntry)
 
     @property
     def control(self) -> Table[ControlRow]:
-        """Who was in control, the mode and the problems: a row for each change."""
+        """Return holder, mode and problems: a row for each change."""
         rows: list[ControlRow] = []
         for time_ns, payload in self._query(
             "SELECT time_ns, payload FROM packets WHERE message = 'ControlState' ORDER BY time_ns"
@@ -123,7 +123,7 @@ class Run:
 
     @property
     def problems(self) -> Table[ProblemRow]:
-        """Each time that a problem was flagged."""
+        """Return each time that a problem was flagged."""
         lanes = self.overview().problem_timelines
         rows = [
             ProblemRow(span.label, number, span.start_ns, span.end_ns, span.by)
@@ -134,7 +134,7 @@ class Run:
 
     @property
     def processes(self) -> Table[ProcessRow]:
-        """A row for each change of a process."""
+        """Return a row for each change of a process."""
         rows = self._query("SELECT * FROM processes ORDER BY time_ns, rowid")
         made = (
             ProcessRow(time_ns, name, role, ProcessCondition(condition), *rest)
@@ -155,13 +155,13 @@ class Run:
 
     @property
     def log(self) -> Table[LogLine]:
-        """What all processes said, oldest first."""
+        """Return the log lines of all processes, oldest first."""
         rows = self._query("SELECT * FROM log ORDER BY time_ns, rowid")
         return Table((LogLine(*row) for row in rows), LogLine)
 
     @property
     def drift(self) -> Table[DriftPoint]:
-        """What was known of drift after each scan; empty without a Drift Compensated Scheduler."""
+        """Return the drift after each scan; empty without a Drift Compensated Scheduler."""
         from afspm.record.overview import DriftPoint
 
         return Table(self.overview(messages=("DriftMapping",)).drift, DriftPoint)
@@ -175,7 +175,7 @@ class Run:
         messages: Sequence[str] | None = None,
         tell: Callable[[str], None] | None = None,
     ) -> Iterator[Packet]:
-        """What the scheduler published and is newer than `since_ns`, oldest first, whole, as it was published.
+        """Yield the scheduler's packets newer than `since_ns`, oldest first, as they were published.
 
         Args:
             messages: names of those wanted, e.g. "ControlState"; None: all.
@@ -187,7 +187,7 @@ class Run:
         yield from packets(self._query, self.folder, since_ns, messages, tell)
 
     def overview(self, messages: Sequence[str] | None = None, problems: ProblemNames | None = None) -> Overview:
-        """What it came to, as the dashboard shows it. Files of scans are not read for it.
+        """Return the overview that the dashboard shows. Files of scans are not read for it.
 
         Args:
             messages: names of those that it is made from; None: all.
@@ -222,7 +222,7 @@ class Run:
 
     @property
     def simulated(self) -> bool:
-        """Whether the microscope was a simulated one."""
+        """Return whether the microscope was simulated."""
         return bool(self._note("simulated"))
 
     @property

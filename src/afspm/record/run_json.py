@@ -22,7 +22,7 @@ LATEST_FILE: Final = "latest"
 
 
 def read_run_json(folder: Path) -> dict[str, Any]:
-    """What run.json in the folder of a run says.
+    """Return what run.json in the folder of a run says.
 
     Raises:
         FileError: it is not there, can't be read, or is something else.
@@ -38,7 +38,7 @@ def read_run_json(folder: Path) -> dict[str, Any]:
 
 
 def run_json_or_empty(folder: Path) -> dict[str, Any]:
-    """The same; empty where nothing can be read."""
+    """Return the same; empty where nothing can be read."""
     try:
         return read_run_json(folder)
     except FileError:
@@ -46,5 +46,5 @@ def run_json_or_empty(folder: Path) -> dict[str, Any]:
 
 
 def experiment_name(folder: Path, otherwise: str = "") -> str:
-    """The name of the experiment that left a folder; `otherwise` if it is not known."""
+    """Return the name of the experiment that left a folder; `otherwise` if it is not known."""
     return str(run_json_or_empty(folder).get("name") or otherwise)

@@ -1,4 +1,4 @@
-"""Whether a run goes on, has ended, or was cut off: who runs it holds a lock, which nobody leaves behind."""
+"""The lock that the supervisor of a run holds: it tells whether the run goes on, has ended, or was cut off."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LOCK_FILE = "running"
 
 @contextlib.contextmanager
 def lock_run(folder: Path) -> Iterator[None]:
-    """The run in this folder goes on while in the block; the system takes the lock back from whoever is killed.
+    """Hold the lock of a run in the block; the system takes it back from a process that is killed.
 
     Raises:
         FileError: it goes on already, in another process.
@@ -31,7 +31,7 @@ def lock_run(folder: Path) -> Iterator[None]:
 
 
 def cut_off_message(folder: Path) -> str:
-    """What to say of a run whose supervisor was killed, or its computer; empty: it goes on, or has ended.
+    """Return what to tell of a run that was cut off; empty: it goes on, or has ended.
 
     Only who can read the disk of the computer that it ran on can know.
     """
@@ -44,7 +44,7 @@ def cut_off_message(folder: Path) -> str:
 
 
 def describe_state(folder: Path) -> str:
-    """How it is with a run, in words: how it ended, that it was cut off, that it goes on."""
+    """Return the state of a run in words: how it ended, that it was cut off, that it goes on."""
     if ended := run_json_or_empty(folder).get(ENDED):
         return str(ended)
     known = (folder / STATE_DIR / LOCK_FILE).exists()
@@ -52,12 +52,12 @@ def describe_state(folder: Path) -> str:
 
 
 def resume_command(folder: Path) -> str:
-    """The command that goes on with a run."""
+    """Return the command that resumes a run."""
     return f"`afspm run --resume {quoted(folder)}`"
 
 
 def quoted(path: Path) -> str:
-    """As it may be typed into a shell: that of Windows knows no single quotes, and takes a backslash as it is."""
+    """Return a path as it may be typed into a shell."""
     if sys.platform != "win32":
         return shlex.quote(str(path))
     from subprocess import list2cmdline
@@ -66,7 +66,7 @@ def quoted(path: Path) -> str:
 
 
 def _is_left(folder: Path) -> bool:
-    """Whether somebody had the lock, and nobody has it."""
+    """Return whether the lock was held, and is not any more."""
     try:
         with (folder / STATE_DIR / LOCK_FILE).open("rb") as file:
             lock(file, shared=True)

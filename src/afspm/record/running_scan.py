@@ -9,7 +9,7 @@ from afspm.model import Region, ScanLines, ScanParameters
 
 @dataclass(slots=True)
 class ChannelLines:
-    """What has come of one channel: its rows, by index."""
+    """The rows of one channel that have come, by index."""
 
     unit: str
     region: Region
@@ -19,13 +19,13 @@ class ChannelLines:
 
 @dataclass(frozen=True, slots=True)
 class DoneScan:
-    """How long a scan took, with the parameters that were in force; None if they were not known."""
+    """The duration of a scan, with the parameters that were in force; None if they were not known."""
 
     parameters: ScanParameters | None
     took_ns: int
 
     def resembles(self, other: RunningScan) -> bool:
-        """Whether both are of the same size and pixels, as far as is known."""
+        """Return whether both are of the same size and pixels, as far as is known."""
         ours, theirs = _extent(self.parameters), _extent(other.parameters)
         return ours is None or theirs is None or ours == theirs
 
@@ -47,7 +47,7 @@ class RunningScan:
     channels: dict[str, ChannelLines] = field(default_factory=dict)
 
     def take(self, lines: ScanLines) -> None:
-        """ChannelLines of it came."""
+        """ChannelTake lines of the scan."""
         if self.began_ns is None:
             self.began_ns = lines.began_ns
         channel = self.channels.get(lines.channel)

@@ -1,4 +1,4 @@
-"""Which packets belong to one measurement: the channels of a scan, its lines, how it ended. Knows no files."""
+"""Packets put together to measurements: the channels of a scan, its lines, how it ended."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class ScanAssembler:
         self._open = AssembledScan()
 
     def copy(self) -> ScanAssembler:
-        """As it is now, to go back to."""
+        """Return a copy, to go back to."""
         other = ScanAssembler(self._state)
         other._open = AssembledScan(list(self._open.channels), list(self._open.lines), self._open.interrupted_ns)
         return other
@@ -104,7 +104,7 @@ class ScanAssembler:
         return [*self.flush(), AssembledSpectrum(packet, spectrum)]
 
     def status(self, status: ScopeStatus, time_ns: int) -> list[Assembled]:
-        """The microscope does something else."""
+        """Take a new state of the microscope."""
         before, self._state = self._state, status.state
         if status.state is ScopeState.INTERRUPTED and before is ScopeState.SCANNING and not self._open.channels:
             interrupted, self._open = self._open, AssembledScan()
@@ -116,14 +116,14 @@ class ScanAssembler:
         return self.flush() if status.state is ScopeState.FREE else []
 
     def flush(self) -> list[Assembled]:
-        """No more channels come to the scan that is being gathered."""
+        """End the open scan if any of its channels has come."""
         if not self._open.channels:
             return []
         taken, self._open = self._open, AssembledScan()
         return [taken]
 
     def finish(self, time_ns: int) -> list[Assembled]:
-        """What was seen of a scan is all that there will be: without its channels, it vanished on the way."""
+        """End the open scan; without its channels, it was lost on the way and counts as interrupted."""
         if not self._open.channels and not self._open.lines:
             return []
         taken, self._open = self._open, AssembledScan()
@@ -133,7 +133,7 @@ class ScanAssembler:
 
 
 def _same(taken: AssembledScan, scan: Scan) -> bool:
-    """Whether this is another channel of the scan. One that comes again, from a translator started anew, is too.
+    """Return whether this is another channel of the scan, or one that comes again from a restarted translator.
 
     Some controllers write a file for each channel: then it is the time that says so, and a channel that is there
     already out of another file is that of another scan.

@@ -44,7 +44,7 @@ _PROCESS = "SELECT role, condition, since_ns, starts, pid, last_exit FROM proces
 
 @dataclass(frozen=True)
 class RecordSettings:
-    """What is so of the whole run.
+    """The settings of a run's record.
 
     Attributes:
         facts: written into every file: the name of the experiment, seeds …
@@ -104,19 +104,19 @@ class RecordStore:
                 self._take(packet, source)
 
     def flush(self) -> None:
-        """No more channels come to the scan that came last. Raises as `take`."""
+        """End the scan that came last. Raises as `take`."""
         if not self.waiting():
             return
         with self._all_or_nothing():
             self._write(self._gathering.flush())
 
     def finish(self) -> None:
-        """The experiment has ended: a scan of which only lines came is all that there will be. Raises as `take`."""
+        """End every scan, also one of which only lines came. Raises as `take`."""
         with self._all_or_nothing():
             self._write(self._gathering.finish(self._newest_ns))
 
     def has(self, packet: Packet) -> bool:
-        """Whether a packet is recorded, or waits to be with others of its scan."""
+        """Return whether a packet is recorded, or waits for others of its scan."""
         row = self._journal.execute(
             "SELECT 1 FROM packets WHERE time_ns = ? AND envelope = ?", (packet.time_ns, packet.envelope)
         )
@@ -124,7 +124,7 @@ class RecordStore:
         return row.fetchone() is not None or any(waits)
 
     def note(self, name: str, value: Any) -> None:
-        """Something about the whole run, in JSON's types."""
+        """Note something about the whole run, in JSON's types."""
         text = json.dumps(value, ensure_ascii=False)
         self._journal.execute("INSERT OR REPLACE INTO about VALUES (?, ?)", (name, text))
 
@@ -135,7 +135,7 @@ class RecordStore:
         sync_folder(self._folder)
 
     def settle(self) -> None:
-        """Nothing more is to come: the journal becomes one file that can be read without making others beside it."""
+        """Make the journal one file that can be read without files beside it."""
         self._journal.execute("PRAGMA busy_timeout = 1000")
         with suppress(sqlite3.OperationalError):  # somebody reads it: it stays as it is, which is as good
             self._journal.execute("PRAGMA journal_mode = DELETE")
@@ -177,7 +177,7 @@ class RecordStore:
             self._newest_ns = max(self._newest_ns, packet.time_ns or 0)
 
     def _add(self, packet: Packet, message: str, source: str, thing: Any) -> None:
-        """What is kept in the journal alone."""
+        """Add a packet that is kept in the journal alone."""
         payload = without_values(message, packet.payload) if message else bytes(packet.payload)
         insert_packet(self._journal, packet, message, payload, source=source)
         match thing:
@@ -204,12 +204,12 @@ class RecordStore:
             self._journal.execute("RELEASE measured")
 
     def _keep(self, taken: Assembled) -> None:
-        """Packets whole, with their values, since there is no file that has them."""
+        """Insert packets whole, with their values, since no file has them."""
         for packet in taken.packets():
             insert_packet(self._journal, packet, wire.message_of(packet.envelope), bytes(packet.payload))
 
     def _placed(self, thing: Any) -> Any:
-        """With the frame of its place, which the wire does not say."""
+        """Return it in its frame, which the wire does not say."""
         if self._about.frame is Frame.TIP:
             return thing
         if isinstance(thing, Spectrum):
@@ -238,7 +238,7 @@ class RecordStore:
 
 
 def _read(packet: Packet) -> tuple[str, Any]:
-    """The name of the message, and what is in it; what can't be read is kept as it is."""
+    """Return the name of the message and its content; ("", None) if it can't be read."""
     try:
         message = wire.message_of(packet.envelope)
     except WireError:

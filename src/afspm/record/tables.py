@@ -1,4 +1,4 @@
-"""What the record gives: rows as small objects, and tables of them as arrays."""
+"""The rows of a record as small objects, and tables of them as arrays."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def _names(kind: type[Any]) -> list[str]:
 
 
 def _apart(row: Any) -> dict[str, Any]:
-    """A row as numbers and texts."""
+    """Return a row as numbers and texts."""
     made: dict[str, Any] = {}
     for field in fields(row):
         name, value = field.name, getattr(row, field.name)

@@ -1,4 +1,4 @@
-"""What was so from when to when, as lanes of a time line."""
+"""Spans of time in which something held, one after the other."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ MOST_SPANS = 20_000
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Something that was so for a while.
+    """A time in which something held.
 
     Attributes:
         label: what.
@@ -24,7 +24,7 @@ class Span:
     by: str = ""
 
     def lasted_ns(self, now_ns: int) -> int:
-        """How long it was so until `now_ns`."""
+        """Return how long it held until `now_ns`."""
         end_ns = now_ns if self.end_ns is None else min(self.end_ns, now_ns)
         return max(0, end_ns - self.start_ns)
 
@@ -39,7 +39,7 @@ class Timeline:
 
     @property
     def now(self) -> Span | None:
-        """What is so at last."""
+        """Return the last span if it has no end."""
         return self.spans[-1] if self.spans and self.spans[-1].end_ns is None else None
 
     def change(self, label: str | None, time_ns: int, by: str = "") -> None:
@@ -56,19 +56,19 @@ class Timeline:
             self.spans.append(Span(label, time_ns, by=by))
 
     def name_last(self, by: str) -> None:
-        """Tell who brought the last span about, where that was not known yet."""
+        """Name the cause of the last span if it was not known yet."""
         if self.spans and not self.spans[-1].by:
             self.spans[-1] = replace(self.spans[-1], by=by)
 
     def at(self, time_ns: int) -> Span | None:
-        """What was so at a time."""
+        """Return the span that holds a time."""
         for span in reversed(self.spans):
             if span.start_ns <= time_ns:
                 return span if span.end_ns is None or time_ns < span.end_ns else None
         return None
 
     def lasted_ns(self, now_ns: int) -> dict[str, int]:
-        """For how long altogether each label was so, in the order in which they came."""
+        """Return how long each label held altogether, in the order in which they came."""
         total: dict[str, int] = {}
         for span in self.spans:
             total[span.label] = total.get(span.label, 0) + span.lasted_ns(now_ns)

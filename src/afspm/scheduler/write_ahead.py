@@ -1,4 +1,4 @@
-"""What the scheduler writes before anybody is told of it: its state, and the packets that it publishes."""
+"""The state and the packets that the scheduler writes before it publishes them."""
 
 from __future__ import annotations
 

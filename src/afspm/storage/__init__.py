@@ -1,1 +1,1 @@
-"""What is kept on disk: files replaced atomically, saved state, and the threads that write and sync."""
+"""Files that are replaced atomically, saved state, the packet log, and the threads that write and sync."""

@@ -1,4 +1,4 @@
-"""Files that are replaced as a whole: whoever reads finds what was there before or what is there now."""
+"""Files that are replaced atomically: a reader finds the old content or the new."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def replace_file(
 
 
 def _rename(aside: Path, path: Path) -> None:
-    """Give a file its name. Windows refuses that while somebody, a virus scanner say, reads what has the name now."""
+    """Give a file its name. Windows refuses that while another program, a virus scanner say, reads the old one."""
     for left in reversed(range(_TRIES)):
         try:
             aside.replace(path)
@@ -77,7 +77,7 @@ def _rename(aside: Path, path: Path) -> None:
 
 
 def write_atomic(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = True) -> None:
-    """`replace`, for whoever tells people of it. Raises FileError: it can't be written."""
+    """Replace a file. Raises FileError: it can't be written."""
     try:
         replace_file(path, parts, synced=synced)
     except OSError as error:
@@ -164,7 +164,7 @@ class OutageLog:
 
 
 def previous_generation(path: Path) -> Path:
-    """The generation before, of a file that `CheckpointFile` keeps."""
+    """Return the file with the generation before."""
     return path.with_name(f"{path.name}.old")
 
 
@@ -252,12 +252,12 @@ class CheckpointFile:
 
 
 def _is_there(file: io.FileIO) -> bool:
-    """Whether a file that is open still has a name: somebody may have removed it."""
+    """Return whether an open file still has a name: it may have been removed."""
     return os.fstat(file.fileno()).st_nlink > 0
 
 
 def load_checkpoint(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, str]:
-    """What `CheckpointFile` saved last; None if there is no such file.
+    """Return what `CheckpointFile` saved last; None if there is no such file.
 
     Args:
         read: makes something of a generation; raises ValueError, KeyError or TypeError if it is damaged.

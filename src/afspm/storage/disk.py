@@ -1,4 +1,4 @@
-"""Work for a disk, in threads of its own: a disk that hangs holds up nobody for longer than a moment.
+"""Work for a disk, in threads of its own: a disk that hangs delays no process for longer than a moment.
 
 Control, retraction and notification never wait for a disk. What must be written before something is told is waited for,
 `DEADLINE_S` at most; then that is said, and the process goes on. The work is still done once the disk answers again.
@@ -58,7 +58,7 @@ class DiskTask:
 
 
 class DiskThread:
-    """Does one thing after the other in a thread.
+    """A thread that does one task after the other.
 
     Attributes:
         hangs: something was not done in time, and is not done yet: nothing is waited for until it is.
@@ -129,7 +129,7 @@ class DiskThread:
 
 
 def run_bounded(work: Callable[[], T], within_s: float) -> T:
-    """Do something that takes a disk, once.
+    """Do something with the disk in a thread, once.
 
     Raises:
         DiskTimeout: not in time; what becomes of it then is not known.
@@ -152,7 +152,7 @@ class Syncer:
         self._thread: threading.Thread | None = None
 
     def soon(self, file: int) -> None:
-        """What was written to a file, by its descriptor, is on the disk within the period."""
+        """Have what was written to a file, by its descriptor, on the disk within the period."""
         found = os.fstat(file)
         with self._changed:
             if (key := (found.st_dev, found.st_ino)) in self._written:
@@ -164,11 +164,11 @@ class Syncer:
             self._changed.notify_all()
 
     def folder_soon(self, folder: Path) -> None:
-        """The same for the names of the files in a folder. Raises OSError."""
+        """Do the same for the names of the files in a folder. Raises OSError."""
         _with_folder(folder, self.soon)
 
     def now(self, within_s: float) -> None:
-        """All that was written until now is on the disk.
+        """Wait until all that was written until now is on the disk.
 
         Raises:
             DiskTimeout: not in time.

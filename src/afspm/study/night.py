@@ -27,7 +27,7 @@ _95_PERCENT = -2.0 * math.log(0.05)  # of the square of a normal error of two co
 
 @dataclass(frozen=True, eq=False)
 class SimulatedNight:
-    """What came of it. "Misplaced" is how far off its place on the sample a scan was taken.
+    """The outcome of a night. "Misplaced" is how far off its place on the sample a scan was taken.
 
     Attributes:
         record: scan by scan.
@@ -53,7 +53,7 @@ class SimulatedNight:
         return self.record.drift_m - self.record.drift_m[:1] - self.truth_m
 
     def metrics(self) -> dict[str, float]:
-        """What nights are compared by; lengths in nm."""
+        """Return the numbers by which nights are compared; lengths in nm."""
         settled = self.record.time_s - self.record.time_s[0] >= min(SETTLED_S, np.ptp(self.record.time_s) / 4)
         misplaced, unknown = 1e9 * self.misplaced_m, self.unknown_m
         inverse = np.linalg.pinv(self.record.covariance_m2[1:])
@@ -71,7 +71,7 @@ class SimulatedNight:
 
 
 def night(settings: NightSettings, seed: int) -> SimulatedNight:
-    """A night of those settings. The same seed is the same sample, drift and noise for all settings.
+    """Simulate a night. The same seed is the same sample, drift and noise for all settings.
 
     Raises:
         ConfigError: settings without a meaning.
@@ -110,7 +110,7 @@ def _taken(
 
 
 def _again(settings: NightSettings, place: Region, scan: DriftScan, update: Update) -> str:
-    """Why it is to be taken again, empty if not."""
+    """Return why a scan is to be taken again; empty if not."""
     scanned = update.after.mapping.to_sample(scan.region)
     if settings.rescan == "paper":
         return too_little_shared(place, scanned, settings.f_rescan)

@@ -30,7 +30,7 @@ class Series:
 
 
 def series(contents: Sequence[FileContent], channel: str = "") -> Series:
-    """The scans of one channel; without a name, that of the topography of most files.
+    """Return the scans of one channel; without a name, that of the topography of most files.
 
     Raises:
         InvalidValue: there are no two scans of it.
@@ -56,7 +56,7 @@ def series(contents: Sequence[FileContent], channel: str = "") -> Series:
 
 
 def topography(contents: Sequence[FileContent]) -> str:
-    """The channel that is the topography of most files.
+    """Return the channel that is the topography of most files.
 
     Raises:
         InvalidValue: none has one.
@@ -68,7 +68,7 @@ def topography(contents: Sequence[FileContent]) -> str:
 
 
 def drift_scan(scan: Scan, content: FileContent) -> DriftScan:
-    """One channel of a file. Where the file does not say how long it took, it counts as taken when it was finished."""
+    """Return one channel of a file. Without a duration it counts as taken when it was finished."""
     end_ns = content.end_ns if content.end_ns is not None else content.start_ns
     start_ns = content.start_ns if content.start_ns is not None else end_ns
     if start_ns is None or end_ns is None:

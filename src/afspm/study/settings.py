@@ -1,4 +1,4 @@
-"""What a simulated night is made of, from names as a command line or a TOML file gives them."""
+"""The settings of a simulated night, from names in a command line or a TOML file."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class NightSettings:
 
     @property
     def scans(self) -> int:
-        """How many scans are planned."""
+        """Return how many scans are planned."""
         return int(self.hours * 3600.0 / self.every_s + 1e-9)
 
     @classmethod

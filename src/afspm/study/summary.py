@@ -1,4 +1,4 @@
-"""What many nights say about settings: medians and spread, the best, and whether the defaults hold."""
+"""The summary of many nights: medians and spread, the best settings, and whether the defaults hold."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Summary:
 def summarised(
     labels: Sequence[str], metrics: Mapping[str, Sequence[Mapping[str, float]]], failed: Mapping[str, Sequence[str]]
 ) -> list[Summary]:
-    """One summary for each label, best first. The first label is that of the defaults.
+    """Return one summary for each label, best first. The first label is that of the defaults.
 
     Args:
         metrics: of the nights, by label. Nights that were lost count as infinitely bad.

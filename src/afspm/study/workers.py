@@ -33,14 +33,14 @@ class TaskOutcome:
 
 
 def processes(asked: int | None, pixels: int) -> int:
-    """How many: as asked for; or one a core, where there is so much to compare that it pays to start them."""
+    """Return how many processes to use: as asked for, or one a core where that pays."""
     if asked is not None:
         return asked
     return 1 if pixels <= _FEW_PIXELS else os.cpu_count() or 1
 
 
 def on_cores(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *, jobs: int) -> Iterator[TaskOutcome]:
-    """The outcomes of `function(*task)`, as they come, from `jobs` processes (1: in this one)."""
+    """Yield the outcomes of `function(*task)`, as they come, from `jobs` processes (1: in this one)."""
     if jobs <= 1:
         for index, task in enumerate(tasks):
             yield _done(function, index, task)

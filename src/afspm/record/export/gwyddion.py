@@ -133,7 +133,7 @@ def _typical(values: NDArray[np.float64]) -> float:
 
 
 def _meta(about: Mapping[str, Any]) -> dict[str, str]:
-    """What is known of a measurement as Gwyddion shows it: names and texts."""
+    """Return what is known of a measurement as names and texts, as Gwyddion shows them."""
     said = {}
     for name, value in about.items():
         if name in ("channels", "variables", "content") or value is None:

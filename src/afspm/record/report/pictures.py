@@ -96,7 +96,7 @@ def draw(run: Run, story: RunStory, shown: Sequence[Small]) -> None:
 
 
 def _is_ours(folder: Path, own: str, components: str) -> bool:
-    """Whether a figure is ours to draw. One drawn while the run went on is taken away if a component has drawn it."""
+    """Return whether a figure is ours to draw; remove ours if a component has drawn it since."""
     if (folder / components).exists():
         (folder / own).unlink(missing_ok=True)
         return False
@@ -104,7 +104,7 @@ def _is_ours(folder: Path, own: str, components: str) -> bool:
 
 
 def night_of(run: Run, story: RunStory, shown: Sequence[Small]) -> NightRecord:
-    """What the picture of the night shows."""
+    """Return the record that the picture of the night shows."""
     record = NightRecord(end_ns=story.end_ns, scans_taken=len(story.scans))
     record.shots = [
         Shot(small.row.time_ns, small.row.began_ns, small.row.holder, small.picture)

@@ -1,4 +1,4 @@
-"""What the report tells of a run: read once, reckoned up, independent of how it is shown."""
+"""The contents of a run's report, independent of how they are shown."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class RunStory:
 
     @property
     def interrupted(self) -> int:
-        """How many scans were."""
+        """Return how many scans were interrupted."""
         return sum(scan.interrupted for scan in self.scans)
 
     @property
@@ -78,13 +78,13 @@ class RunStory:
         return sorted(lane.lasted_ns(self.end_ns).items(), key=lambda share: -share[1])
 
     def done_meanwhile(self, problem: Span) -> list[str]:
-        """What was done to the tip while a problem was flagged: "4 × pulse", "1 × crash"."""
+        """Return the treatments of the tip while a problem was flagged: "4 × pulse", "1 × crash"."""
         end_ns = self.end_ns if problem.end_ns is None else problem.end_ns
         done = [entry.what for entry in self.actions if problem.start_ns <= entry.time_ns <= end_ns]
         return [f"{count} × {what.removeprefix('x-')}" for what, count in Counter(done).items()]
 
     def repairs(self, problem: Span) -> list[str]:
-        """Who was in control while a problem was flagged, in the order in which they came."""
+        """Return the holders while a problem was flagged, in the order in which they came."""
         end_ns = self.end_ns if problem.end_ns is None else problem.end_ns
         during = [
             span.label
@@ -95,7 +95,7 @@ class RunStory:
 
 
 def read(run: Run) -> RunStory:
-    """The story of a run. Raises FileError: the record is damaged."""
+    """Return the story of a run. Raises FileError: the record is damaged."""
     overview, scans = run.overview(), run.scans
     clock = run.facts.get("clock") or {}
     # the clock of a run that was resumed is that of its last part
@@ -120,7 +120,7 @@ def read(run: Run) -> RunStory:
 
 
 def gathered(refusals: Sequence[JournalEntry]) -> list[Refusals]:
-    """The same refused again and again told once, in the order in which each came first."""
+    """Return equal refusals grouped, in the order in which each came first."""
     groups: dict[tuple[str, str, str], list[int]] = {}
     for entry in refusals:
         groups.setdefault((entry.who, entry.what, entry.reason), []).append(entry.time_ns)
@@ -128,7 +128,7 @@ def gathered(refusals: Sequence[JournalEntry]) -> list[Refusals]:
 
 
 def sentence(story: RunStory) -> str:
-    """The run in one sentence."""
+    """Return the run in one sentence."""
     parts = [_counted(len(story.scans) - story.interrupted, "scan", "scans")]
     if story.interrupted:
         parts.append(f"{story.interrupted} interrupted")
@@ -163,7 +163,7 @@ def states_in_words(label: str) -> str:
 
 
 def in_trouble(lane: Timeline) -> list[Span]:
-    """When a process was not well."""
+    """Return the spans in which a process was not well."""
     labels = {condition.name.lower().replace("_", " ") for condition in _PROCESS_TROUBLE}
     return [span for span in lane.spans if span.label in labels]
 
