@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import deque
 from collections.abc import Sequence
 
@@ -233,6 +234,8 @@ class Invariants:
 
     def _answered_in_time(self, host: SchedulerHost) -> None:
         now_s = self._timeline.monotonic_s()
+        if host.core.leave_at_s < math.inf:
+            return  # the experiment has ended: whoever asks again is told so
         while self._open:
             key, (since_s, _) = next(iter(self._open.items()))
             since_s = max(since_s, host.since_s)
