@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from parts import Held
+from core_parts import Held
 
 from afspm.logic.forwarder import ForwardedRequest, Forwarder, ForwardOutcome, SettledRequest
 from afspm.logic.idempotency_cache import IdempotencyCache, RequestStatus

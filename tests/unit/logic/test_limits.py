@@ -6,7 +6,7 @@ import json
 import math
 
 import pytest
-from parts import Held
+from core_parts import Held
 
 from afspm import wire
 from afspm.logic.limit_checker import LimitChecker

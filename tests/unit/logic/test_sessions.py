@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from parts import Held
+from core_parts import Held
 
 from afspm.logic.sessions import Hearing, SessionTable, token_of
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from core_parts import Dog
 from logic_lab import Lab
-from parts import Dog
 
 from afspm.logic.arbitration import Cause
 from afspm.logic.holder_timeout import Lease
