@@ -58,10 +58,16 @@ class Shadow:
         return ""
 
     def _named(self, number: int) -> str:
+        """Give the content of a file a name; where another thread or process is quicker, it is theirs."""
         name = str(uuid.uuid4())
         aside = self._files / f".{name}"
         aside.write_text(name)
-        _replace(aside, self._files / str(number))
+        try:
+            os.link(aside, self._files / str(number))
+        except FileExistsError:
+            return self._content_of(number) or self._named(number)
+        finally:
+            _unlink(aside)
         return name
 
     def _sync_names(self, path: str) -> None:
