@@ -16,9 +16,8 @@ from afspm.model import (
     names,
 )
 from afspm.testing.translators.client import Observation, states, told
-from afspm.testing.translators.measuring import NEAR, CheckMeasurements, FrameSetting, difference, in_words, number
+from afspm.testing.translators.measuring import CheckMeasurements, FrameSetting, difference, number
 from afspm.testing.translators.registry import Failed, Skipped, check, expect, near
-from afspm.wire import messages
 
 
 @check("published/in-force", "what is in force is published at the start, the state last")
@@ -158,38 +157,3 @@ def parameters(kit: CheckMeasurements) -> None:
         came = number(kit.client.get(name), unit)
         alike = near(came, value, absolute=1e-3 * width if unit == "m" else 0.1 if unit == "deg" else 0.0)
         expect(alike, f"{name} = {value:.6g} {unit}".rstrip(), f"{came:.6g} {unit}".rstrip())
-
-
-_NEEDS = (names.PROBE_POS_X, names.PROBE_POS_Y)
-
-
-def require_place(kit: CheckMeasurements, xy_m: tuple[float, float]) -> None:
-    """The probe is said to be there: as published, and by its parameters."""
-    newest = kit.client.observations.newest(ProbePosition)
-    if newest is None:
-        raise Failed("a ProbePosition", "none")
-    within_m = NEAR * min(kit.frames.whole.size_m)
-    expect(math.dist(newest.xy_m, xy_m) <= within_m, f"ProbePosition {in_words(xy_m)}", in_words(newest.xy_m))
-    x_m, y_m = (number(kit.client.get(name), "m") for name in _NEEDS)
-    expect(math.dist((x_m, y_m), xy_m) <= within_m, f"probe-pos-x, -y {in_words(xy_m)}", in_words((x_m, y_m)))
-
-
-@check("probe/move", "the probe is moved: SS_MOVING, ProbePosition as set, once, SS_FREE", needs=_NEEDS)
-def move(kit: CheckMeasurements) -> None:
-    kit.move_probe(kit.frames.plain.region.center_m)
-    heard = kit.move_probe(kit.frames.other.region.center_m)
-    require_told_once(heard, ProbePosition, "ProbePosition")
-    require_place(kit, kit.frames.other.region.center_m)
-
-
-@check("probe/one-axis", "only the coordinate that is present is set", needs=_NEEDS)
-def one_axis(kit: CheckMeasurements) -> None:
-    kit.move_probe(kit.frames.other.region.center_m)
-    x_m, y_m = kit.frames.other.region.center_m
-    y_m += 0.1 * min(kit.frames.whole.size_m)
-    message = messages.ProbePosition(units="nm")
-    message.point.y = y_m * 1e9
-    mark = kit.client.observations.mark()
-    kit.client.asked(ControlRequest.SET_PROBE_POS, message, "moving the probe in y, given in nm")
-    kit.client.settled(mark)
-    require_place(kit, (x_m, y_m))
