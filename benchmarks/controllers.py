@@ -23,8 +23,8 @@ from afspm.microscopes.nanonis import Nanonis
 from afspm.model import ControlRequest, Parameter, Region, Request, ScanParameters, ScopeState, names
 from afspm.process.memory import Memory
 from afspm.translator.driver import Driver
-from afspm.translator.process import Translator
 from afspm.translator.tcp import Receiver
+from afspm.translator.translator import Translator
 from afspm.transport.port import RequestReceived, Served
 from benchmarks.processes import CLOCK, Roles, roles
 from benchmarks.rows import Row, measurement

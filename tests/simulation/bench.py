@@ -10,7 +10,7 @@ import numpy as np
 
 from afspm.microscopes import simulator
 from afspm.model import Scan, ScopeState, ScopeStatus, Spectrum, names
-from afspm.translator import settings
+from afspm.translator import setting_groups
 from afspm.translator.driver import Driver, action
 from afspm.translator.parameters import Value
 
@@ -82,7 +82,7 @@ class BenchMicroscope(Driver):
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         values: dict[str, Any]
         values, end_s = next((v, s) for number, v, s in self.memory["finished"] if f"scan-{number}" == result)
-        region, shape = settings.frame(values)
+        region, shape = setting_groups.frame(values)
         return [Scan(region, channel, "m", np.zeros(shape), round(end_s * 1e9), result) for channel in CHANNELS]
 
     @action(names.START_SCAN)

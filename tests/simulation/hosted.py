@@ -18,7 +18,8 @@ from afspm.model import Packet, Request, Response
 from afspm.process.context import MEASURED_MESSAGES, STATE_MESSAGES, ProcessActivity, ProcessContext
 from afspm.process.memory import Memory
 from afspm.translator.driver import Driver
-from afspm.translator.process import Translator
+from afspm.translator.translator import Translator
+from afspm.transport.late_joiners import PublishedHistory
 from afspm.transport.port import (
     CaughtUp,
     ControlConnected,
@@ -31,7 +32,6 @@ from afspm.transport.port import (
     SubscriberJoined,
 )
 from afspm.transport.port import Killed as KillReceived
-from afspm.transport.replay import Published
 from tests.simulation.baton import Baton
 from tests.simulation.network import ControlLine, Feed, Weather
 from tests.simulation.process import Process
@@ -282,7 +282,7 @@ class HostedTranslator(HostedProcess):
         self._folder = folder
 
     def connect(self) -> None:
-        self._published = Published(self.timeline)
+        self._published = PublishedHistory(self.timeline)
         self._feeds: list[Feed] = []
         self._inbox: deque[Served | tuple[ControlLine, Request, int]] = deque()
         self._answering: tuple[ControlLine, int] | None = None

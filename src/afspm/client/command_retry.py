@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from afspm.client.control_hold import ControlHold
-from afspm.client.link import ExperimentLink
+from afspm.client.experiment_link import ExperimentLink
 from afspm.errors import NoResponse, Refused
 from afspm.model import ControlRequest, ControlResponse, Response, ScopeState
 

@@ -7,7 +7,7 @@ import json
 import weakref
 from pathlib import Path
 
-from afspm.client.link import ExperimentLink
+from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError, FileError, NoResponse

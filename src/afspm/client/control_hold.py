@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from afspm.client.link import ExperimentLink
+from afspm.client.experiment_link import ExperimentLink
 from afspm.errors import ControlLost, ExperimentEnded, NoResponse, Refused
 from afspm.model import ControlMode, ControlRequest, ControlResponse, Packet, Problem, ProblemNames
 from afspm.process.parent import StopRequested

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from afspm import wire
 from afspm.client.backlog import PacketBacklog
-from afspm.client.link import ExperimentLink
+from afspm.client.experiment_link import ExperimentLink
 from afspm.errors import ExperimentEnded, WireError
 from afspm.model import Packet
 

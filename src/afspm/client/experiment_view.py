@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from numbers import Real
 
 from afspm.client.events import Events
-from afspm.client.link import ExperimentLink
+from afspm.client.experiment_link import ExperimentLink
 from afspm.errors import InvalidValue
 from afspm.model import (
     ControlMode,

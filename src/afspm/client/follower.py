@@ -7,7 +7,7 @@ from pathlib import Path
 
 from afspm import wire
 from afspm.client.connect import guest_of
-from afspm.client.link import ExperimentLink
+from afspm.client.experiment_link import ExperimentLink
 from afspm.clock import Clock, ExperimentClock
 from afspm.errors import ExperimentEnded, NoResponse, WireError
 from afspm.launch import Launch

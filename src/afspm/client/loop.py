@@ -10,7 +10,7 @@ from afspm import wire
 from afspm.client.backlog import PacketBacklog
 from afspm.client.component import Component
 from afspm.client.dispatch import MessageDispatcher, overrides
-from afspm.client.link import ExperimentLink
+from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
 from afspm.clock import NS_PER_S, Clock
 from afspm.errors import ConfigError, ExperimentEnded, MeasurementFailed, RequestError

@@ -11,9 +11,9 @@ from afspm import wire
 from afspm.client.command_retry import NOT_IN_CONTROL, CommandRetry
 from afspm.client.control_hold import ControlHold
 from afspm.client.cycle import Cycle, CycleOutcome
+from afspm.client.experiment_link import ExperimentLink
 from afspm.client.keyed_results import KeyedResults, MeasurementResult, check_key
-from afspm.client.link import ExperimentLink
-from afspm.client.setup import MeasurementSetup
+from afspm.client.measurement_setup import MeasurementSetup
 from afspm.client.targets import Target, target_from
 from afspm.errors import MeasurementFailed, NoResponse, Refused, WireError
 from afspm.formatting import day_and_time

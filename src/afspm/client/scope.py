@@ -10,12 +10,12 @@ from afspm import wire
 from afspm.client.command_retry import SETTLED_WITHIN_S, CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.events import Events, PublishedEvent
+from afspm.client.experiment_link import ExperimentLink
 from afspm.client.experiment_view import ExperimentView
 from afspm.client.keyed_results import KeyedResults, check_key
-from afspm.client.link import ExperimentLink
 from afspm.client.measurement import MeasurementRunner
+from afspm.client.measurement_setup import MeasurementSetup
 from afspm.client.parameter_values import Value, to_parameter, value_in
-from afspm.client.setup import MeasurementSetup
 from afspm.client.targets import ScanTarget, SpectrumTarget
 from afspm.errors import ExperimentEnded
 from afspm.model import (

@@ -11,7 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 from afspm import wire
-from afspm.client.link import ExperimentLink
+from afspm.client.experiment_link import ExperimentLink
 from afspm.client.parameter_values import from_parameter, to_parameter
 from afspm.clock import Clock
 from afspm.dashboard.access import Access, Visitor, check_name

@@ -101,12 +101,12 @@ class Experiment:
     @cached_property
     def resolved(self) -> ResolvedExperiment:
         """Classes imported, settings in SI, sections parsed, sockets connected."""
-        from afspm.experiment import checks
+        from afspm.experiment import structure_checks
         from afspm.experiment.resolution import resolve
 
         resolved = resolve(self.parts, self._document)
         if self._document.is_whole:  # what is missing may be in a file that can't be read, which has been reported
-            checks.check(resolved)
+            structure_checks.check(resolved)
         return resolved
 
     def require_valid(self) -> None:

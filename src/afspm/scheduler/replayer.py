@@ -10,11 +10,11 @@ from afspm import wire
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import TransportError, WireError
 from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlResponse, Packet, Response
+from afspm.transport.late_joiners import PublishedHistory
 from afspm.transport.network import Network
 from afspm.transport.polling import Poller, WakeUp, milliseconds
 from afspm.transport.publisher import Publisher
 from afspm.transport.rate_limited_log import RateLimitedLog
-from afspm.transport.replay import Published
 from afspm.transport.router import PeerAsked, Router
 
 REASON = "this is a replay of a recorded run: nothing can be asked of it"
@@ -45,7 +45,7 @@ class Replayer:
         self._packets = packets
         self._clock = clock
         self._network = Network.from_launch("replay", None)
-        self._published = Published(clock)
+        self._published = PublishedHistory(clock)
         self._wake_up: WakeUp[None] = WakeUp()
         try:
             self._publisher = Publisher(self._network, publish, self._published)

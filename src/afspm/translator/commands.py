@@ -17,7 +17,7 @@ from afspm.translator.driver import LOST, Action, Driver
 from afspm.translator.parameters import Value
 from afspm.translator.sequence import SequenceStep, StatusSequence
 from afspm.translator.setters import apply, wanted_values
-from afspm.translator.settings import MOVES, of_message
+from afspm.translator.setting_groups import MOVES, of_message
 from afspm.translator.temporary_settings import TemporarySettings, state_for
 from afspm.wire import encode
 

@@ -16,7 +16,7 @@ from afspm.errors import AfspmError, ConfigError, InvalidValue, Refused
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.translator.parameters import ParameterTable, Value
 from afspm.translator.polling import EAGER_S
-from afspm.translator.settings import SettingsGroup
+from afspm.translator.setting_groups import SettingsGroup
 from afspm.units import Duration
 
 if TYPE_CHECKING:
@@ -371,6 +371,6 @@ class Driver(ABC):
 
     def run_process(self, context: ProcessContext) -> int:
         """Be the translator of an experiment (what the host calls)."""
-        from afspm.translator.process import run_translator
+        from afspm.translator.translator import run_translator
 
         return run_translator(self, context)

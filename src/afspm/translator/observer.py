@@ -12,7 +12,7 @@ from afspm import wire
 from afspm.clock import NS_PER_S
 from afspm.errors import AfspmError
 from afspm.model import ScopeState, ScopeStatus, names
-from afspm.translator import settings
+from afspm.translator import setting_groups
 from afspm.translator.driver import LOST, MEASURING, Driver
 from afspm.translator.outbox import Outbox
 from afspm.translator.parameters import Value
@@ -130,7 +130,7 @@ class Observer:
 
     def publish_all(self) -> None:
         """Publish everything in force, for a scheduler that has just connected."""
-        for thing in settings.messages(self.values).values():
+        for thing in setting_groups.messages(self.values).values():
             self.publish(thing)
         said = self._state.sequence.said
         if said.state is not ScopeState.UNDEFINED:
@@ -139,7 +139,7 @@ class Observer:
             self._polled_for = said.state
             self._polling.began(object(), self._clock.monotonic_s())
 
-    def publish(self, thing: settings.Published | ScopeStatus) -> None:
+    def publish(self, thing: setting_groups.Published | ScopeStatus) -> None:
         """Publish a message."""
         name, payload = wire.encode(thing)
         self._port.publish(name, payload, self._state.stamp()[0])
@@ -150,9 +150,9 @@ class Observer:
 
     def _observe_values(self, announce: Sequence[str]) -> None:
         values = self._read()
-        before = settings.messages(self.values)
+        before = setting_groups.messages(self.values)
         self._take_in(values)
-        for name, thing in settings.messages(values).items():
+        for name, thing in setting_groups.messages(values).items():
             if name in announce or before.get(name) != thing:
                 self.publish(thing)
         wait_s, next_s = self._driver.poll_period_s, self._driver.next_change_s()
@@ -163,7 +163,7 @@ class Observer:
     def _read(self) -> dict[str, Value]:
         """Return what is in force; differences below the controller's precision are none."""
         table, old = self._driver.table, self.values
-        values = self._driver.in_force(settings.watched(table))
+        values = self._driver.in_force(setting_groups.watched(table))
         return {
             name: old[name] if name in old and table[name].same(old[name], value) else value
             for name, value in values.items()
@@ -171,7 +171,7 @@ class Observer:
 
     def _take_in(self, values: dict[str, Value]) -> None:
         self.values = values
-        if self._feedback.saw(settings.feedback(values).on):
+        if self._feedback.saw(setting_groups.feedback(values).on):
             self._state.save()
 
     def _poll_for(self, state: ScopeState) -> None:
@@ -191,7 +191,7 @@ class Observer:
 
     def _scan_s(self) -> tuple[float | None, tuple[Value, ...]]:
         """Return the real seconds of the scan, if no time is lost at its edges, and the values they depend on."""
-        extent = tuple(self.values.get(name, 0.0) for name in settings.EXTENT)
+        extent = tuple(self.values.get(name, 0.0) for name in setting_groups.EXTENT)
         with contextlib.suppress(*LOST, AfspmError, ArithmeticError):
             if all(extent) and names.SCAN_SPEED in self._driver.table:
                 speed_m_s = float(self._driver.in_force([names.SCAN_SPEED])[names.SCAN_SPEED])

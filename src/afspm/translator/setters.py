@@ -21,7 +21,7 @@ from afspm.model import (
 )
 from afspm.translator.driver import LOST, Driver
 from afspm.translator.parameters import ParameterSpec, Value, refuse_value
-from afspm.translator.settings import FEEDBACK, FRAME, POSITION, check_together
+from afspm.translator.setting_groups import FEEDBACK, FRAME, POSITION, check_together
 
 _UNBOUNDED: Final = (-math.inf, math.inf)
 

@@ -13,7 +13,7 @@ from afspm.model import ScopeState, ScopeStatus
 from afspm.translator.driver import LOST, Driver
 from afspm.translator.parameters import Value
 from afspm.translator.setters import apply
-from afspm.translator.settings import MOVES
+from afspm.translator.setting_groups import MOVES
 from afspm.translator.state import TranslatorState
 
 _KEY = "temporary"

@@ -7,8 +7,8 @@ import zmq
 from afspm import wire
 from afspm.model import Packet
 from afspm.transport.frames import descriptor_of, property_of, receive_frames, send_packet
+from afspm.transport.late_joiners import LONGEST, History, Marker, is_reserved, spelled_out
 from afspm.transport.network import ACCEPTED, DISCONNECTED, Monitor, Network
-from afspm.transport.replay import LONGEST, History, Marker, is_reserved, spelled_out
 from afspm.transport.tcp_guard import MOST_SUBSCRIBED_BYTES, MOST_UNSENT_BYTES, TcpGuard
 from afspm.wire.protocol import prefixes_of_version_1
 

@@ -10,10 +10,10 @@ import zmq
 from afspm import wire
 from afspm.errors import ConfigError, WireError
 from afspm.transport.frames import contents, receive_frames
+from afspm.transport.late_joiners import LONGEST, Marker, topic
 from afspm.transport.network import CONNECTED, MAX_PACKET_BYTES, Monitor, Network
 from afspm.transport.port import CaughtUp, Incoming, Killed, PacketReceived
 from afspm.transport.rate_limited_log import RateLimitedLog
-from afspm.transport.replay import LONGEST, Marker, topic
 from afspm.wire import Buffer, decode_packet
 
 _MOST_ENVELOPES = 10_000

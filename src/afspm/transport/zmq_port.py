@@ -10,12 +10,12 @@ from afspm.clock import Clock
 from afspm.errors import ConfigError
 from afspm.launch import Launch
 from afspm.transport.control_client import ControlClient
+from afspm.transport.late_joiners import PublishedHistory
 from afspm.transport.network import Network
 from afspm.transport.polling import Poller, WakeUp, milliseconds
 from afspm.transport.port import Incoming, ReplyReceived
 from afspm.transport.publisher import Publisher
 from afspm.transport.rate_limited_log import RateLimitedLog
-from afspm.transport.replay import Published
 from afspm.transport.subscriber import Subscriber
 
 T = TypeVar("T")
@@ -33,7 +33,7 @@ class BasePort(Generic[T]):
         self._clock = clock
         self._wake_up: WakeUp[T] = WakeUp()
         self._poller: Poller[Callable[[], Sequence[T]]] = Poller(self._wake_up)
-        self._published = Published(clock)
+        self._published = PublishedHistory(clock)
         self._publisher = None
         self._closed = False
         if publish is not None:

@@ -15,11 +15,11 @@ from typing import Any
 from afspm.errors import FileError, Refused
 from afspm.microscopes.simulator import Simulator
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
-from afspm.translator import commands, parameters, sequence, settings
+from afspm.translator import commands, parameters, sequence, setting_groups
 from afspm.translator.driver import Action, action
 from afspm.translator.observer import Observer
 from afspm.translator.parameters import Value
-from afspm.translator.process import run_translator
+from afspm.translator.translator import run_translator
 
 
 class Broken(Simulator):
@@ -268,7 +268,7 @@ class DiesOfNaN(Broken):
 
 class PublishesTwice(Broken):
     def spoil(self) -> None:
-        def publish(self: Observer, thing: settings.Published | ScopeStatus) -> None:
+        def publish(self: Observer, thing: setting_groups.Published | ScopeStatus) -> None:
             plainly(self, thing)
             if not isinstance(thing, ScopeStatus):
                 plainly(self, thing)

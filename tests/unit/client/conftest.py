@@ -9,7 +9,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from client_lab import SOURCE, Lab, LabPort
 
-from afspm.client.link import ExperimentLink
+from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
 
 

@@ -8,7 +8,7 @@ import pytest
 from client_lab import OTHER_REGION, REGION, SOURCE, Lab, LabPort
 
 from afspm import model
-from afspm.client.link import ExperimentLink
+from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
 from afspm.errors import NoResponse
 from afspm.model import ControlRequest

@@ -11,7 +11,7 @@ from client_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, LabPort
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from afspm.client.link import ExperimentLink
+from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
 from afspm.errors import InvalidValue, NoResponse, Refused
 from afspm.logic.arbitration import ArbitrationEvent

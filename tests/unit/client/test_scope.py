@@ -9,7 +9,7 @@ import pytest
 from client_lab import OTHER_REGION, REGION, SCAN_S, SOURCE, Lab, LabPort
 
 from afspm import model, wire
-from afspm.client.link import ExperimentLink
+from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
 from afspm.errors import ControlLost, ExperimentEnded, InvalidValue, NoResponse, Refused, UnitError
 from afspm.model import (

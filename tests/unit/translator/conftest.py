@@ -29,7 +29,7 @@ from afspm.model import (
 )
 from afspm.process.memory import Memory
 from afspm.translator import Driver, Value, action
-from afspm.translator.process import Translator
+from afspm.translator.translator import Translator
 from afspm.transport.port import RequestReceived, Served
 
 TABLE = """

@@ -23,7 +23,7 @@ from afspm.microscopes.simulator import Simulator
 from afspm.process.context import ProcessActivity, ProcessContext
 from afspm.translator import controller_lock
 from afspm.translator.controller_lock import ControllerTaken, commanding
-from afspm.translator.process import run_translator
+from afspm.translator.translator import run_translator
 
 DIES_HOLDING = """
 import os, sys

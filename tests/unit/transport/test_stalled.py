@@ -10,10 +10,10 @@ import zmq
 
 from afspm.clock import ExperimentClock
 from afspm.transport import network
+from afspm.transport.late_joiners import PublishedHistory
 from afspm.transport.network import DISCONNECTED, Network
 from afspm.transport.port import PacketReceived
 from afspm.transport.publisher import Publisher
-from afspm.transport.replay import Published
 from afspm.transport.zmq_port import ZmqPort
 
 pytestmark = pytest.mark.skipif(sys.platform == "darwin", reason="the system can't tell that a peer takes nothing")
@@ -28,7 +28,7 @@ SOON_S = 6.0  # earlier than anything else disconnects it
 def publisher(monkeypatch: pytest.MonkeyPatch, open_: Any, gone: Any) -> Any:
     """One that waits for a peer for half a second and remembers its last packet alone."""
     monkeypatch.setattr(network, "_STALLED_MS", 500)
-    published = Published(CLOCK, most_packets=2 * SCANS, most_bytes=2 * SCANS * len(SCAN))
+    published = PublishedHistory(CLOCK, most_packets=2 * SCANS, most_bytes=2 * SCANS * len(SCAN))
 
     class Lab:
         def __init__(self) -> None:

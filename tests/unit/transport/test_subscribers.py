@@ -9,10 +9,10 @@ import pytest
 import zmq
 
 from afspm.clock import ExperimentClock
+from afspm.transport.late_joiners import PublishedHistory
 from afspm.transport.network import DISCONNECTED, Network
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.publisher import Publisher
-from afspm.transport.replay import Published
 from afspm.transport.tcp_guard import MOST_SUBSCRIBED_BYTES
 from afspm.transport.zmq_port import ZmqPort
 
@@ -31,7 +31,7 @@ class Lab:
         self.payload = bytes(SCAN)
         self.events: list[int] = []
         self.network = Network()
-        self.published = Published(CLOCK, most_packets=1)
+        self.published = PublishedHistory(CLOCK, most_packets=1)
         self.publisher = Publisher(self.network, ANY, self.published, most_unsent=MOST_WAITING)
         self._gone = gone(self.publisher)
         self._references = sys.getrefcount(self.payload)

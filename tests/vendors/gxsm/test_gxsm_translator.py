@@ -24,7 +24,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
-from afspm.translator.settings import FRAME
+from afspm.translator.setting_groups import FRAME
 
 Make = Callable[..., Bench]
 

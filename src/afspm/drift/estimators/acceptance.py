@@ -97,7 +97,7 @@ class AcceptanceLimits:
                 raise ConfigError(f"{name} = {value!r} is no number", where="limits")
         return cls(**table)
 
-    def reason(self, found: MatchEvidence, *, expected: bool) -> str:
+    def refusal(self, found: MatchEvidence, *, expected: bool) -> str:
         """Return why a match is refused, in words; empty if it is accepted."""
         overlap = self.overlap_expected if expected else self.overlap
         if found.correlation < self.correlation or found.information < self.information:

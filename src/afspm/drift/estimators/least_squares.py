@@ -85,7 +85,7 @@ class LeastSquares:
     def _registration(
         self, theta: Array, total: Array, box: OverlapBox, grid: CommonGrid, found: MatchEvidence, *, expected: bool
     ) -> Registration:
-        reason = self._limits.reason(found, expected=expected)
+        reason = self._limits.refusal(found, expected=expected)
         return Registration(
             accepted=not reason,
             reason=reason,

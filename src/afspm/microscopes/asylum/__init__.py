@@ -19,7 +19,7 @@ from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, 
 from afspm.translator.driver import ControllerLost, Driver, action
 from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.translator.result_files import SCAN
-from afspm.translator.settings import FRAME, POSITION, KeptSettings, frame
+from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
 from afspm.units import Duration
 
 _AT_FIRST: Final[dict[str, Value]] = {

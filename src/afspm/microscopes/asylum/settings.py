@@ -16,7 +16,7 @@ from afspm.files.asylum import clockwise, counter_clockwise
 from afspm.microscopes.asylum.session import Session
 from afspm.model import ControlResponse, Region, names
 from afspm.translator.parameters import FEEDBACK_ON, Value
-from afspm.translator.settings import FRAME, POSITION, SettingsGroup, frame, frame_values
+from afspm.translator.setting_groups import FRAME, POSITION, SettingsGroup, frame, frame_values
 
 GLOBALS: Final = (
     "XOffset", "YOffset", "FastScanSize", "SlowScanSize", "ScanAngle", "ScanPoints", "ScanLines", "ScanRate",

@@ -37,7 +37,7 @@ from afspm.microscopes.gxsm.settings import (
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.translator.driver import ControllerLost, Driver, action
 from afspm.translator.parameters import FEEDBACK_ON, Value
-from afspm.translator.settings import FRAME, POSITION, KeptSettings, frame
+from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
 from afspm.units import Duration
 
 _AT_FIRST: Final[dict[str, Value]] = {names.SPEC_KIND: "IV", names.PULSE_VOLTAGE: 4.0, names.PULSE_DURATION: 0.1}

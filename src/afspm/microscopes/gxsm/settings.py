@@ -17,7 +17,7 @@ from afspm.microscopes.gxsm.hardware import Doing
 from afspm.microscopes.gxsm.link import Asking
 from afspm.model import ControlResponse, Region, names
 from afspm.translator.parameters import FEEDBACK_ON, Value
-from afspm.translator.settings import FRAME, POSITION, SettingsGroup, frame, frame_values
+from afspm.translator.setting_groups import FRAME, POSITION, SettingsGroup, frame, frame_values
 from afspm.translator.state import Kept
 
 ANGSTROM_M: Final = 1e-10

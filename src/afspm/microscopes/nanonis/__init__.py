@@ -17,7 +17,7 @@ from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatu
 from afspm.translator.driver import ControllerLost, Driver, action
 from afspm.translator.parameters import Value
 from afspm.translator.result_files import SCAN, Entry, as_region
-from afspm.translator.settings import FRAME, KeptSettings, frame
+from afspm.translator.setting_groups import FRAME, KeptSettings, frame
 from afspm.units import Duration
 
 _AT_FIRST: Final[dict[str, Value]] = {

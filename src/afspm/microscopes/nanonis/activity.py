@@ -16,7 +16,7 @@ from afspm.microscopes.nanonis.settings import Probe, ScanFrame
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.translator.driver import ControllerLost
 from afspm.translator.result_files import SCAN, as_list
-from afspm.translator.settings import frame
+from afspm.translator.setting_groups import frame
 from afspm.translator.state import Kept
 
 _SETTLES_S: Final = 1.0

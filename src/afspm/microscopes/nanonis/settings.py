@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Final
 from afspm.microscopes.nanonis.protocol import BadReply
 from afspm.model import Region, names
 from afspm.translator.parameters import FEEDBACK_ON, Value, refuse_value
-from afspm.translator.settings import FRAME, POSITION, SettingsGroup, frame, frame_values
+from afspm.translator.setting_groups import FRAME, POSITION, SettingsGroup, frame, frame_values
 
 Ask = Callable[..., tuple[Any, ...]]
 

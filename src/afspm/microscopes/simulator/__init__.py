@@ -268,7 +268,7 @@ class Simulator(Driver):
     def run_process(self, context: ProcessContext) -> int:
         """Be the translator, with the faults that are not the controller's."""
         from afspm.microscopes.simulator.faulty import FaultyTranslator
-        from afspm.translator.process import run_translator
+        from afspm.translator.translator import run_translator
 
         return run_translator(self, context, FaultyTranslator)
 

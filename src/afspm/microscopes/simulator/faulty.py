@@ -9,7 +9,7 @@ import threading
 from afspm.exit_codes import ExitCode
 from afspm.microscopes.simulator.faults import Fault, Faults
 from afspm.model import Response
-from afspm.translator.process import Translator
+from afspm.translator.translator import Translator
 
 
 class FaultyTranslator(Translator):

@@ -26,7 +26,7 @@ from afspm.simulation import SimulatedScan, World
 from afspm.storage.atomic import write_atomic
 from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 from afspm.translator.parameters import ParameterTable, Value
-from afspm.translator.settings import feedback, frame
+from afspm.translator.setting_groups import feedback, frame
 from afspm.translator.state import Kept
 
 LISTED_RESULTS = 16

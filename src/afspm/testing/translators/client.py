@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
 from afspm import wire
-from afspm.client.link import ExperimentLink
+from afspm.client.experiment_link import ExperimentLink
 from afspm.clock import Clock
 from afspm.errors import ExperimentEnded, NoResponse, WireError
 from afspm.model import (

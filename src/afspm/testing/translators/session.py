@@ -14,7 +14,7 @@ from pathlib import Path
 
 from afspm.addresses import connectable
 from afspm.client.component import Component
-from afspm.client.link import ExperimentLink
+from afspm.client.experiment_link import ExperimentLink
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, ProcessStart, Role, load

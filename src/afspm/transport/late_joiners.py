@@ -83,7 +83,7 @@ def spelled_out(prefixes: Iterable[bytes]) -> list[bytes]:
     return found
 
 
-class Published:
+class PublishedHistory:
     """Gives packets their time, and keeps the last of them for those who join later.
 
     Kept is the last packet of every envelope, and of all others as many of the newest as fit the bounds.
