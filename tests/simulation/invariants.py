@@ -160,7 +160,7 @@ class Invariants:
         self._holder = control.holder
 
     def _presence(self, host: SchedulerHost) -> None:
-        """ArbitrationState never stays with the dead."""
+        """Control never stays with the dead."""
         now_s = self._timeline.monotonic_s()
         for client in self.components:
             if client.identity != client.name:

@@ -48,7 +48,7 @@ class Keeper:
         self._beat()
 
     def restart(self, name: str) -> None:
-        """StartChild a process anew, as somebody ordered."""
+        """Start a process anew, as somebody ordered."""
         process, watch = self._children[name]
         self._do(process, watch.restart(self._timeline.monotonic_s()))
 

@@ -69,7 +69,7 @@ class SchedulerFence:
         told = epoch.run if epoch is not None else run
         if told and self._run and told != self._run:
             return ANOTHER
-        if self._obeyed is None or (told == self._obeyed.run and (epoch is None or epoch.life >= self._obeyed.life)):
+        if self._obeyed is None or self._obeyed.is_followed_by(epoch, told):
             self._obeyed = epoch or self._obeyed
             return ""
         if is_connected():

@@ -1,4 +1,4 @@
-"""ExperimentLimits of an experiment: what of the microscope may be set, how far, how fast, where and by whom."""
+"""Limits of an experiment: which parameters may be set, how far, how fast, where and by which component."""
 
 from __future__ import annotations
 

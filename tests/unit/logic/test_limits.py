@@ -1,4 +1,4 @@
-"""ExperimentLimits: what is refused, with which words."""
+"""Limits: what is refused, with which words."""
 
 from __future__ import annotations
 

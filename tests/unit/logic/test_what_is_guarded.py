@@ -1,4 +1,4 @@
-"""ExperimentLimits, through the whole scheduler: where something is done, over its own death."""
+"""Limits, through the whole scheduler: where something is done, over its own death."""
 
 from __future__ import annotations
 

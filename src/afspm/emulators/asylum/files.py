@@ -44,7 +44,7 @@ class PendingWrites:
         self._writes.sort(key=lambda write: write.at_s)
 
     def advance(self, now_s: float, *, there: bool) -> float | None:
-        """FilePart what is due, if the drive is `there`; returns when there is more."""
+        """Write what is due, if the drive is `there`; returns when there is more."""
         while self._writes and self._writes[0].at_s <= now_s:
             write = self._writes.pop(0)
             with contextlib.suppress(OSError):

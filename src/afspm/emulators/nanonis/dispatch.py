@@ -6,6 +6,7 @@ import inspect
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -68,7 +69,7 @@ class Dispatcher:
         for module in modules:
             for attribute, marked in vars(type(module)).items():
                 for name in getattr(marked, "answered_functions", ()):
-                    self._handlers[name] = getattr(module, attribute)
+                    self._handlers[name] = _bound(getattr(module, attribute), name)
 
     def call(self, name: str, arguments: list[Any]) -> Answer:
         """Execute a function and return its results.
@@ -79,8 +80,7 @@ class Dispatcher:
         handler = self._handlers.get(name)
         _refuse_nan(name, arguments, keeps_nan=handler is None or name in _KEEPS_NAN)
         if handler is not None:
-            named = "name" in inspect.signature(handler).parameters
-            return handler(*([name] if named else []), *arguments)
+            return handler(*arguments)
         if name.partition(".")[0] not in _STORED:
             raise FunctionRefused("Module not available")
         if name.endswith("Get"):
@@ -92,6 +92,11 @@ class Dispatcher:
         except ValueError as error:
             raise FunctionRefused(str(error)) from error
         return ()
+
+
+def _bound(handler: Handler, name: str) -> Handler:
+    """Return the handler for one function, whose name it is told if it asks for that."""
+    return partial(handler, name) if "name" in inspect.signature(handler).parameters else handler
 
 
 def chosen(number: int, *choices: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The TCP TcpLogger: a stream of signals on a port of its own, to whoever has connected there. No sockets here."""
+"""The TCP Logger: a stream of signals on a port of its own, to every client connected there. No sockets here."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _DISCONNECTED, _IDLE, _RUNNING, _OVERFLOW = 0, 1, 4, 7
 
 
 class TcpLogger:
-    """The TCP TcpLogger: which slots it streams, and its frames.
+    """The TCP Logger: which slots it streams, and its frames.
 
     Attributes:
         slots: of the Signals Manager, which the channels are.

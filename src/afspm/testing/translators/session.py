@@ -124,7 +124,7 @@ def prepare(options: CheckOptions) -> Experiment:
 
 @contextmanager
 def opened(options: CheckOptions) -> Iterator[CheckSession]:
-    """ProcessStart, or join, what is to be checked; in control of the microscope while in the block.
+    """Start, or join, what is to be checked; in control of the microscope while in the block.
 
     Raises:
         ConfigError: the experiment file or the options are wrong; nothing was started.
