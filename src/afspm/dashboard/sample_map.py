@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -90,9 +91,7 @@ def places_of(scans: Sequence[ScanSummary]) -> tuple[list[tuple[ScanSummary, int
     found: dict[tuple[int, ...], tuple[ScanSummary, int]] = {}
     seen: dict[tuple[int, ...], int] = {}
     for scan in scans:
-        (x, y), (width, height) = scan.region.center_m, scan.region.size_m
-        step = max(width, height) / _SAME
-        key = (*(round(v / step) for v in (x, y, width, height)), round(scan.region.angle_rad * 500))
+        key = _place_key(scan.region)
         if seen.get(key) != scan.time_ns:
             seen[key] = scan.time_ns
             count = found.pop(key, (scan, 0))[1]
@@ -100,6 +99,16 @@ def places_of(scans: Sequence[ScanSummary]) -> tuple[list[tuple[ScanSummary, int
     newest = list(found.values())[-MOST_PLACES:]
     newest.sort(key=lambda one: -one[0].region.size_m[0] * one[0].region.size_m[1])
     return newest, len(found) - len(newest)
+
+
+def _place_key(region: Region) -> tuple[int, ...]:
+    """Return a key that is the same for regions alike in size, place and angle.
+
+    Sizes count by their logarithm: divided by the size, those of all squares would be the same.
+    """
+    step_m = max(region.size_m) / _SAME
+    sizes = (round(math.log(side_m) * _SAME) for side_m in region.size_m)
+    return (*(round(v / step_m) for v in region.center_m), *sizes, round(region.angle_rad * 500))
 
 
 @dataclass(frozen=True)

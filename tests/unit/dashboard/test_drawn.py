@@ -84,6 +84,14 @@ def test_scans_of_one_place_are_one_on_the_map_and_the_newest_is_meant() -> None
     assert (newest.time_ns, count) == (49 * S, 49)
 
 
+@pytest.mark.parametrize("center_m", [(0.0, 0.0), (1e-6, -2e-6)])
+def test_squares_of_different_sizes_at_one_place_are_all_on_the_map(center_m: tuple[float, float]) -> None:
+    sizes_m = [2e-6, 400e-9, 390e-9, 1e-6]
+    scans = [taken(i, Region(center_m, (size_m, size_m))) for i, size_m in enumerate(sizes_m, 1)]
+    drawn = {shape.get("data-time") for shape in shapes(map_html(MapContent(scans)), "scan")}
+    assert drawn == {str(i * S) for i in range(1, 5)}
+
+
 def test_ten_thousand_places_are_drawn_as_far_as_that_makes_sense_and_the_rest_is_told() -> None:
     scans = [taken(i, Region((i * 1e-6, 0.0), (1e-6, 1e-6))) for i in range(10_000)]
     html = map_html(MapContent(scans))
