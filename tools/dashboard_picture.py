@@ -94,9 +94,7 @@ def running_night(folder: Path) -> Iterator[str]:
 def open_page(browser: Browser, url: str, screen: str, theme: Any = "light", person: str = "") -> Any:
     """Return the page in a window of its own."""
     width, height = SCREENS[screen]
-    window = browser.new_context(
-        viewport={"width": width, "height": height}, color_scheme=theme, has_touch=width < 500
-    )
+    window = browser.new_context(viewport={"width": width, "height": height}, color_scheme=theme, has_touch=width < 500)
     page = window.new_page()
     page.set_default_timeout(60_000)
     page.goto(f"{url}/login" if person else url)
