@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 from afspm.errors import UnitError
 
@@ -54,6 +55,39 @@ _SPECIAL: dict[str, tuple[str, Fraction]] = {
 
 
 @dataclass(frozen=True)
+class Dimension:
+    """A kind of quantity.
+
+    Attributes:
+        name: of one quantity, with its article.
+        example: a quantity as people write it.
+        largest_plain: the largest number without a unit that is accepted, in SI.
+    """
+
+    name: str
+    example: str
+    largest_plain: float = math.inf
+
+    @property
+    def hint(self) -> str:
+        """What to write, for an error."""
+        return f'{self.name}, for example "{self.example}"'
+
+
+DIMENSIONS: Final[Mapping[str, Dimension]] = {
+    "m": Dimension("a length", "400 nm", 1e-3),
+    "m/s": Dimension("a speed", "2 um/s", 1e-3),
+    "V": Dimension("a voltage", "300 mV", 10.0),
+    "A": Dimension("a current", "50 pA", 1e-6),
+    "N": Dimension("a force", "5 nN", 1e-6),
+    "rad": Dimension("an angle", "30 deg", math.tau),
+    "s": Dimension("a time", "15 min"),
+    "Hz": Dimension("a frequency", "2 kHz"),
+}
+"""By SI unit. A plain number is in SI, and a person who writes 400 for a length meant nanometres, not metres."""
+
+
+@dataclass(frozen=True)
 class Unit:
     """Marks a float of a component's settings: the experiment file may give it as text with any unit of this kind.
 
@@ -73,10 +107,10 @@ class Unit:
         """Return a quantity of the experiment file in this SI unit; a plain number is in it already.
 
         Raises:
-            UnitError: not a finite number, an unknown unit, or one of another kind.
+            UnitError: not a finite number, an unknown unit, one of another kind, or none where there should be one.
         """
         if isinstance(value, bool) or not isinstance(value, str | float | int):
-            raise UnitError(f"{value!r} is not a quantity", hint=f'write it as "2.5 {self.si}"')
+            raise UnitError(f"{value!r} is not a quantity", hint=_hint(self.si))
         number = si(value, self.si)
         if not math.isfinite(number):
             raise UnitError(f"{value!r} is not a finite number")
@@ -120,7 +154,7 @@ def parse_quantity(text: str) -> tuple[float, str]:
     if match is None:
         raise UnitError(f"{text!r} is not a number with a unit", hint='write it as "2.5 um"')
     if match[2].startswith(","):  # else 1,5 um would be one of the unit ",5 um"
-        raise UnitError(f"{text!r} is not a number with a unit", hint="a number has a decimal point, and no commas")
+        raise UnitError(f"{text!r} has a comma: numbers have a decimal point", hint='write it as "2.5 um"')
     return float(match[1]), match[2]
 
 
@@ -128,14 +162,30 @@ def si(value: str | float, unit: str) -> float:
     """Return a quantity as text ("2.5 um") or a plain number (SI already) as a float in the SI unit `unit`.
 
     Raises:
-        UnitError: not a number, an unknown unit, or one of another kind than `unit`.
+        UnitError: not a number, an unknown unit, one of another kind than `unit`, or none where there should be one.
     """
     if isinstance(value, bool):
         raise UnitError(f"{value} is not a number in {unit}")
-    if not isinstance(value, str):
-        return float(value)
-    number, given = parse_quantity(value)
-    return convert(number, given or unit, unit)
+    try:
+        number, given = parse_quantity(value) if isinstance(value, str) else (float(value), "")
+        converted = convert(number, given or unit, unit)
+    except UnitError as error:
+        raise UnitError(error.what, hint=_hint(unit) or error.hint) from error
+    if not given:
+        require_unit(number, unit)
+    return converted
+
+
+def require_unit(number: float, unit: str) -> None:
+    """Refuse a number given without a unit if it is too large in `unit` to be meant so.
+
+    Raises:
+        UnitError: it is above `Dimension.largest_plain`.
+    """
+    dimension = DIMENSIONS.get(unit)
+    if dimension is not None and dimension.largest_plain < abs(number) < math.inf:
+        what = f"without a unit this means {number:g} {unit}"
+        raise UnitError(what, hint=dimension.hint)
 
 
 def si_unit(unit: str) -> str:
@@ -165,6 +215,11 @@ def _ratio(unit_from: str, unit_to: str) -> Fraction:
             hint=f"give it in {unit_to}" if unit_to else "leave the unit out",
         )
     return factor_from / factor_to
+
+
+def _hint(si_unit: str) -> str:
+    dimension = DIMENSIONS.get(si_unit)
+    return dimension.hint if dimension else ""
 
 
 @lru_cache(maxsize=1000)
@@ -217,7 +272,7 @@ def _by_pint(unit: str) -> tuple[str, Fraction]:
         none, one = (pint.Quantity(value, unit).to_base_units() for value in (0.0, 1.0))
         base, factor = f"{one.units}", Fraction(float(one.magnitude))
     except Exception as error:  # pint raises many kinds, even plain AttributeError and TokenError
-        raise UnitError(f"{unit!r} is not a unit that is known here", hint="e.g. nm, um, mV, nA, deg, nm/s") from error
+        raise UnitError(f"{unit!r} is not a unit", hint="e.g. nm, um, mV, nA, deg, nm/s") from error
     if none.magnitude != 0.0:  # degrees Celsius, decibels: 20 of them are not twenty times one
         raise UnitError(f"{unit!r} does not count from zero, and is not converted here", hint=f"give it in {base}")
     return _SI_NAMES.get(base, base), factor

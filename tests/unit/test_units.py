@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from afspm.errors import UnitError
-from afspm.units import convert, parse_quantity, same_kind, si, si_unit
+from afspm.units import DIMENSIONS, convert, parse_quantity, same_kind, si, si_unit
 
 
 @pytest.mark.parametrize(
@@ -26,8 +26,9 @@ from afspm.units import convert, parse_quantity, same_kind, si, si_unit
         ("-2 mV", "V", -0.002),
         ("10 nm/s", "m/s", 1e-8),
         ("1 um/ms", "m/s", 1e-3),
-        ("7", "m", 7.0),
-        (7, "m", 7.0),
+        ("7", "s", 7.0),
+        (7, "s", 7.0),
+        (7e-6, "m", 7e-6),
         ("50 %", "", 0.5),
         ("90 deg", "rad", math.pi / 2),
         ("325 kHz", "Hz", 325e3),
@@ -55,6 +56,18 @@ def test_what_does_not_count_from_zero_is_refused_and_not_multiplied(text: str, 
         si(text, unit)
 
 
+@pytest.mark.parametrize("unit", [unit for unit, one in DIMENSIONS.items() if math.isfinite(one.largest_plain)])
+def test_a_plain_number_above_the_largest_is_refused_and_one_with_a_unit_is_not(unit: str) -> None:
+    dimension = DIMENSIONS[unit]
+    assert si(-dimension.largest_plain, unit) == -dimension.largest_plain
+    for plain in (1.1 * dimension.largest_plain, f"{-1.1 * dimension.largest_plain}"):
+        with pytest.raises(UnitError, match=f"without a unit this means .* {unit} ") as refused:
+            si(plain, unit)
+        assert refused.value.hint == dimension.hint
+    assert si(f"{2 * dimension.largest_plain} {unit}", unit) == 2 * dimension.largest_plain
+    assert abs(si(dimension.example, unit)) <= dimension.largest_plain
+
+
 def test_arrays_are_converted_as_a_whole() -> None:
     np.testing.assert_array_equal(convert(np.array([1.0, 2.0]), "um", "nm"), [1000.0, 2000.0])
 
@@ -75,7 +88,7 @@ def test_kinds() -> None:
 def test_a_decimal_comma_is_told(text: str) -> None:
     with pytest.raises(UnitError) as refused:
         parse_quantity(text)
-    assert "decimal point" in refused.value.hint
+    assert "decimal point" in refused.value.what
 
 
 def test_common_units_need_no_heavy_library() -> None:

@@ -43,7 +43,8 @@ def check(
     show(findings, console)
     if expanded:
         typer.echo(experiment.expanded(), nl=False)
-    console.print(_summary(experiment, findings), markup=False, soft_wrap=True)
+    if experiment.is_readable:
+        console.print(_summary(experiment, findings), markup=False, soft_wrap=True)
     if any(finding.is_error for finding in findings):
         raise typer.Exit(1)
 

@@ -8,7 +8,7 @@ from afspm import wire
 from afspm.errors import InvalidValue, UnitError
 from afspm.model import Parameter, Response
 from afspm.model.names import BASE_PARAMETERS
-from afspm.units import convert, parse_quantity
+from afspm.units import convert, parse_quantity, require_unit
 
 Value = float | str | bool
 
@@ -18,16 +18,21 @@ def to_parameter(name: str, value: Value, unit: str | None) -> Parameter:
 
     Raises:
         InvalidValue: a number that is none.
+        UnitError: a number without a unit that is too large to be meant in SI.
     """
     if isinstance(value, bool):
         return Parameter(name, "true" if value else "false", unit)
     if isinstance(value, str):
         if unit is None and value[:1] in "+-.0123456789" and (quantity := _quantity(value)) is not None:
             number, given = quantity
+            if not given:
+                require_unit(number, BASE_PARAMETERS.get(name) or "")
             return Parameter(name, repr(number), given or BASE_PARAMETERS.get(name))
         return Parameter(name, value, unit)
     if not math.isfinite(value):
         raise InvalidValue(f"{name} can't be set to {value}")
+    if unit is None:
+        require_unit(value, BASE_PARAMETERS.get(name) or "")
     # a numpy number would write itself as "np.float64(…)"
     text = repr(int(value)) if isinstance(value, int) else repr(float(value))
     return Parameter(name, text, BASE_PARAMETERS.get(name) if unit is None else unit)

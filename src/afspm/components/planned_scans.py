@@ -9,9 +9,10 @@ from datetime import UTC
 from typing import Any
 
 from afspm.client.component import Component
+from afspm.client.parameter_values import to_parameter
 from afspm.clock import NS_PER_S
 from afspm.components.scan_plan import XY, PlanStep, RoundSchedule, ScanPlan, grid_centers, rounds_within
-from afspm.errors import ConfigError, InvalidValue
+from afspm.errors import ConfigError, InvalidValue, UnitError
 from afspm.formatting import day_and_time
 from afspm.model import Region, names
 from afspm.units import Angle, Duration, Length
@@ -51,6 +52,11 @@ class PlannedScans(Component):
     ) -> None:
         self.keep_control, self.end_when_done = keep_control, end_when_done
         self.parameters = dict(parameters or {})
+        for name, quantity in self.parameters.items():
+            try:
+                to_parameter(name, quantity, None)
+            except (InvalidValue, UnitError) as error:
+                raise ConfigError(error.what, where=f"parameters.{name}", hint=error.hint) from error
         self.needs_parameters = (*_FRAME, *self.parameters)
 
     def run(self) -> None:

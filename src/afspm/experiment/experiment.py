@@ -63,6 +63,11 @@ class Experiment:
         )
 
     @property
+    def is_readable(self) -> bool:
+        """False if any of its files could not be read as TOML."""
+        return self._document.is_whole
+
+    @property
     def folder(self) -> Path:
         """Of the first file, absolute: relative paths in it are meant from there."""
         return self._document.folders[0]

@@ -30,11 +30,12 @@ from pydantic import Field
 from afspm.errors import AfspmError
 from afspm.experiment.document import Document
 from afspm.experiment.findings import nearest
-from afspm.experiment.sections import Section, parse, report
+from afspm.experiment.sections import Section, parse
 from afspm.experiment.toml_lines import Settings, Table
+from afspm.experiment.validation_messages import report
 from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.model import Parameter, Region, names
-from afspm.units import Angle, Duration, Length, parse_quantity, si
+from afspm.units import Angle, Duration, Length, parse_quantity, require_unit, si
 
 Quantity = str | float
 Pair = tuple[Length, Length]
@@ -74,7 +75,6 @@ class LimitsSection(Section):
 
 
 L = TypeVar("L", bound=ActionLimit)
-LARGEST_REGION_M: Final = 0.01  # no scanner reaches as far
 _OWN: Final = (*LimitsSection.model_fields, "actions")
 
 
@@ -158,8 +158,7 @@ class LimitsReader:
         try:
             read = model.model_validate(table)
         except pydantic.ValidationError as error:
-            for one in error.errors(include_url=False):
-                report(one, path, self.document, known=tuple(model.model_fields))
+            report(error, table, path, self.document, lambda _: model.model_fields)
             return None
         for i, who in enumerate(read.only or ()):
             if who not in self.components:
@@ -197,9 +196,6 @@ class LimitsReader:
         if min(size) <= 0:
             self.document.error("[limits] region is empty", *path, hint="from the smaller to the larger value")
             return None
-        if max(size) > LARGEST_REGION_M:
-            what = f"[limits] region is {size[0]:g} m x {size[1]:g} m: it keeps nothing safe"
-            self.document.warning(what, *path, hint='a plain number is in m: write e.g. "3 um"')
         return Region(center, size, box.angle)
 
     def _check_sizes(self, limits: ExperimentLimits) -> None:
@@ -226,6 +222,7 @@ def _unit_of(read: ParameterLimit) -> str | None:
 def _rate(value: Quantity, unit: str) -> float:
     """Return a change per second, in `unit` per second: "1 V/s", "0.1 V/min"."""
     if not isinstance(value, str):
+        require_unit(value, unit)
         return float(value)
     number, given = parse_quantity(value)
     over, slash, under = given.rpartition("/")

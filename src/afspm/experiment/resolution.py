@@ -16,8 +16,8 @@ from afspm.experiment import (
     implied_parts,
     limits_section,
     planned_measurements,
-    sections,
     settings,
+    validation_messages,
     wiring,
 )
 from afspm.experiment.cache_section import CacheSettings
@@ -273,7 +273,7 @@ def _look_inside(process: ResolvedProcess, component: type, resolved: ResolvedEx
 
 def _report(name: str, error: AfspmError, resolved: ResolvedExperiment) -> None:
     inside = _inside(error)
-    said = f"{sections.name_of((name, *inside))}{':' if inside else ''} {error.what}"
+    said = f"{validation_messages.name_of((name, *inside))}{':' if inside else ''} {error.what}"
     resolved.document.error(said, name, *inside, hint=error.hint)
 
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from datetime import datetime
+from functools import partial
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import pydantic
 from pydantic import Field
 
-from afspm.errors import AfspmError
 from afspm.experiment.document import Document
-from afspm.experiment.findings import nearest
 from afspm.experiment.toml_lines import Settings
+from afspm.experiment.validation_messages import report
 from afspm.units import Duration
 
 
@@ -140,56 +140,8 @@ def parse(model: type[S], name: str, table: Settings, document: Document) -> S:
     try:
         return model.model_validate(table)
     except pydantic.ValidationError as error:
-        for one in error.errors(include_url=False):
-            report(one, (name,), document, known=_fields_at(model, one["loc"]))
+        report(error, table, (name,), document, partial(_fields_at, model))
         return model()
-
-
-_WANTED = {
-    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "a whole number"),
-    **dict.fromkeys(("float_type", "float_parsing"), "a number"),
-    **dict.fromkeys(("bool_type", "bool_parsing"), "true or false"),
-    **dict.fromkeys(("tuple_type", "list_type"), "a list of values in brackets"),
-    **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "a table of keys and values"),
-    **dict.fromkeys(("enum", "literal_error"), "{expected}"),
-    "finite_number": "a finite number",
-    "string_type": "a text in quotes",
-    "greater_than": "above {gt:g}",
-    "greater_than_equal": "at least {ge:g}",
-    "less_than": "below {lt:g}",
-    "less_than_equal": "at most {le:g}",
-}
-"""What was wanted, by pydantic's types of errors."""
-
-
-def report(error: Any, path: tuple[str | int, ...], document: Document, known: tuple[str, ...] = ()) -> None:
-    """Report one error of pydantic in the words of the experiment file."""
-    location = tuple(part for part in error["loc"] if isinstance(part, int) or not part.startswith("function-"))
-    full = (*path, *location)
-    shown, kind, given = name_of(full), error["type"], error.get("input")
-    context, hint = error.get("ctx", {}), ""
-    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
-        said, hint = f"{shown} is not a setting", nearest(str(location[-1]), known)
-    elif kind == "missing":
-        said = f"{shown} is missing"
-    elif kind == "too_long":
-        said = f"{shown} has {context['actual_length']} values, and takes {context['max_length']} at most"
-    elif isinstance(cause := context.get("error"), AfspmError):
-        said, hint = f"{shown} = {given!r}: {cause.what}", cause.hint
-    elif kind in _WANTED:
-        said = f"{shown} is {_WANTED[kind].format(**context)}, not {given!r}"
-    else:
-        told = error["msg"].removeprefix("Value error, ").replace("Input should be", "it should be")
-        said = f"{shown}: {told[:1].lower()}{told[1:]}, not {given!r}"
-    document.error(said, *full, hint=hint)
-
-
-def name_of(path: tuple[str | int, ...]) -> str:
-    """Return ("limits", "a", 0) as "[limits] a[0]"."""
-    text = ""
-    for part in path[1:]:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
-    return f"[{path[0]}] {text}".rstrip()
 
 
 def _fields_at(model: type[pydantic.BaseModel], location: tuple[str | int, ...]) -> tuple[str, ...]:

@@ -21,8 +21,8 @@ from afspm.errors import UnitError
 from afspm.experiment import class_loader
 from afspm.experiment.document import Document
 from afspm.experiment.findings import closest, nearest
-from afspm.experiment.sections import report
 from afspm.experiment.toml_lines import Settings, Table
+from afspm.experiment.validation_messages import report
 
 _ANNOTATED = ("m", "s", "rad", "V", "A", "m/s", "Hz")
 _KINDS_WITHOUT_NAME = {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
@@ -128,8 +128,7 @@ def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Documen
     try:
         return jsonable(adapter.validate_python(value), folder)
     except pydantic.ValidationError as error:
-        for one in error.errors(include_url=False):
-            report(one, path, document)
+        report(error, value, path, document)
         return jsonable(value, folder)
 
 
@@ -218,4 +217,4 @@ def _report_missing(
             continue
         if closest(name, unknown, 0.7):
             continue  # the misspelt key has been reported with this name as the hint
-        document.error(f"[{'.'.join(path)}] lacks its setting {name!r}", *path)
+        document.error(f"[{'.'.join(path)}] needs the setting {name!r}", *path)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Callable, Collection, Iterator
 from typing import Any, Final
 
 from afspm.addresses import EXAMPLE, hint_on, is_address, reaches
 from afspm.errors import InvalidValue
-from afspm.experiment import wiring
+from afspm.experiment import class_loader, wiring
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.handlers import check_handlers
 from afspm.experiment.implied_parts import check_notify, is_program
@@ -46,18 +47,31 @@ _MISSING = {
 
 
 def check(resolved: ResolvedExperiment) -> None:
-    """Run every check; what is found goes to the findings of its document."""
-    for one in CHECKS:
+    """Run every check; what is found goes to the findings of its document.
+
+    Nothing is said of what a missing scheduler or translator, or a class that can't be loaded, may have provided.
+    """
+    for one in CHECKS if _is_complete(resolved) else ALWAYS:
         one(resolved)
+
+
+def _is_complete(resolved: ResolvedExperiment) -> bool:
+    return _all_loaded(resolved) and all(resolved.with_role(role) for role in _MISSING)
+
+
+def _all_loaded(resolved: ResolvedExperiment) -> bool:
+    processes = resolved.processes.values()
+    is_loaded = all(process.part.command or process.component for process in processes)
+    return is_loaded and len(processes) == len(resolved.parts.components)
 
 
 def check_roles(resolved: ResolvedExperiment) -> None:
     """Require one scheduler, one translator, and no two names that only differ in upper and lower case."""
-    # a class that can't be loaded may be the one that is looked for
-    all_loaded = all(process.part.command or process.component for process in resolved.processes.values())
     for role, hint in _MISSING.items():
         having = resolved.with_role(role)
-        if not having and all_loaded and len(resolved.processes) == len(resolved.parts.components):
+        if not having and (name := _not_a_component(resolved, role)):
+            resolved.document.error(f"there is no {role.value}", name, hint=f"[{name}] needs `component = true`")
+        elif not having and _all_loaded(resolved):  # else it may be what can't be loaded
             resolved.document.error(f"there is no {role.value}", hint=hint)
         for extra in having[1:]:
             what = f"[{extra.name}] is a second {role.value} beside [{having[0].name}]"
@@ -68,6 +82,19 @@ def check_roles(resolved: ResolvedExperiment) -> None:
         if other != name:
             what = f"[{name}] and [{other}] are the same name but for upper and lower case"
             resolved.document.error(what, name, hint="their files would be the same on some computers")
+
+
+def _not_a_component(resolved: ResolvedExperiment, role: Role) -> str | None:
+    """Return the table of a class of this role that lacks `component = true`."""
+    for name, table in resolved.parts.intermediaries.items():
+        with contextlib.suppress(class_loader.Unloadable):
+            if (
+                "component" not in table
+                and class_loader.role_of(class_loader.load(class_loader.full_path(str(table.get("class", ".")))))
+                is role
+            ):
+                return name
+    return None
 
 
 def check_names(resolved: ResolvedExperiment) -> None:
@@ -317,16 +344,13 @@ def check_needs(resolved: ResolvedExperiment) -> None:
                     resolved.document.error(what, name, hint=nearest(one, offered))
 
 
-CHECKS: Final[tuple[Callable[[ResolvedExperiment], None], ...]] = (
+Check = Callable[[ResolvedExperiment], None]
+ALWAYS: Final[tuple[Check, ...]] = (
     check_roles,
     check_names,
     check_commands,
     check_intermediaries,
-    check_addresses,
     check_self_subscription,
-    check_listens_to,
-    check_problems,
-    check_envelopes,
     check_controller,
     check_clock,
     check_names_of_people,
@@ -334,4 +358,11 @@ CHECKS: Final[tuple[Callable[[ResolvedExperiment], None], ...]] = (
     check_needs,
     check_handlers,
     check_notify,
+)
+CHECKS: Final[tuple[Check, ...]] = (
+    *ALWAYS,
+    check_addresses,
+    check_listens_to,
+    check_problems,
+    check_envelopes,
 )

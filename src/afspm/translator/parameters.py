@@ -277,10 +277,15 @@ class ParameterTable(Mapping[str, ParameterSpec]):
         spec = self.find(name)
         if isinstance(value, str) and spec.type in ("float", "int"):
             number, unit = units.parse_quantity(value)
-            value = spec.from_unit(number, unit or spec.unit)
+            value = spec.from_unit(number, unit) if unit else self._plain(spec, number)
         elif not isinstance(value, bool | str):
-            value = spec.from_unit(value, spec.unit)
+            value = self._plain(spec, value)
         return spec.checked(value)
+
+    @staticmethod
+    def _plain(spec: ParameterSpec, number: float) -> float:
+        units.require_unit(number, spec.unit)
+        return spec.from_unit(number, spec.unit)
 
     def __getitem__(self, name: str) -> ParameterSpec:
         return self._rows[name]

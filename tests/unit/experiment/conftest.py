@@ -35,6 +35,10 @@ class Scanner(Component):
                  style: Style = Style.QUICK, image: Path | None = None, names: list[str] | None = None): ...
 
 
+class Alternatives(Component):
+    def __init__(self, either: int | str = 1, span: Length | tuple[Length, Length] = 0.0): ...
+
+
 class Classifier(Component):
     flags = ("tip-shape-changed",)
     listens = ("Scan2d",)

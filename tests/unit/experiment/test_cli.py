@@ -39,6 +39,12 @@ def test_check_tells_every_error_with_file_and_line_and_ends_with_1(write: Write
     assert "3 errors" in result.output
 
 
+def test_check_of_an_absent_file_says_no_more_than_that(runner: CliRunner) -> None:
+    result = runner.invoke(app, ["check", "absent.toml"])
+    assert result.exit_code == 1
+    assert result.output == "absent.toml: error: the file can't be read: No such file or directory\n"
+
+
 def test_check_lays_files_over_each_other(write: Write, runner: CliRunner) -> None:
     write(CORRECTOR, '[repair]\nvoltage = "2 nm"\n')
     result = runner.invoke(app, ["check", "night.toml", "over1.toml"])

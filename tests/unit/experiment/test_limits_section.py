@@ -85,12 +85,22 @@ def test_limits_that_contradict_are_errors(write: Write, text: str, said: str) -
 
 
 @pytest.mark.parametrize(
-    ("region", "doubted"),
-    [("{ x = [-3, 3], y = [-3e-6, 3e-6] }", True), ("{ x = [-3e-6, 3e-6], y = [-3e-6, 3e-6] }", False)],
+    ("text", "said"),
+    [
+        ("[limits]\nregion = { x = [-3, 3e-6], y = [-3e-6, 3e-6] }\n", "[limits] region.x[0] = -3: without a unit"),
+        ("[limits]\nregion = { center = [0, 0], size = [400, 1e-6] }\n", "[limits] region.size[0] = 400: without"),
+        ("[limits.scan-size-x]\nmax = 400\n", "means 400 m"),
+        (BIAS + "max = 300\n", "means 300 V"),
+        (BIAS + "rate = 300\n", "means 300 V"),
+        ("[limits.scan-speed]\nmax = 8\n", "means 8 m/s"),
+    ],
 )
-def test_a_region_of_metres_is_doubted(write: Write, region: str, doubted: bool) -> None:
-    found = [finding.what for finding in write(f"[limits]\nregion = {region}\n").check()]
-    assert found == (["[limits] region is 6 m x 6e-06 m: it keeps nothing safe"] if doubted else [])
+def test_a_large_number_without_a_unit_is_an_error(write: Write, text: str, said: str) -> None:
+    assert said in only_error(write(text)).what
+
+
+def test_a_small_number_without_a_unit_is_in_si(write: Write) -> None:
+    assert not errors(write("[limits]\nregion = { x = [-3e-6, 3e-6], y = [-3e-6, 3e-6] }\n" + BIAS + "max = 3\n"))
 
 
 def test_an_action_among_the_parameters_is_told_where_it_belongs(write: Write) -> None:

@@ -63,6 +63,7 @@ def test_a_relative_file_is_one_beside_the_experiment_file(write: Write) -> None
         ("count = 2.5", "a whole number"),
         ('style = "fast"', "'quick' or 'slow'"),
         ('names = "a"', "list of values in brackets"),
+        ("angle = 45", "without a unit this means 45 rad"),
     ],
 )
 def test_a_wrong_value_is_an_error_on_its_line(write: Write, setting: str, said: str) -> None:
@@ -79,6 +80,27 @@ def test_a_wrong_value_is_an_error_on_its_line(write: Write, setting: str, said:
 )
 def test_a_list_of_the_wrong_length_is_an_error(write: Write, size: str, said: str) -> None:
     assert f"[scan] size {said}" in only_error(write(scanner(size=f"size = {size}"))).what
+
+
+@pytest.mark.parametrize("setting", ["every = '15 mn'", "every = '3 nm'", "every = 'soon'"])
+def test_a_wrong_quantity_is_told_what_to_write(write: Write, setting: str) -> None:
+    assert only_error(write(scanner(setting))).hint == 'a time, for example "15 min"'
+
+
+def test_alternatives_of_a_type_are_one_error(write: Write) -> None:
+    table = '[a]\ncomponent = true\nclass = "parts.Alternatives"\n'
+    assert (
+        "[a] either is a whole number or a text in quotes, not [3]" in only_error(write(table + "either = [3]\n")).what
+    )
+    assert "[a] span[1] = '2 V'" in only_error(write(table + 'span = ["1 um", "2 V"]\n')).what
+    assert "[a] span[0] = 2: without a unit" in only_error(write(table + 'span = [2, "1 um"]\n')).what
+
+
+def test_parameters_of_planned_scans_need_their_units(write: Write) -> None:
+    table = '[series]\ncomponent = true\nclass = "ScanSeries"\nsize = ["1 um", "1 um"]\n'
+    error = only_error(write(table + "parameters = { scan-speed = 8 }\n"))
+    assert error.what == "[series] parameters.scan-speed: without a unit this means 8 m/s"
+    assert not errors(write(table + 'parameters = { scan-speed = "8 um/s" }\n'))
 
 
 def test_a_wrong_element_of_a_list_is_named(write: Write) -> None:
@@ -104,7 +126,7 @@ def test_a_setting_of_the_class_that_a_second_file_replaces_is_told_where_it_bel
 def test_a_missing_setting_is_an_error(write: Write) -> None:
     experiment = write(scanner(size=""))
     error = only_error(experiment)
-    assert "lacks its setting 'size'" in error.what
+    assert "needs the setting 'size'" in error.what
     assert error.place.line == line_of(experiment, "[scan]")
 
 

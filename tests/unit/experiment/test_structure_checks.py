@@ -58,6 +58,20 @@ def test_an_experiment_that_fits_together_has_no_findings(write: Write) -> None:
     assert write(CLASSIFIER + CORRECTOR + PEAKS + CHOOSER).check() == []
 
 
+@pytest.mark.parametrize("scheduler", ["", '[scheduler]\ncomponent = true\nclass = "Schedular"\n'])
+def test_a_missing_scheduler_is_the_only_error(write: Write, scheduler: str) -> None:
+    drift = '[pictures]\ncomponent = true\nclass = "DriftPictures"\n'
+    assert "schedul" in only_error(write(scheduler + CLASSIFIER + drift, frame=WITHOUT_SCHEDULER)).what
+
+
+def test_a_scheduler_that_lacks_component_is_pointed_at(write: Write) -> None:
+    table = '[scheduler]\nclass = "Scheduler"\n'
+    experiment = write(table, frame=WITHOUT_SCHEDULER)
+    (error,) = errors(experiment)
+    assert (error.what, error.hint) == ("there is no scheduler", "[scheduler] needs `component = true`")
+    assert error.place.line == line_of(experiment, "[scheduler]")
+
+
 BROKEN = {
     "no scheduler": ("", WITHOUT_SCHEDULER, "there is no scheduler"),
     "no translator": ("", WITHOUT_TRANSLATOR, "there is no translator"),

@@ -1,0 +1,115 @@
+"""The errors of pydantic in the words of an experiment file: one sentence for each value that is wrong."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Final
+
+import pydantic
+
+from afspm.errors import AfspmError
+from afspm.experiment.document import Document
+from afspm.experiment.findings import closest, nearest
+
+SettingPath = tuple[str | int, ...]
+
+_UNKNOWN: Final = ("extra_forbidden", "unexpected_keyword_argument")
+_WANTED: Final = {
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float", "int_parsing_size"), "a whole number"),
+    **dict.fromkeys(("float_type", "float_parsing", "decimal_type", "decimal_parsing"), "a number"),
+    **dict.fromkeys(("bool_type", "bool_parsing"), "true or false"),
+    **dict.fromkeys(("tuple_type", "list_type", "set_type", "frozen_set_type"), "a list of values in brackets"),
+    **dict.fromkeys(
+        ("model_type", "model_attributes_type", "dict_type", "dataclass_type", "mapping_type"),
+        "a table of keys and values",
+    ),
+    **dict.fromkeys(("enum", "literal_error"), "{expected}"),
+    **dict.fromkeys(("path_type", "path_not_file", "path_not_directory"), "a path in quotes"),
+    **dict.fromkeys(("datetime_type", "datetime_parsing", "datetime_from_date_parsing"), "a date and time"),
+    **dict.fromkeys(("date_type", "date_parsing", "date_from_datetime_parsing"), "a date"),
+    "is_instance_of": "a {class}",
+    "none_required": "left out",
+    "finite_number": "a finite number",
+    "string_type": "a text in quotes",
+    "greater_than": "above {gt:g}",
+    "greater_than_equal": "at least {ge:g}",
+    "less_than": "below {lt:g}",
+    "less_than_equal": "at most {le:g}",
+}
+"""What was wanted, by pydantic's types of errors."""
+
+
+def report(
+    error: pydantic.ValidationError,
+    given: Any,
+    path: SettingPath,
+    document: Document,
+    known: Callable[[SettingPath], Iterable[str]] = lambda place: (),
+) -> None:
+    """Report what is wrong with the value given at `path` of the document, once for each place within it.
+
+    Args:
+        known: returns the names that are valid beside an unknown one.
+    """
+    by_place: dict[SettingPath, list[Any]] = {}
+    for one in error.errors(include_url=False):
+        by_place.setdefault(_place(one, given), []).append(one)
+    for place, errors in by_place.items():
+        if any(other[: len(place)] == place != other for other in by_place):
+            continue  # another alternative of the type fits better: it is only wrong further inside
+        full = (*path, *place)
+        what, hint = _sentence(errors, name_of(full), known(place))
+        document.error(what, *full, hint=hint)
+
+
+def name_of(path: SettingPath) -> str:
+    """Return ("limits", "a", 0) as "[limits] a[0]"."""
+    text = ""
+    for part in path[1:]:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return f"[{path[0]}] {text}".rstrip()
+
+
+def _place(one: Any, given: Any) -> SettingPath:
+    """Return where in the given value an error is: its location without the names of alternatives and validators."""
+    place: list[str | int] = []
+    for number, part in enumerate(one["loc"], 1):
+        if part in (given if isinstance(given, Mapping) else range(len(given)) if isinstance(given, list) else ()):
+            given = given[part]
+        elif not (one["type"] == "missing" and number == len(one["loc"]) and isinstance(part, str)):
+            continue
+        place.append(part)
+    return tuple(place)
+
+
+def _sentence(errors: Sequence[Any], shown: str, known: Iterable[str]) -> tuple[str, str]:
+    """Return what is wrong with one value, and the hint."""
+    given = errors[0].get("input")
+    if len(errors) > 1 and isinstance(given, list | Mapping):  # alternatives: it is not meant as a quantity
+        errors = [one for one in errors if _cause(one) is None] or errors
+    last = errors[-1]
+    kind, context = last["type"], last.get("ctx", {})
+    if kind in _UNKNOWN:
+        return f"{shown} is not a setting", nearest(str(last["loc"][-1]), known)
+    if kind == "missing" and isinstance(index := last["loc"][-1], int):
+        return f"{shown} needs {index + 1} values, and has {len(given)}", ""
+    if kind == "missing":
+        return f"{shown} is missing", ""
+    if kind == "too_long":
+        return f"{shown} has {context['actual_length']} values, and takes {context['max_length']} at most", ""
+    for one in errors:
+        if (cause := _cause(one)) is not None:
+            return f"{shown} = {given!r}: {cause.what}", cause.hint
+    wanted = [_WANTED[one["type"]].format(**one.get("ctx", {})) for one in errors if one["type"] in _WANTED]
+    if wanted:
+        near = closest(str(given), re.findall(r"'(.*?)'", " ".join(wanted)))
+        hint = f"did you mean {near!r}?" if near else ""
+        return f"{shown} is {' or '.join(dict.fromkeys(wanted))}, not {given!r}", hint
+    said = last["msg"].removeprefix("Value error, ").replace("Input should be", "it should be")
+    return f"{shown}: {said[:1].lower()}{said[1:]}, not {given!r}", ""
+
+
+def _cause(one: Any) -> AfspmError | None:
+    cause = one.get("ctx", {}).get("error")
+    return cause if isinstance(cause, AfspmError) else None
