@@ -1,4 +1,4 @@
-"""`afspm pause`, `resume`, `end` and `problems`: acting on a running experiment from a terminal, by the user's name."""
+"""`afspm pause`, `resume`, `end`, `problems` and `note`: what a person does to a run, by the user's name."""
 
 from __future__ import annotations
 
@@ -73,6 +73,44 @@ def problems(
                 typer.echo(f"cleared {name}")
         return
     _list(where)
+
+
+def note(
+    words: Annotated[
+        list[str], typer.Argument(metavar="[RUN|FILE] TEXT", help="The run, by default the newest, and what to note.")
+    ],
+    scan: Annotated[
+        int | None, typer.Option(metavar="N", help="The number of the scan that it belongs to.", show_default=False)
+    ] = None,
+) -> None:
+    """Write a note into the record of a run, by your name: on a scan, or on this moment.
+
+    It needs no control. After the end of a run the note is appended to its record, and the report is written again.
+    """
+    from afspm.cli.joining import acting, person
+    from afspm.client.connect import find_run
+    from afspm.clock import ExperimentClock
+    from afspm.record.notes import append_note
+    from afspm.record.report import REPORT_FILE, write
+    from afspm.record.run import open_run
+    from afspm.record.run_lock import goes_on
+
+    *where, text = words
+    if len(where) > 1:
+        raise typer.BadParameter("put the text into quotation marks")
+    folder = find_run(Path(where[0]) if where else RUNS)
+    row = None
+    if scan is not None:
+        with open_run(folder) as run:
+            row = run.numbered(scan)
+    if goes_on(folder):
+        with acting(folder) as scope:
+            scope.note(text, scan=row)
+    else:
+        append_note(folder, person(), text, ExperimentClock.real().now_ns(), row)
+        if (folder / REPORT_FILE).exists():
+            write(folder)
+    typer.echo("noted" if row is None else f"noted on scan {row.number}")
 
 
 def _list(where: Path) -> None:

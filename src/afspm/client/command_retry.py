@@ -7,7 +7,7 @@ from collections.abc import Callable
 from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
 from afspm.errors import NoResponse, Refused
-from afspm.model import ControlRequest, ControlResponse, Response, ScopeState
+from afspm.model import RELAY_REQUEST, ControlRequest, ControlResponse, Response, ScopeState, request_name
 
 PATIENCE_S = 60.0  # real time that a translator may take to be there again
 RETRY_S = 1.0  # before an unreachable one is asked again, when nothing is published in between
@@ -15,7 +15,7 @@ STATE_WITHIN_S = 5.0  # before a warning that the microscope has published no st
 SETTLED_WITHIN_S = 2.0  # what was set is published, if it changed anything
 ASK_FREE_AGAIN_S = 5.0  # should the state FREE never reach us
 
-_ASKED_FOR = {
+_ASKED_FOR: dict[int, str] = {
     ControlRequest.ACTION: "the action",
     ControlRequest.ACTION_SUPPORT: "asking for an action",
     ControlRequest.PARAM: "the parameter",
@@ -27,6 +27,7 @@ _ASKED_FOR = {
     ControlRequest.RMV_EXP_PRBLM: "clearing a problem",
     ControlRequest.SET_CONTROL_MODE: "the mode",
     ControlRequest.END_EXPERIMENT: "ending the experiment",
+    RELAY_REQUEST: "the note",
 }
 _NO_STATE = (
     "waiting for the microscope, which has published no state yet: is its translator running? One of version 1 that "
@@ -183,9 +184,9 @@ class CommandRetry:
         self._link.wait(lambda: counts() != before, until_s)
 
 
-def refused(kind: ControlRequest, response: Response, where: str) -> Refused:
+def refused(kind: int, response: Response, where: str) -> Refused:
     """Return a response as the error that it is."""
     known = response.code in ControlResponse._value2member_map_
     code = ControlResponse(response.code).name if known else str(response.code)
-    what = _ASKED_FOR.get(kind, kind.name)
+    what = _ASKED_FOR.get(kind, request_name(kind))
     return Refused(response.code, f"{what} was refused: {response.reason or code}", where=where, hint=code)

@@ -17,18 +17,22 @@ from afspm.client.measurement import MeasurementRunner
 from afspm.client.measurement_setup import MeasurementSetup
 from afspm.client.parameter_values import Value, to_parameter, value_in
 from afspm.client.targets import ScanTarget, SpectrumTarget
-from afspm.errors import ExperimentEnded
+from afspm.errors import ExperimentEnded, InvalidValue
 from afspm.model import (
+    RELAY_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
     Feedback,
     Frame,
+    HasTime,
+    Note,
     Parameter,
     Problem,
     ProblemNames,
     Progress,
     Region,
+    RelayedMessage,
     ScanSet,
     Spectrum,
 )
@@ -277,6 +281,26 @@ class Scope(ExperimentView):
             left_s = (now_ns - begun_ns) * 1e-9 / (done - begun) * (of - done)
         self._link.tell(Progress(now_ns, self._link.name, done, of, left_s))
 
+    def note(self, text: str, *, scan: HasTime | None = None, time_ns: int | None = None) -> None:
+        """Write a remark into the record of the run: on a scan, on a moment, or on now. It needs no control.
+
+            scope.note("the tip changed here", scan=scans)
+
+        Args:
+            text: at most 1000 characters.
+            scan: that it belongs to: a `ScanSet`, a `Scan`, or a row of `Run.scans`.
+            time_ns: the moment that it is about, experiment time; None: when the scan was finished, or now.
+
+        Raises:
+            InvalidValue: the text is empty or too long, or it is not known when the scan was finished.
+        """
+        if scan is not None and scan.time_ns is None:
+            raise InvalidValue("the scan does not say when it was finished", hint="give time_ns instead")
+        scan_ns, now_ns = None if scan is None else scan.time_ns, self._link.clock.now_ns()
+        about_ns = next(one for one in (time_ns, scan_ns, now_ns) if one is not None)
+        note = Note(about_ns, self._link.name, text, scan_ns, now_ns)
+        self._tell(RELAY_REQUEST, RelayedMessage(*wire.encode(note)))
+
     # --- leaving ---
 
     def close(self) -> None:
@@ -300,7 +324,7 @@ class Scope(ExperimentView):
         self._control.gives_back_inherited = True
         self._control.release_inherited()
 
-    def _tell(self, kind: ControlRequest, subject: int | None) -> None:
+    def _tell(self, kind: int, subject: object) -> None:
         """Ask the scheduler itself, which needs no control."""
         with self._call():
             response = self._link.request(kind, subject)

@@ -4,28 +4,30 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
 
 from afspm.client.component import Component
 from afspm.clock import iso_utc
 from afspm.components.line_file import LineFile, csv_line
-from afspm.model import ControlState, Scan, ScopeState, ScopeStatus, Spectrum
+from afspm.model import ControlState, Note, Scan, ScopeState, ScopeStatus, Spectrum
 
 COLUMNS = (
     "time", "measurement", "filename", "channel", "center_x", "center_y", "width", "height", "length_units",
     "angle_deg", "columns", "rows", "units", "in_control", "mode", "problems", "state",
+    "note",
 )  # fmt: skip
-_IDENTITY = 4  # columns that no two rows share: time, measurement, file and channel
 _BUSY = {ScopeState.SCANNING: "scan", ScopeState.SPEC: "spectrum"}
 
 
 class Metadata(Component):
-    """Writes `metadata.csv` in the run folder: a row for each channel of each scan, and for each spectrum.
+    """Writes `metadata.csv` in the run folder: a row for each channel of each scan, each spectrum and each note.
 
-    Columns: the time it was finished (UTC), `scan` or `spectrum`, the file, the channel (or kind), its place in metres,
-    pixels, units, and as it was when the measurement began: who was in control, the mode, the problems flagged and
-    the microscope's state. What is not known is left empty: a scan that began while this component was not running.
+    Columns: the time it was finished (UTC), `scan`, `spectrum` or `note`, the file, the channel (or kind), its place in
+    metres, pixels, units, and as it was when the measurement began: who was in control, the mode, the problems flagged
+    and the microscope's state; of a note, its author and text. A note on a scan has the time of that scan. What is not
+    known is left empty: a scan that began while this component was not running.
 
     Whatever is killed, there is one header and no row is there twice or missing.
 
@@ -33,7 +35,7 @@ class Metadata(Component):
         file: its name in the run folder.
     """
 
-    listens: ClassVar = ("Scan2d", "Spec1d", "ControlState", "ScopeStateMsg")
+    listens: ClassVar = ("Scan2d", "Spec1d", "ControlState", "ScopeStateMsg", "Note")
 
     def __init__(self, file: str = "metadata.csv") -> None:
         self.file = file
@@ -43,7 +45,7 @@ class Metadata(Component):
 
     def on_start(self) -> None:
         self._table = LineFile(Path(self.run_dir) / self.file, ",".join(COLUMNS))
-        self._written = {tuple(row[:_IDENTITY]) for row in csv.reader(self._table.lines())}
+        self._written = {_identity(dict(zip(COLUMNS, row, strict=False))) for row in csv.reader(self._table.lines())}
 
     def on_control(self, control_state: ControlState) -> None:
         self._control = control_state
@@ -92,6 +94,9 @@ class Metadata(Component):
         of_values = {"columns": str(variables), "rows": str(points), "units": " ".join(spectrum.units)}
         self._write("spectrum", spectrum, {"channel": spectrum.kind, "center_x": x, "center_y": y, **of_values})
 
+    def on_note(self, note: Note) -> None:
+        self._append({"time": iso_utc(note.time_ns), "measurement": "note", "note": f"{note.who}: {note.text}"})
+
     def _write(self, what: str, measured: Scan | Spectrum, columns: dict[str, str]) -> None:
         self._under_way = None  # should it scan on without another state between them, that is the next one
         time_ns = measured.time_ns
@@ -103,10 +108,12 @@ class Metadata(Component):
             "filename": measured.filename,
             "length_units": "m",
         } | columns
-        identity = tuple(row[column] for column in COLUMNS[:_IDENTITY])
-        if identity in self._written:
+        if _identity(row) not in self._written:
+            self._append(row | self._conditions(what, measured.time_ns))
+
+    def _append(self, row: dict[str, str]) -> None:
+        if (identity := _identity(row)) in self._written:
             return  # replayed after a restart
-        row |= self._conditions(what, measured.time_ns)
         self._table.append([csv_line(row.get(column, "") for column in COLUMNS)])
         self._written.add(identity)
 
@@ -122,6 +129,13 @@ class Metadata(Component):
             return {}  # a later one, that began while we were not running
         conditions: dict[str, str] = self.memory["conditions"]
         return conditions
+
+
+def _identity(row: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the cells that no two rows share; a row of an older version has no note."""
+    return tuple(
+        row.get(column, "").replace("\n", " ") for column in ("time", "measurement", "filename", "channel", "note")
+    )
 
 
 def _number(value: float) -> str:

@@ -21,11 +21,10 @@ from afspm.units import si
 KEPT = 6
 PAST = (
     "ProcessStates", "JournalEntries", "ControlState", "ScopeStateMsg", "ScanParameters2d", "Scan2d", "Spec1d",
-    "DriftMapping",
+    "DriftMapping", "Note",
 )  # fmt: skip
 """Messages with which an `Overview` has the time line, the map, drift and refusals. Of others the scheduler has kept
 enough for a late joiner."""
-_SAME_SCAN_NS = 1_000_000_000  # channels of one scan may be stamped one after the other
 
 
 class Archive:
@@ -93,16 +92,8 @@ def _region(box: dict[str, Any]) -> Region:
 
 def _find(folder: Path, time_ns: int, channel: str) -> ChannelFrame | None:
     with open_run(folder) as run:
-        near = [
-            row
-            for row in run.scans
-            if row.file
-            and abs(row.time_ns - time_ns) <= _SAME_SCAN_NS
-            and any(name == channel for name, _ in row.channels)
-        ]
-        if not near:
-            return None
-        return _frame(run.scan(min(near, key=lambda row: abs(row.time_ns - time_ns)))[channel], time_ns)
+        row = run.scan_at(time_ns, channel)
+        return None if row is None or not row.file else _frame(run.scan(row)[channel], time_ns)
 
 
 def _frame(scan: Scan, time_ns: int) -> ChannelFrame:

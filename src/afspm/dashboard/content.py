@@ -148,6 +148,8 @@ def trouble(watch: Watch) -> str:
 def rows_of(overview: Overview, silent: Mapping[str, int]) -> Iterator[TimelineRow]:
     """Yield the rows of the time line: control, mode, scope state, each problem, each process."""
     yield TimelineRow("control", overview.controls.spans, tint_class)
+    if overview.notes:
+        yield TimelineRow("notes", overview.note_spans, lambda _: "marked")
     yield TimelineRow("mode", overview.modes.spans, lambda label: f"mode-{label}")
     yield TimelineRow("microscope", overview.states.spans, lambda label: f"state-{label.replace('_', '-')}")
     for number, lane in sorted(overview.problem_timelines.items()):

@@ -21,6 +21,7 @@ CSS = """
 .lane b{font-weight:500;font-size:12.5px;text-align:right;overflow:hidden;text-overflow:ellipsis;white-space:nowrap}
 .lane>div{position:relative;height:17px;background:var(--lane);border-radius:2px;overflow:hidden}
 .lane span{position:absolute;top:0;bottom:0;min-width:1px;background:var(--quiet);overflow:hidden}
+.lane span.marked{min-width:6px;border-radius:3px;background:currentColor}
 .lane i{display:block;margin:0;height:auto;padding:0 4px;color:#fff;white-space:nowrap}
 .lane i{font-style:normal;font-size:11px;line-height:17px}
 .lane-axis>div{position:relative;height:18px}
@@ -136,10 +137,9 @@ def _row(row: TimelineRow, shown: Sequence[Stretch], begin_ns: int, end_ns: int,
         label = one.label.replace("_", " ")
         start_ns = begin_ns + one.begin * (end_ns - begin_ns) // COLUMNS
         by = f", by {one.by}" if one.by else ""
-        often = (
-            f", {one.count} times about here" if one.count > 1 else f" for {duration_text(one.lasted_ns / NS_PER_S)}"
-        )
-        title = f"{label}{by} from {time_of_day(start_ns, zone)}{often}"
+        lasted = f" for {duration_text(one.lasted_ns / NS_PER_S)}" if one.lasted_ns else ""
+        often = f", {one.count} times about here" if one.count > 1 else lasted
+        title = f"{label}{by} {'from' if one.lasted_ns else 'at'} {time_of_day(start_ns, zone)}{often}"
         left, width = 100 * one.begin / COLUMNS, 100 * (one.end - one.begin) / COLUMNS
         word = f"<i>{escape(label)}</i>" if width > 7 else ""
         cells.append(

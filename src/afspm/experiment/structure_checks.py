@@ -33,6 +33,7 @@ PUBLISHED: Final = (
     "ProcessStates",
     "LogLines",
     "Progress",
+    "Note",
 )
 CONTINUED: Final = ("Scan2d", "Spec1d", "ProcessStates", "Progress")
 LIVE: Final = "ScanLines"

@@ -19,6 +19,7 @@ DEFAULT_HISTORY = {
     "ScanLines": 0,
     "JournalEntries": 1000,
     "LogLines": 1000,
+    "Note": 1000,
 }
 """How many packets are kept of each envelope, by message; of all others one. Lines are of the moment."""
 

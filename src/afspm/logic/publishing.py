@@ -8,9 +8,10 @@ from afspm.logic.event_log import ENTRIES
 from afspm.logic.events import Publish, RequestIn
 from afspm.logic.state import StateDraft
 from afspm.logic.supervisor_registry import announcement
-from afspm.model import ControlResponse
+from afspm.model import HAS_ENDED, ControlResponse, ResponseDetail
 
 CONTROL_STATE = "ControlState"
+NOTE = "Note"
 
 
 def publish(draft: StateDraft, envelope: str, payload: bytes, time_ns: int | None = None) -> None:
@@ -38,6 +39,10 @@ def publish_for_process(draft: StateDraft, event: RequestIn) -> None:
     codec, told = draft.env.codec, announcement(event, draft.env.codec)
     if not told.envelope:
         answers.answer(draft, event, ControlResponse.FAILURE, told.why)
+        return
+    if draft.control.ended and told.envelope == NOTE:  # its author is told, and writes it into the record
+        ended = ResponseDetail.EXPERIMENT_ENDED
+        answers.answer(draft, event, ControlResponse.FAILURE, HAS_ENDED, detail=ended)
         return
     if told.states is not None:
         draft.supervisors = draft.supervisors.told(event.name, told.states, draft.now_s)

@@ -11,6 +11,7 @@ from afspm.logic.events import Codec, RequestIn
 from afspm.logic.frozen import replace
 from afspm.model import (
     LogLines,
+    Note,
     ProcessCondition,
     ProcessState,
     ProcessStates,
@@ -169,6 +170,9 @@ def announcement(event: RequestIn, codec: Codec) -> Announcement:
     if isinstance(thing, Progress) and told.message == "Progress":
         mine = thing.name in (event.name, component_of(event.name))
         return _named(told.message, thing.name) if mine else Announcement("", f"{event.name} is not {thing.name}")
+    if isinstance(thing, Note) and told.message == "Note":
+        mine = thing.who == event.name
+        return Announcement(told.message) if mine else Announcement("", f"{event.name} is not {thing.who[:80]!r}")
     if not isinstance(thing, ProcessStates | LogLines) or type(thing).__name__ != told.message:
         return Announcement("", f"a {told.message[:80]} is not published for others, or can't be read")
     if event.user not in (None, SUPERVISOR):

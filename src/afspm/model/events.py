@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from dataclasses import dataclass
 from enum import Enum, IntEnum
+from typing import Protocol
 
+from afspm.errors import InvalidValue
 from afspm.model.state import ControlMode
 
 PERSON = ":"
 """Between a component and the person that it acts for: "dashboard:Ada"."""
 LONGEST_PROCESS_NAME = 100
 """In bytes: it is also the name of files, on every system."""
+LONGEST_NOTE = 1000
+"""In characters."""
 _PROCESS_NAME = re.compile(r"\w([\w .+-]*[\w+-])?")
 
 
@@ -176,9 +181,45 @@ class Progress:
         return None if self.left_s is None else max(0, round(self.left_s * 1e9) - max(0, now_ns - self.time_ns))
 
 
+class HasTime(Protocol):
+    """Something that was measured, and says when it was finished; None if it does not know."""
+
+    @property
+    def time_ns(self) -> int | None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """A remark of a person, or of a component, on a scan or on a moment.
+
+    Attributes:
+        time_ns: the moment that it is about; of a scan: when that was finished.
+        who: the author; "component:person" where a person wrote it.
+        scan_ns: of the scan that it belongs to, as in `Scan.time_ns`; None: it belongs to none.
+        written_ns: when it was written, experiment time; after the end of the experiment real time.
+
+    Raises:
+        InvalidValue: the text is empty or too long, or has control characters besides line feeds and tabs.
+    """
+
+    time_ns: int
+    who: str
+    text: str
+    scan_ns: int | None = None
+    written_ns: int | None = None
+
+    def __post_init__(self) -> None:
+        if not self.text.strip():
+            raise InvalidValue("the note has no text", hint="write what happened")
+        if len(self.text) > LONGEST_NOTE:
+            raise InvalidValue(f"the note has {len(self.text)} characters", hint=f"at most {LONGEST_NOTE}")
+        if strange := [c for c in self.text if unicodedata.category(c) in ("Cc", "Cs") and c not in "\n\t"]:
+            raise InvalidValue(f"the note has the control character {strange[0]!r}", hint="leave it out")
+
+
 @dataclass(frozen=True, slots=True)
 class RelayedMessage:
-    """A message that the scheduler publishes for others: ProcessStates and LogLines of a supervisor, Progress.
+    """A message that the scheduler publishes for others: ProcessStates and LogLines of a supervisor, Progress, Note.
 
     Its envelope is the message's name, for ProcessStates and Progress followed by "_" and whose it is.
     """

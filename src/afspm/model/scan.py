@@ -278,6 +278,10 @@ class ScanSet(Mapping[str, Scan]):
     def time(self) -> datetime | None:
         return self.first.time
 
+    @property
+    def time_ns(self) -> int | None:
+        return self.first.time_ns
+
     def __getitem__(self, channel: str) -> Scan:
         if channel not in self._scans:
             raise KeyError(f"no channel {channel!r}; there are {', '.join(self._scans)}")

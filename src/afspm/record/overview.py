@@ -23,6 +23,7 @@ from afspm.model import (
     JournalEntry,
     LogLine,
     LogLines,
+    Note,
     ProbePosition,
     ProblemNames,
     ProcessCondition,
@@ -144,7 +145,7 @@ class Overview:
         newest_ns: the time of the newest packet; 0 before the first.
         status, control, scan_parameters, feedback, probe_position: the newest of each; None before the first.
         processes, told_progress: by name; `processes_told_ns`: when each process was told of last.
-        log, entries, refusals: newest last, bounded.
+        log, notes, entries, refusals: newest last, bounded.
         controls: lane of who was in control; `modes`, `states`: lanes of mode and scope state, in lower case.
         problem_timelines: by number; `process_timelines`: by name. A process that is busy counts as alive.
         running: the scan that is being taken; None if none is.
@@ -162,6 +163,7 @@ class Overview:
         self.processes_told_ns: dict[str, int] = {}
         self.told_progress: dict[str, Progress] = {}
         self.log: deque[LogLine] = deque(maxlen=MOST_LINES)
+        self.notes: deque[Note] = deque(maxlen=most_entries)
         self.entries: deque[JournalEntry] = deque(maxlen=most_entries)
         self.refusals: deque[JournalEntry] = deque(maxlen=most_entries)
         self.controls, self.modes, self.states = Timeline(), Timeline(), Timeline()
@@ -189,6 +191,12 @@ class Overview:
     def drift(self) -> Sequence[DriftPoint]:
         """In the order in which they came."""
         return tuple(self._drift.values())
+
+    @property
+    def note_spans(self) -> list[Span]:
+        """The notes as spans without length, for time lines."""
+        spans = [Span(note.text, note.time_ns, note.time_ns, note.who) for note in self.notes]
+        return sorted(spans, key=lambda span: span.start_ns)
 
     @property
     def progress(self) -> dict[str, tuple[int, int]]:
@@ -350,6 +358,9 @@ class Overview:
     def _take_log(self, lines: LogLines, time_ns: int) -> None:
         self.log.extend(lines.lines)
 
+    def _take_note(self, note: Note, time_ns: int) -> None:
+        self.notes.append(note)
+
     def _take_mapping(self, message: Any, time_ns: int) -> None:
         if len(message.matrix) != 6 or len(message.center) != 2:
             return
@@ -397,5 +408,6 @@ _TAKERS: dict[str, Callable[[Overview, Any, int], None]] = {
     "ProcessStates": Overview._take_processes,
     "LogLines": Overview._take_log,
     "Progress": Overview._take_progress,
+    "Note": Overview._take_note,
     "DriftMapping": Overview._take_mapping,
 }

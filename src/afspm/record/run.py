@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from afspm import wire
-from afspm.errors import FileError, WireError
+from afspm.errors import FileError, InvalidValue, WireError
 from afspm.model import (
     ControlState,
     Frame,
     JournalEntry,
     LogLine,
+    Note,
     Packet,
     ProblemNames,
     ProcessCondition,
@@ -26,12 +27,15 @@ from afspm.model import (
     Spectrum,
 )
 from afspm.record import journal
+from afspm.record.journal import SCHEDULER
 from afspm.record.packets import packets, without_reading_files
 from afspm.record.run_json import EXPERIMENT_FILE, LATEST_FILE, REPLAY_OF, run_json_or_empty
-from afspm.record.tables import ControlRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
+from afspm.record.tables import ControlRow, NoteRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
 
 if TYPE_CHECKING:
     from afspm.record.overview import DriftPoint, Overview
+
+_SAME_SCAN_NS = 1_000_000_000
 
 
 def open_run(path: str | Path = "runs") -> Run:
@@ -91,11 +95,45 @@ class Run:
         return spectrum
 
     def about(self, row: ScanRow | SpectrumRow) -> dict[str, Any]:
-        """Return what its file says beside the values: drift, feedback, the controller's header … Raises as `scan`."""
+        """Return what is known beside the values: drift, feedback, the controller's header, notes … See `scan`."""
         header: dict[str, Any] = dict(self._content(row.file, f"number {row.number}").header)
-        return header
+        notes = [f"{note.text} ({note.who})" for note in self.notes_on(row)]
+        return header | {"notes": notes} if notes else header
+
+    def scan_at(self, time_ns: int, channel: str = "") -> ScanRow | None:
+        """Return the scan that was finished at a time; None if there is none.
+
+        Channels of one scan may be stamped one after the other, so the time may differ by up to a second.
+
+        Args:
+            channel: that it must have; empty: any.
+        """
+        near = "SELECT * FROM scans WHERE abs(time_ns - ?) <= ? ORDER BY abs(time_ns - ?), number"
+        rows = map(_scan_row, self._query(near, (time_ns, _SAME_SCAN_NS, time_ns)))
+        return next((row for row in rows if not channel or channel in dict(row.channels)), None)
 
     # --- what happened ---
+
+    @property
+    def notes(self) -> Table[NoteRow]:
+        """Return the notes of persons and components, in the order of the moments that they are about."""
+        return Table(map(self._note_row, self._notes()), NoteRow)
+
+    def notes_on(self, row: ScanRow | SpectrumRow) -> Table[NoteRow]:
+        """Return the notes that belong to a scan."""
+        near = (one for one in self._notes() if one.scan_ns and abs(one.scan_ns - row.time_ns) <= _SAME_SCAN_NS)
+        return Table(map(self._note_row, near), NoteRow).where(
+            lambda note: isinstance(row, ScanRow) and note.scan == row.number
+        )
+
+    def _notes(self) -> list[Note]:
+        payloads = self._query("SELECT payload FROM packets WHERE message = 'Note' ORDER BY time_ns")
+        found = [note for (payload,) in payloads if isinstance(note := self._decoded("Note", payload), Note)]
+        return sorted(found, key=lambda note: note.time_ns)
+
+    def _note_row(self, note: Note) -> NoteRow:
+        scan = None if note.scan_ns is None else self.scan_at(note.scan_ns)
+        return NoteRow(note.time_ns, note.who, note.text, None if scan is None else scan.number, note.written_ns)
 
     @property
     def journal(self) -> Table[JournalEntry]:
@@ -221,6 +259,11 @@ class Run:
         return str(self._note("experiment") or self.facts.get("name") or self.folder.name)
 
     @property
+    def newest_ns(self) -> int:
+        """The time of the last packet."""
+        return int(self._query("SELECT coalesce(max(time_ns), 0) FROM packets WHERE source = ?", (SCHEDULER,))[0][0])
+
+    @property
     def simulated(self) -> bool:
         """Return whether the microscope was simulated."""
         return bool(self._note("simulated"))
@@ -234,6 +277,16 @@ class Run:
     def frame(self) -> Frame:
         """Of all places: those of the sample where drift was compensated."""
         return Frame(self._note("frame") or Frame.TIP.value)
+
+    def numbered(self, number: int) -> ScanRow:
+        """Return the scan with a number, as reports and exports show it. Raises InvalidValue: there is none."""
+        found = self._query("SELECT * FROM scans WHERE number = ?", (number,))
+        if not found:
+            last = self._query("SELECT coalesce(max(number), 0) FROM scans")[0][0]
+            raise InvalidValue(
+                f"there is no scan {number}", hint=f"the last is {last}" if last else "there is none yet"
+            )
+        return _scan_row(found[0])
 
     @property
     def problem_names(self) -> ProblemNames:

@@ -43,6 +43,11 @@ def cut_off_message(folder: Path) -> str:
     return f"it was cut off; {resume_command(folder)} goes on with it"
 
 
+def goes_on(folder: Path) -> bool:
+    """Return whether a run goes on, as far as this computer can know: it has not ended, and was not cut off."""
+    return not run_json_or_empty(folder).get(ENDED) and not cut_off_message(folder)
+
+
 def describe_state(folder: Path) -> str:
     """Return the state of a run in words: how it ended, that it was cut off, that it goes on."""
     if ended := run_json_or_empty(folder).get(ENDED):

@@ -20,7 +20,9 @@ from afspm.errors import WireError
 from afspm.model import (
     Frame,
     JournalEntries,
+    JournalEntry,
     LogLines,
+    Note,
     Packet,
     ProblemNames,
     ProcessStates,
@@ -37,6 +39,8 @@ from afspm.storage.disk import sync_file, sync_folder
 from afspm.wire.values import without_values
 
 _log = logging.getLogger("afspm.record")
+NOTE = "note"
+"""The kind of a journal entry that is a note."""
 _ALL_OF_THEM = (OSError, sqlite3.OperationalError)
 """What is wrong with the disk, and so with whatever is written next."""
 _PROCESS = "SELECT role, condition, since_ns, starts, pid, last_exit FROM processes WHERE name = ? ORDER BY rowid DESC"
@@ -189,6 +193,9 @@ class RecordStore:
                 self._add_processes(thing)
             case LogLines():
                 self._add_log(thing)
+            case Note():
+                note = JournalEntry(thing.time_ns, NOTE, thing.who, thing.text)
+                self._add_entries(JournalEntries((note,)))
 
     def _write(self, taken: Iterable[Assembled]) -> None:
         for one in taken:

@@ -98,6 +98,17 @@ class ProcessRow:
     last_exit: str
 
 
+@dataclass(frozen=True, slots=True)
+class NoteRow:
+    """A note; attributes as of `model.Note`. `scan` is the number of the scan that it belongs to, None: to none."""
+
+    time_ns: int
+    who: str
+    text: str
+    scan: int | None
+    written_ns: int | None
+
+
 class Table(Sequence[T], Generic[T]):
     """Rows of one kind: a sequence, with `to_numpy` and `to_xarray` for the columns that are numbers and texts.
 

@@ -192,6 +192,14 @@ _PROCESS_STATE = MessageMapping(
     step_age_s="step_age",
 )
 _LOG_LINE = MessageMapping(model.LogLine, journal_pb2.LogLine, "name", "level", "text", time_ns=_time())
+_NOTE = MessageMapping(
+    model.Note,
+    journal_pb2.Note,
+    *("who", "text"),
+    time_ns=_time(),
+    scan_ns=_time("scan"),
+    written_ns=_time("written"),
+)
 RELAYED = MessageMapping(
     model.RelayedMessage, journal_pb2.Told, "payload", message=FieldMapping("message", from_wire=_needed("a message"))
 )
@@ -211,6 +219,7 @@ MAPPINGS: tuple[MessageMapping[Any], ...] = (
     ),
     MessageMapping(model.LogLines, journal_pb2.LogLines, lines=_each("lines", _LOG_LINE)),
     MessageMapping(model.Progress, journal_pb2.Progress, "name", "done", "of", time_ns=_time(), left_s="remaining"),
+    _NOTE,
 )
 
 

@@ -48,6 +48,7 @@ class Topic(StrEnum):
     PROCESSES = "ProcessStates"
     LOG = "LogLines"
     PROGRESS = "Progress"
+    NOTE = "Note"
 
 
 VERSION_1_TOPICS: Final = tuple(Topic)[:9]

@@ -18,6 +18,9 @@ from typer.testing import CliRunner
 
 from afspm.cli.app import app
 from afspm.cli.joining import NOT_RUNNING, person
+from afspm.client.connect import find_run
+from afspm.client.follower import Follower
+from afspm.record.run import open_run
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 AFSPM = (sys.executable, "-m", "afspm")
@@ -200,11 +203,35 @@ def test_end_asks_first(night: Running) -> None:
     assert night.status()["mode"] == "AUTOMATED"
 
 
+def test_a_note_on_a_scan_outlives_the_scheduler(night: Running) -> None:
+    night.wait_for(r"scan 2 of")
+    for scan, text in (("1", "tip changed here"), ("99", "no such scan")):
+        said = afspm_here("note", night.runs, text, "--scan", scan)
+        assert (said.exit_code == 0) is (scan == "1"), said.stderr
+    assert "there is no scan 99" in str(said.exception)
+    assert "no text" in str(afspm_here("note", night.runs, "  ").exception)
+    assert afspm("note", night.runs, "the door slammed").stdout == "noted\n"
+    kill_scheduler(night)
+    with Follower(find_run(night.runs)) as late:
+        late.catch_up()
+        assert [(note.who, note.text) for note in late.overview.notes] == [
+            (person(), "tip changed here"),
+            (person(), "the door slammed"),
+        ]
+
+
+def kill_scheduler(night: Running) -> None:
+    processes = night.until(lambda t: t["processes"])["processes"]
+    before = next(one for one in processes if one["name"] == "scheduler")
+    os.kill(before["pid"], signal.SIGKILL)
+    night.until(
+        lambda t: any(one["name"] == "scheduler" and one["starts"] == before["starts"] + 1 for one in t["processes"])
+    )
+
+
 def test_status_survives_the_restart_of_the_scheduler(night: Running) -> None:
-    pid = next(one["pid"] for one in night.until(lambda t: t["processes"])["processes"] if one["name"] == "scheduler")
-    os.kill(pid, signal.SIGKILL)
-    told = night.until(lambda t: any(one["name"] == "scheduler" and one["starts"] == 2 for one in t["processes"]))
-    assert told["mode"] == "AUTOMATED"
+    kill_scheduler(night)
+    assert night.status()["mode"] == "AUTOMATED"
 
 
 def test_where_nothing_runs_that_is_said(tmp_path: Path) -> None:
@@ -221,3 +248,12 @@ def test_end_ends_it_and_then_nothing_runs(night: Running) -> None:
         said = afspm_here(command, night.runs)
         assert said.exit_code == NOT_RUNNING, said.stderr
         assert "has ended (" in said.stderr
+    report = Path(afspm_here("report", night.runs).stdout.strip())
+    assert afspm_here("note", night.runs, "double tip", "--scan", "2").stdout == "noted on scan 2\n"
+    assert "double tip" in report.read_text(encoding="utf-8")
+    with open_run(night.runs) as run:
+        assert [(note.who, note.text, note.scan) for note in run.notes] == [
+            (person(), "tip changed here", 1),
+            (person(), "double tip", 2),
+            (person(), "the door slammed", None),
+        ]

@@ -85,7 +85,8 @@ class Tireless(Component):
         self.scope.clear("thermal-drift")  # a cut between flag and clear leaves it standing, as it should
         for i in itertools.count(self.memory.get("done", 0)):
             region = Region((i % 5 * 1e-6, 0), (1e-6, 1e-6))
-            self.scope.scan(region, shape=(24, 24), key=f"scan-{i}")
+            scans = self.scope.scan(region, shape=(24, 24), key=f"scan-{i}")
+            self.scope.note(f"number {i}", scan=scans)
             if i % 3 == 1:
                 self.scope.spectrum((i % 5 * 1e-6, 0), key=f"spectrum-{i}")
             if i % 4 == 2:
@@ -108,7 +109,7 @@ class Witness:
         self._context: Any = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
         # by the empty prefix a plain socket means what version 1 has
-        for prefix in ("", "JournalEntries", "LogLines", "ProcessStates", "Progress"):
+        for prefix in ("", "JournalEntries", "LogLines", "ProcessStates", "Progress", "Note"):
             self._socket.setsockopt(zmq.SUBSCRIBE, prefix.encode())
         self._socket.setsockopt(zmq.RCVHWM, 0)
         self._socket.setsockopt(zmq.RCVTIMEO, 20)

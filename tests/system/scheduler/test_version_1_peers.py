@@ -22,6 +22,7 @@ from afspm.model import (
     ControlResponse,
     LogLine,
     LogLines,
+    Note,
     ProcessCondition,
     ProcessState,
     ProcessStates,
@@ -87,6 +88,7 @@ def say_everything_of_ours(rig: Any, ours: Any) -> None:
     for thing in (
         LogLines((LogLine(CLOCK.now_ns(), "one", "INFO", "a line"),)),
         ProcessStates(CLOCK.now_ns(), "here", (one,)),
+        Note(CLOCK.now_ns(), "Ours", "a note"),
     ):
         assert ours.ask(RELAY_REQUEST, RelayedMessage(*wire.encode(thing))).ok
     rig.publish_packet(*wire.encode(ScopeStatus(ScopeState.SCANNING)))

@@ -27,6 +27,7 @@ from afspm.model import (
     ProbePosition,
     ProblemNames,
     Region,
+    RelayedMessage,
     Request,
     Response,
     Scan,
@@ -248,6 +249,11 @@ class Lab:
 
     def count(self, kind: ControlRequest) -> int:
         return sum(request.kind == kind for request in self.requests)
+
+    def told(self, message: str) -> list[RelayedMessage]:
+        """What was to be published, of one kind."""
+        relayed = [request.subject for request in self.requests if request.kind == RELAY_REQUEST]
+        return [one for one in relayed if one.message == message]
 
     # --- scheduler and microscope ---
 

@@ -723,3 +723,22 @@ def test_of_progress_told_in_a_tight_loop_only_the_newest_waits_and_arrives(lab:
     told = [request.subject for request in lab.requests if request.kind == model.RELAY_REQUEST]
     assert len(told) == 2
     assert wire.decode(told[-1].message, told[-1].payload).done == 9_999
+
+
+def test_a_note_needs_no_control_and_says_when_its_scan_was_finished(lab: Lab, scope: Scope) -> None:
+    scans = scope.scan(REGION)
+    scope.note("tip changed here", scan=scans)
+    scope.note("the door slammed", time_ns=7)
+    told = [wire.decode("Note", one.payload) for one in lab.told("Note")]
+    assert [(note.who, note.text, note.scan_ns) for note in told] == [
+        (lab.name, "tip changed here", scans.time_ns),
+        (lab.name, "the door slammed", None),
+    ]
+    assert (told[0].time_ns, told[1].time_ns) == (scans.time_ns, 7)
+    assert lab.count(ControlRequest.REQUEST_CTRL) == 1
+
+
+def test_a_note_on_a_scan_of_which_the_time_is_not_known_is_refused(scope: Scope) -> None:
+    scan = Scan(REGION, "Height", "m", np.zeros((2, 2)))
+    with pytest.raises(InvalidValue, match="when it was finished"):
+        scope.note("here", scan=scan)

@@ -16,7 +16,7 @@ from afspm.components.line_file import LineFile
 from afspm.components.metadata import COLUMNS, Metadata
 from afspm.exit_codes import ExitCode
 from afspm.logic import arbitration as a
-from afspm.model import ControlMode, ControlState, Problem, Scan, ScopeState, ScopeStatus, Spectrum
+from afspm.model import ControlMode, ControlState, Note, Problem, Scan, ScopeState, ScopeStatus, Spectrum
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
@@ -225,3 +225,19 @@ def test_times_keep_their_microseconds_and_columns_their_order() -> None:
     assert iso_utc(1_700_000_000_123_456_789) == "2023-11-14T22:13:20.123456Z"
     assert iso_utc(None) == ""
     assert COLUMNS[:4] == ("time", "measurement", "filename", "channel")
+
+
+def note_at(lab: Lab, at_s: float, text: str) -> None:
+    lab.at(at_s, lambda: lab.publish(Note(5, "dashboard:Ada", text, scan_ns=5)))
+
+
+def test_a_note_has_a_row_once_with_its_author_and_the_time_of_its_scan(tmp_path: Path) -> None:
+    for _ in range(2):
+        lab = Lab("metadata")
+        scanned(lab, 10.0)
+        note_at(lab, 200.0, "tip changed,\nhere")
+        note_at(lab, 200.0, "really")
+        lab.at(300.0, lab.kill)
+        run(Metadata(), lab, run_dir=str(tmp_path))
+    notes = [(row["time"], row["note"]) for row in rows(tmp_path) if row["measurement"] == "note"]
+    assert notes == [(iso_utc(5), "dashboard:Ada: tip changed, here"), (iso_utc(5), "dashboard:Ada: really")]

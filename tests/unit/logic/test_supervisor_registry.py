@@ -19,12 +19,14 @@ from afspm.model import (
     ControlResponse,
     LogLine,
     LogLines,
+    Note,
     ProcessCondition,
     ProcessState,
     ProcessStates,
     Progress,
     RelayedMessage,
     Response,
+    ResponseDetail,
     ScopeStatus,
 )
 
@@ -122,6 +124,23 @@ def test_progress_is_told_by_whose_it_is(lab: Lab) -> None:
     assert tell(lab, Progress(1, "series", 3, 9), "series", user="series").code == OK
     assert "Progress_series" in cached(lab)
     assert tell(lab, Progress(1, "series", 3, 9), "other").code == ControlResponse.FAILURE
+
+
+def test_a_note_is_published_once_in_the_name_of_its_author(lab: Lab) -> None:
+    note = Note(5, "dashboard:Ada", "tip changed here", scan_ns=5, written_ns=9)
+    for _ in range(2):  # as where the scheduler is killed before it can answer
+        assert tell(lab, note, "dashboard:Ada", user="dashboard").code == OK
+    assert cached(lab).count("Note") == 1
+    assert lab.codec.decode(published(lab.effects)[-1].payload) == note
+    refused = tell(lab, note, "dashboard:Bob", user="dashboard")
+    assert (refused.code, refused.reason) == (ControlResponse.FAILURE, "dashboard:Bob is not 'dashboard:Ada'")
+
+
+def test_after_the_end_the_author_is_told_to_write_the_note_elsewhere(lab: Lab) -> None:
+    lab.ask("series", ControlRequest.END_EXPERIMENT)
+    answer = tell(lab, Note(5, "series", "too late"), "series")
+    assert (answer.code, answer.detail) == (ControlResponse.FAILURE, ResponseDetail.EXPERIMENT_ENDED)
+    assert "Note" not in cached(lab)
 
 
 def test_an_order_comes_with_the_next_answer_once(lab: Lab) -> None:

@@ -29,6 +29,7 @@ AS_MODEL = {
     "ProcessStates",
     "LogLines",
     "Progress",
+    "Note",
 }
 
 

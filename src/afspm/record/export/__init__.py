@@ -15,7 +15,7 @@ from afspm.record.tables import ScanRow, SpectrumRow
 
 __all__ = ["FORMATS", "chosen", "export"]
 
-FORMATS = {"gwy": "gwyddion", "nc": "netcdf", "png": "png", "csv": "tables"}
+FORMATS = {"h5": "nexus", "gwy": "gwyddion", "nc": "netcdf", "png": "png", "csv": "tables"}
 """By suffix, the module of this package; its `write(run, row)` yields the ends of names and contents of files."""
 
 Writer = Callable[[Run, ScanRow | SpectrumRow], Iterator[tuple[str, bytes]]]

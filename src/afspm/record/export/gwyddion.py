@@ -140,6 +140,8 @@ def _meta(about: Mapping[str, Any]) -> dict[str, str]:
             continue
         if name == "angle_rad":
             said["angle"] = f"{math.degrees(value):g} deg"
+        elif name == "notes":
+            said |= {f"note {number}": note for number, note in enumerate(value, 1)}
         elif isinstance(value, Mapping):
             said |= {f"{name} {inner}": str(one) for inner, one in value.items()}
         else:

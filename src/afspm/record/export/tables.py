@@ -25,6 +25,7 @@ def tables(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow]) -> Iterat
     by_name: dict[str, Table[Any]] = {
         "scans": Table(scans, ScanRow),
         "spectra": Table(spectra, SpectrumRow),
+        "notes": run.notes,
         "journal": run.journal,
         "refusals": run.refusals,
         "control": run.control,

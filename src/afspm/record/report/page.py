@@ -35,6 +35,7 @@ def html(story: RunStory, shown: Sequence[Small], figures: Sequence[Path]) -> st
         ),
         _section("What the time went into", _shares(story)),
         _section("Problems and repairs", _problems(story)),
+        _section("Notes", _notes(story)),
         _section("Scans", _sheet(story, shown)),
         _section("Figures", "".join(map(_figure, figures))),
         _section("Refusals", _refusals(story)),
@@ -119,6 +120,19 @@ def _problems(story: RunStory) -> str:
         _table(["problem", "flagged", "by", "in control meanwhile", "done to the tip", "for", "cleared"], rows)
         or "<p>None.</p>"
     )
+
+
+def _notes(story: RunStory) -> str:
+    rows = [
+        [
+            _clock(story, note.time_ns),
+            "" if note.scan is None else f"scan {note.scan}",
+            escape(note.who),
+            f'<span class="text">{escape(note.text)}</span>',
+        ]
+        for note in story.notes
+    ]
+    return _table(["when", "on", "by", "note"], rows)
 
 
 def _sheet(story: RunStory, shown: Sequence[Small]) -> str:
@@ -246,6 +260,7 @@ i.c1{background:var(--c1)}i.c2{background:var(--c2)}i.c3{background:var(--c3)}i.
 table{border-collapse:collapse;width:100%}th{text-align:left;font-weight:600;color:var(--soft)}
 td,th{padding:.25rem .6rem .25rem 0;border-bottom:1px solid var(--rule);vertical-align:top;
 font-variant-numeric:tabular-nums}
+.text{white-space:pre-wrap;overflow-wrap:anywhere}
 .shares td:nth-child(n+3){white-space:nowrap}.shares td:nth-child(2){width:40%}
 .sheet{display:grid;grid-template-columns:repeat(auto-fill,minmax(92px,1fr));gap:.6rem;align-items:start}
 .sheet figure{margin:0;break-inside:avoid}.sheet img{width:100%;display:block;image-rendering:pixelated}

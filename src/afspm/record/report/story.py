@@ -11,7 +11,7 @@ from afspm.model import JournalEntry, ProcessCondition, ScopeState, names
 from afspm.record.overview import Overview, ProcessRestart
 from afspm.record.run import Run
 from afspm.record.run_lock import describe_state
-from afspm.record.tables import ScanRow
+from afspm.record.tables import NoteRow, ScanRow
 from afspm.record.timeline import Span, Timeline
 
 COLOURS = 5  # of those in control, in turn: the classes c0 to c4 of the page
@@ -58,6 +58,7 @@ class RunStory:
     restarts: Sequence[ProcessRestart]
     given_up: Sequence[str]
     actions: Sequence[JournalEntry]
+    notes: Sequence[NoteRow]
 
     @property
     def lasted_ns(self) -> int:
@@ -115,6 +116,7 @@ def read(run: Run) -> RunStory:
         refusals=gathered(list(run.refusals)),
         restarts=list(overview.restarts),
         actions=[entry for entry in run.journal if entry.what in names.EXTENSION_ACTIONS and entry.response == 0],
+        notes=list(run.notes),
         given_up=[n for n, state in overview.processes.items() if state.condition is ProcessCondition.GIVEN_UP],
     )
 
@@ -195,6 +197,8 @@ def timeline_rows(story: RunStory) -> Iterator[TimelineRow]:
     again = [Span(f"{one.name} started again: {one.last_exit}", one.time_ns, one.time_ns) for one in story.restarts]
     if again:
         yield _row("restarts", "problem", again)
+    if seen.notes:
+        yield _row("notes", "marked", seen.note_spans)
 
 
 def _row(name: str, style: str, spans: Iterable[Span]) -> TimelineRow:

@@ -1,0 +1,47 @@
+"""Notes that are written after the end of a run, into its record."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+from afspm import wire
+from afspm.errors import FileError
+from afspm.model import HasTime, Note, Packet
+from afspm.record.journal import SCHEDULER
+from afspm.record.run import open_run
+from afspm.record.run_json import STATE_DIR
+from afspm.record.run_lock import lock_run
+from afspm.record.store import RecordStore
+from afspm.wire import Topic
+
+_STEP_NS = 1_000
+
+
+def append_note(folder: Path, who: str, text: str, written_ns: int, scan: HasTime | None = None) -> Note:
+    """Append a note to the record of a run that is over, in the form in which the scheduler publishes it.
+
+    Args:
+        folder: of the run.
+        who: the author.
+        written_ns: real time.
+        scan: that it belongs to; None: it is about the end of the run.
+
+    Raises:
+        InvalidValue: the text is empty or too long.
+        FileError: the run goes on, or the record can't be written.
+    """
+    with open_run(folder) as run:
+        folder, end_ns = run.folder, run.newest_ns
+    scan_ns = None if scan is None else scan.time_ns
+    note = Note(end_ns if scan_ns is None else scan_ns, who, text, scan_ns, written_ns)
+    packet = Packet(Topic.NOTE, wire.encode(note)[1], end_ns + _STEP_NS)
+    try:
+        (folder / STATE_DIR).mkdir(exist_ok=True)  # a copy of a run may lack it
+        with lock_run(folder), closing(RecordStore(folder)) as store:
+            store.take([(packet, SCHEDULER)])
+            store.settle()
+    except (OSError, sqlite3.OperationalError) as error:
+        raise FileError(f"the note can't be written: {error}", where=str(folder)) from error
+    return note
