@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Sequence
-from typing import ClassVar
+from pathlib import Path
+from typing import ClassVar, Final
+
+_PACKAGE: Final = str(Path(__file__).parent)
+_LIBRARIES: Final = "site-packages"
+_CELLS: Final = ("<ipython-input", "ipykernel_")
 
 
 class AfspmError(Exception):
@@ -26,6 +32,18 @@ class AfspmError(Exception):
     def __str__(self) -> str:
         text = f"{self.where}: {self.what}" if self.where else self.what
         return f"{text} ({self.hint})" if self.hint else text
+
+    def _render_traceback_(self) -> list[str]:
+        """Return the lines that IPython shows in place of the traceback: the error, and the caller's own lines."""
+        frames = traceback.extract_tb(self.__traceback__)
+        own = [one for one in frames if not one.filename.startswith(_PACKAGE) and _LIBRARIES not in one.filename]
+        own = [one for one in own if one.line]
+        return [f"\x1b[31m{type(self).__name__}\x1b[0m: {self}", *map(_place, own)]
+
+
+def _place(frame: traceback.FrameSummary) -> str:
+    where = "the cell" if any(cell in frame.filename for cell in _CELLS) else frame.filename
+    return f"  line {frame.lineno} of {where}: {frame.line}"
 
 
 class ConfigError(AfspmError):

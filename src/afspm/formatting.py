@@ -131,3 +131,8 @@ def typeset_position(xy_m: tuple[float, float]) -> str:
 def typeset_area(size_m: Sequence[float]) -> str:
     """Return a size for a page: "2 × 1 µm"."""
     return typeset(area_text(size_m))
+
+
+def typeset_length(length_m: float) -> str:
+    """Return a length for a page: "200 nm"."""
+    return typeset(lengths_text([length_m]))

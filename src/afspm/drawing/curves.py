@@ -1,4 +1,4 @@
-"""Curves: fewer points without losing a peak, round ticks, and a small picture of one."""
+"""Curves: fewer points without losing a peak, and round ticks."""
 
 from __future__ import annotations
 
@@ -36,21 +36,3 @@ def round_ticks(low: float, high: float, about: int = 5) -> list[float]:
     first = math.ceil(low / step - 1e-9)
     last = math.floor(high / step + 1e-9)
     return [round(i * step, 15 - math.floor(math.log10(abs(i * step) or 1.0))) for i in range(first, last + 1)]
-
-
-def sparkline(x: Array, y: Array, width: int = 200, height: int = 120) -> str:
-    """Return a curve as a small SVG without axes; what is not finite goes to the middle."""
-    across, up = 5 + (width - 10) * _to_unit(x), height - 5 - (height - 10) * _to_unit(y)
-    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across, up, strict=True))
-    return (
-        f'<svg width="{width}" height="{height}" style="background:#fff">'
-        f'<polyline fill="none" stroke="#a0522d" points="{points}"/></svg>'
-    )
-
-
-def _to_unit(values: Array) -> Array:
-    finite = np.isfinite(values)
-    if not finite.any():
-        return np.full(values.shape, 0.5)
-    low, high = values[finite].min(), values[finite].max()
-    return np.where(finite, (values - low) / (high - low if high > low else 1.0), 0.5)

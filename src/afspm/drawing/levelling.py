@@ -18,6 +18,8 @@ class Levelling(Enum):
     """The plane that fits best (least squares)."""
     LINES = "lines"
     """Of each line, the straight line along the fast axis that fits best."""
+    MEDIANS = "medians"
+    """Of each line, its median."""
 
 
 def levelled(values: Array, how: Levelling) -> Array:
@@ -27,7 +29,7 @@ def levelled(values: Array, how: Levelling) -> Array:
     finite = np.isfinite(values)
     if not finite.any():
         return values
-    return values - (_plane(values, finite) if how is Levelling.PLANE else _lines(values, finite))
+    return values - _BACKGROUNDS[how](values, finite)
 
 
 def _plane(values: Array, finite: NDArray[np.bool_]) -> Array:
@@ -59,3 +61,13 @@ def _lines(values: Array, finite: NDArray[np.bool_]) -> Array:
     mean = known.sum(axis=1) / count
     slope = (known * offset).sum(axis=1) / np.where(spread > 0.0, spread, 1.0)
     return np.asarray(mean[:, None] + slope[:, None] * offset)
+
+
+def _medians(values: Array, finite: NDArray[np.bool_]) -> Array:
+    medians = np.zeros((len(values), 1))
+    some = finite.any(axis=1)
+    medians[some] = np.nanmedian(np.where(finite, values, np.nan)[some], axis=1, keepdims=True)
+    return medians
+
+
+_BACKGROUNDS = {Levelling.PLANE: _plane, Levelling.LINES: _lines, Levelling.MEDIANS: _medians}

@@ -82,7 +82,7 @@ def take_back(draft: StateDraft, job: ForwardedRequest) -> None:
 
 def answer_job(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
     """Answer over the newest connection of the client; without an id only over the one that it asked by."""
-    write_down(draft, job.client, job.request, response, job.heard_s)
+    write_down(draft, job.client, job.request, response, job.heard_s, sent_ns=job.sent_ns)
     connection = draft.sessions.connection_of(job.client)
     if connection is not None and (job.request.id or connection == job.connection):
         draft.effects.append(Reply(connection, job.client, response, job.request.kind))
@@ -100,10 +100,17 @@ def call_back(draft: StateDraft, former: str | None, cause: Cause | None) -> Non
 
 
 def write_down(
-    draft: StateDraft, who: str, request: Request, response: Response, heard_s: float, *, late: bool = False
+    draft: StateDraft,
+    who: str,
+    request: Request,
+    response: Response,
+    heard_s: float,
+    *,
+    sent_ns: int | None = None,
+    late: bool = False,
 ) -> None:
     """Add an answer to the event log."""
-    answered = AnsweredRequest(draft.now_ns, who, request, response, draft.now_s - heard_s, late)
+    answered = AnsweredRequest(draft.now_ns, who, request, response, draft.now_s - heard_s, late, sent_ns)
     draft.event_log = draft.event_log.add_request(draft.now_s, answered)
 
 

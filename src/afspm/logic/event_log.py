@@ -13,6 +13,7 @@ from typing import NamedTuple
 from afspm.logic.arbitration import ArbitrationState, ControlInput, Transition
 from afspm.logic.descriptions import asked
 from afspm.logic.frozen import replace
+from afspm.logic.sessions import key_of
 from afspm.model import (
     CLOCK_REQUEST,
     RELAY_REQUEST,
@@ -48,6 +49,7 @@ class AnsweredRequest(NamedTuple):
     Attributes:
         took_s: real time from the question to the answer.
         late: the answer came after the client had been told that there was none.
+        sent_ns: when it was passed on to the translator; None: it was not.
     """
 
     time_ns: int
@@ -56,6 +58,7 @@ class AnsweredRequest(NamedTuple):
     response: Response
     took_s: float
     late: bool = False
+    sent_ns: int | None = None
 
     def entry(self, problems: ProblemNames) -> JournalEntry:
         kind = ORDER if self.request.kind == RESTART_REQUEST else REQUEST
@@ -73,6 +76,8 @@ class AnsweredRequest(NamedTuple):
             request=self.request.kind,
             problem=int(self.request.subject or 0) if self.request.kind in flags else None,
             late=self.late,
+            sent_ns=self.sent_ns,
+            key=key_of(self.who, self.request.id),
         )
 
 

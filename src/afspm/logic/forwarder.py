@@ -36,6 +36,7 @@ class ForwardedRequest(NamedTuple):
         states_seen: how many states the microscope had told when it was sent on its way.
         mapped: what is sent in place of `request`, where the microscope has other coordinates.
         heard_s: when it was asked, real.
+        sent_ns: when it was passed on, experiment time; None: it was not.
         on_answer: takes the answer to one of the scheduler's own.
     """
 
@@ -50,6 +51,7 @@ class ForwardedRequest(NamedTuple):
     states_seen: int = 0
     mapped: MappedRequest | None = None
     heard_s: float = 0.0
+    sent_ns: int | None = None
     on_answer: OwnAnswer | None = None
 
     @classmethod

@@ -338,7 +338,7 @@ def act_when_moved(draft: StateDraft) -> None:
 def forward(draft: StateDraft, job: ForwardedRequest) -> None:
     """Send a request to the translator, once it is remembered."""
     name, request = job.client, job.request
-    draft.forwarder, refused = draft.forwarder.ask(job, draft.now_s)
+    draft.forwarder, refused = draft.forwarder.ask(job._replace(sent_ns=draft.now_ns), draft.now_s)
     if refused is not None:
         draft.idempotency = draft.idempotency.forgotten(name, request)
         event = RequestIn(job.connection, name, request, heard_s=job.heard_s)
@@ -400,7 +400,7 @@ def _settle_late(draft: StateDraft, job: ForwardedRequest, response: Response) -
     draft.idempotency = draft.idempotency.noted(job.client, job.request, status or response)
     if status is None and not response.ok:
         answers.take_back(draft, job)
-    answers.write_down(draft, job.client, job.request, response, job.heard_s, late=True)
+    answers.write_down(draft, job.client, job.request, response, job.heard_s, sent_ns=job.sent_ns, late=True)
     draft.log("WARNING", f"the translator answered {job.client} late; asked again, it gets that answer")
 
 

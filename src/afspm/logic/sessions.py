@@ -65,6 +65,13 @@ def token_of(name: str, request_id: str) -> str | None:
     return rest[0] if all(map(str.isdigit, rest[1:])) else None  # a number, and perhaps that of an attempt
 
 
+def key_of(name: str, request_id: str) -> str:
+    """Return the key of a measurement in a request id, "<name>/key/<key>/<n>"; empty if it has none."""
+    who, _, rest = request_id.partition("/")
+    parts = rest.split("/")
+    return parts[1] if who == name and len(parts) == 3 and parts[0] == KEYED else ""
+
+
 def run_of(name: str, request_id: str) -> str:
     """Return the identity of the run in a request id, "<name>/<run>-<life>/<n>"; empty if it has none."""
     run, dash, _ = (token_of(name, request_id) or "").partition("-")

@@ -84,6 +84,8 @@ class JournalEntry:
         problem: the number of the problem that was flagged, cleared or is to be solved.
         mode: the new mode, of a MODE_CHANGED.
         late: the answer came after the client had been told that there was none.
+        sent_ns: when it was passed on to the translator; None where it was not.
+        key: of a measurement that is taken exactly once.
     """
 
     time_ns: int
@@ -98,6 +100,8 @@ class JournalEntry:
     problem: int | None = None
     mode: ControlMode | None = None
     late: bool = False
+    sent_ns: int | None = None
+    key: str = ""
 
     @property
     def refused(self) -> bool:

@@ -13,6 +13,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.drawing import levelling as drawing
+from afspm.drawing.levelling import Levelling
 from afspm.errors import InvalidValue
 
 Floats = NDArray[np.float64]
@@ -25,7 +27,9 @@ _MAD: Final = 1.4826
 """From the median of absolute deviations to a standard deviation."""
 
 
-def levelled(values: Floats, order: int = 1, fit: str = "least-squares", quantile: float = 0.5) -> Floats:
+def levelled(
+    values: Floats, order: int = 1, fit: str = "least-squares", quantile: float = 0.5, rows: str | None = None
+) -> Floats:
     """Return values [y, x], NaN where nothing was measured, without a polynomial surface; see `Scan.levelled`."""
     if fit not in FITS:
         raise InvalidValue(f"there is no fit {fit!r}", hint=f"one of {', '.join(sorted(FITS))}")
@@ -34,6 +38,8 @@ def levelled(values: Floats, order: int = 1, fit: str = "least-squares", quantil
             f"order {order}, quantile {quantile}", hint="an order from 0 to 3, a quantile between 0 and 1"
         )
     terms = _terms(values.shape, order)
+    if rows is not None and rows not in ROWS:
+        raise InvalidValue(f"rows can't be levelled by {rows!r}", hint=f"one of {', '.join(sorted(ROWS))}")
     known = np.isfinite(values)
     if known.sum() < 2 * len(terms):
         raise InvalidValue("too little was measured to level it")
@@ -42,7 +48,8 @@ def levelled(values: Floats, order: int = 1, fit: str = "least-squares", quantil
     solve = partial(_quantile, quantile=quantile) if fit == "quantile" else FITS[fit]
     coefficients = solve(columns, (heights - heights.mean()) / scale)
     surface: Floats = np.tensordot(coefficients, terms, 1) * scale + heights.mean()
-    return values - surface
+    flat = values - surface
+    return flat if rows is None else drawing.levelled(flat, ROWS[rows])
 
 
 def _terms(shape: tuple[int, ...], order: int) -> Floats:
@@ -118,6 +125,7 @@ def _few(columns: Floats, heights: Floats) -> tuple[Floats, Floats]:
     return columns[chosen], heights[chosen]
 
 
+ROWS: Final = {"median": Levelling.MEDIANS, "line": Levelling.LINES}
 FITS: Final[dict[str, Callable[..., Floats]]] = {  # from the terms, [pixel, term], and the heights to coefficients
     "least-squares": _least_squares,
     "huber": _huber,

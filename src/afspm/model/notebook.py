@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-import base64
+from collections.abc import Iterable
+from datetime import UTC
 from html import escape
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from afspm.drawing import curves, raster
+from afspm.drawing import image_html
+from afspm.drawing.chart import Axis, Curve, chart
+from afspm.formatting import day_and_time, typeset_area, typeset_position
 
 if TYPE_CHECKING:
     from afspm.model.scan import Scan
@@ -18,32 +21,42 @@ _LARGEST_PX = 256
 
 
 def scan_html(scan: Scan) -> str:
-    """Return the scan as an image with y upwards, and a line that says what it is."""
-    width, height = scan.region.size_m
-    x, y = scan.region.center_m
-    ny, nx = scan.shape
+    """Return the scan as an image with y upwards, scale bar and colour bar, and a line that says what it is."""
+    region, (rows, columns) = scan.region, scan.shape
+    angle = f", turned by {np.degrees(region.angle_rad):.4g}°" if region.angle_rad else ""
     caption = (
-        f"<b>{escape(scan.channel)}</b> [{escape(scan.unit)}] {nx} x {ny} px, "
-        f"{width * 1e9:g} x {height * 1e9:g} nm at ({x * 1e9:g}, {y * 1e9:g}) nm, "
-        f"{np.degrees(scan.region.angle_rad):g}°, {scan.time or 'time unknown'}"
+        f"<b>{escape(scan.channel)}</b> [{escape(scan.unit)}] {columns} × {rows} px, {typeset_area(region.size_m)} "
+        f"at {typeset_position(region.center_m)}{angle}<br/>{_when(scan.time_ns)}"
     )
     if scan.values.size == 0:
-        return f"<figure><figcaption>{caption}, no values</figcaption></figure>"
-    image = base64.b64encode(raster.picture(scan.values, _LARGEST_PX)).decode()
-    shown = max(1, round(_LARGEST_PX * min(1.0, width / height)))
-    return (
-        f'<figure style="display:inline-block"><img width="{shown}" style="image-rendering:pixelated" '
-        f'src="data:image/png;base64,{image}"/><figcaption>{caption}</figcaption></figure>'
-    )
+        return f"<figure>{_caption(f'{caption}, no values')}</figure>"
+    shown = image_html.shown(scan.values, _LARGEST_PX)
+    width = max(40, round(_LARGEST_PX * min(1.0, region.size_m[0] / region.size_m[1])))
+    image = image_html.image_html(shown, region.size_m, scan.unit, f"{width}px")
+    return f'<figure style="display:inline-block;margin:4px">{image}{_caption(caption)}</figure>'
+
+
+def scans_html(scans: Iterable[Scan]) -> str:
+    """Return channels in a row, which wraps where there is no room."""
+    return f'<div style="display:flex;flex-wrap:wrap;gap:12px">{"".join(map(scan_html, scans))}</div>'
+
+
+def _caption(text: str) -> str:
+    return f'<figcaption style="max-width:320px">{text}</figcaption>'
+
+
+def _when(time_ns: int | None) -> str:
+    return "time unknown" if time_ns is None else day_and_time(time_ns, UTC)
 
 
 def spectrum_html(spectrum: Spectrum) -> str:
-    """Return every variable against the first one, as small SVG curves."""
-    others = zip(spectrum.names[1:], spectrum.units[1:], spectrum.values.T[1:], strict=True)
+    """Return every variable against the first one, each way of it, as small charts in a row."""
+    swept = spectrum.values[:, 0]
+    x = Axis.over(spectrum.names[0], spectrum.units[0], swept)
     drawn = "".join(
-        f'<figure style="display:inline-block">{curves.sparkline(spectrum.values[:, 0], values)}'
-        f"<figcaption>{escape(name)} [{escape(unit)}] against {escape(spectrum.names[0])} "
-        f"[{escape(spectrum.units[0])}]</figcaption></figure>"
-        for name, unit, values in others
+        chart(x, Axis.over(name, unit, values), [Curve(swept, values)])
+        for name, unit, values in zip(spectrum.names[1:], spectrum.units[1:], spectrum.values.T[1:], strict=True)
     )
-    return f"<div><b>{escape(spectrum.kind)}</b> at {spectrum.position_m} m<br/>{drawn}</div>"
+    place = "" if spectrum.position_m is None else f" at {typeset_position(spectrum.position_m)}"
+    head = f"<b>{escape(spectrum.kind)}</b>{place}, {_when(spectrum.time_ns)}"
+    return f'<div>{head}<div style="display:flex;flex-wrap:wrap">{drawn}</div></div>'

@@ -1,4 +1,4 @@
-"""A scan drawn with matplotlib: as an image, as contour lines or as a surface (needs the extra `plot`)."""
+"""A scan drawn with matplotlib: as an image, as contour lines or as a surface (needs matplotlib)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from afspm.errors import InvalidValue
+from afspm.drawing.image_html import round_length_m
+from afspm.drawing.palette import PALETTES, colour_map
+from afspm.drawing.raster import value_range
+from afspm.errors import FileError, InvalidValue
+from afspm.formatting import scale, typeset_length
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -15,7 +19,6 @@ if TYPE_CHECKING:
 
 KINDS: Final = ("image", "contour", "surface")
 _LEVELS: Final = 12
-_COLOURS: Final = "afmhot"
 
 
 def draw(scan: Scan, kind: str = "image", axes: Axes | None = None) -> Axes:
@@ -24,28 +27,58 @@ def draw(scan: Scan, kind: str = "image", axes: Axes | None = None) -> Axes:
         raise InvalidValue(f"a scan can't be drawn as {kind!r}", hint=f"one of {', '.join(KINDS)}")
     if not scan.values.size or not np.isfinite(scan.values).any():
         raise InvalidValue(f"the scan {scan.channel!r} has no values to draw")
-    import matplotlib.pyplot as plt
-
+    try:
+        import matplotlib.pyplot as plt
+    except ImportError:
+        raise FileError("drawing a scan needs matplotlib", hint='pip install "afspm[plot]"') from None
     if axes is None:
-        axes = plt.figure().add_subplot(projection="3d" if kind == "surface" else None)
+        axes = plt.figure(layout="constrained").add_subplot(projection="3d" if kind == "surface" else None)
+        axes.set_title(_title(scan), fontsize=9)
+    _fill(scan, kind, axes)
+    return axes
+
+
+def _fill(scan: Scan, kind: str, axes: Any) -> None:
+    """Draw in axes: places in the unit that suits the scan's size, values in the one that suits the largest."""
     ny, nx = scan.shape
     (left, low), (width, height) = scan.region.top_left_m, scan.region.size_m
-    x, y = (
-        1e9 * np.linspace(start, start + size, count) for start, size, count in ((left, width, nx), (low, height, ny))
-    )
-    values = np.ma.masked_invalid(scan.values)
-    given: Any = axes
+    length, length_unit = scale(max(width, height), "m")
+    x, y = (length * np.linspace(start, start + size, n) for start, size, n in ((left, width, nx), (low, height, ny)))
+    span = value_range(scan.values)
+    factor, unit = scale(max(abs(span.low), abs(span.high)), scan.unit)
+    values, label = np.ma.masked_invalid(scan.values * factor), f"{scan.channel} / {unit}" if unit else scan.channel
+    look = {"cmap": _colours(), "vmin": span.low * factor, "vmax": span.high * factor}
     if kind == "surface":
-        drawn = given.plot_surface(*np.meshgrid(x, y), values, cmap=_COLOURS)
-        given.set_zlabel(f"{scan.channel} [{scan.unit}]")
+        axes.plot_surface(*np.meshgrid(x, y), values, **look)
+        axes.set_zlabel(label)
     else:
         drawn = (
-            given.contour(x, y, values, _LEVELS, cmap=_COLOURS)
-            if kind == "contour"
-            else given.pcolormesh(x, y, values, cmap=_COLOURS)
+            axes.contour(x, y, values, _LEVELS, **look) if kind == "contour" else axes.pcolormesh(x, y, values, **look)
         )
-        given.set_aspect("equal")
-        given.figure.colorbar(drawn, ax=given, label=f"{scan.channel} [{scan.unit}]")
-    given.set_xlabel("x [nm]")
-    given.set_ylabel("y [nm]")
-    return axes
+        axes.set_facecolor("0.6")  # what was not measured, and behind contour lines
+        axes.set_aspect("equal")
+        axes.figure.colorbar(drawn, ax=axes, label=label)
+        _scale_bar(axes, scan.region.size_m, (x[0], y[0]), length)
+    axes.set_xlabel(f"x / {length_unit}")
+    axes.set_ylabel(f"y / {length_unit}")
+
+
+def _scale_bar(axes: Any, size_m: tuple[float, float], corner: tuple[float, float], length: float) -> None:
+    bar_m = round_length_m(size_m[0] / 4.0)
+    left, low = corner[0] + 0.05 * size_m[0] * length, corner[1] + 0.05 * size_m[1] * length
+    for color, line in (("black", 6.0), ("white", 3.0)):
+        axes.plot([left, left + bar_m * length], [low, low], color=color, linewidth=line, solid_capstyle="butt")
+    axes.text(
+        left, low + 0.025 * size_m[1] * length, typeset_length(bar_m), color="white", va="bottom",
+        bbox={"facecolor": "black", "alpha": 0.5, "pad": 1.5, "edgecolor": "none"},
+    )  # fmt: skip
+
+
+def _colours() -> Any:
+    from matplotlib.colors import ListedColormap
+
+    return ListedColormap(colour_map(PALETTES[0]) / 255.0)
+
+
+def _title(scan: Scan) -> str:
+    return f"{scan.channel}, {scan.time:%Y-%m-%d %H:%M:%S} UTC" if scan.time else scan.channel

@@ -164,7 +164,9 @@ class Scan:
         values = undistorted(self.values, self.region, velocity_m_s, duration_s, upwards=upwards)
         return replace(self, values=values)
 
-    def levelled(self, order: int = 1, fit: str = "least-squares", quantile: float = 0.5) -> Scan:
+    def levelled(
+        self, order: int = 1, fit: str = "least-squares", quantile: float = 0.5, rows: str | None = None
+    ) -> Scan:
         """Return the scan without the polynomial surface that fits it best.
 
         Args:
@@ -172,23 +174,24 @@ class Scan:
             fit: "least-squares", or one that particles and steps do not lead astray: "huber", "theil-sen", "ransac" or
                 "quantile".
             quantile: of the last: which part of the pixels lies below the surface.
+            rows: "median" or "line": then each row is levelled by its median, or by a straight line; None: none is.
 
         Raises:
             InvalidValue: there is no such fit or order, or too little was measured.
         """
         from afspm.model.levelling import levelled
 
-        return replace(self, values=levelled(self.values, order, fit, quantile))
+        return replace(self, values=levelled(self.values, order, fit, quantile, rows))
 
     def plot(self, kind: str = "image", axes: Axes | None = None) -> Axes:
-        """Draw the scan with matplotlib (needs the extra `plot`).
+        """Draw the scan with matplotlib: with a scale bar, and a colour bar with units (needs the extra `plot`).
 
         Args:
             kind: "image", "contour" or "surface" (in three dimensions).
             axes: to draw in; for a surface they need `projection="3d"`. None: a figure of its own.
 
         Returns:
-            The axes, in nm; the values in their own unit.
+            The axes; places and values in the units that suit them, e.g. µm and nm. `axes.figure.savefig("a.png")`.
 
         Raises:
             InvalidValue: there is no such kind, or nothing was measured.
@@ -305,4 +308,6 @@ class ScanSet(Mapping[str, Scan]):
         return xarray.Dataset({channel: scan.to_xarray() for channel, scan in self.items()})
 
     def _repr_html_(self) -> str:
-        return "".join(scan._repr_html_() for scan in self.values())
+        from afspm.model.notebook import scans_html
+
+        return scans_html(self.values())

@@ -41,6 +41,8 @@ CREATE TABLE IF NOT EXISTS entries (
   time_ns INTEGER NOT NULL, kind TEXT NOT NULL, who TEXT NOT NULL, what TEXT NOT NULL, response INTEGER,
   reason TEXT NOT NULL, took_s REAL);
 CREATE INDEX IF NOT EXISTS entries_by_time ON entries (time_ns);
+-- When scans and spectra were asked for, and under which keys; the answer may have come after what was measured.
+CREATE TABLE IF NOT EXISTS starts (sent_ns INTEGER NOT NULL, action TEXT NOT NULL, key TEXT NOT NULL);
 -- A row for each change of a process, not for each time that it was told.
 CREATE TABLE IF NOT EXISTS processes (
   time_ns INTEGER NOT NULL, name TEXT NOT NULL, role TEXT NOT NULL, condition INTEGER NOT NULL,

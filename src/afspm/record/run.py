@@ -22,12 +22,19 @@ from afspm.model import (
     Packet,
     ProblemNames,
     ProcessCondition,
-    Region,
     ScanSet,
     Spectrum,
 )
 from afspm.record import journal
 from afspm.record.journal import SCHEDULER
+from afspm.record.measured_tables import (
+    KeyedTable,
+    SpectrumTable,
+    read_scans,
+    read_spectra,
+    scan_row,
+    spectrum_row,
+)
 from afspm.record.packets import packets, without_reading_files
 from afspm.record.run_json import EXPERIMENT_FILE, LATEST_FILE, REPLAY_OF, run_json_or_empty
 from afspm.record.tables import ControlRow, NoteRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
@@ -69,28 +76,30 @@ class Run:
     # --- what was measured ---
 
     @property
-    def scans(self) -> Table[ScanRow]:
+    def scans(self) -> KeyedTable[ScanRow]:
         """Return one row for each scan, also of interrupted ones, in the order in which they were recorded."""
-        return Table(map(_scan_row, self._query("SELECT * FROM scans ORDER BY number")), ScanRow)
+        return read_scans(self._query)
 
     @property
-    def spectra(self) -> Table[SpectrumRow]:
+    def spectra(self) -> SpectrumTable:
         """Return one row for each spectrum, in the order in which they were recorded."""
-        return Table(map(_spectrum_row, self._query("SELECT * FROM spectra ORDER BY number")), SpectrumRow)
+        return read_spectra(self._query, self.spectrum)
 
-    def scan(self, index: int | ScanRow) -> ScanSet:
-        """Return all channels of a scan: by its place in `scans` (-1: the last), or by its row.
+    def scan(self, which: int | str | ScanRow) -> ScanSet:
+        """Return all channels of a scan: by its place in `scans` (-1: the last), its key, or its row.
 
         Raises:
             FileError: its file is missing or damaged, or it was interrupted before anything of it was seen.
-            IndexError: there is no such scan.
+            IndexError, KeyError: there is no such scan.
         """
-        row = index if isinstance(index, ScanRow) else self._row("scans", index, _scan_row)
+        row = self.scans[which] if isinstance(which, str) else which
+        row = row if isinstance(row, ScanRow) else self._row("scans", row, scan_row)
         return ScanSet(self._content(row.file, f"scan {row.number}").scans)
 
-    def spectrum(self, index: int | SpectrumRow) -> Spectrum:
-        """Return a spectrum: by its place in `spectra` (-1: the last), or by its row. Raises as `scan`."""
-        row = index if isinstance(index, SpectrumRow) else self._row("spectra", index, _spectrum_row)
+    def spectrum(self, which: int | str | SpectrumRow) -> Spectrum:
+        """Return a spectrum: by its place in `spectra` (-1: the last), its key, or its row. Raises as `scan`."""
+        row = self.spectra[which] if isinstance(which, str) else which
+        row = row if isinstance(row, SpectrumRow) else self._row("spectra", row, spectrum_row)
         spectrum: Spectrum = self._content(row.file, f"spectrum {row.number}").spectra[0]
         return spectrum
 
@@ -98,7 +107,7 @@ class Run:
         """Return what is known beside the values: drift, feedback, the controller's header, notes … See `scan`."""
         header: dict[str, Any] = dict(self._content(row.file, f"number {row.number}").header)
         notes = [f"{note.text} ({note.who})" for note in self.notes_on(row)]
-        return header | {"notes": notes} if notes else header
+        return header | ({"notes": notes} if notes else {}) | ({"key": row.key} if row.key else {})
 
     def scan_at(self, time_ns: int, channel: str = "") -> ScanRow | None:
         """Return the scan that was finished at a time; None if there is none.
@@ -109,7 +118,7 @@ class Run:
             channel: that it must have; empty: any.
         """
         near = "SELECT * FROM scans WHERE abs(time_ns - ?) <= ? ORDER BY abs(time_ns - ?), number"
-        rows = map(_scan_row, self._query(near, (time_ns, _SAME_SCAN_NS, time_ns)))
+        rows = map(scan_row, self._query(near, (time_ns, _SAME_SCAN_NS, time_ns)))
         return next((row for row in rows if not channel or channel in dict(row.channels)), None)
 
     # --- what happened ---
@@ -286,7 +295,7 @@ class Run:
             raise InvalidValue(
                 f"there is no scan {number}", hint=f"the last is {last}" if last else "there is none yet"
             )
-        return _scan_row(found[0])
+        return scan_row(found[0])
 
     @property
     def problem_names(self) -> ProblemNames:
@@ -352,47 +361,3 @@ def _folder(path: Path) -> Path:
         path = path / latest.read_text(encoding="utf-8").strip()
     replayed = None if (path / journal.JOURNAL_FILE).is_file() else run_json_or_empty(path).get(REPLAY_OF)
     return Path(replayed) if isinstance(replayed, str) else path
-
-
-def _scan_row(row: Any) -> ScanRow:
-    (
-        number, time_ns, began_ns, filename, file, interrupted, x, y, width, height, angle, frame, rows, columns,
-        channels, holder, mode, problems,
-    ) = row  # fmt: skip
-    region = None if frame is None else Region((x, y), (width, height), angle, Frame(frame))
-    return ScanRow(
-        number,
-        time_ns,
-        began_ns,
-        tuple((name, unit) for name, unit in json.loads(channels)),
-        region,
-        None if rows is None else (rows, columns),
-        bool(interrupted),
-        holder,
-        mode,
-        tuple(json.loads(problems)),
-        filename,
-        file,
-    )
-
-
-def _spectrum_row(row: Any) -> SpectrumRow:
-    (
-        number, time_ns, began_ns, filename, file, kind, x, y, frame, points, names, units, holder, mode, problems,
-    ) = row  # fmt: skip
-    return SpectrumRow(
-        number,
-        time_ns,
-        began_ns,
-        kind,
-        None if x is None else (x, y),
-        Frame(frame),
-        points,
-        tuple(json.loads(names)),
-        tuple(json.loads(units)),
-        holder,
-        mode,
-        tuple(json.loads(problems)),
-        filename,
-        file,
-    )

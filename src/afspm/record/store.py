@@ -18,6 +18,7 @@ from typing import Any
 from afspm import wire
 from afspm.errors import WireError
 from afspm.model import (
+    ControlResponse,
     Frame,
     JournalEntries,
     JournalEntry,
@@ -30,6 +31,7 @@ from afspm.model import (
     ScanLines,
     ScopeStatus,
     Spectrum,
+    names,
 )
 from afspm.record import journal, provenance
 from afspm.record.journal import SCHEDULER
@@ -228,6 +230,10 @@ class RecordStore:
             "INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?, ?)",
             [(e.time_ns, e.kind, e.who, e.what, e.response, e.reason, e.took_s) for e in entries.entries],
         )
+        self._journal.executemany(
+            "INSERT INTO starts VALUES (?, ?, ?)",
+            [(e.sent_ns, e.what, e.key) for e in entries.entries if _is_start(e)],
+        )
 
     def _add_processes(self, states: ProcessStates) -> None:
         for state in states.processes:
@@ -242,6 +248,12 @@ class RecordStore:
             "INSERT INTO log VALUES (?, ?, ?, ?)",
             [(line.time_ns, line.name, line.level, line.text) for line in log.lines],
         )
+
+
+def _is_start(entry: JournalEntry) -> bool:
+    """Return whether a measurement began, or may have."""
+    may_have_begun = entry.response in (ControlResponse.SUCCESS, ControlResponse.NO_RESPONSE)
+    return entry.sent_ns is not None and entry.what in (names.START_SCAN, names.START_SPEC) and may_have_begun
 
 
 def _read(packet: Packet) -> tuple[str, Any]:

@@ -7,10 +7,12 @@ from dataclasses import dataclass, fields
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
+from afspm.errors import FileError
 from afspm.model import ControlState, Frame, ProcessCondition, Region
 from afspm.model.geometry import XY
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
     from numpy.typing import NDArray
 
@@ -29,6 +31,7 @@ class ScanRow:
         interrupted: only a part of it was taken.
         holder, mode, problems: who was in control when it began, and how things stood; None: not known.
         filename: of the controller; file: of the record, from the run folder, empty if there is none.
+        key: under which it was asked for, `scope.scan(…, key="tile-1")`; empty if it had none.
     """
 
     number: int
@@ -43,6 +46,7 @@ class ScanRow:
     problems: tuple[str, ...]
     filename: str
     file: str
+    key: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +67,7 @@ class SpectrumRow:
     problems: tuple[str, ...]
     filename: str
     file: str
+    key: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +115,9 @@ class NoteRow:
 
 
 class Table(Sequence[T], Generic[T]):
-    """Rows of one kind: a sequence, with `to_numpy` and `to_xarray` for the columns that are numbers and texts.
+    """Rows of one kind: a sequence, which a notebook shows as a table.
+
+    `to_pandas`, `to_numpy` and `to_xarray` give its columns.
 
     Args:
         kind: of the rows: says which columns there are where there are no rows.
@@ -157,6 +164,19 @@ class Table(Sequence[T], Generic[T]):
         import xarray
 
         return xarray.Dataset({name: ("row", _array(name, values)) for name, values in self.columns().items()})
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """A DataFrame: columns as of `to_numpy`, which pandas' own methods filter, group and plot (needs pandas)."""
+        try:
+            import pandas
+        except ImportError:
+            raise FileError("to_pandas needs pandas", hint="pip install pandas") from None
+        return pandas.DataFrame({name: _array(name, values) for name, values in self.columns().items()})
+
+    def _repr_html_(self) -> str:
+        from afspm.record.table_html import table_html
+
+        return table_html(self.columns(), len(self))
 
     def __repr__(self) -> str:
         return f"<Table of {len(self)} {self._kind.__name__}>"

@@ -182,6 +182,8 @@ _JOURNAL_ENTRY = MessageMapping(
     event=_enum("event", model.ControlEvent, sparse=True),
     mode=_enum("mode", model.ControlMode, sparse=True),
     late=FieldMapping("late", sparse=True),
+    sent_ns=_time("sent"),
+    key=FieldMapping("key", sparse=True),
 )
 _PROCESS_STATE = MessageMapping(
     model.ProcessState,

@@ -19,6 +19,10 @@ def test_a_scan_is_drawn_where_it_is(kind: str) -> None:
     axes = SCAN.plot(kind)
     assert axes.get_xlim() == pytest.approx((850, 1150), abs=60)
     assert axes.get_ylim() == pytest.approx((1900, 2100), abs=60)
+    assert axes.get_xlabel() == "x / nm"
+    if kind != "surface":
+        assert axes.figure.axes[1].get_ylabel() == "Height / nm"
+        assert [text.get_text() for text in axes.texts] == ["50 nm"]
     axes.figure.canvas.draw()
     mpl.pyplot.close(axes.figure)
 

@@ -25,7 +25,7 @@ def test_a_scan_without_values_has_the_shape_that_it_was_taken_with() -> None:
     assert scan.shape == (3, 4)
     assert scan.parameters == SCAN.parameters
     assert scan.lines_missing == 3
-    assert "4 x 3 px" in scan._repr_html_()
+    assert "4 × 3 px" in scan._repr_html_()
     assert "4 x 3 px" in repr(ScanSet([scan]))
     array = scan.to_xarray()
     np.testing.assert_allclose(array.y, SCAN.to_xarray().y)
@@ -61,6 +61,14 @@ def test_a_scan_shows_itself_in_a_notebook() -> None:
     assert "&lt;b&gt;" in shown
     assert "data:image/png;base64," in shown
     assert "no values" in Scan(REGION, "Height", "m", np.empty((0, 0)))._repr_html_()
+
+
+def test_channels_are_shown_in_a_row_each_with_its_colour_bar() -> None:
+    shown = ScanSet([SCAN, Scan(REGION, "Phase", "deg", SCAN.values)])._repr_html_()
+    assert shown.count("<figure") == 2
+    assert shown.count("linear-gradient") == 2
+    assert "flex-wrap" in shown
+    assert " deg</span>" in shown
 
 
 def test_a_spectrum_gives_its_variables_by_name() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from afspm.clock import iso_utc
-from afspm.formatting import scale
 from afspm.model import Scan, Spectrum
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
@@ -41,23 +39,9 @@ def scan_figure(scan: Scan, title: str) -> Figure:
 
     figure = Figure(figsize=(5.2, 4.6), layout="constrained")
     axes = figure.add_subplot()
-    factor, unit = scale(float(np.nanmax(np.abs(scan.values), initial=0.0)), scan.unit)
-    known = scan.values[np.isfinite(scan.values)]
-    low, high = np.percentile(known, (0.5, 99.5)) * factor if known.size else (0.0, 1.0)
-    width, height = scan.region.size_m
-    image = axes.imshow(
-        scan.values * factor, origin="lower", extent=(0.0, width, 0.0, height), cmap="viridis", vmin=low, vmax=high
-    )
+    if np.isfinite(scan.values).any():
+        scan.plot(axes=axes)
     axes.set_title(title, fontsize=9)
-    axes.set_axis_off()
-    figure.colorbar(image, ax=axes, label=unit or scan.channel)
-    bar_m = _round_length(width / 4)
-    text_factor, text_unit = scale(bar_m, "m")
-    left, low_edge = 0.05 * width, 0.05 * height
-    for color, line in (("black", 6.0), ("white", 3.0)):
-        axes.plot([left, left + bar_m], [low_edge, low_edge], color=color, linewidth=line, solid_capstyle="butt")
-    axes.text(left, low_edge + 0.02 * height, f"{bar_m * text_factor:g} {text_unit}", color="white", va="bottom",
-              bbox={"facecolor": "black", "alpha": 0.5, "pad": 1.5, "edgecolor": "none"})  # fmt: skip
     return figure
 
 
@@ -85,9 +69,3 @@ def _image(figure: Figure) -> bytes:
 def _title(run: Run, text: str, interrupted: bool) -> str:
     marks = [mark for mark, is_so in (("SIMULATED", run.simulated), ("interrupted", interrupted)) if is_so]
     return ", ".join([*marks, text])
-
-
-def _round_length(length_m: float) -> float:
-    """1, 2 or 5 times a power of ten, at most `length_m`."""
-    power = 10.0 ** math.floor(math.log10(length_m))
-    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= length_m * (1 + 1e-9))

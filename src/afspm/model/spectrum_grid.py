@@ -1,0 +1,216 @@
+"""Spectra of a grid as one array: where each of them belongs, and which curves are the two ways of one variable."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.errors import InvalidValue
+from afspm.model.geometry import XY
+from afspm.model.spectrum import Spectrum
+
+if TYPE_CHECKING:
+    import xarray
+
+Floats = NDArray[np.float64]
+DIMENSIONS: Final = ("y", "x", "repeat", "direction", "z")
+DIRECTIONS: Final = ("forward", "backward")
+_BACKWARD = re.compile(r"\s*(?:\[bwd\]|\bretrace\b|\bbackward\b|\bbwd\b)", re.IGNORECASE)
+_FORWARD = re.compile(r"\s*(?:\[fwd\]|\btrace\b|\bforward\b|\bfwd\b)", re.IGNORECASE)
+_TOLERANCE: Final = 0.1
+"""Of the spacing: so far a position may be from its point of the grid."""
+_LEAST_FILLED: Final = 0.5
+"""Of the points of a grid: so many positions are there at least, or it is a list of places."""
+
+
+@dataclass(frozen=True)
+class PointGrid:
+    """A rectangular grid, and the cell of each position in it.
+
+    Attributes:
+        x_m, y_m: coordinates of columns and rows, of the grid before it was turned about `center_m`.
+        cells: (row, column) of each position.
+    """
+
+    x_m: Floats
+    y_m: Floats
+    center_m: XY
+    angle_rad: float
+    cells: tuple[tuple[int, int], ...]
+
+
+def stack(spectra: Sequence[Spectrum]) -> xarray.Dataset:
+    """Return the curves of a grid as arrays over `DIMENSIONS`; see `SpectrumTable.stack`.
+
+    Raises:
+        InvalidValue: these spectra do not form a grid, or were not measured alike.
+    """
+    import xarray
+
+    first = _alike(spectra)
+    points = grid([spectrum.position_m for spectrum in spectra if spectrum.position_m is not None])
+    repeats = _repeats(points.cells)
+    swept, ways = _ways(first)
+    shape = (len(points.y_m), len(points.x_m), max(repeats) + 1, len(ways), len(swept))
+    units = dict(zip(first.names, first.units, strict=True))
+    arrays = {name: np.full(shape, np.nan) for name in ways[0]}
+    times = np.full(shape[:3], "NaT", "datetime64[ns]")
+    for spectrum, cell, repeat in zip(spectra, points.cells, repeats, strict=True):
+        for direction, names in enumerate(_ways(spectrum)[1]):
+            for name, curve in names.items():
+                arrays[name][(*cell, repeat, direction)] = curve
+        if spectrum.time_ns is not None:
+            times[(*cell, repeat)] = np.datetime64(spectrum.time_ns, "ns")
+    swept_attributes = {"long_name": first.names[0], "units": first.units[0]}
+    return xarray.Dataset(
+        {name: (DIMENSIONS, values, {"units": units.get(name, "")}) for name, values in arrays.items()},
+        {
+            "y": ("y", points.y_m, {"units": "m"}),
+            "x": ("x", points.x_m, {"units": "m"}),
+            "repeat": range(shape[2]),
+            "direction": list(DIRECTIONS[: len(ways)]),
+            "z": ("z", swept, swept_attributes),
+            "time": (DIMENSIONS[:3], times),
+        },
+        {
+            "kind": first.kind,
+            "frame": first.frame.value,
+            "angle_rad": points.angle_rad,
+            "center_m": points.center_m,
+        },
+    )
+
+
+def grid(positions_m: Sequence[XY]) -> PointGrid:
+    """Return the rectangular grid that positions lie on; it may be turned, and points of it may be missing.
+
+    Raises:
+        InvalidValue: they do not lie on one.
+    """
+    given = np.array(positions_m, dtype=np.float64).reshape(-1, 2)
+    center = (given.min(axis=0) + given.max(axis=0)) / 2.0
+    spacing_m, angle_rad = _nearest(given - center)
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    along = (given - center) @ np.array([[cos, -sin], [sin, cos]])
+    (x_m, columns), (y_m, rows) = (_axis(along[:, axis], spacing_m) for axis in (0, 1))
+    cells = tuple(zip(rows.tolist(), columns.tolist(), strict=True))
+    if len(set(cells)) <= _LEAST_FILLED * len(x_m) * len(y_m) and len(set(cells)) > 1:
+        raise InvalidValue(
+            f"{len(set(cells))} positions are no grid: {len(x_m)} columns and {len(y_m)} rows would be needed",
+            hint="read them one by one with run.spectrum(row)",
+        )
+    x, y = (float(value) for value in center)
+    return PointGrid(x + x_m, y + y_m, (x, y), angle_rad, cells)
+
+
+def _nearest(places: Floats) -> tuple[float, float]:
+    """Return the distance of neighbours, and the angle, -45° to 45°, of the grid that they are neighbours in."""
+    from scipy.spatial import cKDTree
+
+    extent = float(np.ptp(places, axis=0).max())
+    same = 1e-3 * extent
+    distinct = places[np.unique(np.round(places / same), axis=0, return_index=True)[1]] if extent else places[:1]
+    if len(distinct) < 2:
+        return 0.0, 0.0
+    found = cKDTree(distinct).query(distinct, k=min(5, len(distinct)))
+    distances, others = np.asarray(found[0]), np.asarray(found[1])
+    spacing_m = float(np.median(distances[:, 1]))
+    one, rank = np.nonzero((distances > 0.0) & (distances < 1.3 * spacing_m))
+    between = distinct[others[one, rank]] - distinct[one]
+    angles = np.arctan2(between[:, 1], between[:, 0])
+    return spacing_m, float(np.angle(np.exp(4j * angles).mean()) / 4.0)  # a quarter turn makes no difference
+
+
+def _axis(along_m: Floats, spacing_m: float) -> tuple[Floats, NDArray[np.int64]]:
+    """Return the coordinates of evenly spaced lines, and the line of each position.
+
+    Raises:
+        InvalidValue: the positions are not evenly spaced.
+    """
+    order = np.sort(along_m)
+    gaps = np.diff(order)
+    steps = gaps[gaps > _TOLERANCE * spacing_m]
+    if not steps.size:
+        return np.array([float(order.mean())]), np.zeros(len(along_m), np.int64)
+    step = float(steps.min())
+    count = round(float(order[-1] - order[0]) / step)
+    step = float(order[-1] - order[0]) / count
+    lines = np.round((along_m - order[0]) / step).astype(np.int64)
+    if np.abs(along_m - order[0] - lines * step).max() > _TOLERANCE * step:
+        raise InvalidValue(
+            "the positions are no grid: they are not evenly spaced", hint="read them one by one with run.spectrum(row)"
+        )
+    return order[0] + step * np.arange(count + 1), lines
+
+
+def _repeats(cells: Sequence[tuple[int, int]]) -> list[int]:
+    """Return how many were measured at the same point before, for each."""
+    seen: dict[tuple[int, int], int] = {}
+    found = []
+    for cell in cells:
+        found.append(seen.get(cell, 0))
+        seen[cell] = found[-1] + 1
+    return found
+
+
+def _alike(spectra: Sequence[Spectrum]) -> Spectrum:
+    """Return the first, after which all others are measured."""
+    if not spectra:
+        raise InvalidValue("there are no spectra to stack")
+    first = spectra[0]
+    for number, other in enumerate(spectra, 1):
+        if other.position_m is None:
+            raise InvalidValue(f"the position of spectrum {number} of {len(spectra)} is not known")
+        if (other.kind, other.names, other.frame) != (first.kind, first.names, first.frame):
+            raise InvalidValue(
+                f"spectra of different kinds do not form one array: {_kind(first)} and {_kind(other)}",
+                hint='choose with run.spectra.where(lambda row: row.kind == "IV")',
+            )
+        if not _same_sweep(first.values[:, 0], other.values[:, 0]):
+            raise InvalidValue(
+                f"spectrum {number} was swept differently: {_sweep(other)} instead of {_sweep(first)}",
+                hint="choose those that were swept alike with run.spectra.where(…)",
+            )
+    return first
+
+
+def _ways(spectrum: Spectrum) -> tuple[Floats, list[dict[str, Floats]]]:
+    """Return the swept values, and the curves of each variable by direction: forward, and backward if there is one."""
+    swept = spectrum.values[:, 0]
+    curves = {name: spectrum.values[:, number] for number, name in enumerate(spectrum.names) if number}
+    if (half := _turning_point(swept)) is not None:
+        there = {name: values[:half] for name, values in curves.items()}
+        return swept[:half], [there, {name: values[half:][::-1] for name, values in curves.items()}]
+    plain = {_FORWARD.sub("", name) or name: values for name, values in curves.items() if not _BACKWARD.search(name)}
+    back = {_BACKWARD.sub("", name): values for name, values in curves.items() if _BACKWARD.search(name)}
+    if not back.keys() <= plain.keys():  # a way back without its way there: they stay under their own names
+        return swept, [curves]
+    return swept, [plain, back] if back else [plain]
+
+
+def _turning_point(swept: Floats) -> int | None:
+    """Return the half of a sweep that goes there and back over the same values; None: it goes one way."""
+    half, odd = divmod(len(swept), 2)
+    extent = float(np.ptp(swept)) if half else 0.0
+    if odd or half < 2 or not np.allclose(swept[:half], swept[half:][::-1], rtol=0.0, atol=1e-3 * extent):
+        return None
+    return half if abs(swept[half] - swept[0]) > 0.5 * extent else None
+
+
+def _same_sweep(one: Floats, other: Floats) -> bool:
+    return one.shape == other.shape and np.allclose(one, other, rtol=0.0, atol=1e-6 * float(np.ptp(one)) + 1e-30)
+
+
+def _kind(spectrum: Spectrum) -> str:
+    return f"{spectrum.kind} ({', '.join(spectrum.names)})"
+
+
+def _sweep(spectrum: Spectrum) -> str:
+    swept = spectrum.values[:, 0]
+    low, high = (f"{value:g}" for value in (swept.min(), swept.max())) if swept.size else ("?", "?")
+    return f"{len(swept)} points of {spectrum.names[0]} from {low} to {high} {spectrum.units[0]}"

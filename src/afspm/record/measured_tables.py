@@ -1,0 +1,170 @@
+"""The tables of what was measured: rows by their keys, and spectra as one array."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any, TypeVar, overload
+
+from afspm.model import Frame, Region, Spectrum, names
+from afspm.record.tables import ScanRow, SpectrumRow, Table
+
+if TYPE_CHECKING:
+    import xarray
+
+R = TypeVar("R", ScanRow, SpectrumRow)
+Query = Callable[[str], list[Any]]
+
+_PUBLISHED = {
+    "scans": "SELECT scan, min(time_ns) FROM packets WHERE message = 'Scan2d' GROUP BY scan",
+    "spectra": "SELECT spectrum, min(time_ns) FROM packets WHERE message = 'Spec1d' GROUP BY spectrum",
+}
+_HAS_STARTS = "SELECT 1 FROM sqlite_master WHERE name = 'starts'"
+
+
+class KeyedTable(Table[R]):
+    """Rows of what was measured: `table["tile-1"]` is the one that was taken under this key."""
+
+    @overload
+    def __getitem__(self, index: int | str) -> R: ...
+    @overload
+    def __getitem__(self, index: slice) -> KeyedTable[R]: ...
+    def __getitem__(self, index: int | str | slice) -> R | KeyedTable[R]:
+        if isinstance(index, str):
+            return self._of_key(index)
+        return self._with(self._rows[index]) if isinstance(index, slice) else self._rows[index]
+
+    def where(self, wanted: Callable[[R], bool]) -> KeyedTable[R]:
+        """The rows for which it is true."""
+        return self._with(row for row in self._rows if wanted(row))
+
+    def _of_key(self, key: str) -> R:
+        """The last of this key: attempts before it were interrupted."""
+        found = [row for row in self._rows if row.key == key]
+        if not found:
+            known = dict.fromkeys(row.key for row in self._rows if row.key)
+            raise KeyError(f"no key {key!r}; {_told(list(known))}")
+        return found[-1]
+
+    def _with(self, rows: Iterable[R]) -> KeyedTable[R]:
+        return KeyedTable(rows, self._kind)
+
+
+class SpectrumTable(KeyedTable[SpectrumRow]):
+    """Rows of spectra, and how their curves are read."""
+
+    def __init__(self, rows: Iterable[SpectrumRow], read: Callable[[SpectrumRow], Spectrum]) -> None:
+        super().__init__(rows, SpectrumRow)
+        self._read = read
+
+    def stack(self) -> xarray.Dataset:
+        """Return the curves of a grid as arrays over (y, x, repeat, direction, z) (needs the extra `xarray`).
+
+        x and y are along the sides of the grid, in m; `angle_rad` and `frame` are in the attributes. z is the variable
+        that was swept: its name and unit are in the attributes of the coordinate. Variables that were measured on the
+        way back, too ("Current Retrace"), have both directions. NaN where nothing was measured.
+
+        Raises:
+            InvalidValue: these spectra do not form a grid, or were not measured alike.
+            FileError: a file is missing or damaged.
+        """
+        from afspm.model.spectrum_grid import stack
+
+        return stack([self._read(row) for row in self._rows])
+
+    def where(self, wanted: Callable[[SpectrumRow], bool]) -> SpectrumTable:
+        return self._with(row for row in self._rows if wanted(row))
+
+    @overload
+    def __getitem__(self, index: int | str) -> SpectrumRow: ...
+    @overload
+    def __getitem__(self, index: slice) -> SpectrumTable: ...
+    def __getitem__(self, index: int | str | slice) -> SpectrumRow | SpectrumTable:
+        return self._with(self._rows[index]) if isinstance(index, slice) else super().__getitem__(index)
+
+    def _with(self, rows: Iterable[SpectrumRow]) -> SpectrumTable:
+        return SpectrumTable(rows, self._read)
+
+
+def read_scans(query: Query) -> KeyedTable[ScanRow]:
+    """Return all scans of a journal."""
+    found = query("SELECT * FROM scans ORDER BY number")
+    keys = _keys(query, "scans", names.START_SCAN, found)
+    return KeyedTable((scan_row(row, keys.get(row[0], "")) for row in found), ScanRow)
+
+
+def read_spectra(query: Query, read: Callable[[SpectrumRow], Spectrum]) -> SpectrumTable:
+    """Return all spectra of a journal."""
+    found = query("SELECT * FROM spectra ORDER BY number")
+    keys = _keys(query, "spectra", names.START_SPEC, found)
+    return SpectrumTable((spectrum_row(row, keys.get(row[0], "")) for row in found), read)
+
+
+def _keys(query: Query, table: str, action: str, rows: Sequence[Any]) -> dict[int, str]:
+    """Return the keys by the number of the row: each start belongs to the measurement that was published next."""
+    starts = query(f"SELECT sent_ns, key FROM starts WHERE action = '{action}'") if query(_HAS_STARTS) else []
+    if not any(key for _, key in starts):
+        return {}
+    published = dict(query(_PUBLISHED[table]))
+    ends = sorted((published.get(number, time_ns), number) for number, time_ns, *_ in rows)
+    keys: dict[int, str] = {}
+    waiting = sorted(starts, key=itemgetter(0), reverse=True)
+    for end_ns, number in ends:
+        while waiting and waiting[-1][0] <= end_ns:
+            keys[number] = waiting.pop()[1]  # the last one counts: those before it came to nothing
+    return keys
+
+
+def _told(keys: Sequence[str]) -> str:
+    if not keys:
+        return "nothing was measured under a key"
+    return f"there are {', '.join(keys[:20])}{' …' if len(keys) > 20 else ''}"
+
+
+def scan_row(row: Any, key: str = "") -> ScanRow:
+    """Return a row of the journal as an object."""
+    (
+        number, time_ns, began_ns, filename, file, interrupted, x, y, width, height, angle, frame, rows, columns,
+        channels, holder, mode, problems,
+    ) = row  # fmt: skip
+    region = None if frame is None else Region((x, y), (width, height), angle, Frame(frame))
+    return ScanRow(
+        number,
+        time_ns,
+        began_ns,
+        tuple((name, unit) for name, unit in json.loads(channels)),
+        region,
+        None if rows is None else (rows, columns),
+        bool(interrupted),
+        holder,
+        mode,
+        tuple(json.loads(problems)),
+        filename,
+        file,
+        key,
+    )
+
+
+def spectrum_row(row: Any, key: str = "") -> SpectrumRow:
+    """Return a row of the journal as an object."""
+    (
+        number, time_ns, began_ns, filename, file, kind, x, y, frame, points, names, units, holder, mode, problems,
+    ) = row  # fmt: skip
+    return SpectrumRow(
+        number,
+        time_ns,
+        began_ns,
+        kind,
+        None if x is None else (x, y),
+        Frame(frame),
+        points,
+        tuple(json.loads(names)),
+        tuple(json.loads(units)),
+        holder,
+        mode,
+        tuple(json.loads(problems)),
+        filename,
+        file,
+        key,
+    )

@@ -1,0 +1,86 @@
+"""The tables of a run: rows by their keys, spectra as one array, tables in a notebook and for pandas."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from record_lab import Given, Night
+
+import afspm
+from afspm.errors import InvalidValue
+from afspm.model import ControlResponse, JournalEntries, JournalEntry, names
+from afspm.record.store import RecordStore
+
+
+def start(night: Night, key: str, action: str = names.START_SCAN, response: int = ControlResponse.SUCCESS) -> Given:
+    """An entry as the scheduler writes it: the answer comes later than the request was sent."""
+    night.now_ns += 1_000_000
+    entry = JournalEntry(night.now_ns, "request", "survey", action, int(response), sent_ns=night.now_ns, key=key)
+    return night.packet(JournalEntries((entry,)))
+
+
+def test_a_scan_is_found_by_the_key_that_it_was_asked_for_with(
+    night: Night, store: RecordStore, tmp_path: Path
+) -> None:
+    first, tile = start(night, "tile-1"), night.whole_scan(1)
+    store.take([*tile, first])  # entries are published some at a time: perhaps after the scan
+    store.take(night.whole_scan(2))  # begun at the controller, by hand
+    refused = start(night, "tile-2", response=ControlResponse.NOT_FREE)
+    store.take([refused, start(night, ""), *night.whole_scan(3)])
+    store.take([start(night, "tile-2"), *night.whole_scan(4), start(night, "iv", names.START_SPEC), night.spectrum()])
+    run = afspm.open_run(tmp_path)
+    assert [row.key for row in run.scans] == ["tile-1", "", "", "tile-2"]
+    assert run.scans["tile-2"].number == 4
+    assert run.scan("tile-1").first.filename == "scan-0001.nc"
+    assert run.spectra["iv"].number == 1
+    assert run.spectrum("iv").kind == "IV"
+    assert run.about(run.scans["tile-1"])["key"] == "tile-1"
+    assert run.scans[1:]["tile-2"] is not None
+    with pytest.raises(KeyError, match="no key 'tile-9'; there are tile-1, tile-2"):
+        run.scan("tile-9")
+
+
+def test_a_record_without_keys_says_so(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    store.take(night.whole_scan(1))
+    with pytest.raises(KeyError, match="nothing was measured under a key"):
+        afspm.open_run(tmp_path).scans["a"]
+
+
+def test_a_table_shows_itself_in_a_notebook(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    store.take(night.whole_scan(1))
+    store.take([start(night, "<b>"), *night.whole_scan(2)])
+    shown = afspm.open_run(tmp_path).scans._repr_html_()
+    assert "&lt;b&gt;" in shown
+    assert "<b>" not in shown
+    assert "<td" in shown
+    assert "width / µm" in shown
+    assert "2026-03-14 20:00:00" in shown
+    assert "2 rows" in shown
+
+
+def test_a_long_table_shows_its_ends(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    for number in range(1, 64):
+        store.take(night.whole_scan(number))
+    shown = afspm.open_run(tmp_path).scans._repr_html_()
+    assert shown.count("<tr>") == 22
+    assert "63 rows" in shown
+
+
+def test_a_table_becomes_a_data_frame(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    store.take([*night.whole_scan(1), *night.whole_scan(2)])
+    frame = afspm.open_run(tmp_path).scans.to_pandas()
+    assert list(frame.number) == [1, 2]
+    assert frame.width_m.mean() == pytest.approx(1e-6)
+    assert str(frame.time_ns.dtype) == "datetime64[ns]"
+
+
+def test_spectra_of_one_place_are_repeats(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    spectra = afspm.open_run(tmp_path).spectra
+    with pytest.raises(InvalidValue, match="no spectra"):
+        spectra.stack()
+    store.take([night.spectrum()])
+    stacked = afspm.open_run(tmp_path).spectra.stack()
+    assert dict(stacked.sizes) == {"y": 1, "x": 1, "repeat": 1, "direction": 1, "z": 20}
+    assert np.isfinite(stacked.Current.values).all()

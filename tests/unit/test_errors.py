@@ -1,0 +1,38 @@
+"""Errors as a notebook shows them."""
+
+from __future__ import annotations
+
+import linecache
+
+import pytest
+
+from afspm import Region
+from afspm.errors import AfspmError, InvalidValue
+
+CELL = "def frame(height):\n    return Region((0, 0), (1e-6, height))\n\nframe(0)\n"
+
+
+def shown(name: str) -> list[str]:
+    """What IPython shows of the error of a cell; IPython keeps the lines of cells so that they can be quoted."""
+    linecache.cache[name] = (len(CELL), None, CELL.splitlines(keepends=True), name)
+    with pytest.raises(AfspmError) as caught:
+        exec(compile(CELL, name, "exec"), {"Region": Region})
+    return caught.value._render_traceback_()
+
+
+@pytest.mark.parametrize("name", ["<ipython-input-3-abc>", "/tmp/ipykernel_12/34.py"])
+def test_a_notebook_shows_the_error_and_the_lines_of_the_cell_alone(name: str) -> None:
+    first, *rest = shown(name)
+    assert "InvalidValue" in first
+    assert "a region of 1e-06 m x 0 m is empty (both sizes are above zero)" in first
+    assert rest[-2:] == [
+        "  line 4 of the cell: frame(0)",
+        "  line 2 of the cell: return Region((0, 0), (1e-6, height))",
+    ]
+    assert not any("geometry.py" in line for line in rest)
+
+
+def test_a_file_of_the_user_is_named() -> None:
+    with pytest.raises(InvalidValue) as caught:
+        Region((0, 0), (0, 0))
+    assert f"of {__file__}: Region((0, 0), (0, 0))" in caught.value._render_traceback_()[-1]
