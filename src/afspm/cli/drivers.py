@@ -187,10 +187,13 @@ def _emulate(emulator: Emulator, speed: float, folder: Path) -> None:
     from afspm.process.log import set_up
 
     log = set_up("emulate", "INFO")
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: emulator.stop())
+    for name in ("SIGINT", "SIGTERM", "SIGBREAK"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), lambda *_: emulator.stop())
 
     def listening(address: str) -> None:
+        # Windows runs handlers only when the main thread comes back from waiting: this is what brings it back
+        signal.set_wakeup_fd(emulator.woken.writer_fileno(), warn_on_full_buffer=False)
         where = f"listening at {address}, files in {folder.resolve()}" if address else "does not listen for now"
         typer.echo(f"SIMULATED {emulator.vendor} controller: {where}")
 

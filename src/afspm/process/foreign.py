@@ -14,7 +14,7 @@ import sys
 import threading
 
 from afspm.exit_codes import ExitCode
-from afspm.process.parent import STDIN, end_within
+from afspm.process.parent import end_within, leave_interrupts_to_parent, take_standard_input
 
 ASK_S = 0.6  # to end by itself once its standard input is closed
 TERMINATE_S = 0.4  # to end after it was told to; then it is killed
@@ -27,7 +27,7 @@ def main(arguments: list[str]) -> int:
     if not command:
         sys.stderr.write("ERROR foreign: no command given\n")
         return ExitCode.CONFIG
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    leave_interrupts_to_parent()
     # a terminal's or a supervisor's wish to end us must not leave the command behind, however early it comes
     wished = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: wished.set())
@@ -37,31 +37,36 @@ def main(arguments: list[str]) -> int:
     except (OSError, ValueError) as error:
         sys.stderr.write(f"ERROR {command[0]} can't be started: {error} (is it installed and executable?)\n")
         return ExitCode.CONFIG
-    program = _ForeignProgram(child)
+    program = _ForeignProgram(child, take_standard_input())
     signal.signal(signal.SIGTERM, lambda *_: program.end_soon())
     if wished.is_set():
         program.end_soon()
     threading.Thread(target=program.pass_on, name="stdin", daemon=True).start()
     code = child.wait()
     program.sweep()
-    if program.ending and code < 0:  # it did not end by itself: that it was stopped is what counts
+    if program.stopped:  # it did not end by itself: that it was stopped is what counts
         return ExitCode.ORPHAN
     return 128 - code if code < 0 else code
 
 
 class _ForeignProgram:
-    """Passes standard input on to the child, and ends it."""
+    """Passes our standard input on to the child, and ends it.
 
-    def __init__(self, child: subprocess.Popen[bytes]) -> None:
+    Attributes:
+        stopped: the child was terminated or killed, since it did not end with its standard input.
+    """
+
+    def __init__(self, child: subprocess.Popen[bytes], pipe: int) -> None:
         self._child = child
+        self._pipe = pipe
         self._parent = os.getppid()
-        self.ending = False
+        self.stopped = False
 
     def pass_on(self) -> None:
         """Everything of our standard input, until its end; then the child is to end."""
         assert self._child.stdin is not None
         with contextlib.suppress(OSError, ValueError):
-            while chunk := os.read(STDIN, _CHUNK):
+            while chunk := os.read(self._pipe, _CHUNK):
                 with contextlib.suppress(BrokenPipeError):  # it doesn't read: it may run all the same
                     self._child.stdin.write(chunk)
                     self._child.stdin.flush()
@@ -77,7 +82,6 @@ class _ForeignProgram:
             os.killpg(0, signal.SIGKILL)  # us too: nobody is there to be told the exit code
 
     def _end(self) -> None:
-        self.ending = True
         assert self._child.stdin is not None
         with contextlib.suppress(OSError, ValueError):
             self._child.stdin.close()
@@ -85,6 +89,7 @@ class _ForeignProgram:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._child.wait(seconds)
                 return
+            self.stopped = True
             with contextlib.suppress(OSError):
                 harder()
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import logging
-import os
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from pathlib import Path
 
 from afspm import wire
 from afspm.clock import Clock, ExperimentClock
@@ -28,7 +26,14 @@ from afspm.process.context import (
 )
 from afspm.process.loading import load
 from afspm.process.message_types import register_all
-from afspm.process.parent import ParentWatch, StopRequested, end_within, read_launch_line
+from afspm.process.parent import (
+    ParentWatch,
+    StopRequested,
+    end_within,
+    leave_interrupts_to_parent,
+    read_launch_line,
+    take_standard_input,
+)
 from afspm.transport.heartbeat import HeartbeatSender
 from afspm.transport.port import ParentGone, Port
 from afspm.transport.zmq_port import open_port
@@ -40,19 +45,18 @@ MOST_FILES = 65_536  # more than anybody needs; some programs that are started b
 
 def main() -> int:
     """Run the process and return its exit code."""
-    # Ctrl-C reaches the whole terminal; whether it ends us is the parent's decision
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    leave_interrupts_to_parent()
+    pipe = take_standard_input()
     try:
-        launch = Launch.from_json(read_launch_line())
+        launch = Launch.from_json(read_launch_line(pipe))
     except ConfigError as error:
         log.set_up("host", "INFO").error("%s", error)
         return ExitCode.CONFIG
     logger = log.set_up(launch.name, launch.log_level)
     _allow_many_connections()
-    parent = ParentWatch(ExitCode.ORPHAN)
+    parent = ParentWatch(pipe, ExitCode.ORPHAN)
     parent.watch()
     signal.signal(signal.SIGTERM, lambda *_: parent.let_go())
-    _detach_stdin()
     try:
         return _host(launch, logger, parent)
     except ConfigError as error:
@@ -149,11 +153,6 @@ def _allow_many_connections() -> None:
     if soft != resource.RLIM_INFINITY and soft < wanted:
         with suppress(OSError, ValueError):
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-
-
-def _detach_stdin() -> None:
-    """Give the component an empty sys.stdin: ours is the bond to the parent."""
-    sys.stdin = Path(os.devnull).open(encoding="utf-8")  # noqa: SIM115 - as long as the process lives
 
 
 if __name__ == "__main__":

@@ -124,13 +124,15 @@ def check_format(connection: sqlite3.Connection, path: Path) -> None:
 
 
 class _OfCopy(sqlite3.Connection):
-    """Takes the copy away that it reads, when it is closed or forgotten."""
+    """Removes the copy that it reads when it is closed, forgotten, or (but on Windows) the program ends."""
 
     remove: Callable[[], object] = staticmethod(lambda: None)
 
     def close(self) -> None:
-        super().close()
+        super().close()  # first: Windows removes no file that is open
         self.remove()
+
+    __del__ = close
 
 
 def _checked_copy(path: Path) -> sqlite3.Connection:

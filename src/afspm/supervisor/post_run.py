@@ -6,7 +6,6 @@ import csv
 import logging
 import os
 import subprocess
-import sys
 import threading
 from collections import Counter
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from afspm.components.notifications import END, GIVEN_UP, NotDelivered, Notifica
 from afspm.errors import ConfigError, FileError
 from afspm.experiment import Role, implied_parts
 from afspm.formatting import duration_text
+from afspm.interpreter import python_command, python_environment
 from afspm.logic.supervision.run_end import EndReason
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.record.journal import JOURNAL_FILE
@@ -128,8 +128,8 @@ def report(folder: Path, log: RunLog) -> None:
     up for long."""
     if not (folder / JOURNAL_FILE).is_file():
         return  # nothing was recorded
-    command = [sys.executable, "-P", "-m", "afspm.record.report", str(folder)]
-    environment = {**os.environ, "MPLBACKEND": "agg"}
+    command = [*python_command("afspm.record.report"), str(folder)]
+    environment = {**os.environ, **python_environment(), "MPLBACKEND": "agg"}
     try:
         done = subprocess.run(
             command,

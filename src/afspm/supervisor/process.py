@@ -15,6 +15,7 @@ from typing import IO
 
 from afspm.errors import AfspmError
 from afspm.experiment import ProcessStart
+from afspm.interpreter import python_command, python_environment
 from afspm.launch import Launch
 from afspm.logic.supervision.supervisor_events import Exited
 from afspm.model import Role
@@ -64,16 +65,15 @@ class Task:
 
 def from_start(start: ProcessStart) -> Task:
     """Return the task of a process: Python classes run in our host, other languages under our guard."""
-    # -P: modules are those beside the experiment file, and never what happens to lie where the run was started
-    python = (sys.executable, "-P", "-m")
-    ours = (*python, GUARD, "--", *start.command) if start.command else (*python, HOST)
+    # modules are those beside the experiment file, and never what happens to lie where the run was started
+    ours = (*python_command(GUARD), "--", *start.command) if start.command else python_command(HOST)
     before = [*start.python_path, *filter(None, [os.environ.get("PYTHONPATH", "")])]
     return Task(
         launch=start.launch,
         command=ours,
         role=start.role,
         folder=start.folder if start.command else None,
-        environment={"PYTHONPATH": os.pathsep.join(before)} if before else {},
+        environment={**python_environment(), **({"PYTHONPATH": os.pathsep.join(before)} if before else {})},
         beats=start.beats,
         hidden=start.hidden,
     )
@@ -177,5 +177,6 @@ def _start(command: Sequence[str], environment: Mapping[str, str], folder: Path 
         cwd=folder,
         env={"PYTHONUNBUFFERED": "1", "PYTHONUTF8": "1", **environment},
         start_new_session=sys.platform != "win32",
-        creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
+        # on Windows what ends the console (Ctrl-Break, or closing its window) must not reach what sees to a tip
+        creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0) | getattr(subprocess, "CREATE_NO_WINDOW", 0),
     )

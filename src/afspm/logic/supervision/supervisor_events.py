@@ -146,8 +146,22 @@ _EXIT_REASONS = {
 }
 
 
+_WINDOWS_REASONS = {
+    0xC0000005: "access violation",
+    0xC0000017: "out of memory",
+    0xC00000FD: "stack overflow",
+    0xC0000135: "a DLL is missing",
+    0xC000013A: "its console was closed",
+    0xC0000374: "damaged heap",
+    0xC0000409: "aborted",
+}
+"""Of the system's own exit codes, those that are met: what a signal is elsewhere."""
+
+
 def describe_exit(code: int) -> str:
     """Return why a process ended, as its exit code says."""
+    if code in _WINDOWS_REASONS:
+        return f"killed by Windows: {_WINDOWS_REASONS[code]} (0x{code:08X})"
     if code < 0:
         try:
             return f"killed by {signal.Signals(-code).name}"

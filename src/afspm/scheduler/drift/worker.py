@@ -7,48 +7,73 @@ The first message on its standard input says what it is; the end of that input e
 from __future__ import annotations
 
 import os
-import signal
+import queue
 import sys
+import threading
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
 
 from afspm.errors import AfspmError, FileError
+from afspm.process.parent import leave_interrupts_to_parent, take_standard_input
 from afspm.scheduler.drift import pipe
 from afspm.scheduler.drift.settings import DriftCompensationSettings
 
 
 def main() -> int:
     """Until the scheduler has gone."""
-    # Ctrl-C reaches the whole terminal; whether it ends us is the scheduler's decision
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    asked, answers = sys.stdin.buffer, _own_output()
-    first = pipe.read(asked)
+    leave_interrupts_to_parent()
+    orders, answers = _Orders(take_standard_input()), _own_output()
+    first = orders.next()
     if first is None:
         return 0
     try:
-        worker = _Worker(first[0], answers)
+        worker = _Worker(first[0], orders, answers)
     except AfspmError as error:
         pipe.write(answers, {"is": "broken", "reason": str(error)})
         return 1
     try:
-        while (message := pipe.read(asked)) is not None:
+        while (message := orders.next()) is not None:
             worker.take(*message)
     except BrokenPipeError:
         return 0
     return 0
 
 
+class _Orders:
+    """The scheduler's messages, read by a thread, so that its end is noticed while a scan is registered.
+
+    Attributes:
+        ended: the scheduler has gone, or wants no more.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        self.ended = False
+        self._pipe = os.fdopen(descriptor, "rb")
+        self._read: queue.SimpleQueue[tuple[dict[str, Any], bytes] | None] = queue.SimpleQueue()
+        threading.Thread(target=self._read_all, name="orders", daemon=True).start()
+
+    def next(self) -> tuple[dict[str, Any], bytes] | None:
+        """Wait for the next message; None: there are no more."""
+        return self._read.get()
+
+    def _read_all(self) -> None:
+        while (message := pipe.read(self._pipe)) is not None:
+            self._read.put(message)
+        self.ended = True
+        self._read.put(None)
+
+
 class _Worker:
     """Answers what it is asked, one after the other."""
 
-    def __init__(self, settings: dict[str, Any], answers: IO[bytes]) -> None:
+    def __init__(self, settings: dict[str, Any], orders: _Orders, answers: IO[bytes]) -> None:
         from afspm.scheduler.drift.worker_state import WorkerStateFile
 
         self._drift = DriftCompensationSettings.from_table(settings["drift"])
         self._store = WorkerStateFile(Path(settings["file"]) if settings["file"] else None)
+        self._orders = orders
         self._answers = answers
-        self._scheduler = os.getppid()
         self._told_full = False
         self._begin()
         self._tell_forecast()
@@ -72,7 +97,7 @@ class _Worker:
 
     def _save(self, state: dict[str, Any]) -> None:
         """Unless the scheduler was killed meanwhile: the next one's worker knows more by now."""
-        if os.getppid() != self._scheduler:
+        if self._orders.ended:
             raise BrokenPipeError
         try:
             self._store.save(state)

@@ -7,7 +7,6 @@ import logging
 import os
 import queue
 import subprocess
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -16,6 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from afspm.interpreter import python_command, python_environment
 from afspm.scheduler.drift import pipe
 from afspm.scheduler.drift.messages import Forecasted, NotRegistered, Registered, ScanJob, WorkerGone, WorkerSaid
 from afspm.scheduler.drift.settings import DriftCompensationSettings
@@ -50,10 +50,10 @@ class DriftWorkerProcess:
         """Begin, or kill what is there and begin anew."""
         self._end(kill=True)
         self._life += 1
-        command = (sys.executable, "-P", "-m", "afspm.scheduler.drift.worker")
+        command = python_command("afspm.scheduler.drift.worker")
         try:
             # it complains where we do; small matrices are not worth more threads than one
-            environment = {**dict.fromkeys(_THREADS, "1"), **os.environ}
+            environment = {**dict.fromkeys(_THREADS, "1"), **os.environ, **python_environment()}
             self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
         except OSError as error:
             self._tell(self._life, WorkerGone(f"it can't be started: {error}"))

@@ -1,0 +1,28 @@
+"""The Python that runs afspm, for processes of its own."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+
+
+def python_command(module: str) -> tuple[str, ...]:
+    """Return the command that runs a module as a process of its own.
+
+    Modules are those that are installed, and never what happens to lie in the current folder.
+    """
+    return (_executable(), "-P", "-m", module)
+
+
+def python_environment() -> Mapping[str, str]:
+    """Return the environment variables to add for `python_command`.
+
+    In a virtual environment of Windows `sys.executable` is only a launcher, with another process number, which starts
+    Python itself. That one is started directly, and told by this variable which environment it belongs to.
+    """
+    return {} if _executable() == sys.executable else {"__PYVENV_LAUNCHER__": sys.executable}
+
+
+def _executable() -> str:
+    base = getattr(sys, "_base_executable", sys.executable)
+    return base if sys.platform == "win32" and base else sys.executable
