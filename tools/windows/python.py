@@ -45,10 +45,13 @@ def main() -> None:
     _install_packages()
     _make_prefix()
     _install_afspm()
+    # Wine's server is started apart, else it would say things of its own on our output
+    environment = {**os.environ, **ENVIRONMENT}
+    subprocess.run([str(WINE.with_name("wineserver")), "-p60"], env=environment, stderr=subprocess.DEVNULL, check=False)
     # a pipe as standard output, and no terminal as standard input: Wine's console is not that of Windows
     run = subprocess.Popen(
         [str(WINE), str(PYTHON / "python.exe"), *sys.argv[1:]],
-        env={**os.environ, **ENVIRONMENT},
+        env=environment,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -99,6 +102,17 @@ def _unpack_python() -> None:
                 target = PYTHON.joinpath(*parts)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 target.write_bytes(archive.read(name))
+    # extensions for any Python 3 (psutil's) look for its stable functions there
+    stable = _symbols((PYTHON / "libs" / "python3.lib").read_bytes())
+    forwarded = forwarding_library("python3.dll", {name: f"python311.{name}" for name in stable})
+    (PYTHON / "python3.dll").write_bytes(forwarded)
+
+
+def _symbols(library: bytes) -> list[str]:
+    """Return the functions and variables of an import library (an archive; its first member lists its symbols)."""
+    (count,) = struct.unpack_from(">I", library, 8 + 60)
+    names = library[8 + 60 + 4 + 4 * count :].split(b"\0", count)[:count]
+    return [name.decode().removeprefix("__imp_") for name in names if name.startswith(b"__imp_")]
 
 
 def _install_packages() -> None:
@@ -151,10 +165,11 @@ def forwarding_library(name: str, exports: dict[str, str]) -> bytes:
     struct.pack_into("<IIHHIIIIIII", section, 0, *directory)
     size = len(section)
     padded = -(-size // 512) * 512
+    image = base + -(-size // 0x1000) * 0x1000
     dos = b"MZ" + bytes(58) + struct.pack("<I", 64)
     coff = struct.pack("<HHIIIHH", 0x8664, 1, 0, 0, 0, 240, 0x2022)
     optional = struct.pack("<HBBIIIII", 0x20B, 14, 0, 0, padded, 0, 0, base)
-    optional += struct.pack("<QIIHHHHHHIIIIHHQQQQII", 0x180000000, 0x1000, 0x200, 6, 0, 0, 0, 6, 0, 0, 0x2000, 0x200, 0,
+    optional += struct.pack("<QIIHHHHHHIIIIHHQQQQII", 0x180000000, 0x1000, 0x200, 6, 0, 0, 0, 6, 0, 0, image, 0x200, 0,
                             2, 0x100, 0x100000, 0x1000, 0x100000, 0x1000, 0, 16)  # fmt: skip
     optional += struct.pack("<II", base, size) + bytes(8 * 15)
     header = struct.pack("<8sIIIIIIHHI", b".edata", size, base, padded, 0x200, 0, 0, 0, 0, 0x40000040)

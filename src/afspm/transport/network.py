@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import ipaddress
 import itertools
+import socket
 import struct
+import sys
 from collections.abc import Mapping
+from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import zmq
@@ -35,6 +38,7 @@ _KEEPALIVE_S, _KEEPALIVE_TRIES = 2, 3
 # A peer that takes nothing is disconnected after this time, and what waited for it is dropped. Connected again it asks
 # for what it missed. (Linux and Windows; `tcp_guard` bounds how much may wait until then.)
 _STALLED_MS = 5_000
+_WINDOWS_MAXRT = 5  # of ws2ipdef.h; Python's socket module has no name for it
 _RECONNECT_MS, _RECONNECT_MAX_MS = 20, 200
 _HANDSHAKE_MS = 5_000
 _OPTIONS = (
@@ -53,6 +57,19 @@ _HEARTBEATS = (
     (zmq.HEARTBEAT_TIMEOUT, _ALIVE_TIMEOUT_MS),
     (zmq.HEARTBEAT_TTL, _ALIVE_TIMEOUT_MS),
 )
+
+
+@cache
+def _can_end_stalled() -> bool:
+    """Return whether the system knows `TCP_MAXRT`: where it does not (Wine), libzmq with it never connects."""
+    if sys.platform != "win32":
+        return True
+    with socket.socket() as probe:
+        try:
+            probe.setsockopt(socket.IPPROTO_TCP, _WINDOWS_MAXRT, 1)
+        except OSError:
+            return False
+    return True
 
 
 class Network:
@@ -94,11 +111,12 @@ class Network:
         socket = self._context.socket(kind)
         self._sockets.append(socket)  # else a forgotten one would be closed by the garbage collector, at any time
         options = _OPTIONS + (_HEARTBEATS if kind in _WITH_HEARTBEATS else ())
+        if _can_end_stalled():
+            options += ((zmq.TCP_MAXRT, _STALLED_MS),)
         for option, value in (
             *options,
             (zmq.RCVHWM, 0 if kind in _UNLIMITED else QUEUE_LENGTH),
             (zmq.MAXMSGSIZE, max_bytes),
-            (zmq.TCP_MAXRT, _STALLED_MS),
         ):
             socket.setsockopt(option, value)
         return socket
