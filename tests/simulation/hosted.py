@@ -257,6 +257,9 @@ class MemoryPort:
     def wake_up(self, incoming: Incoming | None = None) -> None:
         self._host.wake(incoming)
 
+    def wakeup_fileno(self) -> int:
+        return -1
+
     def close(self) -> None:
         """Nothing is held open but by the process."""
 

@@ -14,6 +14,7 @@ RETRY_S = 1.0  # before an unreachable one is asked again, when nothing is publi
 STATE_WITHIN_S = 5.0  # before a warning that the microscope has published no state
 SETTLED_WITHIN_S = 2.0  # what was set is published, if it changed anything
 ASK_FREE_AGAIN_S = 5.0  # should the state FREE never reach us
+ASK_BUSY_AGAIN_S = 25.0  # the same where another state than FREE was published
 
 _ASKED_FOR: dict[int, str] = {
     ControlRequest.ACTION: "the action",
@@ -58,7 +59,13 @@ class CommandRetry:
         while True:
             self._control.regain(until_s)
             states = self._link.view.count("ScopeStateMsg")
-            response = self.send(kind, subject, request_id=request_id, until_s=until_s)
+            try:
+                response = self.send(kind, subject, request_id=request_id, until_s=until_s)
+            except KeyboardInterrupt:
+                if kind == ControlRequest.ACTION:
+                    told = "interrupted before the answer: the action %s may have been carried out"
+                    self._link.log.warning(told, subject)
+                raise
             if response.ok:
                 return response
             if response.code != ControlResponse.NO_RESPONSE:  # else it may have been carried out: the same id again
@@ -166,10 +173,13 @@ class CommandRetry:
     def _wait_free(self, states: int, until_s: float | None) -> None:
         """Wait until the microscope says that it is free, later than `states`; not for ever, should that get lost."""
         link, view = self._link, self._link.view
-        link.wait(
-            lambda: view.state is ScopeState.FREE and view.count("ScopeStateMsg") != states,
-            link.earlier(ASK_FREE_AGAIN_S, until_s),
-        )
+
+        def is_free() -> bool:
+            return view.state is ScopeState.FREE and view.count("ScopeStateMsg") != states
+
+        if not link.wait(is_free, link.earlier(ASK_FREE_AGAIN_S, until_s)) and view.state is not ScopeState.FREE:
+            link.log.info("waiting until the microscope is free; it is %s", view.state.name)
+            link.wait(is_free, link.earlier(ASK_BUSY_AGAIN_S, until_s))
         if until_s is not None and link.clock.monotonic_s() >= until_s:
             raise NoResponse(f"the microscope was not free in time: it is {view.state.name}", where=link.name)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import weakref
 from pathlib import Path
 
@@ -48,11 +49,12 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
     register_all(launch.messages)
     clock = ExperimentClock.from_dict(launch.clock)
     port = open_port(launch, clock)
-    link = ExperimentLink.of_launch(launch, port, new_session(launch.run))
+    link = ExperimentLink.of_launch(launch, port, new_session(launch.run), log=_log_of(name))
     try:
         if not link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S)):
             hint = cut_off_message(folder) or "is the experiment still running?"
             raise NoResponse("nobody is there", where=str(folder), hint=hint)
+        link.wait_caught_up(link.until(JOINED_WITHIN_S))  # so that the first look at the scope tells its state
         frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
         scope = Scope(link, ProblemNames(launch.problems), folder / STATE_DIR, frame=frame)
     except BaseException:  # Ctrl-C in a notebook, too: a connection that is left would keep the name
@@ -60,6 +62,15 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
         raise
     weakref.finalize(scope, port.close)
     return scope
+
+
+def _log_of(name: str) -> logging.Logger:
+    """Return the log of a guest; what it waits for goes to the terminal unless the program has set up logging."""
+    log = logging.getLogger(f"afspm.{name}")
+    if not log.hasHandlers():
+        log.addHandler(logging.StreamHandler())
+        log.setLevel(logging.INFO)
+    return log
 
 
 def guest_facts(launch: Launch) -> Plain:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 from afspm.client.experiment_link import ExperimentLink
 from afspm.errors import ControlLost, ExperimentEnded, NoResponse, Refused
@@ -66,7 +66,8 @@ class ControlHold:
         self._wanted.append(self._wanted[0] if self._wanted else solving)
         was_unbroken = self.is_unbroken
         try:
-            self.regain(until_s)
+            with self._link.interrupts.heeded():
+                self.regain(until_s)
             self.is_unbroken = was_unbroken or unbroken
             yield
         except (ExperimentEnded, StopRequested):
@@ -196,7 +197,9 @@ class ControlHold:
         link = self._link
         try:
             # that we were not in control any more is fine; on the way out of a failure nothing is waited for long
-            link.request(ControlRequest.RELEASE_CTRL, until_s=link.until(link.request_timeout_s if quietly else None))
+            with link.interrupts.heeded(), link.interrupts.deferred() if quietly else nullcontext():
+                until_s = link.until(link.request_timeout_s if quietly else None)
+                link.request(ControlRequest.RELEASE_CTRL, until_s=until_s)
         except (NoResponse, ExperimentEnded, StopRequested):
             if not quietly:
                 raise

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from afspm import wire
+from afspm.client.interrupts import Interrupts
 from afspm.client.published_state import PublishedState
 from afspm.client.request_tracker import RequestTracker
 from afspm.clock import Clock
@@ -72,7 +73,7 @@ class ExperimentLink:
         self.ended = False
         self.request_timeout_s = request_timeout_s
         self.requests = RequestTracker(port.send, name, session)
-        self.next_id = self.requests.next_id
+        self.interrupts = Interrupts(port)
         self._retries = request_retries
         self._source = source
         self._over: BaseException | None = None
@@ -103,8 +104,9 @@ class ExperimentLink:
 
         Raises:
             ExperimentEnded, StopRequested: there is nothing more to wait for.
+            KeyboardInterrupt: the user interrupts.
         """
-        with self.activity.waiting():
+        with self.activity.waiting(), self.interrupts.heeded():
             while not done():
                 left_s = None if until_s is None else until_s - self.clock.monotonic_s()
                 if left_s is not None and left_s <= 0.0:
@@ -127,6 +129,7 @@ class ExperimentLink:
         self.check()
         for incoming in self.port.poll(timeout_s):
             self._take(incoming)
+        self.interrupts.heed()
         self.check()
 
     def check(self) -> None:
@@ -197,6 +200,9 @@ class ExperimentLink:
     @property
     def version(self) -> wire.Version:
         return self.requests.version
+
+    def next_id(self) -> str:
+        return self.requests.next_id()
 
     def request(
         self, kind: int, subject: object = None, *, request_id: str = "", until_s: float | None = None

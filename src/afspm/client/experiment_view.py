@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from numbers import Real
 
 from afspm.client.events import Events
 from afspm.client.experiment_link import ExperimentLink
-from afspm.errors import InvalidValue
+from afspm.errors import AfspmError, InvalidValue
 from afspm.model import (
     ControlMode,
     ControlState,
@@ -34,6 +34,8 @@ class ExperimentView:
         self.problems = problems
 
     def __repr__(self) -> str:
+        with suppress(AfspmError):  # after the end, say, it tells what was known last
+            self._catch_up()
         view = self._link.view
         control = view.control or ControlState(ControlMode.UNDEFINED)
         flagged = "".join(f", {self.problems.name(number)} is flagged" for number in control.problems)
@@ -109,7 +111,8 @@ class ExperimentView:
         self._link.check()
         self._depth += 1
         try:
-            yield
+            with self._link.interrupts.heeded():
+                yield
         finally:
             self._depth -= 1
         if self._depth == 0:
@@ -117,5 +120,6 @@ class ExperimentView:
 
     def _catch_up(self) -> None:
         """Take in what has arrived, so that what is told is not from before the last computation."""
-        self._link.wait_caught_up()
-        self._link.pump(0.0)
+        with self._link.interrupts.heeded():
+            self._link.wait_caught_up()
+            self._link.pump(0.0)

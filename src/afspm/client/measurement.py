@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from datetime import UTC
 from typing import Any
@@ -15,12 +15,13 @@ from afspm.client.experiment_link import ExperimentLink
 from afspm.client.keyed_results import KeyedResults, MeasurementResult, check_key
 from afspm.client.measurement_setup import MeasurementSetup
 from afspm.client.targets import Target, target_from
-from afspm.errors import MeasurementFailed, NoResponse, Refused, WireError
+from afspm.errors import ExperimentEnded, MeasurementFailed, NoResponse, Refused, RequestError, WireError
 from afspm.formatting import day_and_time
 from afspm.logic.sessions import KEYED
 from afspm.model import ControlRequest, ControlResponse, Packet, Response
 
 BEGUN_WITHIN_S = 5.0  # from the success of the action to the state that says so
+STOPPED_WITHIN_S = 10.0  # when the user interrupts
 MOST_FAILURES = 5  # in a row, that nothing explains: then a person should look
 
 
@@ -180,7 +181,11 @@ class MeasurementRunner:
         while True:
             if task.watch is not None and task.watch.is_over():
                 task.drop_watch()
-            self._attempt(task)
+            try:
+                self._attempt(task)
+            except KeyboardInterrupt:
+                self._stop(task)
+                raise
             if task.watch is not None and task.watch.is_over() and self._is_done(task, task.watch.cycle):
                 return task.watch.cycle
 
@@ -222,6 +227,29 @@ class MeasurementRunner:
             task.drop_watch()
         self._get_over(response, states, until_s, is_new=is_new)
 
+    def _stop(self, task: _MeasurementTask) -> None:
+        """Stop what was begun, or may have been, and say what became of it. The user has interrupted it."""
+        target, watch, link = task.target, task.watch, self._link
+        if watch is None or watch.is_over():
+            return
+        link.log.warning("interrupted; stopping the %s", target.what)
+        with link.interrupts.deferred(), suppress(RequestError, ExperimentEnded):
+            if self._is_stopped(target, watch, link.until(STOPPED_WITHIN_S)):
+                link.log.warning("the %s was stopped", target.what)
+                return
+        if not link.ended:
+            link.log.warning("the %s goes on; stop it with scope.action(%r)", target.what, target.stop)
+
+    def _is_stopped(self, target: Target, watch: _Watch, until_s: float | None) -> bool:
+        if not self._control.held:
+            return False
+        response = self._commands.send(ControlRequest.ACTION, target.stop, until_s=until_s)
+        if not response.ok:
+            return False
+        # an action that was never answered may not have been begun at all
+        may_be_idle = not self._link.wait(lambda: watch.cycle.begun, self._link.earlier(BEGUN_WITHIN_S, until_s))
+        return may_be_idle or self._link.wait(watch.is_over, until_s)
+
     def _get_over(self, response: Response, states: int, until_s: float | None, *, is_new: bool) -> None:
         """Wait for what stands in the way of an action, or raise Refused."""
         try:
@@ -255,7 +283,7 @@ class MeasurementRunner:
             raise NoResponse(
                 f"the {task.target.what} was not finished in time",
                 where=link.name,
-                hint="it goes on; stop it with scope.action('stop-scan') if it should not",
+                hint=f"it goes on; stop it with scope.action({task.target.stop!r}) if it should not",
             )
 
     def _is_done(self, task: _MeasurementTask, cycle: Cycle) -> bool:

@@ -33,6 +33,7 @@ class ScanTarget:
 
     what: ClassVar = "scan"
     action: ClassVar = names.START_SCAN
+    stop: ClassVar = names.STOP_SCAN
     busy: ClassVar = ScopeState.SCANNING
     message: ClassVar = "Scan2d"
 
@@ -82,6 +83,7 @@ class SpectrumTarget:
 
     what: ClassVar = "spectrum"
     action: ClassVar = names.START_SPEC
+    stop: ClassVar = names.STOP_SPEC
     busy: ClassVar = ScopeState.SPEC
     message: ClassVar = "Spec1d"
 

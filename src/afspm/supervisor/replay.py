@@ -19,12 +19,13 @@ from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
 from afspm.launch import Launch, Sockets
 from afspm.model import Frame, Packet
+from afspm.process import signals
 from afspm.process.message_types import register_all
 from afspm.record.run import Run, open_run
 from afspm.record.run_json import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR
 from afspm.record.run_lock import lock_run
 from afspm.scheduler.replayer import Replayer
-from afspm.supervisor import run_folder, signals
+from afspm.supervisor import run_folder
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.run import now
 from afspm.transport.rate_limited_log import RateLimitedLog

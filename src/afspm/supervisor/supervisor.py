@@ -39,7 +39,7 @@ from afspm.logic.supervision.supervisor_events import (
 )
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import Role
-from afspm.supervisor import signals
+from afspm.process import signals
 from afspm.supervisor.activity_monitor import ActivityMonitor
 from afspm.supervisor.child_output import OutputDropped, OutputLine
 from afspm.supervisor.clock_check import ClockCheck
@@ -116,7 +116,7 @@ class Supervisor:
             self._log.listener = self._reporter.line
             self._reporter.start()
         try:
-            with signals.caught(self._wakeup.post, self._wakeup.writer_fileno()):
+            with signals.caught(self._on_signal, self._wakeup.writer_fileno()):
                 self._step(RunBegan())
                 while not self._core.is_over:
                     self._wait()
@@ -140,6 +140,9 @@ class Supervisor:
         self._wakeup.post(EndSignal(signal.SIGINT))
 
     # --- events ---
+
+    def _on_signal(self, number: int) -> None:
+        self._wakeup.post(EndSignal(number))
 
     def _wait(self) -> None:
         """Wait for whatever comes first, and take all of it in."""

@@ -101,6 +101,9 @@ class Port(Protocol):
         May be called from any thread: the watch over the parent process says `ParentGone()` this way.
         """
 
+    def wakeup_fileno(self) -> int:
+        """Return the descriptor for `signal.set_wakeup_fd`, by which a signal ends the `poll` under way; -1: none."""
+
     def close(self) -> None:
         """Close all once what was sent has gone out, within a fraction of a second. Safe to repeat."""
 

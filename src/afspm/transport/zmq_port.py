@@ -60,6 +60,9 @@ class BasePort(Generic[T]):
     def wake_up(self, incoming: T | None = None) -> None:
         self._wake_up.post(incoming)
 
+    def wakeup_fileno(self) -> int:
+        return self._wake_up.writer_fileno()
+
     def close(self) -> None:
         """The network is the port's own: it is closed too."""
         if not self._closed:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 import itertools
 import logging
+import signal
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -130,7 +131,8 @@ class Lab:
 
     def poll(self, timeout_s: float | None) -> list[Incoming]:
         until_s = None if timeout_s is None else self.clock.passed_s + timeout_s
-        while not self._inbox:
+        self._is_woken = False
+        while not self._inbox and not self._is_woken:
             if not self._happenings:
                 if until_s is None:
                     raise Nothing
@@ -170,6 +172,11 @@ class Lab:
 
     def connect(self) -> None:
         self._inbox.append(ControlConnected())
+
+    def ctrl_c(self) -> None:
+        """The user interrupts, which ends the `poll` under way."""
+        self._is_woken = True
+        signal.raise_signal(signal.SIGINT)
 
     def disconnect(self) -> None:
         self._inbox.append(ControlDisconnected())
@@ -279,6 +286,9 @@ class Lab:
         reads = request.kind == ControlRequest.PARAM and request.subject.value is None
         if self.control.holder != self.name and not reads and request.kind != ControlRequest.ACTION_SUPPORT:
             return Response(ControlResponse.NOT_IN_CONTROL, reason="you are not in control")
+        if request.subject in ("stop-scan", "stop-spec"):
+            self.stop()
+            return Response(ControlResponse.SUCCESS)
         if self.state is not ScopeState.FREE and not reads:
             return Response(ControlResponse.NOT_FREE)
         return self._execute(request)
@@ -375,6 +385,9 @@ class LabPort:
 
     def wake_up(self, incoming: Incoming | None = None) -> None:
         raise NotImplementedError
+
+    def wakeup_fileno(self) -> int:
+        return -1
 
     def _live(self, work: Callable[[], T]) -> T:
         self.calls += 1

@@ -33,6 +33,9 @@ class Port:
             raise KeyboardInterrupt
         return [self._brings]
 
+    def wakeup_fileno(self) -> int:
+        return -1
+
     def close(self) -> None:
         self.is_closed = True
 

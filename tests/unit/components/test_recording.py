@@ -264,6 +264,9 @@ def test_what_wakes_the_recorder_is_the_port_that_is_open_now(tmp_path: Path, mo
         def wake_up(self) -> None:
             self.woken += 1
 
+        def wakeup_fileno(self) -> int:
+            return -1
+
         def poll(self, timeout_s: float | None) -> list[Incoming]:
             made[0].wake()
             return [ParentGone()] if len(ports) == 2 else []

@@ -9,8 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from afspm.logic.supervision.supervisor_events import EndSignal
-from afspm.supervisor import signals
+from afspm.process import signals
 
 
 @pytest.fixture
@@ -27,7 +26,7 @@ def test_each_is_told_and_ends_nothing_by_itself(name: str, writer: int) -> None
     number = getattr(signal, name, None)
     if number is None or (sys.platform == "win32" and name == "SIGTERM"):
         pytest.skip("no such signal here")
-    told: list[EndSignal] = []
+    told: list[int] = []
     before = signal.signal(number, signal.default_int_handler)  # whatever the tests themselves were begun with: nohup
     try:
         with signals.caught(told.append, writer):
@@ -35,12 +34,12 @@ def test_each_is_told_and_ends_nothing_by_itself(name: str, writer: int) -> None
         assert signal.getsignal(number) is signal.default_int_handler
     finally:
         signal.signal(number, before)
-    assert told == [EndSignal(number)]
+    assert told == [number]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGHUP")
 def test_under_nohup_the_closing_of_the_terminal_stays_ignored(writer: int) -> None:
-    told: list[EndSignal] = []
+    told: list[int] = []
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with signals.caught(told.append, writer):

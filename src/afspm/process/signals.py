@@ -1,21 +1,20 @@
-"""Ctrl-C and its relatives, as events of the supervisor's poller."""
+"""Ctrl-C and its relatives, as events of a poller."""
 
 from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
-from afspm.logic.supervision.supervisor_events import EndSignal
-
-# SIGBREAK is Windows' Ctrl-Break and the closing of its console, SIGHUP that of a POSIX terminal
-_NAMES = ("SIGINT", "SIGTERM", "SIGBREAK", "SIGHUP")
+CTRL_C = ("SIGINT",)
+ENDING = (*CTRL_C, "SIGTERM", "SIGBREAK", "SIGHUP")
+"""SIGBREAK is Windows' Ctrl-Break and the closing of its console, SIGHUP that of a POSIX terminal."""
 
 
 @contextmanager
-def caught(tell: Callable[[EndSignal], None], wakeup_fd: int) -> Iterator[None]:
+def caught(tell: Callable[[int], None], wakeup_fd: int, names: Sequence[str] = ENDING) -> Iterator[None]:
     """Hand signals that end a program to `tell` instead, while in this block; write to `wakeup_fd` with each.
 
     A signal that is ignored already (SIGHUP under nohup) stays ignored. Away from the main thread Python gives no
@@ -26,10 +25,10 @@ def caught(tell: Callable[[EndSignal], None], wakeup_fd: int) -> Iterator[None]:
         return
 
     def handle(number: int, _frame: FrameType | None) -> None:
-        tell(EndSignal(number))
+        tell(number)
 
     before = {}
-    for number in (getattr(signal, name) for name in _NAMES if hasattr(signal, name)):
+    for number in (getattr(signal, name) for name in names if hasattr(signal, name)):
         if signal.getsignal(number) is not signal.SIG_IGN:
             before[number] = signal.signal(number, handle)
     # Windows runs handlers only when the main thread comes back from waiting: this is what brings it back

@@ -1,0 +1,51 @@
+"""Ctrl-C in a script or notebook: raised where a call waits, so that no request or answer is left half done."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from afspm.process import signals
+from afspm.transport.port import Port
+
+
+class Interrupts:
+    """The interrupts (Ctrl-C, the stop button of a notebook) that arrive during calls over one port.
+
+    A program that handles or ignores SIGINT itself, as components do, is left alone.
+    """
+
+    def __init__(self, port: Port) -> None:
+        self._port = port
+        self._is_deferred = False
+        self._has_come = False
+
+    @contextmanager
+    def heeded(self) -> Iterator[None]:
+        """Raise KeyboardInterrupt in this block only where `heed` is called, and at its end."""
+        if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+            yield  # also within another such block
+            return
+        self._has_come = False
+        with signals.caught(self._come, self._port.wakeup_fileno(), signals.CTRL_C):
+            yield
+            self.heed()
+
+    @contextmanager
+    def deferred(self) -> Iterator[None]:
+        """Finish what is in this block, which is to be short; further interrupts during it are dropped."""
+        self._is_deferred = True
+        try:
+            yield
+        finally:
+            self._is_deferred = self._has_come = False
+
+    def heed(self) -> None:
+        """Raise KeyboardInterrupt if an interrupt has come."""
+        if self._has_come and not self._is_deferred:
+            self._has_come = False
+            raise KeyboardInterrupt
+
+    def _come(self, _number: int) -> None:
+        self._has_come = True
