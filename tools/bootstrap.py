@@ -1,6 +1,7 @@
-"""Makes the environment .venv from the lock file, with nothing but Python 3.11 or later.
+"""Make the environment .venv from the lock file, with nothing but Python 3.11 or later.
 
-Run by the Makefile: `python3 tools/bootstrap.py`.
+Run by the Makefile: `python3 tools/bootstrap.py demo` (what a plain install holds), `test` (and what the tests need) or
+`all` (and the tools of `make check`). Each adds to what is there.
 """
 
 from __future__ import annotations
@@ -15,28 +16,44 @@ ROOT = Path(__file__).resolve().parents[1]
 VENV = ROOT / ".venv"
 TOOLS = ROOT / "build" / "tools"
 UV_VERSION = "uv>=0.5,<1"
+EXTRAS = ("dashboard", "features", "messages", "study", "testing", "xarray")
+"""What the tests use; Jupyter they install where they need it."""
 
 
-def main() -> None:
+def main(wanted: str) -> None:
     if sys.version_info < (3, 11):  # noqa: UP036  (it is run by whatever python3 there is)
         sys.exit(f"afspm needs Python 3.11 or later, this is {sys.version.split()[0]}")
+    _sync("--group=pip")
+    _compile()
+    if wanted != "demo":
+        groups = ["test", *(["browser"] if _has_browser() else []), *(["check"] if wanted == "all" else [])]
+        _sync(*(f"--group={group}" for group in ["pip", *groups]), *(f"--extra={extra}" for extra in EXTRAS))
+
+
+def _sync(*options: str) -> None:
     uv = find_uv()
     environment = {**os.environ, "UV_PROJECT_ENVIRONMENT": str(VENV), "UV_PYTHON_DOWNLOADS": "never"}
     environment.pop("VIRTUAL_ENV", None)
-    command = [uv, "sync", "--frozen", "--all-extras", "--python", sys.executable, "--quiet"]
-    if subprocess.run(command, cwd=ROOT, env=environment).returncode != 0:
+    command = [uv, "sync", "--frozen", "--inexact", "--python", sys.executable, "--quiet", "--no-default-groups"]
+    if subprocess.run([*command, *options], cwd=ROOT, env=environment).returncode != 0:
         sys.exit("the environment could not be made: see above")
-    _compile()
+
+
+def _has_browser() -> bool:
+    """Return whether there is a browser for the tests of the page: what drives it is a sixth of all."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    return bool(os.environ.get("AFSPM_CHROMIUM")) or any(map(shutil.which, names))
 
 
 def _compile() -> None:
-    """Compile all modules now, as pip would and uv does not: an experiment starts many processes, and where Python may
-    not keep what it compiled (PYTHONDONTWRITEBYTECODE), each would spend most of its start on compiling them again."""
+    """Compile what an experiment imports now, as pip would and uv does not: it starts many processes, and where Python
+    may not keep what it compiled (PYTHONDONTWRITEBYTECODE), each would spend most of its start on compiling again."""
     python = VENV / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
     packages = "import sysconfig; print(sysconfig.get_path('purelib'))"
     folder = subprocess.run([str(python), "-c", packages], capture_output=True, text=True, check=True).stdout.strip()
-    # what can't be compiled is a package's template for another Python: nobody imports it
-    subprocess.run([str(python), "-m", "compileall", "-qq", "-j", "0", folder, str(ROOT / "src")], check=False)
+    # the tests of packages are not imported; what can't be compiled is a template for another Python
+    skipped = ("-x", r"site-packages[/\\].*[/\\]tests?[/\\]")
+    subprocess.run([python, "-m", "compileall", "-qq", "-j", "0", *skipped, folder, ROOT / "src"], check=False)
 
 
 def find_uv() -> str:
@@ -65,4 +82,4 @@ def _make_venv() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(*(sys.argv[1:] or ["all"]))

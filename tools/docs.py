@@ -99,7 +99,8 @@ def _plain(value: Any) -> str:
 def _class_page(name: str, cls: type) -> str:
     text, _ = _docstring(cls)
     lines = [f"## {name}", "", text, ""]
-    for attribute, says in (("solves", "Solves"), ("flags", "Flags"), ("publishes", "Publishes")):
+    said = {"solves": "Solves", "flags": "Flags", "publishes": "Publishes", "requires": "Needs"}
+    for attribute, says in said.items():
         if told := getattr(cls, attribute, ()):
             lines += [f"{says}: {', '.join(f'`{one}`' for one in told)}.", ""]
     settings = list(_settings(cls))

@@ -28,7 +28,7 @@ ROWS = [
 def defaults(owner: str) -> dict[str, Any]:
     if owner == "bank":
         return {field.name: field.default for one in (BankSettings, Choice) for field in dataclasses.fields(one)}
-    path = ({**estimators.READY_MADE, **trackers.READY_MADE})[owner].path
+    path = ({**estimators.READY_MADE, **trackers.READY_MADE})[owner]
     module, _, name = path.rpartition(".")
     parameters = inspect.signature(getattr(importlib.import_module(module), name)).parameters
     return {name: one.default for name, one in parameters.items()}

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from afspm import plugins
-from afspm.cli import dashboard, drift, drivers, experiment_file, recorded, run, status, steer
+from afspm.cli import dashboard, demo, drift, drivers, experiment_file, new, recorded, run, status, steer
 from afspm.errors import ConfigError
 
 app = typer.Typer(
@@ -41,7 +41,9 @@ def _afspm(
 BEFORE, MEANWHILE, AFTERWARDS = "Before", "While it runs", "Afterwards"
 MICROSCOPES, PLUGINS = "Microscopes", "Plug-ins"
 
+app.command("demo")(demo.demo)
 app.command("run")(run.run)
+app.add_typer(new.app, name="new", rich_help_panel=BEFORE)
 app.command("check", rich_help_panel=BEFORE)(experiment_file.check)
 app.command("graph", rich_help_panel=BEFORE)(experiment_file.graph)
 app.command("keys", rich_help_panel=BEFORE)(experiment_file.keys)
@@ -57,7 +59,6 @@ app.command("report", rich_help_panel=AFTERWARDS)(recorded.report)
 app.command("export", rich_help_panel=AFTERWARDS)(recorded.export)
 app.command("replay", rich_help_panel=AFTERWARDS)(recorded.replay)
 app.add_typer(drift.app, name="drift", rich_help_panel=AFTERWARDS)
-app.add_typer(drivers.new, name="new", rich_help_panel=MICROSCOPES)
 app.command("test-translator", rich_help_panel=MICROSCOPES)(drivers.check_translator)
 app.command("emulate", rich_help_panel=MICROSCOPES)(drivers.emulate)
 

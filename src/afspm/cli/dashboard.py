@@ -129,11 +129,13 @@ def _join(folder: Path, settings: dict[str, Any]) -> int:
     from afspm.exit_codes import ExitCode
     from afspm.experiment.process_starts import DASHBOARD
     from afspm.record.run_json import read_run_json
+    from afspm.requirements import require
 
     url = url_in(read_run_json(folder).get("processes"), folder, DASHBOARD)
     if url is not None:
         typer.echo(f"this run has a dashboard already: {url}")
         return 0
+    require(Dashboard)
     with looking(folder):
         pass  # somebody is there
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)

@@ -165,11 +165,8 @@ def written(found: Series, analysis: Analysis, truth: Array | None, folder: Path
         yield folder / "drift_stack.nc"
     except InvalidValue as error:
         console.print(f"no stack: {error}", markup=False, soft_wrap=True)
-    try:
-        from afspm.drift.figures import album
-    except ImportError:
-        console.print('no figures without matplotlib: pip install "afspm[plot]"', markup=False)
-        return
+    from afspm.drift.figures import album
+
     part = album.RunPart("", found.channel, 0, len(found.scans), analysis.estimates)
     matched = next(((0, k, one) for k, one in enumerate(analysis.pairs, 1) if one.accepted and one.matches), None)
     yield from album.write(album.DriftRun(found.scans, analysis.record, [part], matched, truth), folder)

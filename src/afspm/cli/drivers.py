@@ -1,4 +1,4 @@
-"""`afspm new driver`, `test-translator` and `emulate`: for those who connect a microscope."""
+"""`afspm test-translator` and `emulate`: for those who connect a microscope."""
 
 from __future__ import annotations
 
@@ -18,29 +18,6 @@ if TYPE_CHECKING:
 _ASK = """The probe will be moved, scans and spectra be taken, gains and bias changed by a few percent, the feedback
 switched off and on, all within the frame that is set now; everything is put back. Nothing is approached, pulsed or
 crashed. Is the tip so far from the sample that it can't reach it, whatever the feedback does?"""
-
-new = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Make something to begin with.")
-
-
-@new.callback()
-def _new() -> None:
-    """Make something to begin with."""
-
-
-@new.command("driver")
-def driver(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Of the package, e.g. my_scope.")],
-    into: Annotated[Path, typer.Option("--into", metavar="DIR", help="Where to make its folder.")] = Path(),
-) -> None:
-    """Make a package with a driver for a new controller.
-
-    As it is, it drives a controller that only pretends, and passes the checks of what it has.
-    """
-    from afspm.testing.skeletons import write_driver
-
-    folder = write_driver(name, into)
-    typer.echo(f"{folder}: replace its PretendController, and look how far it is with")
-    typer.echo(f"    cd {folder} && afspm test-translator experiment.toml")
 
 
 def check_translator(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -70,9 +70,9 @@ def show(findings: Sequence[Finding], console: Console) -> None:
         console.print(line, soft_wrap=True)  # a wrapped line could not be clicked or searched
 
 
-def require_no_errors(experiment: Experiment) -> None:
-    """Show what is wrong or doubtful. Raises typer.Exit if something is wrong."""
-    findings = experiment.check()
+def require_no_errors(experiment: Experiment, only: Collection[str] = (), without: Collection[str] = ()) -> None:
+    """Show what is wrong or doubtful, where these are started here. Raises typer.Exit if something is wrong."""
+    findings = experiment.check(only, without)
     if findings:
         from rich.console import Console
 

@@ -69,12 +69,13 @@ def run(
         found = resuming.find(resume)
         if dashboard:
             found = resumed_with_dashboard(found)
-        require_no_errors(found.experiment)
+        as_begun = found.options(options)
+        require_no_errors(found.experiment, as_begun.only, as_begun.without)
         raise typer.Exit(resuming.resume(found, options, terminal=sys.stdout).outcome.exit_code)
     if not files:
         raise typer.BadParameter("name an experiment file, or a run with --resume", param_hint="FILE")
     experiment = with_dashboard(files) if dashboard else load(*files)
-    require_no_errors(experiment)
+    require_no_errors(experiment, options.only, options.without)
     if dry_run:
         for start in running.dry_run(experiment, options):
             typer.echo(_told(start))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import importlib
-import importlib.util
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -67,12 +66,13 @@ class DriftPictures(DriftTable):
     While the experiment goes on, it compares each scan with the first by itself, once for the scans before correction
     was switched on and once for those after: what is left of drift then, estimated apart from what the scheduler
     follows. Where the microscope is simulated, the true errors are drawn too. It reads the files that the microscope
-    saves, and needs matplotlib (`pip install "afspm[plot]"`).
+    saves.
 
     Args:
         channel: of the scans that are compared.
         estimator: that compares them.
-        features: an estimator of matched features, for the figure of those.
+        features: an estimator of matched features, for the figure of those; by default "brief" where `afspm[features]`
+            is installed.
         title: above the figure of the offset.
         file: the table's name in the run folder.
     """
@@ -85,11 +85,15 @@ class DriftPictures(DriftTable):
         self,
         channel: str = "Height",
         estimator: str = "least-squares",
-        features: str = "brief",
+        features: str | None = None,
         title: str = "",
         file: str = "drift_correction.csv",
     ) -> None:
         super().__init__(file)
+        if features is not None:
+            from afspm.drift import estimators
+
+            estimators.estimator(features)  # refused now, and not at the end of the night
         self.channel, self.estimator, self.features, self.title = channel, estimator, features, title
         self._pairs: dict[tuple[str, str], Registration] = {}
         self._drawing_is_loaded = self._has_told = False
@@ -101,7 +105,7 @@ class DriftPictures(DriftTable):
         self._again = deque((told[start], one) for _, start, stop in parts(told) for one in told[start + 1 : stop])
 
     def on_tick(self) -> None:
-        if not self._drawing_is_loaded and importlib.util.find_spec("matplotlib"):
+        if not self._drawing_is_loaded:
             importlib.import_module(_ALBUM)  # now, when there is time: at the end all must be quick
         self._drawing_is_loaded = True
         if self._again:
@@ -119,8 +123,6 @@ class DriftPictures(DriftTable):
         told = self._told()
         if len(told) < 2:
             self.log.info("drift of %d scans, no pictures", len(told))
-        elif importlib.util.find_spec("matplotlib") is None:
-            self.log.error('no pictures without matplotlib: pip install "afspm[plot]"; the table is in %s', self.file)
         else:
             self._draw(told)
 
@@ -165,9 +167,9 @@ class DriftPictures(DriftTable):
         from afspm.drift.estimators import estimator
 
         try:
-            by = estimator(self.features)
+            by = estimator(self.features or "brief")
         except AfspmError as error:
-            self.log.warning("no picture of features: %s", error)
+            self.log.info("no picture of features: %s", error)
             return None
         without = [k for k, one in enumerate(told) if not one.correcting] or list(range(len(told)))
         for second in reversed(without[1:]):

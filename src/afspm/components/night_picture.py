@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import json
 from pathlib import Path
 from typing import Any, Literal
@@ -20,7 +20,6 @@ class NightPicture(Component):
 
     Where the microscope is simulated, the picture says so. It listens to everything, and keeps what it needs on disk as
     it goes: killed and started again, it draws the same.
-    It needs matplotlib (`pip install "afspm[plot]"`).
 
     Args:
         channel: shown of each scan.
@@ -43,7 +42,7 @@ class NightPicture(Component):
         self.record = NightRecord.from_lines(self._file.lines())
 
     def on_tick(self) -> None:
-        if not self._drawing_is_loaded and importlib.util.find_spec("matplotlib"):
+        if not self._drawing_is_loaded:
             # now, when there is time: at the end all must be quick
             importlib.import_module("afspm.record.night_figure").prepare()
         self._drawing_is_loaded = True
@@ -78,13 +77,8 @@ class NightPicture(Component):
         if not self.record.shots:
             self.log.info("no scan, no picture")
             return
-        try:
-            from afspm.record.night_figure import draw
-        except ImportError:
-            self.log.error(
-                'no picture without matplotlib: pip install "afspm[plot]"; the record is in %s', self._file.path
-            )
-            return
+        from afspm.record.night_figure import draw
+
         path = Path(self.run_dir) / self.file
         names = {number: self.scope.problems.name(number) for number in self.record.problems}
         draw(self.record, path, names, title=self.title, simulated=self.simulated)

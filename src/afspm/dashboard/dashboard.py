@@ -42,6 +42,7 @@ class Dashboard(Component):
     """
 
     operates = True
+    requires = ("afspm[dashboard]",)
     listens = ("",)
     longest_step_s = 60.0  # the first import of everything, on a busy computer
 

@@ -4,33 +4,17 @@ from __future__ import annotations
 
 import difflib
 import importlib
-import importlib.util
 import inspect
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from afspm import plugins
 from afspm.errors import AfspmError, ConfigError
-
-
-@dataclass(frozen=True)
-class ReadyMade:
-    """Something that has a name.
-
-    Attributes:
-        path: its class, "module.Name".
-        library: what it needs besides numpy.
-        extra: of afspm, which installs that.
-    """
-
-    path: str
-    library: str = "scipy"
-    extra: str = "drift"
+from afspm.requirements import require
 
 
 def named(
-    what: str, spec: str | Mapping[str, Any], ready_made: Mapping[str, ReadyMade], default: str, *arguments: object
+    what: str, spec: str | Mapping[str, Any], ready_made: Mapping[str, str], default: str, *arguments: object
 ) -> tuple[object, str]:
     """Return the part that a user asks for, and its name.
 
@@ -49,6 +33,7 @@ def named(
     if not isinstance(name, str):
         raise ConfigError(f"{_a(what)} is named by a text, not {name!r}", where="class")
     found = _imported(what, name) if "." in name else _ready_made(what, name, ready_made)
+    require(found)
     _check_settings(what, name, found, settings, len(arguments))
     try:
         return found(*arguments, **settings), name
@@ -72,19 +57,14 @@ def _imported(what: str, name: str) -> type[Any]:
     return found
 
 
-def _ready_made(what: str, name: str, ready_made: Mapping[str, ReadyMade]) -> type[Any]:
+def _ready_made(what: str, name: str, ready_made: Mapping[str, str]) -> type[Any]:
     if name not in ready_made:
         if isinstance(plugin := plugins.load(f"afspm.{what}s", name), type):
             return plugin
         known = ", ".join(ready_made)
         hint = _near(name.casefold(), ready_made) or f"there are {known}; write one of your own as module.Name"
         raise ConfigError(f"there is no {what} {name!r}", hint=hint)
-    entry = ready_made[name]
-    if importlib.util.find_spec(entry.library) is None:
-        raise ConfigError(f"the {what} {name!r} needs {entry.library}", hint=f'pip install "afspm[{entry.extra}]"')
-    module_name, _, class_name = entry.path.rpartition(".")
-    found: type[Any] = getattr(importlib.import_module(module_name), class_name)
-    return found
+    return _imported(what, ready_made[name])
 
 
 def _check_settings(what: str, name: str, class_: type[Any], settings: Mapping[str, Any], given: int) -> None:

@@ -40,5 +40,4 @@ def _imported(module: str, name: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        hint = f'pip install "afspm[{name}]"' if name in names() else "is it on the path?"
-        raise ConfigError(f"the emulator {name} can't be imported: {error}", hint=hint) from error
+        raise ConfigError(f"the emulator {name} can't be imported: {error}", hint="is it on the path?") from error

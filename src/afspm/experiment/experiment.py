@@ -12,7 +12,7 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import document as documents
 from afspm.experiment import parts as sorting
-from afspm.experiment.findings import Finding
+from afspm.experiment.findings import Finding, Findings
 from afspm.experiment.implied_parts import RECORDS
 from afspm.experiment.toml_lines import Table
 from afspm.launch import Launch
@@ -98,10 +98,20 @@ class Experiment:
         """Those who keep the record of a run: by default one."""
         return self.resolved.saying(RECORDS)
 
-    def check(self) -> list[Finding]:
-        """Return everything that is wrong or doubtful: errors first, then by line. Nothing is started."""
-        self.resolved  # noqa: B018  (finds what there is to find)
-        return self._document.findings.ordered()
+    def check(self, only: Collection[str] = (), without: Collection[str] = ()) -> list[Finding]:
+        """Return everything that is wrong or doubtful: errors first, then by line. Nothing is started.
+
+        Args:
+            only, without: as for `launches`; what is started elsewhere need not be installed here.
+
+        Raises:
+            ConfigError: `only` or `without` names no component.
+        """
+        from afspm.experiment import process_starts
+
+        chosen = process_starts.chosen_names(self.resolved, only, without)
+        missing = process_starts.not_installed(self.resolved, chosen)
+        return Findings([*self._document.findings.found, *missing]).ordered()
 
     @cached_property
     def resolved(self) -> ResolvedExperiment:
@@ -114,9 +124,9 @@ class Experiment:
             structure_checks.check(resolved)
         return resolved
 
-    def require_valid(self) -> None:
+    def require_valid(self, only: Collection[str] = (), without: Collection[str] = ()) -> None:
         """Raises ConfigError that lists all errors, if there are any."""
-        errors = [finding for finding in self.check() if finding.is_error]
+        errors = [finding for finding in self.check(only, without) if finding.is_error]
         if errors:
             raise ConfigError("\n".join(map(str, errors)), hint="afspm check shows what is wrong")
 
@@ -147,7 +157,7 @@ class Experiment:
         """
         from afspm.experiment import process_starts
 
-        self.require_valid()
+        self.require_valid(only, without)
         starts = process_starts.starts(self.resolved, take_address, only, without)
         knowing = process_starts.knowing_the_run(self.resolved)
         return [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import shutil
 import sys
 from pathlib import Path
@@ -28,15 +27,7 @@ def recorder(resolved: ResolvedExperiment) -> ExperimentPart | None:
     section = resolved.sections.record
     if not section.on or resolved.saying(RECORDS) or not resolved.with_role(Role.SCHEDULER):
         return None
-    scans = section.scans
-    if scans and importlib.util.find_spec("h5py") is None:
-        scans = False
-        resolved.document.warning(
-            "scans and spectra are not recorded: h5py is not installed",
-            "record",
-            hint='pip install "afspm[record]"; or say [record] scans = false',
-        )
-    return _implied(resolved, RECORDER, {} if scans else {"scans": False}, "record")
+    return _implied(resolved, RECORDER, {} if section.scans else {"scans": False}, "record")
 
 
 def notifier(resolved: ResolvedExperiment) -> ExperimentPart | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ from afspm.addresses import connectable, reaches
 from afspm.errors import ConfigError
 from afspm.experiment import limits_section
 from afspm.experiment.experiment import ProcessStart
-from afspm.experiment.findings import nearest
+from afspm.experiment.findings import Finding, Level, nearest
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.toml_writer import SECRET
 from afspm.experiment.wiring import ProcessSockets
@@ -19,6 +19,7 @@ from afspm.launch import Launch, Sockets
 from afspm.logic.microscope_status import FEEDBACK_OFF
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import Frame, Role
+from afspm.requirements import require
 
 if TYPE_CHECKING:
     from afspm.experiment.resolution import ResolvedExperiment, ResolvedProcess
@@ -66,6 +67,17 @@ def chosen_names(resolved: ResolvedExperiment, only: Collection[str], without: C
         if name not in names:
             raise ConfigError(f"there is no component {name!r}", hint=nearest(name, names))
     return {name for name in names if (not only or name in only) and name not in without}
+
+
+def not_installed(resolved: ResolvedExperiment, names: Collection[str]) -> Iterator[Finding]:
+    """Yield an error for each of these processes whose class requires a package that is not installed here."""
+    for process in resolved.processes.values():
+        try:
+            if process.name in names:
+                require(process.component)
+        except ConfigError as error:
+            place = resolved.document.place(process.name, "class")
+            yield Finding(Level.ERROR, f"[{process.name}] class: {error.what}", place, error.hint)
 
 
 def _subscribing(resolved: ResolvedExperiment, name: str, chosen: set[str], without: set[str]) -> ProcessSockets:

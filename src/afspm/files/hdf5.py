@@ -23,11 +23,9 @@ def is_hdf5(path: Path) -> bool:
 
 
 def opened(path: Path) -> Any:
-    """The file; to be closed. Raises FileError: h5py is missing, or it is none."""
-    try:
-        import h5py
-    except ImportError:
-        raise FileError("reading HDF5 needs h5py", where=str(path), hint='pip install "afspm[files]"') from None
+    """The file; to be closed. Raises FileError: it is none."""
+    import h5py
+
     if not is_hdf5(path):
         raise FileError("is no HDF5 file", where=str(path))
     _check_heaps(path.read_bytes(), path)

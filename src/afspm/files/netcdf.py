@@ -88,10 +88,8 @@ def _file(file: Any) -> File:
 
 
 def _netcdf_file(content: io.BytesIO, mode: Literal["r", "w"]) -> Any:
-    try:
-        from scipy.io import netcdf_file
-    except ImportError:
-        raise FileError("NetCDF needs scipy", hint='pip install "afspm[files]"') from None
+    from scipy.io import netcdf_file
+
     return netcdf_file(content, mode, mmap=False, version=2)
 
 

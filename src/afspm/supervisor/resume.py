@@ -98,8 +98,8 @@ def resume(found: ResumableRun, options: RunOptions, terminal: TextIO | None = N
     FileError: it is still going on.
     """
     experiment, folder, facts = found.experiment, found.folder, found.facts
-    experiment.require_valid()
     options = found.options(options)
+    experiment.require_valid(options.only, options.without)
     with lock_run(folder):
         _wait_until_gone(facts, folder)
         common = _common(experiment, options, facts, folder)

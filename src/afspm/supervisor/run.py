@@ -75,7 +75,7 @@ def run(experiment: Experiment, options: RunOptions = RunOptions(), terminal: Te
         ConfigError: the experiment file has errors, or the options don't fit it; nothing was started.
         FileError: there is no place for the run folder; nothing was started.
     """
-    experiment.require_valid()
+    experiment.require_valid(options.only, options.without)
     own = _own(experiment, options)
     # whatever is wrong is told before a folder is made
     first = _starts(experiment, options, own, FreePorts())
@@ -162,7 +162,7 @@ def facts_to_resume(experiment: Experiment, starts: Sequence[ProcessStart], opti
 
 def dry_run(experiment: Experiment, options: RunOptions = RunOptions()) -> list[ProcessStart]:
     """Return what `run` would start, and nothing else. Raises as `run` does."""
-    experiment.require_valid()
+    experiment.require_valid(options.only, options.without)
     return _starts(experiment, options, _own(experiment, options), FreePorts())
 
 

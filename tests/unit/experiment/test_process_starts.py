@@ -70,13 +70,24 @@ def test_the_file_may_do_without_a_recorder_or_have_its_own(write: Write) -> Non
     assert starts(write(CORRECTOR + "[record]\nscans = false\n"))["recorder"].launch.settings == {"scans": False}
 
 
-def test_without_h5py_the_journal_alone_is_kept_and_that_is_said(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    experiment = write(CORRECTOR)
+NEEDY = """
+from afspm import Component
+class Needy(Component):
+    requires = ("afspm[dashboard]", "no-such-package>=2")
+"""
+
+
+def test_a_class_whose_packages_are_not_installed_is_refused_where_it_is_started(write: Write, tmp_path: Path) -> None:
+    (tmp_path / "needy.py").write_text(NEEDY)
+    experiment = write(CORRECTOR + '[watcher]\ncomponent = true\nclass = "needy.Needy"\n')
     (finding,) = experiment.check()
-    assert "h5py is not installed" in finding.what
-    assert not finding.is_error
-    assert starts(experiment)["recorder"].launch.settings == {"scans": False}
+    assert finding.is_error
+    assert finding.what == "[watcher] class: Needy needs what is not installed: no-such-package"
+    assert finding.hint == 'pip install "no-such-package>=2"'
+    with pytest.raises(ConfigError, match="no-such-package"):
+        starts(experiment)
+    assert experiment.check(without=["watcher"]) == []
+    assert "watcher" not in starts(experiment, without=["watcher"])
 
 
 def test_a_component_called_recorder_keeps_its_name(write: Write) -> None:

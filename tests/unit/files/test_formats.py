@@ -201,17 +201,6 @@ def test_an_igor_wave_with_a_damaged_header_is_refused(tmp_path: Path) -> None:
         afspm.read(tmp_path / "a.ibw")
 
 
-def test_hdf5_without_its_library_is_refused_with_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("nsid.h5", "gxsm4.nc"):
-        WHOLE[name](tmp_path / name)
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    for name in ("nsid.h5", "gxsm4.nc"):
-        with pytest.raises(FileError, match=r"afspm\[files\]"):
-            afspm.read(tmp_path / name)
-
-
 def test_nothing_is_loaded_that_a_file_does_not_need(tmp_path: Path) -> None:
     (tmp_path / "a.sxm").write_bytes(sxm())
     code = (

@@ -1,17 +1,19 @@
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 
 import pytest
 
 from afspm.errors import ConfigError, FileError
-from afspm.testing.skeletons import write_driver
+from afspm.experiment import load
+from afspm.testing.skeletons import write
 
 
 @pytest.mark.parametrize("name", ["tip_top", "tip-top", " Tip Top "])
 def test_a_package_has_the_name_that_was_asked_for_everywhere(name: str, tmp_path: Path) -> None:
-    folder = write_driver(name, tmp_path)
+    folder = write("driver", name, tmp_path)
     assert folder == tmp_path / "tip_top"
     files = {str(file.relative_to(folder)): file.read_text() for file in folder.rglob("*") if file.is_file()}
     assert set(files) == {
@@ -26,7 +28,7 @@ def test_a_package_has_the_name_that_was_asked_for_everywhere(name: str, tmp_pat
 @pytest.mark.parametrize("name", ["2tips", "", "a.b", "../up", "afspm"])
 def test_what_can_not_be_a_package_is_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="can't be the name of a package"):
-        write_driver(name, tmp_path)
+        write("driver", name, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -34,5 +36,16 @@ def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "work.txt").write_text("of years")
     with pytest.raises(FileError, match="there is such a folder already"):
-        write_driver("mine", tmp_path)
+        write("driver", "mine", tmp_path)
     assert [file.name for file in (tmp_path / "mine").iterdir()] == ["work.txt"]
+
+
+@pytest.mark.parametrize("kind", ["experiment", "component"])
+def test_what_is_made_has_its_name_and_no_error(kind: str, tmp_path: Path) -> None:
+    folder = write(kind, "height-watch", tmp_path)
+    text = "".join(file.read_text() for file in folder.iterdir())
+    assert not re.search(f"my_?{kind}", text, re.IGNORECASE)
+    experiment = load(folder / "experiment.toml")
+    assert experiment.check() == []
+    assert experiment.name == "height_watch"
+    assert ("height_watch" in experiment.component_names) is (kind == "component")

@@ -11,20 +11,20 @@ from collections.abc import Mapping
 from typing import Any
 
 from afspm.drift.estimators.guarded import Guarded
-from afspm.drift.naming import ReadyMade, named
+from afspm.drift.naming import named
 from afspm.drift.registration import Estimator
 from afspm.errors import ConfigError
 
-__all__ = ["DEFAULT", "READY_MADE", "Guarded", "ReadyMade", "estimator"]
+__all__ = ["DEFAULT", "READY_MADE", "Guarded", "estimator"]
 
 DEFAULT = "least-squares"
 
-READY_MADE: Mapping[str, ReadyMade] = {
-    DEFAULT: ReadyMade("afspm.drift.estimators.least_squares.LeastSquares"),
-    "brief": ReadyMade("afspm.drift.estimators.features.Brief", "skimage", "features"),
-    "orb": ReadyMade("afspm.drift.estimators.features.Orb", "skimage", "features"),
-    "sift": ReadyMade("afspm.drift.estimators.features.Sift", "skimage", "features"),
-    "correlation": ReadyMade("afspm.drift.estimators.correlation.Correlation"),
+READY_MADE: Mapping[str, str] = {
+    DEFAULT: "afspm.drift.estimators.least_squares.LeastSquares",
+    "brief": "afspm.drift.estimators.features.Brief",
+    "orb": "afspm.drift.estimators.features.Orb",
+    "sift": "afspm.drift.estimators.features.Sift",
+    "correlation": "afspm.drift.estimators.correlation.Correlation",
 }
 
 

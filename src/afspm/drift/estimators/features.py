@@ -60,6 +60,7 @@ class Features:
     bend_max: float = 0.1
     seed: int = 0
     kind: ClassVar[str]
+    requires: ClassVar = ("afspm[features]",)
 
     def __post_init__(self) -> None:
         if self.transform not in FORMS:

@@ -11,7 +11,7 @@ from collections.abc import Mapping as Table
 from typing import Any
 
 from afspm.drift.estimators import estimator as default_estimator
-from afspm.drift.naming import ReadyMade, named
+from afspm.drift.naming import named
 from afspm.drift.registration import Estimator
 from afspm.drift.trackers.bank import BankTracker
 from afspm.drift.trackers.forecast import BankForecast
@@ -24,9 +24,9 @@ __all__ = ["DEFAULT", "READY_MADE", "BankTracker", "PaperTracker", "forecast_fro
 
 DEFAULT = "bank"
 
-READY_MADE: Table[str, ReadyMade] = {
-    DEFAULT: ReadyMade("afspm.drift.trackers.bank.BankTracker", "numpy"),
-    "paper": ReadyMade("afspm.drift.trackers.paper.PaperTracker", "numpy"),
+READY_MADE: Table[str, str] = {
+    DEFAULT: "afspm.drift.trackers.bank.BankTracker",
+    "paper": "afspm.drift.trackers.paper.PaperTracker",
 }
 _FORECASTS: Table[str, type[BankForecast] | type[PaperForecast]] = {
     kind.KIND: kind for kind in (BankForecast, PaperForecast)

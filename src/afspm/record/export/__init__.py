@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
@@ -34,7 +33,7 @@ def export(
 
     Raises:
         InvalidValue: there is no such format, or no such scan.
-        FileError: a file can't be read or written, or what it needs is not installed.
+        FileError: a file can't be read or written.
     """
     if to not in FORMATS:
         raise InvalidValue(f"there is no format {to!r}", hint=f"one of {', '.join(FORMATS)}")
@@ -44,8 +43,6 @@ def export(
             tell(f"scan {row.number} was interrupted before anything of it was seen")
     spectra = list(run.spectra) if scans is None else []
     wanted = [row for row in wanted if row.file]
-    if to == "png" and importlib.util.find_spec("matplotlib") is None:
-        raise FileError("pictures need matplotlib", hint='pip install "afspm[plot]"')
     module = import_module(f"afspm.record.export.{FORMATS[to]}")
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -78,9 +77,7 @@ def topography(scans: ScanSet) -> str:
 
 
 def draw(run: Run, story: RunStory, shown: Sequence[Small]) -> None:
-    """Draw the night and drift against time, where no component has, as far as matplotlib is there."""
-    if importlib.util.find_spec("matplotlib") is None:
-        return
+    """Draw the night and drift against time, where no component has."""
     if _is_ours(run.folder, OWN_NIGHT, NIGHT) and any(small.picture is not None for small in shown):
         from afspm.record import night_figure
 

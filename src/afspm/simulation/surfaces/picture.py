@@ -55,12 +55,8 @@ def read(path: Path) -> Heightmap:
 
 def read_picture(path: Path) -> Heightmap:
     """Any picture that pillow reads: bright is high, its top at large y."""
-    try:
-        from PIL import Image
-    except ImportError:
-        raise FileError(
-            "reading pictures needs pillow", where=str(path), hint="pip install afspm[simulation]"
-        ) from None
+    from PIL import Image
+
     with Image.open(path) as image:
         grey = image if image.mode in ("F", "I", "I;16", "L") else image.convert("L")
         return Heightmap(np.asarray(grey, dtype=np.float64)[::-1])

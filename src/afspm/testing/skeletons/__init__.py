@@ -7,15 +7,21 @@ from pathlib import Path
 
 from afspm.errors import ConfigError, FileError
 
-_MODULE, _CLASS = "my_scope", "MyScope"
+_NAMES = {
+    "driver": ("my_scope", "MyScope"),
+    "component": ("my_component", "MyComponent"),
+    "experiment": ("my_experiment", "MyExperiment"),
+}
+"""Of each kind, the module and the class that are called otherwise."""
 _SKIPPED = {"__pycache__", "__init__.pyc"}
 
 
-def write_driver(name: str, into: Path) -> Path:
-    """Write the package of a driver.
+def write(kind: str, name: str, into: Path) -> Path:
+    """Write a skeleton.
 
     Args:
-        name: of the package; "my-scope" becomes my_scope, with the class MyScope.
+        kind: "driver", "component" or "experiment".
+        name: of its folder; "my-scope" becomes my_scope, with the class MyScope.
 
     Returns:
         its folder, new in `into`.
@@ -29,15 +35,16 @@ def write_driver(name: str, into: Path) -> Path:
         raise ConfigError(f"{name!r} can't be the name of a package", hint="letters, digits and _, e.g. my_scope")
     class_name = "".join(part[:1].upper() + part[1:] for part in module.split("_"))
     target = into / module
-    source = Path(__file__).with_name("driver")
+    source = Path(__file__).with_name(kind)
+    own_module, own_class = _NAMES[kind]
     try:
         target.mkdir(parents=True)
         for file in sorted(source.rglob("*")):
             if file.is_file() and _SKIPPED.isdisjoint(file.parts):
-                written = target / str(file.relative_to(source)).replace(_MODULE, module)
+                written = target / str(file.relative_to(source)).replace(own_module, module)
                 written.parent.mkdir(parents=True, exist_ok=True)
                 text = file.read_text(encoding="utf-8")
-                written.write_text(text.replace(_MODULE, module).replace(_CLASS, class_name), encoding="utf-8")
+                written.write_text(text.replace(own_module, module).replace(own_class, class_name), encoding="utf-8")
     except FileExistsError:
         raise FileError("there is such a folder already", where=str(target), hint="choose another name") from None
     except OSError as error:

@@ -1,0 +1,36 @@
+"""MyComponent: say in a sentence what it decides."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from afspm import Component, Scan
+
+
+class MyComponent(Component):
+    """Tells how rough each scan is, and at the end which was the roughest.
+
+    Args:
+        channel: that it looks at.
+    """
+
+    listens = ("Scan2d",)
+
+    def __init__(self, channel: str = "Height") -> None:
+        self.channel = channel
+
+    def on_scan(self, scan: Scan) -> None:
+        if scan.channel != self.channel:
+            return
+        found = self.memory.setdefault("rms_nm", [])  # kept on disk: it survives a restart
+        found.append(1e9 * roughness(scan.values))
+        self.log.info("scan %d: %.2f nm rms", len(found), found[-1])
+
+    def on_end(self) -> None:
+        if found := self.memory.get("rms_nm"):
+            self.log.info("the roughest is scan %d: %.2f nm rms", int(np.argmax(found)) + 1, max(found))
+
+
+def roughness(heights_m: np.ndarray) -> float:
+    """Return the root mean square of the heights, in metres, once the median of each line is taken away."""
+    return float(np.nanstd(heights_m - np.nanmedian(heights_m, axis=1, keepdims=True)))
