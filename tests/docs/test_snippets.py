@@ -7,7 +7,8 @@ On each page, in the order of the page and in one empty folder:
 - other ```python blocks are executed, sharing their names;
 - other ```toml blocks must be TOML;
 - ```console blocks: each line after `$ ` is run by the shell and must succeed; the lines below must come in its output,
-  in this order, where … stands for anything. What two processes say (`… tiles … tile 1`) is in no order.
+  in this order, where … stands for anything. What two processes say (`… tiles … tile 1`) is in no order. An error that
+  the page does not show fails the test.
 
 Blocks of other kinds (```text, ```sh …) are only shown.
 """
@@ -32,6 +33,8 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((RO
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\((?!https?:|#|mailto:)([^)#]+)")
 PROCESS = re.compile(r"… (\w+) …")
+TROUBLE = ("ERROR", "Traceback", "Logging error")
+"""A page whose snippet says one of these without showing it would startle its reader."""
 FILE_NAME = re.compile(r"(?:#|//) ([\w./-]+\.(?:py|toml|proto))\n")
 
 
@@ -77,6 +80,8 @@ def run_console(text: str, folder: Path, where: str) -> None:
         )
         output = done.stdout + done.stderr
         assert done.returncode == 0, f"{where}: {command} failed:\n{output}"
+        for word in TROUBLE:
+            assert word in expected or word not in output, f"{where}: {word} in the output of {command}:\n{output}"
         ends: defaultdict[str, int] = defaultdict(int)
         for line in filter(None, map(str.strip, expected.splitlines())):
             pattern = ".*?".join(re.escape(piece) for piece in line.split("…"))
