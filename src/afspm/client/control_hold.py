@@ -7,15 +7,10 @@ from contextlib import contextmanager, nullcontext
 
 from afspm.client.experiment_link import ExperimentLink
 from afspm.errors import ControlLost, ExperimentEnded, NoResponse, Refused
-from afspm.model import ControlMode, ControlRequest, ControlResponse, Packet, Problem, ProblemNames
+from afspm.model import WAIT_FOR_CONTROL, ControlMode, ControlRequest, ControlResponse, Packet, Problem, ProblemNames
 from afspm.process.parent import StopRequested
 
 ASK_AGAIN_S = 10.0  # should a published control state ever not reach us
-_WAIT_FOR = {
-    ControlResponse.ALREADY_UNDER_CONTROL,
-    ControlResponse.WRONG_CONTROL_MODE,
-    ControlResponse.WRONG_EXP_PROBLEM,
-}
 
 
 class ControlHold:
@@ -153,7 +148,7 @@ class ControlHold:
             # the state that names us may have come before the answer
             self.held, self._was_named = True, link.view.control is not None and link.view.control.holder == link.name
             return None
-        if response.code not in _WAIT_FOR:
+        if response.code not in WAIT_FOR_CONTROL:
             raise Refused(response.code, response.reason or "control was refused", where=link.name)
         if solving and response.code == ControlResponse.WRONG_EXP_PROBLEM and not self._is_flagged(solving):
             raise ControlLost(f"{self._name(solving)} is not flagged: there is nothing to solve", where=link.name)

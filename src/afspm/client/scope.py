@@ -233,9 +233,17 @@ class Scope(ExperimentView):
         return self._control.held
 
     def flag(self, problem: int | str) -> None:
-        """Flag a problem, by name or number: control is taken from whoever has it, until the problem is cleared."""
+        """Flag a problem, by name or number: control is taken from its holder, until the problem is cleared.
+
+        Raises:
+            ExperimentEnded: it is over; the record says nevertheless that the problem was seen.
+        """
         number, states = self.problems.number(problem), self._link.view.count("ControlState")
-        self._tell(ControlRequest.ADD_EXP_PRBLM, number)
+        try:
+            self._tell(ControlRequest.ADD_EXP_PRBLM, number)
+        except ExperimentEnded:
+            self._link.send_only(ControlRequest.ADD_EXP_PRBLM, number)
+            raise
         self._flagged[number] = states
 
     def clear(self, problem: int | str) -> None:

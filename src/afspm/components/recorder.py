@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from afspm.record.store import RecordSettings
 
 REST_S = 0.5
-"""Real: for what is said of the end after it."""
+"""Shortest time, real, to stay after the end of the experiment: for what components say on their way out."""
+LONGEST_REST_S = 30.0
+"""Longest such time: until then the supervisor asks the recorder to leave, after the other components."""
 SIGNS_OF_LIFE = ("ControlState",)
 """What a recorder hears of a scheduler whose log it follows."""
 
@@ -71,7 +73,7 @@ class Recorder(Component):
             wake=lambda: port.wake_up(),  # of whichever is open then
         )
         writer.start()
-        until_s, is_to_ask_again = math.inf, False
+        ended_s, until_s, is_to_ask_again = math.inf, math.inf, False
         try:
             while (left_s := until_s - context.clock.monotonic_s()) > 0.0:
                 for incoming in port.poll(None if left_s == math.inf else left_s):
@@ -83,9 +85,12 @@ class Recorder(Component):
                         case PacketReceived() if not segments(log):  # a scheduler of version 1 keeps no log
                             heard, is_to_ask_again = None, True
                         case Killed():
-                            until_s = min(until_s, context.clock.monotonic_s() + REST_S)
+                            ended_s = min(ended_s, context.clock.monotonic_s())
+                            until_s = min(until_s, ended_s + LONGEST_REST_S)
+                        case ParentGone() if ended_s < math.inf:
+                            until_s = ended_s + REST_S
                         case ParentGone():
-                            writer.finish(ended=until_s < math.inf)
+                            writer.finish(ended=False)
                             return ExitCode.ORPHAN
                 writer.check()
                 if writer.wants_replay() or is_to_ask_again:

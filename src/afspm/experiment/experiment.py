@@ -34,6 +34,7 @@ class ProcessStart:
         folder: to start commands in: that of the experiment file.
         beats: whether it sends heartbeats; a command that does not (`heartbeats = false`) is only known by its exit.
         python_path: to be put before PYTHONPATH, so that modules beside the file are found.
+        leaves_last: whether it stays until the other components have ended, to record what they say at the end.
         hidden: environment variables that hold secrets of others.
     """
 
@@ -43,6 +44,7 @@ class ProcessStart:
     folder: Path
     python_path: tuple[str, ...]
     beats: bool = True
+    leaves_last: bool = False
     hidden: tuple[str, ...] = ()
 
 

@@ -12,6 +12,7 @@ from afspm.errors import ConfigError
 from afspm.experiment import limits_section
 from afspm.experiment.experiment import ProcessStart
 from afspm.experiment.findings import Finding, Level, nearest
+from afspm.experiment.implied_parts import RECORDS
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.toml_writer import SECRET
 from afspm.experiment.wiring import ProcessSockets
@@ -160,7 +161,8 @@ def _start(
         command = (sys.executable, *command[1:])
     folders = resolved.document.folders
     beats = process.part.own.get("heartbeats") is not False
-    return ProcessStart(launch, role, command, folders[0], tuple(map(str, folders)), beats, _hidden(resolved, process))
+    hidden, is_last = _hidden(resolved, process), process.says(RECORDS)
+    return ProcessStart(launch, role, command, folders[0], tuple(map(str, folders)), beats, is_last, hidden)
 
 
 def _hidden(resolved: ResolvedExperiment, process: ResolvedProcess) -> tuple[str, ...]:

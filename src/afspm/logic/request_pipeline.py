@@ -142,6 +142,8 @@ def authorise(draft: StateDraft, event: RequestIn) -> bool:
         control_change.answer_unless_ending(
             draft, event, ControlResponse.FAILURE, HAS_ENDED, ResponseDetail.EXPERIMENT_ENDED
         )
+        if kind == ControlRequest.ADD_EXP_PRBLM:  # seen too late to be flagged: the record is to show it
+            publishing.publish_entries(draft)
     elif kind == RESTART_REQUEST:
         publishing.order_restart(draft, event)
     elif kind == CLOCK_REQUEST:

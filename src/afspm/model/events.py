@@ -9,6 +9,7 @@ from enum import Enum, IntEnum
 from typing import Protocol
 
 from afspm.errors import InvalidValue
+from afspm.model.requests import WAIT_FOR_CONTROL, ControlRequest, ControlResponse
 from afspm.model.state import ControlMode
 
 PERSON = ":"
@@ -17,6 +18,7 @@ LONGEST_PROCESS_NAME = 100
 """In bytes: it is also the name of files, on every system."""
 LONGEST_NOTE = 1000
 """In characters."""
+_NOT_REFUSED = (None, ControlResponse.SUCCESS, ControlResponse.NO_RESPONSE, ControlResponse.NOT_FREE)
 _PROCESS_NAME = re.compile(r"\w([\w .+-]*[\w+-])?")
 
 
@@ -105,8 +107,12 @@ class JournalEntry:
 
     @property
     def refused(self) -> bool:
-        """True if it was asked for and not done."""
-        return bool(self.response)
+        """True if it was asked for, and the answer was no.
+
+        To wait for control or for a busy microscope, and to get no answer, is not to be refused.
+        """
+        waits = self.request == ControlRequest.REQUEST_CTRL and self.response in WAIT_FOR_CONTROL
+        return not waits and self.response not in _NOT_REFUSED
 
 
 @dataclass(frozen=True, slots=True)

@@ -65,6 +65,12 @@ class ControlResponse(IntEnum):
     ACTION_ERROR = 12
 
 
+WAIT_FOR_CONTROL = frozenset(
+    {ControlResponse.ALREADY_UNDER_CONTROL, ControlResponse.WRONG_CONTROL_MODE, ControlResponse.WRONG_EXP_PROBLEM}
+)
+"""Answers to a request for control that will be granted later: nothing was refused, the component waits."""
+
+
 class RescanKind(IntEnum):
     """Requests to a Rescanner; a message of ours."""
 

@@ -16,6 +16,7 @@ from afspm.errors import FileError, InvalidValue, WireError
 from afspm.model import (
     ControlState,
     Frame,
+    JournalEntries,
     JournalEntry,
     LogLine,
     Note,
@@ -147,14 +148,16 @@ class Run:
     @property
     def journal(self) -> Table[JournalEntry]:
         """Return requests with their answers, changes of control and orders; oldest first."""
-        rows = self._query("SELECT * FROM entries ORDER BY time_ns, rowid")
-        return Table((JournalEntry(*row) for row in rows), JournalEntry)
+        rows = self._query("SELECT payload FROM packets WHERE message = 'JournalEntries' ORDER BY time_ns, rowid")
+        published = (self._decoded("JournalEntries", payload) for (payload,) in rows)
+        entries = [entry for one in published if isinstance(one, JournalEntries) for entry in one.entries]
+        notes = (JournalEntry(*row) for row in self._query("SELECT * FROM entries WHERE kind = 'note' ORDER BY rowid"))
+        return Table(sorted((*entries, *notes), key=lambda entry: entry.time_ns), JournalEntry)
 
     @property
     def refusals(self) -> Table[JournalEntry]:
-        """Return the requests that were refused, with the reasons."""
-        rows = self._query("SELECT * FROM entries WHERE response > 0 ORDER BY time_ns, rowid")
-        return Table((JournalEntry(*row) for row in rows), JournalEntry)
+        """Return the requests that were refused, with the reasons; to wait for control is not to be refused."""
+        return self.journal.where(lambda entry: entry.refused)
 
     @property
     def control(self) -> Table[ControlRow]:

@@ -40,7 +40,8 @@ _LEVELS = logging.getLevelNamesMapping()
 _LATE_S = 0.005
 """How late a deadline may be noticed while messages come: to ask for the next one after each takes as long as some of
 them do."""
-_TELL = bytes([RELAY_REQUEST])
+_WRITTEN_DOWN_LATE = (bytes([RELAY_REQUEST]), bytes([ControlRequest.ADD_EXP_PRBLM]))
+"""Requests that are still written down after the end."""
 
 
 class SchedulerShell:
@@ -142,10 +143,10 @@ class SchedulerShell:
             self._sockets.link.send(0, [wire.CLOSE])
 
     def _asked_late(self, asked: RouterEvent) -> None:
-        """A supervisor says its last words, or who is still at work; all others hear that it is over."""
+        """Take the last words of a supervisor, and problems that were seen too late; answer that it is over."""
         if not isinstance(asked, PeerAsked) or not asked.frames:
             return
-        if asked.frames[0] == _TELL:
+        if asked.frames[0] in _WRITTEN_DOWN_LATE:
             self._request(asked)
             return
         ended = ResponseDetail.EXPERIMENT_ENDED

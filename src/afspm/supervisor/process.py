@@ -51,6 +51,7 @@ class Task:
     folder: Path | None = None
     environment: Mapping[str, str] = field(default_factory=dict)
     beats: bool = True
+    leaves_last: bool = False
     hidden: tuple[str, ...] = ()
 
     @property
@@ -75,6 +76,7 @@ def from_start(start: ProcessStart) -> Task:
         folder=start.folder if start.command else None,
         environment={**python_environment(), **({"PYTHONPATH": os.pathsep.join(before)} if before else {})},
         beats=start.beats,
+        leaves_last=start.leaves_last,
         hidden=start.hidden,
     )
 

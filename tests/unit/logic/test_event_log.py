@@ -63,6 +63,23 @@ def test_a_refusal_is_written_down_with_its_reason(lab: Lab) -> None:
     assert (entry.response, entry.reason) == (C.NOT_IN_CONTROL, "stranger is not in control, nobody is")
 
 
+@pytest.mark.parametrize("flagged", [True, False])
+def test_who_waits_for_control_is_not_refused(lab: Lab, flagged: bool) -> None:
+    if flagged:
+        lab.ask("judge", R.ADD_EXP_PRBLM, 1)
+    else:
+        lab.take_control("series")
+    lab.ask("grid", R.REQUEST_CTRL, 0)
+    entry = lab.entries()[-1]
+    assert entry.response in (C.WRONG_EXP_PROBLEM, C.ALREADY_UNDER_CONTROL)
+    assert not entry.refused
+
+
+@pytest.mark.parametrize(("code", "refused"), [(C.NOT_FREE, False), (C.NO_RESPONSE, False), (C.PARAM_ERROR, True)])
+def test_a_refusal_is_told_by_its_code(code: C, refused: bool) -> None:
+    assert JournalEntry(0, "request", "series", "start-scan", int(code), request=int(R.ACTION)).refused is refused
+
+
 def test_nothing_is_published_oftener_than_its_period_nor_without_having_happened(lab: Lab) -> None:
     lab.take_control("series")
     due_s = lab.core.deadline_s()

@@ -76,3 +76,11 @@ def test_what_a_supervisor_said_before_does_not_count_when_another_speaks(lab: L
 def test_a_scheduler_that_was_killed_at_the_end_stays_too(lab: Lab) -> None:
     again = Lab(state=lab.core.snapshot())
     assert again.core.leave_at_s == again.now_s + SHUTDOWN_GRACE_S
+
+
+def test_a_problem_that_is_seen_after_the_end_is_written_down_at_once(lab: Lab) -> None:
+    lab.entries()
+    lab.ask("judge", ControlRequest.ADD_EXP_PRBLM, 1)
+    (entry,) = lab.entries()
+    assert (entry.who, entry.problem, entry.refused) == ("judge", 1, True)
+    assert lab.core.state.control.problems == {}

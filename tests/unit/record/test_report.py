@@ -252,6 +252,20 @@ def test_times_of_more_than_a_day_have_the_day(tmp_path: Path) -> None:
     assert "2 · 2023-11-16 04:13:20" in text
 
 
+def test_a_problem_that_is_seen_after_the_end_is_told_and_is_no_refusal(run: Path) -> None:
+    store, flag = RecordStore(run, RecordSettings({})), model.ControlRequest.ADD_EXP_PRBLM
+    ended = model.JournalEntry(START, "control", "series", "ended", event=model.ControlEvent.EXPERIMENT_ENDED)
+    seen = [model.JournalEntry(START + n, "request", "judge", "flags", 1, request=flag, problem=1) for n in (1, 2)]
+    entries = model.JournalEntries((ended, *seen))
+    store.take([(model.Packet("JournalEntries", wire.encode(entries)[1], START + 5000 * S), "")])
+    store.flush()
+    store.close()
+    story = told(run)
+    assert [(one.who, story.problem_name(one)) for one in story.seen_late] == [("judge", "tip-shape-changed")]
+    assert "judge" not in [one.who for one in story.refusals]
+    assert "tip-shape-changed seen after the end" in write(run).read_text(encoding="utf-8")
+
+
 def test_time_is_shared_out(run: Path) -> None:
     shares = dict(told(run).shares(told(run).overview.controls))
     assert shares["corrector"] == 90 * S

@@ -18,11 +18,13 @@ class ChildSpec:
 
     Attributes:
         beats: whether it sends heartbeats; one that does not is only known by its exit.
+        leaves_last: whether it stays until the other components have ended, to record what they say at the end.
     """
 
     name: str
     role: Role = Role.COMPONENT
     beats: bool = True
+    leaves_last: bool = False
 
     @property
     def essential(self) -> bool:

@@ -295,10 +295,12 @@ class SupervisorCore:
                 child.life = None
 
     def _release_scheduler(self) -> None:
-        """Kill components that are frozen, and let the scheduler go once nobody needs it any more."""
+        """Kill components that are frozen; once all others have ended let the recorder go, then the scheduler."""
         left = [child for child in self.children.values() if child.life is not None]
+        recorders = [child for child in left if child.spec.leaves_last]
+        others = [child for child in left if child.spec.role is not Role.SCHEDULER and child not in recorders]
         for child in left:
-            if all(other.spec.role is Role.SCHEDULER for other in left):
+            if not others and child in (recorders or left):
                 self._command(ProcessAction.CLOSE_INPUT, child)
             elif self._may_be_rescued(child) and child.life and child.life.is_silent(self._now_s, self._liveness):
                 self._command(ProcessAction.KILL, child)

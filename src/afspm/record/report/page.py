@@ -116,6 +116,9 @@ def _problems(story: RunStory) -> str:
                 "<b>not solved</b>" if span.end_ns is None else _clock(story, end_ns),
             ]
         )
+    for entry in story.seen_late:
+        name = escape(story.problem_name(entry))
+        rows.append([name, _clock(story, entry.time_ns), escape(entry.who), "", "", "", "<b>seen after the end</b>"])
     return (
         _table(["problem", "flagged", "by", "in control meanwhile", "done to the tip", "for", "cleared"], rows)
         or "<p>None.</p>"

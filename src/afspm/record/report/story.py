@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from afspm.drawing.timeline import TimelineRow
-from afspm.model import JournalEntry, ProcessCondition, ScopeState, names
+from afspm.model import ControlEvent, ControlRequest, JournalEntry, ProcessCondition, ScopeState, names
 from afspm.record.overview import Overview, ProcessRestart
 from afspm.record.run import Run
 from afspm.record.run_lock import describe_state
@@ -42,6 +43,7 @@ class RunStory:
         problems: spans of all problems in the order of time.
         restarts, given_up: of processes.
         actions: what was done to the tip, e.g. pulses.
+        seen_late: the first request to flag each problem that was only noticed after the end.
     """
 
     name: str
@@ -59,10 +61,15 @@ class RunStory:
     given_up: Sequence[str]
     actions: Sequence[JournalEntry]
     notes: Sequence[NoteRow]
+    seen_late: Sequence[JournalEntry]
 
     @property
     def lasted_ns(self) -> int:
         return max(0, self.end_ns - self.start_ns)
+
+    def problem_name(self, entry: JournalEntry) -> str:
+        """Return the name of the problem that an entry is about."""
+        return self.overview.problems.name(entry.problem or 0)
 
     @property
     def interrupted(self) -> int:
@@ -97,7 +104,7 @@ class RunStory:
 
 def read(run: Run) -> RunStory:
     """Return the story of a run. Raises FileError: the record is damaged."""
-    overview, scans = run.overview(), run.scans
+    overview, scans, late = run.overview(), run.scans, _late_flags(run.journal)
     clock = run.facts.get("clock") or {}
     # the clock of a run that was resumed is that of its last part
     starts_ns = [*_first_ns(overview, scans), *([round(float(clock["start_s"]) * 1e9)] if clock else [])]
@@ -113,12 +120,19 @@ def read(run: Run) -> RunStory:
         overview=overview,
         scans=list(scans),
         spectra=len(run.spectra),
-        refusals=gathered(list(run.refusals)),
+        refusals=gathered([entry for entry in run.refusals if entry not in late]),
         restarts=list(overview.restarts),
         actions=[entry for entry in run.journal if entry.what in names.EXTENSION_ACTIONS and entry.response == 0],
         notes=list(run.notes),
+        seen_late=list({entry.problem: entry for entry in reversed(late)}.values()),
         given_up=[n for n, state in overview.processes.items() if state.condition is ProcessCondition.GIVEN_UP],
     )
+
+
+def _late_flags(journal: Iterable[JournalEntry]) -> list[JournalEntry]:
+    """Return the requests to flag a problem that came after the end."""
+    after_the_end = itertools.dropwhile(lambda entry: entry.event is not ControlEvent.EXPERIMENT_ENDED, journal)
+    return [entry for entry in after_the_end if entry.request == ControlRequest.ADD_EXP_PRBLM and entry.refused]
 
 
 def gathered(refusals: Sequence[JournalEntry]) -> list[Refusals]:
@@ -138,6 +152,7 @@ def sentence(story: RunStory) -> str:
         parts.append(_counted(story.spectra, "spectrum", "spectra"))
     flagged = Counter(span.label for span in story.problems)
     parts += [f"{name} flagged {_times(count)}" for name, count in flagged.items()]
+    parts += [f"{story.problem_name(entry)} seen after the end" for entry in story.seen_late]
     if story.restarts:
         parts.append(_counted(len(story.restarts), "restart", "restarts"))
     parts += [f"{name} given up" for name in story.given_up]

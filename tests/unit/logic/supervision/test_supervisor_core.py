@@ -228,3 +228,14 @@ def test_exits_are_described() -> None:
     assert describe_exit(-signal.SIGTERM) == "killed by SIGTERM"
     assert describe_exit(ExitCode.CONFIG) == "its settings can't work"
     assert describe_exit(3) == "exit code 3"
+
+
+def test_the_recorder_leaves_after_the_other_components_and_before_the_scheduler() -> None:
+    run = Run(*SPECS, ChildSpec("recorder", leaves_last=True))
+    run.beat(*run.pids)
+    run.exits("series", ExitCode.ENDED)
+    assert run.step(TimePassed()) == []
+    run.exits("scope", ExitCode.ENDED)
+    assert run.step(TimePassed()) == [(CLOSE, "recorder")]
+    run.exits("recorder", ExitCode.ENDED)
+    assert run.step(TimePassed()) == [(CLOSE, "scheduler")]
