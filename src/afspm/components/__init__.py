@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from afspm.components.recorder import Recorder as Recorder
     from afspm.components.rescanner import Rescanner as Rescanner
     from afspm.components.spectroscopy_grid import SpectroscopyGrid as SpectroscopyGrid
+    from afspm.components.survey import Survey as Survey
     from afspm.components.tip_classifier import TipClassifier as TipClassifier
     from afspm.components.tip_corrector import TipCorrector as TipCorrector
 
@@ -38,6 +39,7 @@ _MODULES = {
     "ScanList": "planned_scans",
     "ScanSeries": "planned_scans",
     "SpectroscopyGrid": "spectroscopy_grid",
+    "Survey": "survey",
     "TipClassifier": "tip_classifier",
     "TipCorrector": "tip_corrector",
 }

@@ -18,7 +18,7 @@ from afspm.model import Region, names
 from afspm.units import Angle, Duration, Length
 
 Pixels = tuple[int, int]
-_FRAME = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
+FRAME = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
 
 
 class PlannedScans(Component):
@@ -57,7 +57,7 @@ class PlannedScans(Component):
                 to_parameter(name, quantity, None)
             except (InvalidValue, UnitError) as error:
                 raise ConfigError(error.what, where=f"parameters.{name}", hint=error.hint) from error
-        self.needs_parameters = (*_FRAME, *self.parameters)
+        self.needs_parameters = (*FRAME, *self.parameters)
 
     def run(self) -> None:
         self._began_s = self.clock.now_s()

@@ -47,7 +47,7 @@ def _fill(scan: Scan, kind: str, axes: Any) -> None:
     span = value_range(scan.values)
     factor, unit = scale(max(abs(span.low), abs(span.high)), scan.unit)
     values, label = np.ma.masked_invalid(scan.values * factor), f"{scan.channel} / {unit}" if unit else scan.channel
-    look = {"cmap": _colours(), "vmin": span.low * factor, "vmax": span.high * factor}
+    look = {"cmap": gold(), "vmin": span.low * factor, "vmax": span.high * factor}
     if kind == "surface":
         axes.plot_surface(*np.meshgrid(x, y), values, **look)
         axes.set_zlabel(label)
@@ -58,23 +58,36 @@ def _fill(scan: Scan, kind: str, axes: Any) -> None:
         axes.set_facecolor("0.6")  # what was not measured, and behind contour lines
         axes.set_aspect("equal")
         axes.figure.colorbar(drawn, ax=axes, label=label)
-        _scale_bar(axes, scan.region.size_m, (x[0], y[0]), length)
+        draw_scale_bar(axes, scan.region.size_m, (x[0], y[0]), length)
     axes.set_xlabel(f"x / {length_unit}")
     axes.set_ylabel(f"y / {length_unit}")
 
 
-def _scale_bar(axes: Any, size_m: tuple[float, float], corner: tuple[float, float], length: float) -> None:
+def draw_scale_bar(
+    axes: Any, size_m: tuple[float, float], corner: tuple[float, float], length: float, *,
+    font: float | None = None, named: bool = True,
+) -> None:  # fmt: skip
+    """Draw a bar of round length into the lower left corner of a picture.
+
+    Args:
+        corner: where the picture begins in the axes.
+        length: a metre in the axes.
+        font: size of the label; None: matplotlib's.
+        named: with its length above it.
+    """
     bar_m = round_length_m(size_m[0] / 4.0)
     left, low = corner[0] + 0.05 * size_m[0] * length, corner[1] + 0.05 * size_m[1] * length
     for color, line in (("black", 6.0), ("white", 3.0)):
         axes.plot([left, left + bar_m * length], [low, low], color=color, linewidth=line, solid_capstyle="butt")
-    axes.text(
-        left, low + 0.025 * size_m[1] * length, typeset_length(bar_m), color="white", va="bottom",
-        bbox={"facecolor": "black", "alpha": 0.5, "pad": 1.5, "edgecolor": "none"},
-    )  # fmt: skip
+    if named:
+        axes.text(
+            left, low + 0.025 * size_m[1] * length, typeset_length(bar_m), color="white", va="bottom", fontsize=font,
+            bbox={"facecolor": "black", "alpha": 0.5, "pad": 1.5, "edgecolor": "none"},
+        )  # fmt: skip
 
 
-def _colours() -> Any:
+def gold() -> Any:
+    """Return the colours of heights as a colour map of matplotlib."""
     from matplotlib.colors import ListedColormap
 
     return ListedColormap(colour_map(PALETTES[0]) / 255.0)

@@ -52,24 +52,36 @@ def made_of(value: Any, where: str) -> Any:
 
 def find_class(path: str, where: str) -> type[Any]:
     """Return the class "package.module.Name". Raises ConfigError if there is none."""
-    module_name, _, class_name = path.rpartition(".")
+    class_ = find_object(path, where, "class")
+    if not isinstance(class_, type):
+        raise ConfigError(f"{path} is not a class", where=where)
+    return class_
+
+
+def find_object(path: str, where: str, what: str = "function") -> Any:
+    """Return the object "package.module.name". Raises ConfigError if there is none.
+
+    Args:
+        what: it should be, for the error.
+    """
+    module_name, _, name = path.rpartition(".")
     if not module_name:
-        raise ConfigError(f"{path!r} names no class", where=where, hint='write class = "module.Name"')
+        raise ConfigError(f"{path!r} names no {what}", where=where, hint=f'write {what} = "module.name"')
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         raise ConfigError(
-            f"the class {path} can't be imported: {error}", where=where, hint="is it installed, or on the path?"
+            f"the {what} {path} can't be imported: {error}", where=where, hint="is it installed, or on the path?"
         ) from error
-    class_ = getattr(module, class_name, None)
-    if not isinstance(class_, type):
-        near = difflib.get_close_matches(class_name, vars(module), n=1)
+    found = getattr(module, name, None)
+    if found is None:
+        near = difflib.get_close_matches(name, vars(module), n=1)
         raise ConfigError(
-            f"the module {module_name} has no class {class_name}",
+            f"the module {module_name} has no {what} {name}",
             where=where,
             hint=f"did you mean {near[0]!r}?" if near else "",
         )
-    return class_
+    return found
 
 
 def _check_settings(class_: type[Any], launch: Launch) -> None:

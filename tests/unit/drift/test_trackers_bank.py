@@ -357,7 +357,7 @@ def test_a_wide_scan_and_narrow_ones_in_it() -> None:
 def test_a_zoom_that_can_not_be_compared_with_the_overview_begins_a_row_of_its_own() -> None:
     """It is as far from the overview as it is, and to scan it again would not change that."""
     world = World(night(4))
-    following = BankTracker(world)
+    following = BankTracker(world, sr_norm_min=0.25)
     following.add(scan_at(FRAME_S, pixels=16, key="overview"))
     asked, updates = [], []
     plain = world.register

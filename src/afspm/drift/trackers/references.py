@@ -55,7 +55,7 @@ class Choice:
     anchors: int = 8
     most_bytes: int = 256_000_000
     overlap_min: float = 0.3
-    sr_norm_min: float = 0.25
+    sr_norm_min: float = 0.05
     stale_after: int = 3
     alike: float = 0.6
 

@@ -1,0 +1,250 @@
+"""`Survey`: a wide scan, the targets found in it, and a zoom and curves at each."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from afspm.client.component import Component
+from afspm.client.keyed_results import check_key
+from afspm.components.planned_scans import FRAME, Pixels, pair
+from afspm.components.scan_plan import XY, ScanPlan
+from afspm.components.target_finder import TargetFinder
+from afspm.errors import ConfigError, Refused
+from afspm.formatting import lengths_text, position_text
+from afspm.model import Region, Scan, ScanSet, names
+from afspm.storage.atomic import OutageLog
+from afspm.survey.record import Outcome, SurveyRecord, Visit
+from afspm.survey.targets import Target, lowest_beside
+from afspm.units import Angle, Length
+
+
+class Survey(Component):
+    """Takes a wide scan, finds targets in it, takes a zoom of each and curves on and beside it.
+
+    It leaves a table in the run folder (number, position, height, outcome, files of zoom and curves) and a picture:
+    the survey with its numbered targets, their zooms and curves. A target whose zoom or curve is refused, by a limit
+    for instance, is in the table with the reason, and the next one follows. With a Drift Compensated Scheduler the
+    positions are those of the sample.
+
+    Whatever is killed, and whenever, each scan and each curve is taken once. When the experiment ends early the table
+    and the picture hold what there is. Finding particles needs scikit-image (`pip install "afspm[features]"`), the
+    picture matplotlib (`pip install "afspm[plot]"`).
+
+    Args:
+        size: (width, height) of the survey, or one length for both.
+        zoom: (width, height) of each zoom, or one length for both.
+        curves: by name, where curves are taken: a pair is an offset (x, y) from the target, a length the distance at
+            which the zoom is lowest, 0 the target itself, e.g. {top = "0 nm", beside = "150 nm"}.
+        kind: of the curves, where the microscope can choose, e.g. "IV" or "force".
+        count: the most targets that are visited.
+        center: (x, y) of the middle of the survey.
+        angle: of survey and zooms, counter-clockwise.
+        pixels: (columns, rows) of the survey.
+        zoom_pixels: (columns, rows) of each zoom.
+        channel: that targets are found in.
+        min_height: of a particle above the ground around it; by default six times the noise.
+        separation: of two particles that are nearer to each other only the higher counts; by default half a zoom.
+        targets: a function of yours that finds targets instead of particles, e.g. "my_module.corners": it is given the
+            `Scan`, and returns positions (x, y) in metres, the best first.
+        refine: whether a target is found again in its zoom, so that curves are taken where it is there.
+        parameters: set before the survey, e.g. {scan-speed = "10 um/s"}.
+        zoom_parameters: set before the zooms.
+        end_when_done: whether to end the whole experiment after the last target.
+        file: name of the table and of the picture in the run folder, without `.csv` and `.png`.
+    """
+
+    needs_actions: tuple[str, ...] = (names.START_SCAN,)
+    _outage = OutageLog("the table of targets can't be written", logging.getLogger("afspm.records"))
+
+    def __init__(
+        self,
+        size: Length | tuple[Length, Length],
+        zoom: Length | tuple[Length, Length],
+        curves: dict[str, Length | tuple[Length, Length]] | None = None,
+        kind: str | None = None,
+        count: int = 10,
+        center: tuple[Length, Length] = (0.0, 0.0),
+        angle: Angle = 0.0,
+        pixels: Pixels = (128, 128),
+        zoom_pixels: Pixels = (128, 128),
+        channel: str = "Height",
+        min_height: Length | None = None,
+        separation: Length | None = None,
+        targets: str | None = None,
+        refine: bool = True,
+        parameters: dict[str, str | float] | None = None,
+        zoom_parameters: dict[str, str | float] | None = None,
+        end_when_done: bool = False,
+        file: str = "targets",
+    ) -> None:
+        self._wide = _ScanSetup(Region(pair(center), _both(size), angle), _shape(pixels), dict(parameters or {}))
+        self._closer = _ScanSetup(
+            Region((0.0, 0.0), _both(zoom), angle), _shape(zoom_pixels), dict(zoom_parameters or {})
+        )
+        self.plan = ScanPlan((self._wide.region,), self._wide.shape)  # the part that `afspm check` can look at
+        half_m = min(self._closer.region.size_m) / 2
+        self.curves = {name: _place(name, place, half_m) for name, place in (curves or {}).items()}
+        self.kind, self.channel, self.end_when_done, self.file = kind, channel, end_when_done, file
+        if targets is not None:
+            for name, value in {"min_height": min_height, "separation": separation}.items():
+                if value is not None:
+                    raise ConfigError("is of particles, and says nothing of `targets`", where=name)
+        if count < 1:
+            raise ConfigError(f"{count} targets are none", where="count")
+        separation_m = half_m if separation is None else separation
+        self.finder = TargetFinder(targets, count, min_height, separation_m, min(self._wide.region.size_m), refine)
+        self._record: SurveyRecord | None = None
+        self._needs(dict.fromkeys((*self._wide.parameters, *self._closer.parameters)))
+
+    def _needs(self, parameters: Iterable[str]) -> None:
+        probe: tuple[str, ...] = ()
+        if self.curves:
+            self.needs_actions = (names.START_SCAN, names.START_SPEC)
+            probe = (names.PROBE_POS_X, names.PROBE_POS_Y, *((names.SPEC_KIND,) if self.kind else ()))
+        self.needs_parameters = (*FRAME, *probe, *parameters)
+
+    def check(self) -> None:
+        """Raise ConfigError: the function is not there, or a library that is needed."""
+        self.finder.check()
+
+    def run(self) -> None:
+        self._set(self._wide.parameters)
+        survey = self._channel(self.scope.scan(self._wide.region, shape=self._wide.shape, key="survey"))
+        self._record = SurveyRecord(survey, self._targets(survey), tuple(self.curves))
+        self._keep(self._record)
+        visits = self._record.visits
+        self._set(self._closer.parameters if visits else {})
+        for visit in visits:
+            self._visit(visit)
+            self._keep(self._record)
+            self.scope.progress(visit.number, len(visits))
+            self._tell(visit, self._record.outcome(visit))
+        if self.end_when_done:
+            self.scope.end_experiment()
+
+    def on_end(self) -> None:
+        if self._record is None:
+            self.log.warning("no survey was taken: there is no table and no picture")
+            return
+        self._keep(self._record)
+        path = Path(self.run_dir) / f"{self.file}.png"
+        try:
+            self._record.draw(path, title=self.name, simulated=self.simulated)
+        except ImportError:
+            self.log.error('no picture without matplotlib: pip install "afspm[plot]"')
+            return
+        self.log.info("the survey is drawn: %s", path)
+
+    def _set(self, parameters: Mapping[str, str | float]) -> None:
+        if parameters:
+            with self.clock.late(), self.scope.control():
+                for name, quantity in parameters.items():
+                    self.scope.set(name, quantity)
+
+    def _targets(self, survey: Scan) -> list[Target]:
+        """Return the targets, in every life the same: a function of the user's may leave some to chance."""
+        if "targets" not in self.memory:
+            with self.clock.late():
+                found = self.finder.targets(survey)
+            self.memory["targets"] = [[*target.position_m, target.height] for target in found]
+            self.memory.save()
+            if found:
+                self.log.info("%d targets found", len(found))
+            else:
+                self.log.warning("no target found in the survey: nothing is zoomed")
+        return [Target((x, y), height) for x, y, height in self.memory["targets"]]
+
+    def _visit(self, visit: Visit) -> None:
+        """Take the zoom and the curves of a target; what is refused is noted."""
+        region = self._closer.region.moved_to(visit.target.position_m)
+        try:
+            scans = self.scope.scan(region, shape=self._closer.shape, key=f"zoom-{visit.number}")
+        except Refused as refused:
+            visit.refusals.append(f"zoom: {refused.reason}")
+            return
+        visit.zoom = self._channel(scans)
+        visit.center_m = self._center(visit, visit.zoom)
+        for name, place in self.curves.items():
+            at_m = place.of(visit.center_m, visit.zoom)
+            try:
+                key = f"{name}-{visit.number}"
+                visit.curves[name] = self.scope.spectrum(at_m, kind=self.kind, key=f"curve-{key}")
+            except Refused as refused:
+                visit.refusals.append(f"{name}: {refused.reason}")
+
+    def _center(self, visit: Visit, zoom: Scan) -> XY:
+        """Return where the target lies in its zoom, in every life the same."""
+        centers = self.memory.setdefault("centers", {})
+        if str(visit.number) not in centers:
+            with self.clock.late():
+                centers[str(visit.number)] = list(self.finder.again(zoom, visit.target))
+            self.memory.save()
+        return pair(centers[str(visit.number)])
+
+    def _channel(self, scans: ScanSet) -> Scan:
+        if self.channel not in scans:
+            raise ConfigError(
+                f"the microscope records no channel {self.channel!r}",
+                where="channel",
+                hint=f"one of {', '.join(scans)}",
+            )
+        return scans[self.channel]
+
+    def _keep(self, record: SurveyRecord) -> None:
+        """Write the table; where that can't be, on a full disk, it is said, and the next target tries again."""
+        with self._outage.trying():
+            record.write(Path(self.run_dir) / f"{self.file}.csv")
+
+    def _tell(self, visit: Visit, outcome: Outcome) -> None:
+        where, of = position_text(visit.center_m), len(self._record.visits) if self._record else 0
+        if outcome is Outcome.REFUSED:
+            self.log.warning("target %d of %d at %s refused: %s", visit.number, of, where, "; ".join(visit.refusals))
+        else:
+            self.log.info("target %d of %d at %s measured", visit.number, of, where)
+
+
+@dataclass(frozen=True)
+class _ScanSetup:
+    """A region with its pixels as (rows, columns), and the parameters that are set before it is scanned."""
+
+    region: Region
+    shape: tuple[int, int]
+    parameters: dict[str, str | float]
+
+
+@dataclass(frozen=True)
+class _CurvePlace:
+    """Where a curve is taken: at an offset from the target, or at a distance where its zoom is lowest."""
+
+    offset_m: XY
+    distance_m: float = 0.0
+
+    def of(self, center_m: XY, zoom: Scan) -> XY:
+        if self.distance_m:
+            return lowest_beside(zoom, center_m, self.distance_m)
+        return center_m[0] + self.offset_m[0], center_m[1] + self.offset_m[1]
+
+
+def _place(name: str, place: float | Sequence[float], half_zoom_m: float) -> _CurvePlace:
+    check_key(f"curve-{name}-1")
+    if not isinstance(place, int | float):
+        return _CurvePlace(pair(place))
+    if not 0.0 <= place < half_zoom_m:
+        raise ConfigError(
+            f"a curve {lengths_text([place])} beside the target lies outside its zoom",
+            where=f"curves.{name}",
+            hint=f"at most {lengths_text([half_zoom_m])}, or an offset as a pair",
+        )
+    return _CurvePlace((0.0, 0.0), place)
+
+
+def _both(length: float | Sequence[float]) -> XY:
+    return (float(length), float(length)) if isinstance(length, int | float) else pair(length)
+
+
+def _shape(pixels: Sequence[int]) -> tuple[int, int]:
+    columns, rows = pixels
+    return int(rows), int(columns)

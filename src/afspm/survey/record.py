@@ -1,0 +1,108 @@
+"""The record of a survey: its targets and what was measured at each, as a table and a picture."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+
+from afspm.model import Scan, Spectrum
+from afspm.model.geometry import XY
+from afspm.storage.atomic import write_atomic
+from afspm.survey.targets import Target
+
+
+class Outcome(Enum):
+    """What became of a target."""
+
+    MEASURED = "measured"
+    REFUSED = "refused"
+    """All of it or a part: the reason says why."""
+    INCOMPLETE = "incomplete"
+    """The survey ended before the last curve."""
+    NOT_REACHED = "not-reached"
+
+
+@dataclass(eq=False)
+class Visit:
+    """A target and what was measured at it.
+
+    Attributes:
+        number: counts from 1, in the order of the targets.
+        center_m: (x, y) that curves are taken relative to: where the survey shows the target, or its zoom.
+        zoom: None: it was not taken, or not yet.
+        curves: by their names.
+        refusals: why something was refused.
+    """
+
+    number: int
+    target: Target
+    center_m: XY
+    zoom: Scan | None = None
+    curves: dict[str, Spectrum] = field(default_factory=dict)
+    refusals: list[str] = field(default_factory=list)
+
+
+class SurveyRecord:
+    """A wide scan, and a visit for each target in it.
+
+    Args:
+        survey: the wide scan.
+        targets: in the order in which they are visited.
+        curves: the names of the curves of each target.
+
+    Attributes:
+        visits: one for each target; fill them in as they are measured.
+    """
+
+    def __init__(self, survey: Scan, targets: Sequence[Target], curves: Sequence[str] = ()) -> None:
+        self.survey = survey
+        self.curves = tuple(curves)
+        self.visits = [Visit(number, target, target.position_m) for number, target in enumerate(targets, start=1)]
+
+    def outcome(self, visit: Visit) -> Outcome:
+        """Return what became of a target."""
+        if visit.refusals:
+            return Outcome.REFUSED
+        if visit.zoom is None:
+            return Outcome.NOT_REACHED
+        return Outcome.MEASURED if visit.curves.keys() >= set(self.curves) else Outcome.INCOMPLETE
+
+    def write(self, path: str | Path) -> None:
+        """Write the table: a row for each target, with the controller's files of its zoom and curves.
+
+        Raises:
+            OSError: the disk is full …
+        """
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows(self._rows())
+        write_atomic(Path(path), [text.getvalue().encode()])
+
+    def draw(self, path: str | Path, *, title: str = "", simulated: bool = False) -> None:
+        """Draw the survey with its numbered targets, their zooms and their curves (needs the extra `plot`).
+
+        Args:
+            path: of the picture; its ending names the format.
+            simulated: written on it, so that the picture is not taken for a measurement.
+        """
+        from afspm.survey.figure import draw
+
+        draw(self, Path(path), title=title, simulated=simulated)
+
+    def _rows(self) -> Iterator[list[str]]:
+        yield ["number", "x", "y", "length_units", "height", "height_units", "outcome", "reason", "zoom", *self.curves]
+        for visit in self.visits:
+            height = visit.target.height
+            yield [
+                str(visit.number),
+                *(f"{value:.9g}" for value in visit.center_m),
+                "m",
+                *(("", "") if height is None else (f"{height:.6g}", self.survey.unit)),
+                self.outcome(visit).value,
+                "; ".join(visit.refusals),
+                visit.zoom.filename if visit.zoom else "",
+                *(visit.curves[name].filename if name in visit.curves else "" for name in self.curves),
+            ]
