@@ -10,7 +10,9 @@ from afspm.clock import NS_PER_S
 
 _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"),
              (1e-12, "p"), (1e-15, "f"))  # fmt: skip
-PREFIXABLE = frozenset({"m", "V", "A", "s", "N", "Hz", "W", "F", "m/s", "m/V", "V/m", "C", "Pa", "Ohm", "Ω", "T", "g"})
+PREFIXABLE = frozenset(
+    {"m", "V", "A", "s", "N", "Hz", "W", "F", "m/s", "m/V", "V/m", "C", "S", "Pa", "Ohm", "Ω", "T", "g"}
+)
 _LENGTHS = ((1e-3, "mm"), (1e-6, "um"), (1e-9, "nm"), (1e-12, "pm"))
 
 

@@ -12,8 +12,10 @@ from afspm.drawing.curves import Array, round_ticks, thinned
 from afspm.formatting import scale
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 8.0, 8.0, 34.0
-_MOST_POINTS = 300
-_FAINT = 0.25
+_MOST_POINTS = 200
+Size = tuple[int, int]
+FORWARD, BACKWARD = "#c2571a", "#3f7fc4"
+"""Colours that can be told apart on white and on black."""
 
 
 @dataclass(frozen=True)
@@ -48,22 +50,25 @@ class Axis:
 
 @dataclass(frozen=True)
 class Curve:
-    """One curve; `style` is a class of SVG shapes: "faint" for one of many, else "curve"."""
+    """One curve; `opacity` below 1: one of many, drawn thin. An empty colour is that of the text."""
 
     x: Array
     y: Array
-    style: str = "curve"
+    colour: str = FORWARD
+    opacity: float = 1.0
 
 
-def chart(
-    x: Axis,
-    y: Axis,
-    curves: Sequence[Curve],
-    *,
-    band: tuple[Array, Array, Array] | None = None,
-    size: tuple[int, int] = (320, 210),
-) -> str:
-    """Return curves in a frame; `band` is (x, low, high) of a filled area behind them."""
+@dataclass(frozen=True)
+class Band:
+    """An area between two curves, behind all others."""
+
+    x: Array
+    low: Array
+    high: Array
+
+
+def chart(x: Axis, y: Axis, curves: Sequence[Curve], band: Band | None = None, size: Size = (320, 210)) -> str:
+    """Return curves in a frame."""
     width, height = size
     drawn = [] if band is None else [_band(x, y, band, size)]
     drawn += [_line(x, y, curve, size) for curve in curves]
@@ -74,29 +79,29 @@ def chart(
     )
 
 
-def _line(x: Axis, y: Axis, curve: Curve, size: tuple[int, int]) -> str:
-    faint = f' opacity="{_FAINT}"' if curve.style == "faint" else ""
-    colour, wide = ("currentColor", 0.6) if faint else ("#c2571a", 1.6)
-    points = _places(x, y, *thinned(curve.x, curve.y, _MOST_POINTS), size)
-    stroke = f'stroke="{colour}" stroke-width="{wide}"{faint}'
-    return f'<polyline class="{curve.style}" fill="none" {stroke} points="{points}"/>'
+def _line(x: Axis, y: Axis, curve: Curve, size: Size) -> str:
+    is_thin = curve.opacity < 1.0
+    look = f' stroke-width="0.7" opacity="{curve.opacity:.2g}"' if is_thin else ' stroke-width="1.6"'
+    points = _places(x, y, *thinned(curve.x, curve.y, _MOST_POINTS // 2 if is_thin else _MOST_POINTS), size)
+    look += ' vector-effect="non-scaling-stroke"'
+    return f'<polyline fill="none" stroke="{curve.colour or "currentColor"}"{look} points="{points}"/>'
 
 
-def _band(x: Axis, y: Axis, band: tuple[Array, Array, Array], size: tuple[int, int]) -> str:
-    step = max(1, len(band[0]) // _MOST_POINTS)
-    across, low, high = (values[::step] for values in band)
+def _band(x: Axis, y: Axis, band: Band, size: Size) -> str:
+    step = max(1, len(band.x) // _MOST_POINTS)
+    across, low, high = (values[::step] for values in (band.x, band.low, band.high))
     there, back = _places(x, y, across, low, size), _places(x, y, across[::-1], high[::-1], size)
-    return f'<polygon fill="#c2571a" fill-opacity="0.22" points="{there} {back}"/>'
+    return f'<polygon fill="{FORWARD}" fill-opacity="0.22" points="{there} {back}"/>'
 
 
-def _places(x: Axis, y: Axis, across: Array, up: Array, size: tuple[int, int]) -> str:
+def _places(x: Axis, y: Axis, across: Array, up: Array, size: Size) -> str:
     known = np.isfinite(across) & np.isfinite(up)
     left = x.at(across[known], _LEFT, size[0] - _RIGHT)
     top = y.at(up[known], size[1] - _BOTTOM, _TOP)
     return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(left, top, strict=True))
 
 
-def _frame(x: Axis, y: Axis, size: tuple[int, int]) -> str:
+def _frame(x: Axis, y: Axis, size: Size) -> str:
     right, bottom = size[0] - _RIGHT, size[1] - _BOTTOM
     (x_factor, x_label), (y_factor, y_label) = x.scaled, y.scaled
     made = [

@@ -10,11 +10,11 @@ from html import escape
 import numpy as np
 
 from afspm.drawing.palette import PALETTES, colour_map
-from afspm.drawing.raster import Array, ValueRange, indices, png, value_range
+from afspm.drawing.raster import Array, ValueRange, indices, png, reduced, value_range, webp
 from afspm.formatting import quantity, scale, typeset_length
 
 _LABEL = "font:11px/1.2 system-ui,sans-serif;white-space:nowrap"
-_SHADOW = "text-shadow:0 0 2px #000,0 0 2px #000"
+_PILL = "background:rgba(0,0,0,.55);padding:0 3px;border-radius:2px"
 
 
 @dataclass(frozen=True)
@@ -22,27 +22,29 @@ class Shown:
     """Values as a picture.
 
     Attributes:
-        png: the picture, y upwards.
+        image: a PNG or WebP, y upwards.
         span: the values at the ends of the colours.
-        shape: (rows, columns) of the picture.
     """
 
-    png: bytes
+    image: bytes
     span: ValueRange
-    shape: tuple[int, int]
 
 
-def shown(values: Array, largest_px: int, palette: str = PALETTES[0]) -> Shown:
-    """Return values [y, x], y ascending, as a picture of at most `largest_px` a side: every second, third … pixel."""
-    step = max(1, -(-max(values.shape) // largest_px))
-    some = values[::step, ::step]
+def shown(values: Array, largest_px: int, palette: str = PALETTES[0], *, small: bool = False) -> Shown:
+    """Return values [y, x], y ascending, as a picture of at most `largest_px` a side.
+
+    Args:
+        small: a file of few bytes counts for more than exact colours.
+    """
+    some = reduced(values, largest_px)
     span = value_range(some)
-    return Shown(png(indices(some, span), palette), span, (some.shape[0], some.shape[1]))
+    return Shown((webp if small else png)(indices(some, span), palette), span)
 
 
 def data_url(image: bytes) -> str:
-    """Return a PNG as an address that needs no file."""
-    return f"data:image/png;base64,{base64.b64encode(image).decode()}"
+    """Return a PNG or WebP as an address that needs no file."""
+    kind = "webp" if image.startswith(b"RIFF") else "png"
+    return f"data:image/{kind};base64,{base64.b64encode(image).decode()}"
 
 
 def image_html(image: Shown, size_m: tuple[float, float], unit: str, width: str, palette: str = PALETTES[0]) -> str:
@@ -50,7 +52,7 @@ def image_html(image: Shown, size_m: tuple[float, float], unit: str, width: str,
     return (
         f'<div style="display:flex;gap:6px"><div style="position:relative;width:{width}">'
         f'<img alt="" style="display:block;width:100%;image-rendering:pixelated;'
-        f'aspect-ratio:{size_m[0] / size_m[1]:.5g}" src="{data_url(image.png)}"/>{scale_bar(size_m)}</div>'
+        f'aspect-ratio:{size_m[0] / size_m[1]:.5g}" src="{data_url(image.image)}"/>{scale_bar(size_m)}</div>'
         f"{_colour_bar(image.span, unit, palette)}</div>"
     )
 
@@ -66,8 +68,8 @@ def scale_bar(size_m: tuple[float, float]) -> str:
     length_m = round_length_m(size_m[0] / 3.0)
     return (
         f'<div style="position:absolute;left:4%;bottom:4%;width:{100.0 * length_m / size_m[0]:.3g}%">'
-        f'<span style="{_LABEL};color:#fff;{_SHADOW}">{escape(typeset_length(length_m))}</span>'
-        f'<div style="height:3px;background:#fff;outline:1px solid #000"></div></div>'
+        f'<span style="{_LABEL};color:#fff;{_PILL}">{escape(typeset_length(length_m))}</span>'
+        f'<div style="height:3px;margin-top:2px;background:#fff;outline:1px solid #000"></div></div>'
     )
 
 

@@ -20,6 +20,9 @@ class Levelling(Enum):
     """Of each line, the straight line along the fast axis that fits best."""
     MEDIANS = "medians"
     """Of each line, its median."""
+    DIFFERENCES = "differences"
+    """Of each line, the median of its differences from the line before, added up: features longer than half a line
+    do no harm."""
 
 
 def levelled(values: Array, how: Levelling) -> Array:
@@ -70,4 +73,17 @@ def _medians(values: Array, finite: NDArray[np.bool_]) -> Array:
     return medians
 
 
-_BACKGROUNDS = {Levelling.PLANE: _plane, Levelling.LINES: _lines, Levelling.MEDIANS: _medians}
+def _differences(values: Array, finite: NDArray[np.bool_]) -> Array:
+    some = finite.any(axis=1)  # the line before is the last that has values
+    known, there = np.where(finite, values, 0.0)[some], finite[some]
+    offsets = np.zeros((len(values), 1))
+    offsets[some] = np.cumsum([[0.0], *_medians(np.diff(known, axis=0), there[1:] & there[:-1])], axis=0)
+    return offsets
+
+
+_BACKGROUNDS = {
+    Levelling.PLANE: _plane,
+    Levelling.LINES: _lines,
+    Levelling.MEDIANS: _medians,
+    Levelling.DIFFERENCES: _differences,
+}

@@ -6,16 +6,21 @@ import io
 from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drawing.palette import LEVELS, PALETTES, UNMEASURED, colour_map
 
+if TYPE_CHECKING:
+    from PIL import Image
+
 Array = NDArray[np.float64]
 _SAMPLED = 65_536  # values that the range is found from, of a larger picture evenly chosen ones
 _OUTLIERS_PERCENT = 0.5
 _FAST = 1  # of zlib: pictures are made by the dozen, and looked at once
+_QUALITY = 80
 
 
 class Contrast(Enum):
@@ -69,21 +74,41 @@ def indices(values: Array, span: ValueRange) -> NDArray[np.uint8]:
 
 def png(levels: NDArray[np.uint8], palette: str = PALETTES[0]) -> bytes:
     """Return indices [y, x], y ascending, as a PNG with the highest y on top; UNMEASURED is transparent."""
+    written = io.BytesIO()
+    opacity = b"\xff" * LEVELS + b"\0"
+    _image(levels, palette).save(written, "PNG", compress_level=_FAST, transparency=opacity)
+    return written.getvalue()
+
+
+def webp(levels: NDArray[np.uint8], palette: str = PALETTES[0]) -> bytes:
+    """Return the same in a third of the bytes, where exact colours don't matter."""
+    written = io.BytesIO()
+    image = _image(levels, palette)
+    image.info["transparency"] = UNMEASURED
+    image.convert("RGBA").save(written, "WEBP", quality=_QUALITY)
+    return written.getvalue()
+
+
+def reduced(values: Array, largest_px: int) -> Array:
+    """Return the means of squares of pixels, so that at most `largest_px` a side are left; NaN counts for nothing."""
+    step = max(1, -(-max(values.shape) // largest_px))
+    if step == 1:
+        return values
+    across, along = (min(step, count) for count in values.shape)  # a few long lines are not put together
+    rows, columns = values.shape[0] // across, values.shape[1] // along
+    blocks = values[: rows * across, : columns * along].reshape(rows, across, columns, along)
+    measured = np.isfinite(blocks)
+    count = measured.sum(axis=(1, 3))
+    total = np.where(measured, blocks, 0.0).sum(axis=(1, 3))
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _image(levels: NDArray[np.uint8], palette: str) -> Image.Image:
     from PIL import Image
 
     picture = Image.fromarray(np.ascontiguousarray(levels[::-1]), "L")
     picture.putpalette(_table(palette))
-    written = io.BytesIO()
-    opacity = b"\xff" * LEVELS + b"\0"
-    picture.save(written, "PNG", compress_level=_FAST, transparency=opacity)
-    return written.getvalue()
-
-
-def picture(values: Array, largest_px: int = 256) -> bytes:
-    """Return values [y, x], y ascending, as a PNG of at most `largest_px` a side: every second, third … is shown."""
-    step = max(1, -(-max(values.shape) // largest_px))
-    some = values[::step, ::step]
-    return png(indices(some, value_range(some)))
+    return picture
 
 
 @lru_cache(16)

@@ -18,7 +18,8 @@ _DAY_S = _STEPS_S[-1]
 CSS = """
 .lanes{display:grid;gap:3px}
 .lane,.lane-axis{display:grid;grid-template-columns:130px minmax(0,1fr);align-items:center;gap:8px}
-.lane b{font-weight:500;font-size:12.5px;text-align:right;overflow:hidden;text-overflow:ellipsis;white-space:nowrap}
+.lane b,.lane-axis b{font-weight:500;font-size:12.5px;text-align:right}
+.lane b{overflow:hidden;text-overflow:ellipsis;white-space:nowrap}
 .lane>div{position:relative;height:17px;background:var(--lane);border-radius:2px;overflow:hidden}
 .lane span{position:absolute;top:0;bottom:0;min-width:1px;background:var(--quiet);overflow:hidden}
 .lane span.marked{min-width:6px;border-radius:3px;background:currentColor}
@@ -65,8 +66,20 @@ class Stretch:
     count: int = 1
 
 
-def timeline_html(rows: Iterable[TimelineRow], begin_ns: int | None, end_ns: int, zone: tzinfo | None = None) -> str:
-    """Return rows from `begin_ns` (None: from the first interval on) to `end_ns`, with an axis of times of day."""
+def timeline_html(
+    rows: Iterable[TimelineRow],
+    begin_ns: int | None,
+    end_ns: int,
+    zone: tzinfo | None = None,
+    *,
+    local_too: bool = False,
+) -> str:
+    """Return rows from `begin_ns` (None: from the first interval on) to `end_ns`, with an axis of times of day.
+
+    Args:
+        zone: of the axis; None: this computer's.
+        local_too: whether there is a second axis with the times of this computer's zone.
+    """
     read = [(row, tuple(row.spans)) for row in rows]
     starts = [spans[0].start_ns for _, spans in read if spans]
     if not starts:
@@ -74,12 +87,20 @@ def timeline_html(rows: Iterable[TimelineRow], begin_ns: int | None, end_ns: int
     begin_ns = min(starts) if begin_ns is None else begin_ns
     end_ns = max(end_ns, begin_ns + NS_PER_S)
     body = "".join(_row(row, stretches(spans, begin_ns, end_ns), begin_ns, end_ns, zone) for row, spans in read)
+    axes = _axis(begin_ns, end_ns, zone, "UTC" if local_too else "")
+    axes += _axis(begin_ns, end_ns, None, "local") if local_too else ""
+    return f'<div class="lanes">{body}{axes}</div>'
+
+
+def _axis(begin_ns: int, end_ns: int, zone: tzinfo | None, name: str) -> str:
+    at_s = time_ticks(begin_ns / NS_PER_S, end_ns / NS_PER_S)
+    seconds = any(s % 60 for s in at_s)
     ticks = "".join(
         f'<span style="left:{100.0 * (s * NS_PER_S - begin_ns) / (end_ns - begin_ns):.2f}%">'
-        f"{time_of_day(round(s * NS_PER_S), zone, seconds=False)}</span>"
-        for s in time_ticks(begin_ns / NS_PER_S, end_ns / NS_PER_S)
+        f"{time_of_day(round(s * NS_PER_S), zone, seconds=seconds)}</span>"
+        for s in at_s
     )
-    return f'<div class="lanes">{body}<div class="lane-axis"><b></b><div>{ticks}</div></div></div>'
+    return f'<div class="lane-axis"><b>{name}</b><div>{ticks}</div></div>'
 
 
 def tint_class(name: str) -> str:

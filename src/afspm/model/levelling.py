@@ -40,6 +40,7 @@ def levelled(
     terms = _terms(values.shape, order)
     if rows is not None and rows not in ROWS:
         raise InvalidValue(f"rows can't be levelled by {rows!r}", hint=f"one of {', '.join(sorted(ROWS))}")
+    values = values if rows is None else drawing.levelled(values, ROWS[rows])
     known = np.isfinite(values)
     if known.sum() < 2 * len(terms):
         raise InvalidValue("too little was measured to level it")
@@ -48,8 +49,7 @@ def levelled(
     solve = partial(_quantile, quantile=quantile) if fit == "quantile" else FITS[fit]
     coefficients = solve(columns, (heights - heights.mean()) / scale)
     surface: Floats = np.tensordot(coefficients, terms, 1) * scale + heights.mean()
-    flat = values - surface
-    return flat if rows is None else drawing.levelled(flat, ROWS[rows])
+    return values - surface
 
 
 def _terms(shape: tuple[int, ...], order: int) -> Floats:
@@ -125,7 +125,7 @@ def _few(columns: Floats, heights: Floats) -> tuple[Floats, Floats]:
     return columns[chosen], heights[chosen]
 
 
-ROWS: Final = {"median": Levelling.MEDIANS, "line": Levelling.LINES}
+ROWS: Final = {"median": Levelling.MEDIANS, "difference": Levelling.DIFFERENCES, "line": Levelling.LINES}
 FITS: Final[dict[str, Callable[..., Floats]]] = {  # from the terms, [pixel, term], and the heights to coefficients
     "least-squares": _least_squares,
     "huber": _huber,

@@ -1,4 +1,4 @@
-"""A scan drawn with matplotlib: as an image, as contour lines or as a surface (needs matplotlib)."""
+"""A scan drawn with matplotlib: as an image, as contour lines or as a surface."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from afspm.drawing.image_html import round_length_m
 from afspm.drawing.palette import PALETTES, colour_map
 from afspm.drawing.raster import value_range
-from afspm.errors import FileError, InvalidValue
+from afspm.errors import InvalidValue
 from afspm.formatting import scale, typeset_length
 
 if TYPE_CHECKING:
@@ -27,10 +27,8 @@ def draw(scan: Scan, kind: str = "image", axes: Axes | None = None) -> Axes:
         raise InvalidValue(f"a scan can't be drawn as {kind!r}", hint=f"one of {', '.join(KINDS)}")
     if not scan.values.size or not np.isfinite(scan.values).any():
         raise InvalidValue(f"the scan {scan.channel!r} has no values to draw")
-    try:
-        import matplotlib.pyplot as plt
-    except ImportError:
-        raise FileError("drawing a scan needs matplotlib", hint='pip install "afspm[plot]"') from None
+    import matplotlib.pyplot as plt
+
     if axes is None:
         axes = plt.figure(layout="constrained").add_subplot(projection="3d" if kind == "surface" else None)
         axes.set_title(_title(scan), fontsize=9)

@@ -174,7 +174,8 @@ class Scan:
             fit: "least-squares", or one that particles and steps do not lead astray: "huber", "theil-sen", "ransac" or
                 "quantile".
             quantile: of the last: which part of the pixels lies below the surface.
-            rows: "median" or "line": then each row is levelled by its median, or by a straight line; None: none is.
+            rows: how each row is levelled before: by its "median", by the median "difference" from the row below it,
+                which long features do not mislead, or by a straight "line"; None: not at all.
 
         Raises:
             InvalidValue: there is no such fit or order, or too little was measured.

@@ -55,13 +55,13 @@ def stack(spectra: Sequence[Spectrum]) -> xarray.Dataset:
     first = _alike(spectra)
     points = grid([spectrum.position_m for spectrum in spectra if spectrum.position_m is not None])
     repeats = _repeats(points.cells)
-    swept, ways = _ways(first)
-    shape = (len(points.y_m), len(points.x_m), max(repeats) + 1, len(ways), len(swept))
+    swept, first_ways = ways(first)
+    shape = (len(points.y_m), len(points.x_m), max(repeats) + 1, len(first_ways), len(swept))
     units = dict(zip(first.names, first.units, strict=True))
-    arrays = {name: np.full(shape, np.nan) for name in ways[0]}
+    arrays = {name: np.full(shape, np.nan) for name in first_ways[0]}
     times = np.full(shape[:3], "NaT", "datetime64[ns]")
     for spectrum, cell, repeat in zip(spectra, points.cells, repeats, strict=True):
-        for direction, names in enumerate(_ways(spectrum)[1]):
+        for direction, names in enumerate(ways(spectrum)[1]):
             for name, curve in names.items():
                 arrays[name][(*cell, repeat, direction)] = curve
         if spectrum.time_ns is not None:
@@ -73,7 +73,7 @@ def stack(spectra: Sequence[Spectrum]) -> xarray.Dataset:
             "y": ("y", points.y_m, {"units": "m"}),
             "x": ("x", points.x_m, {"units": "m"}),
             "repeat": range(shape[2]),
-            "direction": list(DIRECTIONS[: len(ways)]),
+            "direction": list(DIRECTIONS[: len(first_ways)]),
             "z": ("z", swept, swept_attributes),
             "time": (DIMENSIONS[:3], times),
         },
@@ -179,7 +179,7 @@ def _alike(spectra: Sequence[Spectrum]) -> Spectrum:
     return first
 
 
-def _ways(spectrum: Spectrum) -> tuple[Floats, list[dict[str, Floats]]]:
+def ways(spectrum: Spectrum) -> tuple[Floats, list[dict[str, Floats]]]:
     """Return the swept values, and the curves of each variable by direction: forward, and backward if there is one."""
     swept = spectrum.values[:, 0]
     curves = {name: spectrum.values[:, number] for number, name in enumerate(spectrum.names) if number}

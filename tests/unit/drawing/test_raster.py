@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from afspm.drawing.image_html import data_url, round_length_m, scale_bar, shown
 from afspm.drawing.levelling import Levelling, levelled
-from afspm.drawing.palette import LEVELS, PALETTES, UNMEASURED, colour_map
-from afspm.drawing.raster import Contrast, ValueRange, indices, picture, png, value_range
+from afspm.drawing.palette import LEVELS, UNMEASURED, colour_map
+from afspm.drawing.raster import Contrast, ValueRange, indices, png, reduced, value_range
 
 BUMP = np.exp(-((np.arange(40) - 20.0) ** 2) / 8)[:, None] * np.exp(-((np.arange(60) - 30.0) ** 2) / 8)
 
@@ -101,17 +102,41 @@ def test_the_first_row_of_the_picture_is_the_highest_y_and_what_is_not_measured_
     assert (rgba[::-1, :, :3][levels != UNMEASURED] == colour_map("gold")[levels[levels != UNMEASURED]]).all()
 
 
-def test_a_picture_for_a_notebook_is_small_and_brightest_where_values_are_highest() -> None:
+@pytest.mark.parametrize("small", [True, False])
+def test_a_picture_is_small_and_brightest_where_values_are_highest(small: bool) -> None:
     values = np.tile(np.linspace(0.0, 1.0, 1000), (600, 1))
-    values[-1] = np.nan
-    read = Image.open(io.BytesIO(picture(values, 256))).convert("LA")
+    values[-4:] = np.nan
+    image = shown(values, 256, small=small)
+    read = Image.open(io.BytesIO(image.image)).convert("RGBA")
     assert read.size == (250, 150)
-    grey = np.asarray(read)[..., 0].astype(int)
-    assert grey[-1, 0] < grey[-1, 125] < grey[-1, -1]
+    pixels = np.asarray(read).astype(int)
+    assert pixels[0, :, 3].max() == 0  # not measured
+    assert pixels[-1, 0, 0] < pixels[-1, 125, 0] < pixels[-1, -1, 0]
+    assert data_url(image.image).startswith(f"data:image/{'webp' if small else 'png'};base64,")
+    assert (image.span.low, image.span.high) == pytest.approx((0.0, 1.0), abs=0.02)
 
 
-@pytest.mark.parametrize("name", PALETTES)
-def test_colours_grow_lighter_with_the_value(name: str) -> None:
-    luminance = colour_map(name) @ np.array([0.2126, 0.7152, 0.0722])
-    assert (np.diff(luminance) >= -0.5).all()
-    assert luminance[-1] - luminance[0] > 180
+def test_pixels_are_put_together_by_their_means_whatever_is_missing() -> None:
+    values = np.arange(36.0).reshape(6, 6)
+    values[0, 0] = np.nan
+    values[:3, 3:] = np.nan
+    few = reduced(values, 2)
+    assert few.shape == (2, 2)
+    assert few[0, 0] == pytest.approx(np.nanmean(values[:3, :3]))
+    assert np.isnan(few[0, 1])
+    assert reduced(values, 6) is values
+
+
+def test_a_scale_bar_is_of_a_round_length() -> None:
+    assert [round_length_m(length) for length in (9.9e-7, 1e-6, 3.3e-9)] == pytest.approx([5e-7, 1e-6, 2e-9])
+    assert "width:20%" in scale_bar((1e-6, 1e-6))
+    assert "200 nm" in scale_bar((1e-6, 1e-6))
+
+
+def test_rows_are_aligned_by_their_differences_beside_a_pit_that_is_longer_than_half_a_row() -> None:
+    pit = np.zeros((20, 40))
+    pit[5:12, 10:] = -1.0
+    steps = np.random.default_rng(3).normal(size=(20, 1))
+    by_differences = levelled(pit[:, :28] + steps, Levelling.DIFFERENCES)
+    assert np.ptp(levelled((pit + steps)[5:12], Levelling.DIFFERENCES)[:, :10]) < 1e-12
+    assert np.ptp(by_differences[12:, 0]) < 1e-12

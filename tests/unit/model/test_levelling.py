@@ -63,7 +63,7 @@ def test_what_can_not_be_levelled_is_refused() -> None:
         scan(np.full(SHAPE, np.nan)).levelled()
 
 
-@pytest.mark.parametrize("rows", ["median", "line"])
+@pytest.mark.parametrize("rows", ["median", "difference", "line"])
 def test_rows_are_levelled_one_by_one(rows: str) -> None:
     steps = np.random.default_rng(0).normal(size=(16, 1))
     values = np.broadcast_to(steps, (16, 32)).copy()
@@ -72,5 +72,5 @@ def test_rows_are_levelled_one_by_one(rows: str) -> None:
     flat = scan(values).levelled(rows=rows).values
     assert np.nanmax(np.abs(flat)) < 1e-4 < np.ptp(steps)
     assert np.isnan(flat[7]).all()
-    with pytest.raises(InvalidValue, match="one of line, median"):
+    with pytest.raises(InvalidValue, match="one of difference, line, median"):
         scan(values).levelled(rows="mean")

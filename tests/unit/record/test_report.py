@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import re
+import time
+from collections.abc import Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -117,6 +119,22 @@ def recorded(into: Path) -> Path:
     return folder
 
 
+def with_spectra(into: Path, positions: Sequence[tuple[float, float]]) -> str:
+    """The report of a run of force curves, the third of another sweep."""
+    store = RecordStore(into, RecordSettings({"experiment": "curves"}))
+    for number, position in enumerate(positions):
+        z = np.linspace(0.0, 1e-7 + 1e-9 * (number == 2), 50)
+        values = np.stack([z, z * (number + 1), z * 2], axis=1)
+        names, units = ("Z", "Force <N>", "Force <N> Retrace"), ("m", "N", "N")
+        spectrum = model.Spectrum(position, "force", names, units, values, START + number * S, f"{number}.dat")
+        store.take([(model.Packet("Spec1d_force", wire.encode(spectrum)[1], START + number * S), "")])
+    ended = entry(60, "control", "survey", "ended", event=model.ControlEvent.EXPERIMENT_ENDED, reason="tip <is> gone")
+    store.take([(model.Packet("JournalEntries", wire.encode(ended)[1], START + 60 * S), "")])
+    store.flush()
+    store.close()
+    return write(into).read_text(encoding="utf-8")
+
+
 def told(run: Path) -> story.RunStory:
     with open_run(run) as opened:
         return story.read(opened)
@@ -150,8 +168,8 @@ def test_the_page_needs_nothing_else_and_is_whole(report: Path) -> None:
     text = report.read_text(encoding="utf-8")
     page = Page(text)
     assert page.open == []
-    assert page.pictures == 4  # the scans, the interrupted one too
-    assert [load for load in page.loads if not load.startswith("data:image/png;base64,")] == []
+    assert page.pictures == 5  # the scans, the interrupted one too, and the newest of their place on the map
+    assert [load for load in page.loads if not load.startswith(("data:image/webp;base64,", "#"))] == []
     assert "<script" not in text
     assert re.findall(r"url\(|@import", text) == []
 
@@ -191,7 +209,8 @@ def test_what_a_component_has_drawn_is_shown_instead(run: Path) -> None:
     (run / pictures.NIGHT).write_bytes(drawn)
     text = write(run).read_text(encoding="utf-8")
     assert not (run / pictures.OWN_NIGHT).exists()
-    assert text.count("night.png") == 1
+    assert ">night.png</figcaption>" in text
+    assert len(pictures.of_figures(run)[0].image) < len(drawn)
 
 
 def test_writing_again_is_the_same(run: Path) -> None:
@@ -300,3 +319,69 @@ def test_a_run_of_which_nothing_is_recorded_has_a_report(tmp_path: Path) -> None
     text = write(tmp_path).read_text(encoding="utf-8")
     assert Page(text).open == []
     assert "0 scans" in text
+
+
+def test_spectra_are_shown_with_mean_and_spread_and_one_by_one_in_their_grid(tmp_path: Path) -> None:
+    text = with_spectra(tmp_path, [(x * 1e-9, y * 1e-9) for y in range(2) for x in range(3)])
+    assert Page(text).open == []
+    assert "force: 6" in text
+    assert text.count("<polygon") == 1  # the spread of the one variable
+    assert "on the way back" in text
+    assert "Force &lt;N&gt; / nN" in text
+    assert "grid-template-columns:repeat(3," in text
+    assert 'id="spectrum-1-4"' in text
+    assert "grid-row:1;grid-column:1" in text  # the fourth is the first of the upper row
+    assert text.count("spectrum at (") == 6
+
+
+def test_spectra_that_form_no_grid_are_shown_in_their_order(tmp_path: Path) -> None:
+    text = with_spectra(tmp_path, [(0.0, 0.0), (1e-9, 7e-9), (5e-9, 2e-9)])
+    assert "force: 3" in text
+    assert "grid-row" not in text
+
+
+def test_the_page_says_what_ended_the_experiment_and_why(tmp_path: Path) -> None:
+    text = with_spectra(tmp_path, [(0.0, 0.0)])
+    assert "survey ended the experiment at 2023-11-14 22:14:20 UTC: tip &lt;is&gt; gone" in text
+
+
+def test_local_time_stands_beside_utc_where_it_is_another(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not hasattr(time, "tzset"):
+        pytest.skip("this system has one zone")
+    assert "local" not in write(run).read_text(encoding="utf-8") or time.timezone
+    monkeypatch.setenv("TZ", "XYZ-5:30")
+    time.tzset()
+    try:
+        text = write(run).read_text(encoding="utf-8")
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    assert "2023-11-14 22:13 to 23:13 UTC (2023-11-15 03:43 to 04:43 XYZ)" in text
+    assert "22:38:20<small>04:08:20 XYZ</small>" in text  # a problem was flagged
+    assert ">local</b>" in text
+
+
+def test_pictures_lie_on_the_map_where_they_were_taken_the_newest_on_top(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path, RecordSettings({"experiment": "map"}))
+    places = [((0.0, 0.0), 4e-6), ((1e-6, 1e-6), 1e-6), ((1e-6, 1e-6), 1e-6)]
+    for number, (center, side) in enumerate(places, 1):
+        values = np.random.default_rng(number).normal(size=(8, 8))
+        scan = model.Scan(
+            model.Region(center, (side, side), 0.1), "Z", "m", values, START + number * S, f"{number}.sxm"
+        )
+        store.take([(model.Packet("Scan2d_Z", wire.encode(scan)[1], START + number * S), "")])
+    store.flush()
+    store.close()
+    text = write(tmp_path).read_text(encoding="utf-8")
+    sample = text[text.index('<div class="map"') : text.index("newest scan on top")]
+    assert re.findall(r'href="#scan-(\d)"', sample) == ["1", "3"]
+    left, top, width = (float(x) for x in re.findall(r"left:([\d.]+)%;top:([\d.]+)%;width:([\d.]+)%", sample)[1])
+    assert left > 50.0 > top
+    assert width == pytest.approx(100 / 4.7, abs=2.0)
+    assert "rotate(-5.730deg)" in sample
+    assert "µm" in sample
+
+
+def test_a_figure_that_is_none_is_left_out(run: Path) -> None:
+    (run / "half.png").write_bytes(b"\x89PNG but no more")
+    assert "half.png" not in write(run).read_text(encoding="utf-8")

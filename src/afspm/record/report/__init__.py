@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from afspm.errors import FileError
-from afspm.record.report import page, pictures, story
+from afspm.record.report import curves, page, pictures, story
 from afspm.record.run import open_run
 from afspm.storage.atomic import replace_file
 
@@ -27,11 +27,12 @@ def write(folder: str | Path) -> Path:
     """
     with open_run(folder) as run:
         told = story.read(run)
-        shown = pictures.smalls(run, told.scans)
+        shown = pictures.of_scans(run, told.scans)
         target = run.folder / REPORT_FILE
         try:
             pictures.draw(run, told, shown)
-            replace_file(target, [page.html(told, shown, pictures.figures(run.folder)).encode()], synced=False)
+            text = page.html(told, shown, curves.read(run), pictures.of_figures(run.folder))
+            replace_file(target, [text.encode()], synced=False)
         except OSError as error:
             raise FileError(f"can't be written: {error.strerror or error}", where=str(target)) from error
     return target

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm import wire
-from afspm.drawing.raster import picture
+from afspm.drawing.image_html import Shown, shown
+from afspm.drawing.levelling import Levelling, levelled
 from afspm.errors import AfspmError
 from afspm.model import ControlMode, ControlState, ScanSet, names
 from afspm.record.night_record import NightMark, NightRecord, Shot, thumbnail
@@ -21,6 +23,9 @@ from afspm.record.run import Run
 from afspm.record.tables import ScanRow
 
 MOST = 98
+LARGEST_PX = 192
+FIGURE_PX = 1400
+_QUALITY = 80
 NIGHT, OFFSET = "night.png", "drift_offset.png"
 """As components draw them."""
 OWN_NIGHT, OWN_OFFSET = "report.png", "report_drift.png"
@@ -29,21 +34,36 @@ _log = logging.getLogger("afspm.report")
 
 
 @dataclass(frozen=True)
-class Small:
-    """A scan and a grey picture of it, [y, x] with y upwards; None if its values can't be had."""
+class TopographyPicture:
+    """A scan, and pictures of its topography; None if its values can't be had.
+
+    Attributes:
+        image: in colour, levelled.
+        grey: for the figure of the night, [y, x] with y upwards.
+    """
 
     row: ScanRow
-    channel: str
-    picture: NDArray[np.uint8] | None
+    channel: str = ""
+    unit: str = ""
+    image: Shown | None = None
+    grey: NDArray[np.uint8] | None = None
 
     @property
-    def png(self) -> bytes:
-        """In colour, with y upwards. Raises AttributeError without a picture."""
-        assert self.picture is not None
-        return picture(self.picture.astype(np.float64))
+    def is_bad(self) -> bool:
+        """Return whether a problem was flagged, or it was interrupted."""
+        return self.row.interrupted or bool(self.row.problems)
 
 
-def smalls(run: Run, rows: Sequence[ScanRow]) -> list[Small]:
+@dataclass(frozen=True)
+class FigurePicture:
+    """A figure that a component has drawn, as it is put into the page; `ratio`: width by height."""
+
+    name: str
+    image: bytes
+    ratio: float
+
+
+def of_scans(run: Run, rows: Sequence[ScanRow]) -> list[TopographyPicture]:
     """All scans, or of too many the interrupted ones and some evenly among the rest."""
     return list(_read(run, chosen(rows)))
 
@@ -58,17 +78,23 @@ def chosen(rows: Sequence[ScanRow], most: int = MOST) -> list[ScanRow]:
     return [rows[k] for k in sorted({*odd, *even})]
 
 
-def _read(run: Run, rows: Sequence[ScanRow]) -> Iterator[Small]:
+def _read(run: Run, rows: Sequence[ScanRow]) -> Iterator[TopographyPicture]:
     for row in rows:
         try:
             scans = run.scan(row)
         except AfspmError as error:
             _log.debug("scan %d has no picture: %s", row.number, error)
-            yield Small(row, "", None)
+            yield TopographyPicture(row)
             continue
-        channel = topography(scans)
-        values = scans[channel].values
-        yield Small(row, channel, thumbnail(values) if values.size else None)
+        scan = scans[topography(scans)]
+        has_values = bool(np.isfinite(scan.values).any())
+        image = shown(flat(scan.values), LARGEST_PX, small=True) if has_values else None
+        yield TopographyPicture(row, scan.channel, scan.unit, image, thumbnail(scan.values) if has_values else None)
+
+
+def flat(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return values with their rows brought to one height, and without their plane."""
+    return levelled(levelled(values, Levelling.DIFFERENCES), Levelling.PLANE)
 
 
 def topography(scans: ScanSet) -> str:
@@ -76,12 +102,12 @@ def topography(scans: ScanSet) -> str:
     return next((c for name in _TOPOGRAPHY for c in scans if c.lower().startswith(name)), scans.first.channel)
 
 
-def draw(run: Run, story: RunStory, shown: Sequence[Small]) -> None:
+def draw(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -> None:
     """Draw the night and drift against time, where no component has."""
-    if _is_ours(run.folder, OWN_NIGHT, NIGHT) and any(small.picture is not None for small in shown):
+    if _is_ours(run.folder, OWN_NIGHT, NIGHT) and any(one.grey is not None for one in pictures):
         from afspm.record import night_figure
 
-        record = night_of(run, story, shown)
+        record = night_of(run, story, pictures)
         numbers = {number: story.overview.problems.name(number) for number in record.problems}
         night_figure.draw(record, run.folder / OWN_NIGHT, numbers, title=story.name, simulated=story.simulated)
     if _is_ours(run.folder, OWN_OFFSET, OFFSET) and len(story.overview.drift) > 1:
@@ -100,13 +126,11 @@ def _is_ours(folder: Path, own: str, components: str) -> bool:
     return True
 
 
-def night_of(run: Run, story: RunStory, shown: Sequence[Small]) -> NightRecord:
+def night_of(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -> NightRecord:
     """Return the record that the picture of the night shows."""
     record = NightRecord(end_ns=story.end_ns, scans_taken=len(story.scans))
     record.shots = [
-        Shot(small.row.time_ns, small.row.began_ns, small.row.holder, small.picture)
-        for small in shown
-        if small.picture is not None
+        Shot(one.row.time_ns, one.row.began_ns, one.row.holder, one.grey) for one in pictures if one.grey is not None
     ]
     record.control = [(row.time_ns, row.state) for row in run.control] or [
         (story.start_ns, ControlState(ControlMode.UNDEFINED))
@@ -141,8 +165,25 @@ def drift_of(run: Run) -> Any:
     )
 
 
-def figures(folder: Path) -> list[Path]:
-    """The pictures for the page: the night first, then drift, then whatever else there is in the run folder."""
+def of_figures(folder: Path) -> list[FigurePicture]:
+    """The figures for the page: the night first, then drift, then all others in the run folder."""
     found = [path for path in folder.glob("*.png") if path.name != OWN_NIGHT]  # the page has all that is in that
     first = (NIGHT, OFFSET, OWN_OFFSET)
-    return sorted(found, key=lambda path: (first.index(path.name) if path.name in first else len(first), path.name))
+    found.sort(key=lambda path: (first.index(path.name) if path.name in first else len(first), path.name))
+    return [made for path in found if (made := _reduced(path)) is not None]
+
+
+def _reduced(path: Path) -> FigurePicture | None:
+    """A figure with as many pixels as a page shows, and a tenth of the bytes; None if it is no picture."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            small = image.convert("RGB")
+    except OSError as error:  # also of what is no picture
+        _log.warning("%s is not shown: %s", path.name, error)
+        return None
+    small.thumbnail((FIGURE_PX, FIGURE_PX))
+    written = io.BytesIO()
+    small.save(written, "WEBP", quality=_QUALITY)
+    return FigurePicture(path.name, written.getvalue(), small.width / small.height)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from afspm.drawing.timeline import TimelineRow
-from afspm.model import ControlEvent, ControlRequest, JournalEntry, ProcessCondition, ScopeState, names
+from afspm.model import ControlEvent, ControlRequest, Frame, JournalEntry, ProcessCondition, ScopeState, names
 from afspm.record.overview import Overview, ProcessRestart
 from afspm.record.run import Run
 from afspm.record.run_lock import describe_state
@@ -40,6 +40,8 @@ class RunStory:
         start_ns, end_ns: the first and the last that is known of it.
         speed: experiment seconds in a real second.
         ended: how it ended, in words; that it goes on, or was cut off.
+        end: the journal's entry of the end: the component or person that asked for it, and why; None: none did.
+        frame: of all places.
         problems: spans of all problems in the order of time.
         restarts, given_up: of processes.
         actions: what was done to the tip, e.g. pulses.
@@ -53,6 +55,8 @@ class RunStory:
     end_ns: int
     speed: float
     ended: str
+    end: JournalEntry | None
+    frame: Frame
     overview: Overview
     scans: Sequence[ScanRow]
     spectra: int
@@ -117,6 +121,8 @@ def read(run: Run) -> RunStory:
         end_ns=max(overview.newest_ns, start_ns),
         speed=float(clock.get("speed", 1.0)),
         ended=describe_state(run.folder),
+        end=next((one for one in reversed(overview.entries) if one.event is ControlEvent.EXPERIMENT_ENDED), None),
+        frame=run.frame,
         overview=overview,
         scans=list(scans),
         spectra=len(run.spectra),

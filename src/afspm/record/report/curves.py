@@ -1,0 +1,223 @@
+"""The spectra of a report: for each kind all curves with their mean and spread, and small ones that enlarge."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.drawing.chart import BACKWARD, Axis, Band, Curve, chart
+from afspm.errors import AfspmError, InvalidValue
+from afspm.formatting import typeset_position
+from afspm.model import Spectrum
+from afspm.model.geometry import XY
+from afspm.model.spectrum_grid import grid, ways
+from afspm.record.report import markup
+from afspm.record.report.markup import PageTimes
+from afspm.record.run import Run
+from afspm.record.tables import SpectrumRow
+
+MOST_READ = 400
+MOST_SMALL = 100
+_WIDEST_GRID = 12
+_LEAST_AVERAGED = 3
+_log = logging.getLogger("afspm.report")
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SpectrumCurves:
+    """A spectrum, and its row."""
+
+    row: SpectrumRow
+    spectrum: Spectrum
+
+    @property
+    def curves(self) -> dict[str, Array]:
+        """The variables on the way there, by name."""
+        return ways(self.spectrum)[1][0]
+
+    @property
+    def back(self) -> dict[str, Array]:
+        """Those that were measured on the way back, too."""
+        directions = ways(self.spectrum)[1]
+        return directions[1] if len(directions) > 1 else {}
+
+    def values(self, name: str) -> Array:
+        """Return all values of a variable, of both ways."""
+        return np.concatenate([way[name] for way in (self.curves, self.back) if name in way])
+
+    @property
+    def swept(self) -> Array:
+        return ways(self.spectrum)[0]
+
+
+@dataclass(frozen=True)
+class SpectrumGroup:
+    """Spectra of one kind and of the same variables; `count`: with those that were not read."""
+
+    measured: Sequence[SpectrumCurves]
+    count: int
+
+    @property
+    def first(self) -> Spectrum:
+        return self.measured[0].spectrum
+
+    @property
+    def positions(self) -> list[XY]:
+        return [one.spectrum.position_m for one in self.measured if one.spectrum.position_m is not None]
+
+    @property
+    def axes(self) -> tuple[Axis, dict[str, Axis]]:
+        """The axis of what was swept, and that of each variable, with room for all curves."""
+        first = self.first
+        units = dict(zip(first.names, first.units, strict=True))
+        swept = np.concatenate([one.swept for one in self.measured])
+        found = {
+            name: Axis.over(name, units.get(name, ""), np.concatenate([one.values(name) for one in self.measured]))
+            for name in self.measured[0].curves
+        }
+        return Axis.over(first.names[0], first.units[0], swept), found
+
+
+def read(run: Run) -> list[SpectrumGroup]:
+    """Read the spectra of a run, of too many some evenly among them."""
+    rows: dict[tuple[object, ...], list[SpectrumRow]] = {}
+    for row in run.spectra:
+        if len(row.names) > 1:
+            rows.setdefault((row.kind, row.names, row.units), []).append(row)
+    groups = []
+    for of_kind in rows.values():
+        some = np.unique(np.linspace(0, len(of_kind) - 1, MOST_READ).round().astype(int))
+        if measured := list(_read(run, [of_kind[k] for k in some])):
+            groups.append(SpectrumGroup(measured, len(of_kind)))
+    return groups
+
+
+def html(groups: Sequence[SpectrumGroup], clock: PageTimes) -> str:
+    """Return all spectra; nothing if there are none."""
+    return "".join(_group(group, number, clock) for number, group in enumerate(groups, 1))
+
+
+def _read(run: Run, rows: Iterable[SpectrumRow]) -> Iterator[SpectrumCurves]:
+    for row in rows:
+        try:
+            yield SpectrumCurves(row, run.spectrum(row))
+        except AfspmError as error:
+            _log.debug("spectrum %d is not shown: %s", row.number, error)
+
+
+def _group(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
+    x, axes = group.axes
+    charts = "".join(_all(group, x, axis, name) for name, axis in axes.items())
+    kind = escape(group.first.kind or "spectra")
+    return (
+        f'<h3>{kind}: {group.count}</h3><div class="charts">{charts}</div><p class="note">{_legend(group)}</p>'
+        f"{_small(group, number, clock)}"
+    )
+
+
+def _all(group: SpectrumGroup, x: Axis, y: Axis, name: str) -> str:
+    """Return the curves of one variable, thin, and over them their mean, with a band of one standard deviation."""
+    measured = group.measured
+    if len(measured) < _LEAST_AVERAGED:
+        return chart(x, y, [curve for one in measured for curve in _both_ways(one, name)])
+    step = -(-len(measured) // MOST_SMALL)
+    thin = max(0.15, min(0.6, 6.0 / len(measured)))
+    curves = [Curve(one.swept, one.curves[name], "", thin) for one in measured[::step]]
+    if (common := _common(measured)) is None:
+        return chart(x, y, curves)
+    if back := [_at(common, one.swept, one.back[name]) for one in measured if name in one.back]:
+        curves.append(Curve(common, np.mean(back, axis=0), BACKWARD))
+    values = np.stack([_at(common, one.swept, one.curves[name]) for one in measured])
+    mean, spread = values.mean(axis=0), values.std(axis=0, ddof=1)
+    return chart(x, y, [*curves, Curve(common, mean)], Band(common, mean - spread, mean + spread))
+
+
+def _both_ways(one: SpectrumCurves, name: str) -> Iterator[Curve]:
+    """Yield the curve of the way back, if there is one, and over it that of the way there."""
+    if name in one.back:
+        yield Curve(one.swept, one.back[name], BACKWARD)
+    yield Curve(one.swept, one.curves[name])
+
+
+def _common(measured: Sequence[SpectrumCurves]) -> Array | None:
+    """Return values that all were swept over; None if that is less than half of what any was."""
+    low, high = (max(float(np.min(one.swept)) for one in measured), min(float(np.max(one.swept)) for one in measured))
+    widest = max(float(np.ptp(one.swept)) for one in measured)
+    return np.linspace(low, high, len(measured[0].swept)) if high - low > 0.5 * widest else None
+
+
+def _at(common: Array, swept: Array, values: Array) -> Array:
+    order = np.argsort(swept)
+    return np.interp(common, swept[order], values[order])
+
+
+def _legend(group: SpectrumGroup) -> str:
+    told = []
+    if len(group.measured) >= _LEAST_AVERAGED:
+        told.append("Thin: single curves. Thick: their mean; the band is one standard deviation.")
+    if any(one.back for one in group.measured):
+        told.append("Orange: on the way there; blue: on the way back.")
+    if left_out := group.count - len(group.measured):
+        told.append(f"{left_out} more are not read.")
+    return " ".join(told)
+
+
+def _small(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
+    """Return each spectrum small; those of a grid as they lie on the sample."""
+    shown = group.measured[:MOST_SMALL]
+    if len(shown) < 2:
+        return ""
+    places, columns = _places(shown)
+    names = ["", *(f"spectrum-{number}-{one.row.number}" for one in shown), ""]
+    axes = group.axes
+    figures = "".join(
+        _figure(one, axes, clock, names[k : k + 3], places[k] if places else "") for k, one in enumerate(shown)
+    )
+    style = f' style="grid-template-columns:repeat({columns},minmax(0,1fr));gap:.3rem"' if places else ""
+    told = "Each lies where it was measured on the grid, y upwards. " if places else ""
+    more = f" {group.count - len(shown)} more are not shown." if group.count > len(shown) else ""
+    note = f'<p class="note">{told}Click a curve to enlarge it; all have the same axes.{more}</p>'
+    return f'<div class="sheet"{style}>{figures}</div>{note}'
+
+
+def _places(shown: Sequence[SpectrumCurves]) -> tuple[list[str], int]:
+    """Return the place of each in a grid of the page, and its columns; none if they form no grid."""
+    positions = [one.spectrum.position_m for one in shown]
+    try:
+        points = grid([position for position in positions if position is not None])
+    except InvalidValue:
+        return [], 0
+    columns, rows = len(points.x_m), len(points.y_m)
+    if None in positions or len(set(points.cells)) < len(shown) or not 1 < columns <= _WIDEST_GRID:
+        return [], 0
+    return [f"grid-row:{rows - row};grid-column:{column + 1}" for row, column in points.cells], columns
+
+
+def _figure(
+    one: SpectrumCurves, axes: tuple[Axis, dict[str, Axis]], clock: PageTimes, names: Sequence[str], place: str
+) -> str:
+    x, others = axes
+    charts = [chart(x, axis, list(_both_ways(one, name))) for name, axis in others.items()]
+    row = one.row
+    where = "" if row.position_m is None else typeset_position(row.position_m)
+    facts = {
+        "spectrum": f"{row.number}{f', {escape(row.key)}' if row.key else ''}",
+        "finished": clock.whole(row.time_ns),
+        "at": where,
+        "points": str(row.points),
+        "in control": escape(row.holder or "nobody"),
+        "problems": escape(", ".join(row.problems)),
+        "file": escape(row.file),
+        "variables": f'<div class="charts">{"".join(charts[1:])}</div>' if charts[1:] else "",
+    }
+    before, name, after = names
+    return markup.figure(
+        name, charts[0], str(row.number), facts, beside=(before, after), style="curves", ratio=1.5, place=place
+    )

@@ -1,0 +1,168 @@
+"""The scans of a report as a sheet of pictures, and on a map where they lie on the sample."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.clock import NS_PER_S
+from afspm.drawing.curves import round_ticks
+from afspm.drawing.image_html import data_url, scale_bar
+from afspm.formatting import duration_text, quantity, scale, typeset_area, typeset_position
+from afspm.model import Frame
+from afspm.model.geometry import XY
+from afspm.record.report import markup
+from afspm.record.report.markup import PageTimes
+from afspm.record.report.pictures import TopographyPicture
+from afspm.record.report.story import RunStory, colours
+from afspm.record.tables import ScanRow
+
+_LEGEND = (
+    "Click a picture to enlarge it. The bar below it has the colour of who was in control; framed: a problem was "
+    "flagged, or it was interrupted. Topography, rows brought to one height, without its plane."
+)
+_MARGIN = 0.04
+_HIDDEN_BEHIND = 40  # places of a run that are drawn at most where one lies over the other
+
+
+def sheet(story: RunStory, shown: Sequence[TopographyPicture], clock: PageTimes) -> str:
+    """Return the pictures of scans in the order of time."""
+    if not shown:
+        return "" if story.spectra else "<p>None.</p>"
+    styles = colours(story)
+    names = ["", *(_name(one.row) for one in shown), ""]
+    figures = [_figure(one, story, styles, clock, (names[index], names[index + 2])) for index, one in enumerate(shown)]
+    left_out = len(story.scans) - len(shown)
+    note = f'<p class="note">{left_out} more are not shown.</p>' if left_out else ""
+    return f'<div class="sheet">{"".join(figures)}</div>{note}<p class="note">{_LEGEND}</p>'
+
+
+def sample_map(shown: Sequence[TopographyPicture], spectra_m: Sequence[XY], frame: Frame) -> str:
+    """Return where pictures and spectra lie on the sample, the newest on top; nothing where no place is known."""
+    pictures = _topmost(shown)
+    corners = [one.row.region.corners_m() for one in pictures if one.row.region is not None]
+    corners += [np.array([position]) for position in spectra_m]
+    if not corners:
+        return ""
+    view = _View(np.concatenate(corners))
+    images = "".join(view.image(one) for one in pictures)
+    points = "".join(view.point(position) for position in spectra_m)
+    places = "sample coordinates" if frame is Frame.SAMPLE else "coordinates of the scanner"
+    points_told = "; the points are spectra" if spectra_m else ""
+    scans_told = ", the newest scan on top; click one to see it" if pictures else ""
+    note = f'<p class="note">{places.capitalize()}{scans_told}{points_told}.</p>'
+    return f"{view.frame(images + points)}{note}"
+
+
+class _View:
+    """From places in m to those on the map, in percent of its width and height."""
+
+    def __init__(self, places_m: NDArray[np.float64]) -> None:
+        low, high = places_m.min(axis=0), places_m.max(axis=0)
+        extent = max(float((high - low).max()), 1e-12)
+        middle = (low + high) / 2.0
+        half = np.maximum((high - low) / 2.0, 0.3 * extent) + _MARGIN * extent
+        self.left, self.low = (float(value) for value in middle - half)
+        self.width, self.height = (float(value) for value in 2.0 * half)
+
+    def frame(self, content: str) -> str:
+        factor, unit = scale(max(abs(self.left), abs(self.low), self.width, self.height), "m")
+        x_ticks = round_ticks(self.left * factor, (self.left + self.width) * factor)
+        y_ticks = round_ticks(self.low * factor, (self.low + self.height) * factor)
+        ticks = [f'<s class="x" style="left:{self._x(tick / factor):.2f}%">{tick:g}</s>' for tick in x_ticks[:-1]]
+        ticks += [f'<s class="y" style="top:{self._y(tick / factor):.2f}%">{tick:g}</s>' for tick in y_ticks]
+        ticks.append(f'<s class="x" style="left:97%">{unit}</s>')
+        bar = scale_bar((self.width, self.height))
+        ratio = self.width / self.height
+        look = f"aspect-ratio:{ratio:.5g};max-width:{min(560.0, 480.0 * ratio):.0f}px"
+        return f'<div class="map" style="{look}">{content}{bar}{"".join(ticks)}</div>'
+
+    def image(self, one: TopographyPicture) -> str:
+        region = one.row.region
+        assert region is not None
+        assert one.image is not None
+        (width, height), (x, y) = region.size_m, region.center_m
+        place = (
+            f"left:{self._x(x - width / 2):.3f}%;top:{self._y(y + height / 2):.3f}%;"
+            f"width:{100 * width / self.width:.3f}%;height:{100 * height / self.height:.3f}%"
+        )
+        turned = f";transform:rotate({-math.degrees(region.angle_rad):.3f}deg)" if region.angle_rad else ""
+        bad = "bad" if one.is_bad else ""
+        return (
+            f'<a class="{bad}" href="#{_name(one.row)}" title="scan {one.row.number}, {typeset_area(region.size_m)}" '
+            f'style="{place}{turned}"><img src="{data_url(one.image.image)}" alt=""></a>'
+        )
+
+    def point(self, position_m: XY) -> str:
+        x, y = position_m
+        title = f"spectrum at {typeset_position(position_m)}"
+        return f'<b style="left:{self._x(x):.3f}%;top:{self._y(y):.3f}%" title="{title}"></b>'
+
+    def _x(self, x_m: float) -> float:
+        return 100.0 * (x_m - self.left) / self.width
+
+    def _y(self, y_m: float) -> float:
+        return 100.0 - 100.0 * (y_m - self.low) / self.height
+
+
+def _topmost(shown: Sequence[TopographyPicture]) -> list[TopographyPicture]:
+    """Return the newest picture of each place, in the order of time."""
+    newest = {one.row.region: one for one in shown if one.image is not None and one.row.region is not None}
+    return sorted(newest.values(), key=lambda one: one.row.number)[-_HIDDEN_BEHIND:]
+
+
+def _figure(
+    one: TopographyPicture, story: RunStory, styles: dict[str, str], clock: PageTimes, beside: tuple[str, str]
+) -> str:
+    row, region = one.row, one.row.region
+    width, height = region.size_m if region else (1.0, 1.0)
+    if one.image is None:
+        shown = '<div class="none">no values</div>'
+    else:
+        shown = (
+            f'<img src="{data_url(one.image.image)}" alt="scan {row.number}" style="aspect-ratio:{width / height:.4g}">'
+            f"{scale_bar((width, height))}"
+        )
+    mark = " <b>interrupted</b>" if row.interrupted else ""
+    noted = " ✎" if any(note.scan == row.number for note in story.notes) else ""
+    size = f"<br>{typeset_area(region.size_m)}" if region else ""
+    caption = (
+        f'<i class="{styles.get(row.holder or "", "state")}"></i>'
+        f"{row.number} · {clock.utc(row.time_ns)}{noted}{mark}{size}"
+    )
+    facts = dict(_facts(one, story, clock))
+    return markup.figure(
+        _name(row), shown, caption, facts, beside=beside, style="scan bad" if one.is_bad else "scan",
+        ratio=width / height,
+    )  # fmt: skip
+
+
+def _facts(one: TopographyPicture, story: RunStory, clock: PageTimes) -> Iterator[tuple[str, str]]:
+    row, region = one.row, one.row.region
+    yield "scan", f"{row.number}{f', {escape(row.key)}' if row.key else ''}"
+    yield "finished", clock.whole(row.time_ns)
+    if row.began_ns is not None:
+        yield "took", duration_text((row.time_ns - row.began_ns) / NS_PER_S)
+    if region is not None:
+        turned = f", turned by {math.degrees(region.angle_rad):.4g}°" if region.angle_rad else ""
+        yield "size", f"{typeset_area(region.size_m)}{turned}"
+        yield "centre", typeset_position(region.center_m)
+    if row.shape is not None:
+        yield "pixels", f"{row.shape[1]} × {row.shape[0]}"
+    if one.image is not None:
+        span = one.image.span
+        yield "shown", f"{escape(one.channel)}, {quantity(span.high - span.low, one.unit, 3)} from dark to light"
+    yield "in control", escape(row.holder or "nobody")
+    yield "problems", escape(", ".join(row.problems))
+    yield "interrupted", "yes" if row.interrupted else ""
+    notes = [note for note in story.notes if note.scan == row.number]
+    yield "notes", "<br>".join(f"{escape(note.text)} ({escape(note.who)})" for note in notes)
+    yield "file", escape(row.file)
+
+
+def _name(row: ScanRow) -> str:
+    return f"scan-{row.number}"
