@@ -185,7 +185,7 @@ class Scan:
         return replace(self, values=levelled(self.values, order, fit, quantile, rows))
 
     def plot(self, kind: str = "image", axes: Axes | None = None) -> Axes:
-        """Draw the scan with matplotlib: with a scale bar, and a colour bar with units (needs the extra `plot`).
+        """Draw the scan with matplotlib: with a scale bar, and a colour bar with units.
 
         Args:
             kind: "image", "contour" or "surface" (in three dimensions).
