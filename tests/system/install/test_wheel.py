@@ -1,0 +1,164 @@
+"""What a new user meets: the wheel alone, in an environment of its own, far from the clone."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[3]
+BUILT_FROM = ("src", "proto", "experiments", "pyproject.toml", "hatch_build.py", "README.md", "LICENSE")
+LOOK = """
+import afspm
+scope = afspm.connect(name="notebook")
+scan = scope.scan(shape=(16, 20)).first
+print(scope.state.name, scan.shape, float(scan.to_xarray().std()) > 0)
+scan
+"""
+
+pytestmark = pytest.mark.timeout(400)
+
+
+class Installed:
+    """An environment with afspm from its wheel.
+
+    Attributes:
+        wheel: with its path; folder: of the environment.
+    """
+
+    def __init__(self, uv: str, wheel: Path, folder: Path) -> None:
+        self._uv, self.wheel, self.folder = uv, wheel, folder
+        self.bin = folder / ("Scripts" if os.name == "nt" else "bin")
+        hidden = ("PYTHONPATH", "VIRTUAL_ENV", "PYTEST_CURRENT_TEST")
+        self.environment = {name: value for name, value in os.environ.items() if name not in hidden}
+        self.environment |= {"PATH": f"{self.bin}{os.pathsep}{os.environ['PATH']}", "COLUMNS": "200"}
+
+    def add(self, *requirements: str) -> None:
+        """Install more. Skips the test where that can't be had."""
+        command = (self._uv, "pip", "install", "-q", "--python", str(self.folder), *requirements)
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            pytest.skip(f"packages can't be had here: {done.stderr}")
+
+    def run(self, *command: str, cwd: Path, code: int = 0) -> str:
+        """Run a command of the environment, and return its output."""
+        done = subprocess.run(
+            command, cwd=cwd, env=self.environment, capture_output=True, text=True, timeout=200, check=False
+        )
+        output = done.stdout + done.stderr
+        assert done.returncode == code, output
+        return output
+
+    def start(self, *command: str, cwd: Path) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            command, cwd=cwd, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    """afspm with its normal dependencies and nothing else."""
+    beside = ROOT / "build/tools" / ("Scripts/uv.exe" if os.name == "nt" else "bin/uv")
+    uv = shutil.which("uv") or (str(beside) if beside.exists() else None)
+    if uv is None:
+        pytest.skip("there is no uv, which installs quickly")
+    folder = tmp_path_factory.mktemp("installed")
+    subprocess.run([uv, "venv", "-q", "--python", sys.executable, folder / "venv"], check=True)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    probe = [uv, "pip", "install", "--dry-run", "-q", "--python", folder / "venv", *project["build-system"]["requires"]]
+    if (probed := subprocess.run(probe, capture_output=True, text=True, check=False)).returncode != 0:
+        pytest.skip(f"packages can't be had here: {probed.stderr}")
+    clone = folder / "clone"  # a build writes into the clone, in which other tests run
+    for name in BUILT_FROM:
+        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy2
+        clone.mkdir(exist_ok=True)
+        copy(ROOT / name, clone / name)
+    subprocess.run([uv, "build", "--wheel", "-q", "-o", folder, clone], check=True)
+    shutil.rmtree(clone)
+    (wheel,) = folder.glob("*.whl")
+    made = Installed(uv, wheel, folder / "venv")
+    made.add(str(wheel))
+    return made
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a console's Ctrl-C reaches all who share it")
+@pytest.mark.parametrize(("options", "enough"), [((), "scan 2 of 49"), (("--drift",), "scan 2 of 73")])
+def test_the_demonstration_measures_and_leaves_a_report(
+    installed: Installed, tmp_path: Path, options: tuple[str, ...], enough: str
+) -> None:
+    with installed.start("afspm", "demo", *options, cwd=tmp_path) as night:
+        assert night.stdout is not None
+        lines = []
+        for line in night.stdout:
+            lines.append(line)
+            if enough in line:
+                night.send_signal(signal.SIGINT)
+    output = "".join(lines)
+    assert night.returncode == 130, output
+    assert "A simulated night" in lines[0]
+    for word in ("ERROR", "Traceback"):
+        assert word not in output
+    (run,) = (folder for folder in (tmp_path / "runs").iterdir() if (folder / "run.json").exists())
+    assert f"the report is {run / 'report.html'}" in output
+    assert (run / "report.html").stat().st_size > 10_000
+    assert len(list((run / "scans").glob("*.h5"))) >= 2
+
+
+@pytest.mark.parametrize("kind", ["experiment", "component"])
+def test_what_new_makes_is_right_and_measures_at_once(installed: Installed, tmp_path: Path, kind: str) -> None:
+    assert "afspm run experiment.toml" in installed.run("afspm", "new", kind, "my-idea", cwd=tmp_path)
+    folder = tmp_path / "my_idea"
+    assert "nothing wrong" in installed.run("afspm", "check", "experiment.toml", cwd=folder)
+    output = installed.run("afspm", "run", "experiment.toml", cwd=folder)
+    assert "measured: 6 scans" in output
+    assert len(list(folder.glob("runs/*/scans/*.h5"))) == 6
+    if kind == "component":
+        assert "the roughest is scan" in output
+
+
+def test_what_is_not_installed_is_found_before_anything_starts(installed: Installed, tmp_path: Path) -> None:
+    installed.run("afspm", "new", "experiment", "night", cwd=tmp_path)
+    folder = tmp_path / "night"
+    (folder / "brief.toml").write_text(
+        '[scheduler]\nclass = "DriftCompensatedScheduler"\ndrift = { estimator = "brief" }\n'
+    )
+    says = {
+        ("run", "experiment.toml", "--dashboard"): 'pip install "afspm[dashboard]"',
+        ("check", "experiment.toml", "brief.toml"): 'pip install "afspm[features]"',
+        ("run", "experiment.toml", "brief.toml"): 'pip install "afspm[features]"',
+    }
+    for arguments, remedy in says.items():
+        output = installed.run("afspm", *arguments, cwd=folder, code=1)
+        assert "needs what is not installed" in output
+        assert remedy in output
+        assert "Traceback" not in output
+    assert not (folder / "runs").exists()
+
+
+def test_a_notebook_joins_measures_and_shows_a_scan(installed: Installed, tmp_path: Path) -> None:
+    installed.add(f"afspm[notebook] @ {installed.wheel.as_uri()}")
+    installed.run("afspm", "new", "experiment", "night", cwd=tmp_path)
+    folder = tmp_path / "night"
+    cells = [{"cell_type": "code", "id": "a", "metadata": {}, "outputs": [], "execution_count": None, "source": LOOK}]
+    kernel = {"kernelspec": {"name": "python3", "display_name": "Python 3"}}
+    made = {"cells": cells, "metadata": kernel, "nbformat": 4, "nbformat_minor": 5}
+    (folder / "look.ipynb").write_text(json.dumps(made), encoding="utf-8")
+    frame = "series = { component = false }\nmetadata = { component = false }\n"
+    (folder / "notebook.toml").write_text(frame)
+    with installed.start("afspm", "run", "experiment.toml", "notebook.toml", cwd=folder) as night:
+        assert night.stdout is not None
+        assert any("processes, into" in line for line in night.stdout)
+        installed.run("jupyter", "execute", "--inplace", "look.ipynb", cwd=folder)
+        installed.run("afspm", "end", "--yes", cwd=folder)
+        assert night.wait(60) == 0, night.stdout.read()
+    (cell,) = json.loads((folder / "look.ipynb").read_text(encoding="utf-8"))["cells"]
+    text, shown = cell["outputs"]
+    assert "FREE (16, 20) True" in "".join(text["text"])
+    assert "text/html" in shown["data"] or "image/png" in shown["data"]
