@@ -142,7 +142,7 @@ class Night:
         if code is None:
             return [f"it did not end within {DEADLINE_S:g} s"]
         wrong = [] if code == 0 else [f"exit code {code}"]
-        name = (self.folder / "runs" / "latest").read_text(encoding="utf-8").strip()
+        name = (self.folder / "runs" / "latest").resolve().name
         return wrong + list(found_wrong(self.folder / "runs" / name))
 
     def _read(self, process: subprocess.Popen[bytes]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import platform
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -63,12 +64,13 @@ def acting(where: Path) -> Iterator[Scope]:
 def describe(follower: Follower, *, fancy: bool = True) -> RunDescription:
     """Return what is known of the run besides what it publishes."""
     from afspm.cli.status_text import RunDescription
-    from afspm.record.run_json import read_run_json
+    from afspm.record.run_json import REPLAY_OF, read_run_json
 
-    clock = follower.launch.clock
+    clock, facts = follower.launch.clock, read_run_json(follower.folder)
     return RunDescription(
-        name=str(read_run_json(follower.folder).get("name", follower.folder.name)),
+        name=str(facts.get("name", follower.folder.name)),
         folder=str(follower.folder),
+        replay_of=str(facts.get(REPLAY_OF, "")),
         simulated=follower.launch.simulated,
         began_ns=round(float(clock["start_s"]) * 1e9) if clock else None,
         speed=float(clock["speed"]) if clock else 1.0,
@@ -88,6 +90,13 @@ def can_show_blocks() -> bool:
 def say_nothing_runs(why: str) -> NoReturn:
     """End the command: raises typer.Exit."""
     typer.echo(f"afspm: nothing runs here: {why}", err=True)
+    raise typer.Exit(NOT_RUNNING)
+
+
+def say_unreachable(folder: Path, computer: str) -> NoReturn:
+    """End the command where a run of another computer does not answer: raises typer.Exit."""
+    what = f"{folder.resolve().name} was started on {computer}, and does not answer to this computer"
+    typer.echo(f"afspm: {what} ({platform.node()}): run this command there", err=True)
     raise typer.Exit(NOT_RUNNING)
 
 
@@ -111,7 +120,7 @@ def _running(where: Path) -> Path:
 def _only_if_running(folder: Path) -> Iterator[None]:
     from afspm.errors import ExperimentEnded, NoResponse
     from afspm.record.run_json import run_json_or_empty
-    from afspm.record.run_lock import cut_off_message
+    from afspm.record.run_lock import cut_off_message, other_computer
 
     try:
         yield
@@ -120,6 +129,8 @@ def _only_if_running(folder: Path) -> Iterator[None]:
     except NoResponse:
         if told := cut_off_message(folder):
             say_nothing_runs(f"nobody answers in {folder.resolve().name}; {told}")
+        if name := other_computer(folder):
+            say_unreachable(folder, name)
         said = f"nobody answers in {folder.resolve().name}, though it has not ended"
         if (run_json_or_empty(folder).get("guest") or {}).get("keys"):
             said += f"; perhaps its scheduler lacks the public key of {TERMINAL}"

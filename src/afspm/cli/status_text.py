@@ -29,6 +29,7 @@ class RunDescription:
     """Facts of a run besides what it publishes.
 
     Attributes:
+        replay_of: the folder of the run that is published again; empty: it is no replay.
         began_ns: experiment time at its start; None if it is not known.
         speed: experiment seconds in a real second.
         fancy: True if the terminal can show block characters.
@@ -37,6 +38,7 @@ class RunDescription:
     name: str
     folder: str
     simulated: bool = False
+    replay_of: str = ""
     began_ns: int | None = None
     speed: float = 1.0
     fancy: bool = True
@@ -96,7 +98,8 @@ class StatusText:
         from rich.text import Text
 
         run = self._run
-        line = Text.assemble((run.name, "bold")).append("  SIMULATED" if run.simulated else "", "bold red")
+        line = Text.assemble((run.name, "bold")).append("  REPLAY" if run.replay_of else "", "bold yellow")
+        line.append("  SIMULATED" if run.simulated else "", "bold red")
         line.append(f"  {day_and_time(self._now_ns)}")
         if run.began_ns is not None:
             line.append(f", running{self._since(run.began_ns)}")
@@ -206,6 +209,7 @@ class StatusText:
             "experiment": run.name,
             "folder": run.folder,
             "simulated": run.simulated,
+            "replay_of": run.replay_of or None,
             "time": _iso(self._now_ns),
             "mode": control.mode.name if control else None,
             "holder": control.holder if control else None,

@@ -17,7 +17,7 @@ from afspm.model import Frame, ProblemNames
 from afspm.model.snapshot import Plain
 from afspm.process.context import new_session
 from afspm.process.message_types import register_all
-from afspm.record.run_json import LATEST_FILE, RUN_FILE, STATE_DIR, read_run_json, run_json_or_empty
+from afspm.record.run_json import RUN_FILE, STATE_DIR, latest_run, read_run_json, run_json_or_empty
 from afspm.record.run_lock import cut_off_message
 from afspm.transport.zmq_port import open_port
 
@@ -130,17 +130,17 @@ def find_run(where: Path) -> Path:
             raise FileError("no run of this experiment is found", where=str(where), hint="start it with `afspm run`")
         return found[0]
     if (where / RUN_FILE).is_file():
-        return where
-    latest = where / LATEST_FILE
-    if latest.is_file():
-        return where / latest.read_text(encoding="utf-8").strip()
+        return where.resolve() if where.is_symlink() else where
+    if (latest := latest_run(where)) is not None:
+        return latest
     raise FileError("there is no run here", where=str(where), hint="name the folder of a run, e.g. runs/…")
 
 
 def _newest(runs: Path, name: str, file: Path) -> Path | None:
     """Return the newest run of the experiment `name` in the folder `runs`."""
     name = _name_in(file) or name
-    found = [run for run in runs.glob(f"*/{RUN_FILE}") if run_json_or_empty(run.parent).get("name") == name]
+    written = [run for run in runs.glob(f"*/{RUN_FILE}") if not run.parent.is_symlink()]
+    found = [run for run in written if run_json_or_empty(run.parent).get("name") == name]
     return max(found, key=_started).parent if found else None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import math
 import threading
@@ -15,7 +16,7 @@ from afspm.addresses import Listens
 from afspm.clock import Clock, ExperimentClock
 from afspm.emulators.faults import Fault, Faults
 from afspm.emulators.rig import Rig
-from afspm.errors import AfspmError, ErrorCollector
+from afspm.errors import AfspmError, ErrorCollector, TransportError
 from afspm.exit_codes import ExitCode
 from afspm.translator.emulated_controller import AddressNotice, notice_file
 from afspm.transport.polling import WakeUp
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 LOOPBACK = "127.0.0.1"
 LONGEST_WAIT_S = 60.0
 _AGAIN_S = 1.0
+_TAKEN = {errno.EADDRINUSE, getattr(errno, "WSAEADDRINUSE", errno.EADDRINUSE)}
 """After an error that nobody foresaw, `tick` is called again after so long, experiment time."""
 FAREWELL_S = 0.5
 """So long, real time, a controller stays there when the experiment has ended: the translator stops the tip first."""
@@ -167,6 +169,7 @@ class Emulator(ABC):
 
         Raises:
             Crashed: it was told to.
+            TransportError: another program listens at its port.
         """
         self.clock, self.folder, self.log, self.listening = clock, folder, log, listening
         self.rig = Rig(self._world_settings, self.seed, clock)
@@ -175,13 +178,24 @@ class Emulator(ABC):
         self.woken = WakeUp()
         self.rig.drawing.wake, self.rig.drawing.log = self.woken.post, log
         try:
-            listening(self.open())
+            listening(self._open())
             while not self._stop.is_set() and clock.monotonic_s() < self._leave_at_s:
                 self._survive(self.serve, self._wait_s())
                 self.woken.take()
         finally:
             self.close()
             self.woken.close()
+
+    def _open(self) -> str:
+        try:
+            return self.open()
+        except Exception as error:
+            if getattr(error, "errno", None) not in _TAKEN:
+                raise
+            hint = "end that, or choose another port; without --port and --usual a free one is taken"
+            raise TransportError(
+                f"another program listens at the port {self.port or 'of the vendor'}", hint=hint
+            ) from error
 
     def stop(self) -> None:
         """End `run` soon. From any thread, also before it began."""

@@ -37,7 +37,7 @@ from afspm.record.measured_tables import (
     spectrum_row,
 )
 from afspm.record.packets import packets, without_reading_files
-from afspm.record.run_json import EXPERIMENT_FILE, LATEST_FILE, REPLAY_OF, run_json_or_empty
+from afspm.record.run_json import EXPERIMENT_FILE, REPLAY_OF, latest_run, run_json_or_empty
 from afspm.record.tables import ControlRow, NoteRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
 
 if TYPE_CHECKING:
@@ -359,8 +359,8 @@ class Run:
 
 
 def _folder(path: Path) -> Path:
-    latest = path / LATEST_FILE
-    if not (path / journal.JOURNAL_FILE).is_file() and latest.is_file():
-        path = path / latest.read_text(encoding="utf-8").strip()
+    if not (path / journal.JOURNAL_FILE).is_file():
+        path = latest_run(path) or path
+    path = path.resolve() if path.is_symlink() else path
     replayed = None if (path / journal.JOURNAL_FILE).is_file() else run_json_or_empty(path).get(REPLAY_OF)
     return Path(replayed) if isinstance(replayed, str) else path

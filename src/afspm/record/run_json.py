@@ -17,8 +17,12 @@ REPLAY_OF: Final = "replay_of"
 """In run.json of a replay: the folder of the run that it publishes again."""
 EXPERIMENT_FILE: Final = "experiment.toml"
 """Beside it: the experiment as it was expanded."""
-LATEST_FILE: Final = "latest"
-"""In the folder of all runs: the name of the newest."""
+COMPUTER: Final = "computer"
+"""In run.json: the name of the computer that the run was started on."""
+LATEST_LINK: Final = "latest"
+"""In the folder of all runs: a link to the newest."""
+LATEST_FILE: Final = "latest.txt"
+"""Where no links can be made: a file with the name of the newest."""
 
 
 def read_run_json(folder: Path) -> dict[str, Any]:
@@ -43,6 +47,14 @@ def run_json_or_empty(folder: Path) -> dict[str, Any]:
         return read_run_json(folder)
     except FileError:
         return {}
+
+
+def latest_run(runs: Path) -> Path | None:
+    """Return the newest run in the folder of all runs; None: there is none."""
+    link, file = runs / LATEST_LINK, runs / LATEST_FILE
+    if link.is_dir():
+        return runs / link.resolve().name
+    return runs / file.read_text(encoding="utf-8").strip() if file.is_file() else None
 
 
 def experiment_name(folder: Path, otherwise: str = "") -> str:

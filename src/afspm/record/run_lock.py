@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import platform
 import shlex
 import sys
 from collections.abc import Iterator
@@ -10,7 +11,7 @@ from pathlib import Path
 
 from afspm.errors import FileError
 from afspm.file_lock import lock
-from afspm.record.run_json import ENDED, REPLAY_OF, STATE_DIR, run_json_or_empty
+from afspm.record.run_json import COMPUTER, ENDED, REPLAY_OF, STATE_DIR, run_json_or_empty
 
 LOCK_FILE = "running"
 
@@ -33,14 +34,20 @@ def lock_run(folder: Path) -> Iterator[None]:
 def cut_off_message(folder: Path) -> str:
     """Return what to tell of a run that was cut off; empty: it goes on, or has ended.
 
-    Only who can read the disk of the computer that it ran on can know.
+    Only the computer that it ran on can know.
     """
     facts = run_json_or_empty(folder)
-    if not facts or facts.get(ENDED) or not _is_left(folder):
+    if not facts or facts.get(ENDED) or other_computer(folder) or not _is_left(folder):
         return ""
     if REPLAY_OF in facts:
         return "this replay was cut off"
     return f"it was cut off; {resume_command(folder)} goes on with it"
+
+
+def other_computer(folder: Path) -> str:
+    """Return the name of the computer that a run was started on; empty: this one, or it is not known."""
+    name = str(run_json_or_empty(folder).get(COMPUTER) or "")
+    return "" if name == platform.node() else name
 
 
 def goes_on(folder: Path) -> bool:
@@ -52,6 +59,8 @@ def describe_state(folder: Path) -> str:
     """Return the state of a run in words: how it ended, that it was cut off, that it goes on."""
     if ended := run_json_or_empty(folder).get(ENDED):
         return str(ended)
+    if name := other_computer(folder):
+        return f"it goes on, or was cut off; {name}, on which it was started, knows"
     known = (folder / STATE_DIR / LOCK_FILE).exists()
     return cut_off_message(folder) or ("it goes on" if known else "it goes on, or was cut off")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import platform
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from afspm.errors import ConfigError
 from afspm.experiment import Experiment, ProcessStart, Role
 from afspm.launch import Launch, Sockets
 from afspm.logic.supervisor_registry import LOGGED_AS
-from afspm.record.run_json import ENDED, STATE_DIR, run_json_or_empty
+from afspm.record.run_json import COMPUTER, ENDED, STATE_DIR, run_json_or_empty
 from afspm.record.run_lock import lock_run
 from afspm.storage.disk import run_bounded
 from afspm.storage.packet_log import discard_if_recorded, expect_recorder, log_folder
@@ -172,6 +173,7 @@ def run_facts(name: str, starts: Sequence[ProcessStart], common: RunIdentity) ->
         "name": name,
         RUN: common.run,
         "simulated": common.simulated,
+        COMPUTER: platform.node(),
         "clock": common.clock.as_dict(),
         "processes": {
             start.launch.name: {

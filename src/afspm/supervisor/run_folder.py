@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from afspm.errors import FileError
-from afspm.record.run_json import EXPERIMENT_FILE, LATEST_FILE, RUN_FILE, STATE_DIR
+from afspm.record.run_json import EXPERIMENT_FILE, LATEST_FILE, LATEST_LINK, RUN_FILE, STATE_DIR
 from afspm.storage.atomic import replace_file
 from afspm.storage.disk import sync_folder
 
@@ -20,7 +20,7 @@ MOST_RUNS_A_SECOND = 1000
 
 
 def create(runs: Path, experiment: str, started: datetime) -> Path:
-    """Return a new, empty run folder `runs/<experiment>-<time>/`, absolute; `runs/latest` then names it.
+    """Return a new, empty run folder `runs/<experiment>-<time>/`, absolute; `runs/latest` then leads to it.
 
     Raises:
         FileError: the folder can't be made.
@@ -32,7 +32,7 @@ def create(runs: Path, experiment: str, started: datetime) -> Path:
         folder = _new_folder(runs.resolve(), stamp)
         (folder / STATE_DIR).mkdir()
         sync_folder(folder)
-        _replace(runs / LATEST_FILE, folder.name + "\n")
+        _point_to(runs, folder.name)
     except OSError as error:
         raise FileError(
             f"no folder for the run can be made: {error.strerror or error}",
@@ -59,6 +59,17 @@ def _new_folder(runs: Path, stamp: str) -> Path:
             folder.mkdir()
             return folder
     raise FileExistsError(f"{stamp} is there {MOST_RUNS_A_SECOND} times")
+
+
+def _point_to(runs: Path, name: str) -> None:
+    """Make the newest run found in the folder of all runs: by a link, or a file where links can't be made."""
+    aside = runs / f".{LATEST_LINK}-{name}"
+    try:
+        aside.symlink_to(name, target_is_directory=True)
+        aside.replace(runs / LATEST_LINK)
+    except OSError:  # Windows lets only some users make links
+        aside.unlink(missing_ok=True)
+        _replace(runs / LATEST_FILE, name + "\n")
 
 
 def _replace(file: Path, text: str) -> None:

@@ -178,7 +178,7 @@ def test_a_report_may_be_had_while_it_goes_on(night: Running) -> None:
 def test_a_run_whose_supervisor_is_killed_is_told_as_cut_off_everywhere(tmp_path: Path) -> None:
     run = Running(tmp_path)
     run.wait_for(r"scan 1 of")
-    folder = str(run.runs / (run.runs / "latest").read_text(encoding="utf-8").strip())
+    folder = str((run.runs / "latest").resolve())
     watching = subprocess.Popen(
         [*AFSPM, "watch", folder], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8"
     )

@@ -37,7 +37,7 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
     command = [sys.executable, "-m", "afspm", "run", str(SAMPLE), "shorter.toml", "--speed", "300"]
     ended = subprocess.run(command, cwd=folder, capture_output=True, timeout=110, encoding="utf-8", check=False)
     assert ended.returncode == 0, ended.stdout + ended.stderr
-    return folder / "runs" / (folder / "runs" / "latest").read_text(encoding="utf-8").strip()
+    return (folder / "runs" / "latest").resolve()
 
 
 def record_of(night: Path) -> NightRecord:

@@ -64,6 +64,18 @@ def test_a_crash_on_the_command_line_ends_with_1(tmp_path: Path) -> None:
         assert process.wait(DEADLINE_S) == 1
 
 
+@pytest.mark.parametrize("vendor", ["nanonis", "asylum", "gxsm"])
+def test_a_port_that_is_taken_is_told_in_one_sentence(vendor: str, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        with started("afspm", "emulate", vendor, "--port", port, cwd=tmp_path) as process:
+            told = process.communicate(timeout=60.0)
+    assert process.returncode == 1
+    said = "".join(filter(None, told)).strip()
+    assert f"another program listens at the port {port}" in said
+    assert "Traceback" not in said
+
+
 def test_a_fault_that_it_does_not_have_is_refused_before_it_listens(tmp_path: Path) -> None:
     with started("afspm", "emulate", "echo.Echo", "--fault", "crush", cwd=tmp_path) as process:
         out, err = process.communicate(timeout=DEADLINE_S)

@@ -160,7 +160,7 @@ def test_a_run_is_found_by_its_experiment_file_or_the_folder_of_runs(
     for name in ("a-1", "a-2", "b-1"):
         (tmp_path / "runs" / name).mkdir(parents=True)
         (tmp_path / "runs" / name / "run.json").write_text(json.dumps({"name": name[0]}))
-    (tmp_path / "runs" / "latest").write_text("b-1\n")
+    (tmp_path / "runs" / "latest.txt").write_text("b-1\n")
     (tmp_path / "a.toml").write_text("")
     assert find_run(Path("a.toml")).name == "a-2"
     assert find_run(Path("runs")).name == "b-1"

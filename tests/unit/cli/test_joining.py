@@ -12,7 +12,7 @@ import typer
 from afspm.cli.joining import NOT_RUNNING, acting, looking
 from afspm.cli.status import _console
 from afspm.errors import NoResponse
-from afspm.record.run_lock import lock_run
+from afspm.record.run_lock import cut_off_message, describe_state, lock_run
 
 
 @pytest.mark.parametrize("runs", [False, True], ids=["cut off", "it runs"])
@@ -47,6 +47,25 @@ def test_a_run_that_was_cut_off_says_how_it_goes_on_and_one_that_runs_what_may_b
     assert (f"it was cut off; `afspm run --resume {tmp_path / 'night-1'}` goes on with it" in said) is not runs
     assert ("though it has not ended" in said) is runs
     assert ("lacks the public key of terminal" in said) is (runs and keys != "null")
+
+
+def test_a_run_of_another_computer_is_not_said_to_be_cut_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def nobody(*_: object) -> None:
+        raise NoResponse("nobody is there")
+
+    folder = tmp_path / "night-1"
+    (folder / "state").mkdir(parents=True)
+    (folder / "run.json").write_text('{"name": "night", "computer": "lab-7", "guest": {}}', encoding="utf-8")
+    monkeypatch.setattr("afspm.client.connect.connect", nobody)
+    with lock_run(folder):
+        pass
+    assert cut_off_message(folder) == ""
+    assert describe_state(folder) == "it goes on, or was cut off; lab-7, on which it was started, knows"
+    with pytest.raises(typer.Exit), acting(folder):
+        pass
+    assert "night-1 was started on lab-7, and does not answer to this computer" in capsys.readouterr().err
 
 
 def test_a_run_that_has_ended_is_named_from_its_folder_too(

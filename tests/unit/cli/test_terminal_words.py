@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
@@ -80,6 +81,13 @@ def shown(overview: Overview, about: RunDescription = ABOUT, width: int = 140, s
 )
 def test_what_is_so_is_said(night: Overview, said: str) -> None:
     assert said in shown(night)
+
+
+def test_a_replay_is_called_one(night: Overview) -> None:
+    about = replace(ABOUT, replay_of="runs/night-0")
+    assert "REPLAY" in shown(night, about)
+    assert StatusText(night, about, START).as_json()["replay_of"] == "runs/night-0"
+    assert "REPLAY" not in shown(night)
 
 
 def test_what_takes_longer_than_it_said_does_not_promise_its_end(night: Overview) -> None:

@@ -12,7 +12,7 @@ from afspm.clock import ExperimentClock
 from afspm.emulators import registry
 from afspm.emulators.asylum import AsylumEmulator
 from afspm.emulators.emulator import Emulator
-from afspm.errors import ConfigError
+from afspm.errors import ConfigError, TransportError
 
 from .tiny import Tiny, ask
 
@@ -57,9 +57,12 @@ def test_an_emulated_crash_closes_the_connection_without_an_answer(tmp_path: Pat
 
 
 def test_a_port_that_is_taken_is_an_error_of_the_block(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(OSError, match=r"use|permitted"):  # noqa: SIM117
-        with Tiny(port=taken.getsockname()[1]).running(tmp_path):
-            pytest.fail("it listens on a taken port")
+    with (
+        socket.create_server(("127.0.0.1", 0)) as taken,
+        pytest.raises(TransportError, match="another program listens"),
+        Tiny(port=taken.getsockname()[1]).running(tmp_path),
+    ):
+        pytest.fail("it listens on a taken port")
 
 
 def test_the_vendors_usual_port_is_taken_on_request_alone() -> None:

@@ -110,7 +110,7 @@ def test_who_reads_while_it_ends_is_not_disturbed(night: Night, store: RecordSto
 def test_the_newest_of_a_folder_of_runs_is_meant(night: Night, tmp_path: Path) -> None:
     (tmp_path / "night-2").mkdir()
     RecordStore(tmp_path / "night-2", ABOUT).close()
-    (tmp_path / "latest").write_text("night-2\n")
+    (tmp_path / "latest.txt").write_text("night-2\n")
     assert afspm.open_run(tmp_path).folder == tmp_path / "night-2"
 
 

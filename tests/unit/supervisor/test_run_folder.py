@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from afspm.errors import FileError
+from afspm.record.run_json import latest_run
 from afspm.supervisor import run_folder
 
 STARTED = datetime(2026, 11, 20, 22, 15, 3, tzinfo=UTC)
@@ -24,7 +25,18 @@ def test_two_runs_of_one_second_do_not_share_a_folder(tmp_path: Path) -> None:
     first = run_folder.create(tmp_path, "night", STARTED)
     second = run_folder.create(tmp_path, "night", STARTED)
     assert first != second
-    assert (tmp_path / "latest").read_text() == second.name + "\n"
+    assert (tmp_path / "latest").resolve() == second
+    assert latest_run(tmp_path) == second
+
+
+def test_where_no_link_can_be_made_a_file_names_the_newest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object, **__: object) -> None:
+        raise OSError("a required privilege is not held by the client")
+
+    monkeypatch.setattr(Path, "symlink_to", refused)
+    newest = run_folder.create(tmp_path, "night", STARTED)
+    assert latest_run(tmp_path) == newest
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["latest.txt", newest.name]
 
 
 def test_a_name_cannot_lead_out_of_the_folder(tmp_path: Path) -> None:
