@@ -43,6 +43,7 @@ class = "Scheduler"
 [random_points]
 component = true
 class = "points.RandomPoints"
+around = "600 nm"
 
 [best_points]
 component = true
@@ -114,14 +115,27 @@ def wait_for_scans(page: Any, places: int) -> None:
 def photograph_all(browser: Browser, url: str, folder: Path) -> None:
     """Leave a picture of each screen and theme, as far as one scrolls."""
     folder.mkdir(parents=True, exist_ok=True)
-    for person in ("", "Ada"):
-        for theme in ("light", "dark"):
-            for screen in SCREENS:
-                page = open_page(browser, url, screen, theme, person)
-                page.wait_for_timeout(2500)
-                name = f"{screen}-{theme}{'-signed-in' if person else ''}.png"
-                page.screenshot(path=folder / name, full_page=True)
-                page.context.close()
+    for screen in SCREENS:
+        for person, theme in (("", "light"), ("", "dark"), ("Ada", "light"), ("Ada", "dark")):
+            page = open_page(browser, url, screen, theme, person)
+            name = f"{screen}-{theme}{'-signed-in' if person else ''}"
+            for part in parts_of(page, screen):
+                page.wait_for_timeout(1500)
+                page.screenshot(path=folder / f"{name}-{part}.png")
+            page.context.close()
+
+
+def parts_of(page: Any, screen: str) -> Iterator[str]:
+    """Show one part of the page after the other."""
+    if screen == "phone":
+        for tab in page.locator("[role=tab]").all():
+            tab.click()
+            yield tab.inner_text().lower()
+    else:
+        yield "top"
+        page.mouse.move(700, 600)
+        page.evaluate("window.scrollTo(0, document.body.scrollHeight)")
+        yield "further"
 
 
 def main() -> None:

@@ -31,6 +31,12 @@ def shown(page: Any, scan: Scan) -> Any:
     return page.locator(".picture")
 
 
+def drawn(page: Any) -> str:
+    """Wait for a picture; its time."""
+    page.wait_for_function("document.querySelector('.picture').dataset.number > 0")
+    return str(page.get_attribute(".picture", "data-time"))
+
+
 def read_value(page: Any, column: int, row: int) -> float:
     """Point at a pixel, and read its value."""
     x, y = page.evaluate(
@@ -85,8 +91,10 @@ def test_it_is_said_to_be_simulated_and_what_is_scanned(night: Night, opened: Op
     page = opened(night.url)
     shown(page, scan)
     assert page.locator(".simulated").inner_text() == "SIMULATED: this is no real microscope"
-    assert "turned by 22.92°" in page.inner_text(".caption")
-    assert "72 × 48 px" in page.inner_text(".caption")
+    facts = dict(zip(*(page.locator(f".facts {tag}").all_inner_texts() for tag in ("dt", "dd")), strict=True))
+    assert (facts["Angle"], facts["Pixels"], facts["Size"]) == ("22.92°", "72 × 48", "800 × 500 nm")
+    assert facts["Bias"] == "100 mV"
+    assert {"Scan", "Finished", "Took", "Speed", "Setpoint"} <= facts.keys()
     keep(page, "watching")
 
 
@@ -181,8 +189,11 @@ def test_control_processes_log_and_time_line_are_as_published(night: Night, open
         page.wait_for_selector(f"[role=rowheader]:text-is('{name}')")
         assert state.starts >= 1
     page.wait_for_selector("ul.log >> text=the dashboard is at")
-    for lane in ("control", "mode", "microscope", "scheduler"):
-        assert page.locator(f".lane > b:text-is('{lane}')").count() >= 1
+    for lane in ("control", "mode", "microscope", "processes"):
+        assert page.locator(f".lane > b:text-is('{lane}')").count() == 1
+    page.click(".time .q-toggle")
+    page.wait_for_selector(".lane > b:text-is('scheduler')")
+    page.locator(".lane > b:text-is('processes')").wait_for(state="detached")
 
 
 def test_the_log_is_filtered(night: Night, opened: Opened) -> None:
@@ -202,8 +213,8 @@ def test_it_fits_any_screen(
     night: Night, opened: Opened, scan: Scan, keep: Any, width: int, height: int, theme: str
 ) -> None:
     page = opened(night.url, width=width, height=height, theme=theme)
-    page.wait_for_selector(".map svg")
-    page.wait_for_selector("[role=rowheader]")
+    page.wait_for_selector(".map svg", state="attached")
+    page.wait_for_selector("[role=rowheader]", state="attached")
     page.wait_for_function("document.querySelector('.picture').dataset.number > 0")
     assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
     ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
@@ -212,9 +223,91 @@ def test_it_fits_any_screen(
     keep(page, f"{theme}-{width}")
 
 
+@pytest.mark.parametrize("person", ["", "Ada"])
+def test_time_line_and_log_are_on_the_first_screen(
+    night: Night, opened: Opened, scan: Scan, person: str, keep: Any
+) -> None:
+    page = opened(night.url, person=person, width=1440, height=900)
+    drawn(page)
+    page.wait_for_selector("ul.log li")
+    for part in ("scan", "sample", "time", "log"):
+        box = page.locator(f"section.{part}").bounding_box()
+        assert box["y"] >= 0
+        assert box["y"] + box["height"] <= 900, part
+    picture = page.evaluate("(() => { const { width, height } = afspm.image.geometry.box; return [width, height]; })()")
+    assert max(picture) > 300
+    keep(page, f"first-screen-{person or 'nobody'}")
+
+
+@pytest.mark.parametrize("name", ["scan", "sample", "time", "log"])
+def test_a_phone_shows_one_part_at_a_time_below_a_bar_that_stays(
+    night: Night, opened: Opened, scan: Scan, name: str, keep: Any
+) -> None:
+    page = opened(night.url, width=390, height=844)
+    drawn(page)
+    page.click(f"[role=tab][data-tab={name}]")
+    page.locator(f"section.{name}").wait_for(state="visible")
+    others = {"scan", "sample", "time", "log"} - {name}
+    assert not any(page.locator(f"section.{other}").is_visible() for other in others)
+    assert page.evaluate("document.documentElement.scrollHeight") < 1600
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    page.evaluate("window.scrollTo(0, 5000)")
+    bar, tabs = (page.locator(part).bounding_box() for part in ("[data-part=mode]", ".tabs"))
+    assert 0 <= bar["y"] < 150
+    assert tabs["y"] + tabs["height"] == pytest.approx(844, abs=1)
+    keep(page, f"phone-{name}")
+
+
+def test_scans_of_different_sizes_at_one_place_are_pictures_on_the_map(
+    night: Night, opened: Opened, scan: Scan, keep: Any
+) -> None:
+    with afspm.connect(night.folder, "mapper") as scope, scope.control():
+        taken = [scope.scan(Region((0, 0), (side, side)), shape=(24, 24), timeout_s=60.0).first
+                 for side in (0.9e-6, 0.3e-6)]  # fmt: skip
+    page = opened(night.url)
+    for one in taken:
+        page.wait_for_selector(f".map polygon[data-time='{one.time_ns}']", state="attached")
+        picture = page.locator(f".map image[href*='/{one.time_ns}?']")
+        assert picture.count() == 1
+        answer = page.request.get(night.url + picture.get_attribute("href"))
+        assert (answer.status, answer.headers["content-type"]) == (200, "image/png")
+        assert answer.body().startswith(b"\x89PNG")
+    page.wait_for_selector(f".strip img[data-time='{taken[-1].time_ns}']")
+    keep(page, "map")
+
+
+def test_a_scan_is_seen_again_by_a_click_on_the_time_line(night: Night, opened: Opened, scan: Scan) -> None:
+    page = opened(night.url)
+    newest = drawn(page)
+    other = page.locator(f".strip img:not([data-time='{newest}'])").first
+    time_ns = other.get_attribute("data-time")
+    other.click()
+    page.wait_for_function(f"document.querySelector('.picture').dataset.time === '{time_ns}'")
+
+
+def test_both_axes_of_the_picture_have_one_unit(night: Night, opened: Opened, scan: Scan) -> None:
+    with afspm.connect(night.folder, "liner") as scope, scope.control():
+        far = scope.scan(Region((2e-6, 0), (0.4e-6, 0.4e-6)), shape=(16, 16), timeout_s=60.0).first
+    page = opened(night.url)
+    page.evaluate(
+        """() => {
+          const draw = CanvasRenderingContext2D.prototype.fillText;
+          window.texts = [];
+          CanvasRenderingContext2D.prototype.fillText = function (text, ...rest) {
+            window.texts.push(text);
+            return draw.call(this, text, ...rest);
+          };
+        }"""
+    )
+    page.wait_for_selector(f".map polygon[data-time='{far.time_ns}']", state="attached")
+    page.evaluate(f"afspm.pin({{ time: '{far.time_ns}', channel: '{far.channel}' }})")
+    page.wait_for_function("window.texts?.includes('y [µm]') && window.texts.includes('x [µm]')")
+
+
 def test_whoever_has_not_signed_in_can_steer_nothing(night: Night, opened: Opened) -> None:
     page = opened(night.url)
     page.wait_for_selector("[role=rowheader]")
-    assert page.locator(".steer button").count() == 0
+    assert page.locator("section.steer").count() == 0
+    assert page.locator(".bar button:visible:has-text('Take over')").count() == 0
     assert page.locator(".process button:visible").count() == 0
     assert page.locator("[data-tool=scan]:visible").count() == 0

@@ -6,9 +6,9 @@ import logging
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from afspm import wire
 from afspm.client.experiment_link import ExperimentLink
@@ -16,7 +16,7 @@ from afspm.client.parameter_values import from_parameter, to_parameter
 from afspm.clock import Clock
 from afspm.dashboard.access import Access, Visitor, check_name
 from afspm.dashboard.watch import Watch
-from afspm.errors import AfspmError
+from afspm.errors import AfspmError, UnitError
 from afspm.formatting import quantity, typeset_position
 from afspm.launch import Launch
 from afspm.model import (
@@ -39,19 +39,27 @@ from afspm.record.overview import Overview
 from afspm.transport.network import Network
 from afspm.transport.port import ParentGone
 from afspm.transport.zmq_port import ZmqPort
+from afspm.units import parse_quantity
 
 ANSWER_S = 20.0  # real time that an answer may take
 FREE_S = 60.0  # that the microscope may take to get to a place
 SETTLED_S = 2.0  # what was set is published by then, if it changed anything
 MOST_PERSONS = 32
+_PAGE = ".page"  # no name of a person begins so
 
 
 @dataclass(frozen=True)
 class ActionResult:
-    """The result of an action; `text` is for the person, with the reason of a refusal."""
+    """The result of an action.
+
+    Attributes:
+        text: for the person, with the reason of a refusal.
+        each: of an action on several parameters, the result for each by its name.
+    """
 
     text: str
     ok: bool = True
+    each: Mapping[str, ActionResult] = field(default_factory=dict)
 
 
 class Actions:
@@ -109,17 +117,22 @@ class Actions:
         response = self._ask(ControlRequest.ACTION, names.STOP_SPEC if is_spectrum else names.STOP_SCAN)
         return _result(response, "The spectrum is stopped" if is_spectrum else "The scan is stopped")
 
-    def read(self, parameter: str) -> ActionResult:
-        """Return the value of a parameter that is in force, with its unit, as the text of the result."""
-        response = self._ask(ControlRequest.PARAM, Parameter(parameter))
-        return _result(response, "") if not response.ok else ActionResult(_in_force(parameter, response))
+    def read(self, parameters: Iterable[str]) -> ActionResult:
+        """Return the values of parameters that are in force, with their units; one that is refused is not ok."""
+        return ActionResult("", each={name: self._read(name) for name in parameters})
 
-    def set(self, parameter: str, text: str) -> ActionResult:
-        """Set a parameter to a quantity as a person writes it: "0.5 V", "2 um/s", "12"; without a unit it is SI."""
-        response = self._ask(ControlRequest.PARAM, to_parameter(parameter, _number_or(text.strip()), None))
-        if not response.ok or not response.payload:
-            return _result(response, f"{parameter} is set to {text}")
-        return ActionResult(f"{parameter} is now {_in_force(parameter, response)}")
+    def set(self, wanted: Mapping[str, str]) -> ActionResult:
+        """Set parameters to quantities as a person writes them: "0.5 V", "2 um/s", "12". Each is asked for by itself.
+
+        If one of them can't be what is meant, nothing is sent.
+        """
+        checked = {name: unclear(name, text) for name, text in wanted.items()}
+        if wrong := {name: ActionResult(why, ok=False) for name, why in checked.items() if why}:
+            text = " ".join(("Nothing was set.", *(one.text for one in wrong.values())))
+            return ActionResult(text, ok=False, each=wrong)
+        each = {name: self._set(name, text.strip()) for name, text in wanted.items()}
+        refused = [one.text for one in each.values() if not one.ok]
+        return ActionResult(" ".join(refused or [one.text for one in each.values()]), ok=not refused, each=each)
 
     def scan(self, region: Region | None = None, shape: tuple[int, int] | None = None) -> ActionResult:
         """Begin a scan; `region` and `shape` None: as they are set. It is done when the scan has begun."""
@@ -147,6 +160,17 @@ class Actions:
     def _ask(self, kind: int, subject: object = None) -> Response:
         self._link.pump(0.0)  # what has come of the connection since we asked last
         return self._link.request(kind, subject, until_s=self._link.until(ANSWER_S))
+
+    def _read(self, parameter: str) -> ActionResult:
+        response = self._ask(ControlRequest.PARAM, Parameter(parameter))
+        return ActionResult(_in_force(parameter, response)) if response.ok else _result(response, "")
+
+    def _set(self, parameter: str, text: str) -> ActionResult:
+        response = self._ask(ControlRequest.PARAM, to_parameter(parameter, _number_or(text), None))
+        if not response.ok:
+            return ActionResult(f"{parameter}: {refusal(response)}.", ok=False)
+        now = _in_force(parameter, response) if response.payload else text
+        return ActionResult(f"{parameter} is now {now}.")
 
     def _when_free(self, action: str) -> Response:
         """Ask for an action, again and again while the microscope is not free."""
@@ -185,6 +209,24 @@ def _in_force(parameter: str, response: Response) -> str:
     if isinstance(value, bool) or not isinstance(value, float | int):
         return str(value)
     return f"{math.degrees(value):.6g} deg" if unit == "rad" else quantity(value, unit, 6)
+
+
+def unclear(parameter: str, text: str) -> str:
+    """Return why a text can't be the value of a parameter; empty: it can. A number must have its unit, if there is one.
+
+    >>> unclear("scan-speed", "8")
+    'scan-speed: write the unit as well, for example "8 m/s".'
+    """
+    unit = names.BASE_PARAMETERS.get(parameter)
+    if not text.strip():
+        return f"{parameter}: write a value."
+    try:
+        _, given = parse_quantity(text)
+    except UnitError as error:
+        return f"{parameter}: {error}." if unit is not None else ""
+    if given or not unit or unit == "px":
+        return ""
+    return f'{parameter}: write the unit as well, for example "{text.strip()} {unit}".'
 
 
 def _number_or(text: str) -> float | str:
@@ -247,6 +289,13 @@ class Steering:
             done: Future[ActionResult] = Future()
             done.set_result(ActionResult("Sign in first: what is done is in the record with a name.", ok=False))
             return done
+        return self._submit(person, action)
+
+    def read(self, action: Action) -> Future[ActionResult]:
+        """Carry out an action that only reads, in the name of the page itself."""
+        return self._submit(_PAGE, action)
+
+    def _submit(self, person: str, action: Action) -> Future[ActionResult]:
         with self._lock:
             one = self._persons.get(person)
             if one is None:
@@ -254,7 +303,7 @@ class Steering:
                     self._persons.popitem(last=False)[1].close()
                 one = self._persons[person] = _Person(ThreadPoolExecutor(1, thread_name_prefix="person"))
             self._persons.move_to_end(person)
-        return one.thread.submit(self._carry_out, person, one, action)
+            return one.thread.submit(self._carry_out, person, one, action)
 
     def close(self) -> None:
         """End all connections; what is under way ends without an answer."""

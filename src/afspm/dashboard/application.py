@@ -33,7 +33,7 @@ def application(
 
     app = FastAPI(lifespan=lifespan, openapi_url=None)
     add_sign_in(app, access, title, encrypted=encrypted, only_here=is_loopback(host))
-    live = Live(services.watch, bell, archive)
+    live = Live(services.watch, bell, archive, services.conditions)
     live.add_to(app)
     app.mount("/assets", StaticFiles(directory=ASSETS))
 

@@ -10,10 +10,12 @@ from html import escape
 
 from afspm.clock import NS_PER_S
 from afspm.dashboard.charts import Chart, drift_chart
-from afspm.dashboard.sample_map import MapContent, map_html
+from afspm.dashboard.flags import Flag, flags
+from afspm.dashboard.sample_map import MapContent, map_html, picture_url
+from afspm.dashboard.scan_facts import ends_text
 from afspm.dashboard.watch import Watch
 from afspm.drawing.timeline import TimelineRow, timeline_html, tint_class
-from afspm.formatting import day_and_time, duration_text, time_of_day, typeset_position
+from afspm.formatting import day_and_time, duration_text, time_of_day, typeset_area
 from afspm.model import ControlMode, JournalEntry, LogLine, ProcessState, Region
 from afspm.record.overview import OVER, Overview
 from afspm.record.timeline import Span, Timeline
@@ -22,17 +24,22 @@ ANEW_S = 0.4  # at most that often, however much is published
 SLOWLY_S = 2.0  # for what takes longer to make
 OLD_AFTER_S = 8.0  # a supervisor tells of its processes every 2 s
 NOT_HEARD_OF = "not heard of"
-Flag = tuple[int, str, str]
-"""Number and name of a problem, and who flagged it."""
+_FAILED = {"silent", "restarting", "given up", NOT_HEARD_OF}
 
 
 @dataclass(frozen=True)
 class SlowContent:
-    """The parts that take longer to make; `sample_map_near` shows only where something was measured."""
+    """The parts that take longer to make.
+
+    Attributes:
+        sample_map_near: only where something was measured.
+        time_line_unfolded: with a row for each process.
+    """
 
     sample_map: str = ""
     sample_map_near: str = ""
     time_line: str = ""
+    time_line_unfolded: str = ""
     drift: Chart = field(default_factory=lambda: Chart(""))
 
 
@@ -55,6 +62,7 @@ class Content:
     unheard: Mapping[str, int] = field(default_factory=dict)
     log: tuple[LogLine, ...] = ()
     is_manual: bool = False
+    adjustable: tuple[str, ...] = ()
     ended: bool = False
 
 
@@ -63,11 +71,13 @@ class Contents:
 
     Args:
         limits: where scans may lie at all, in tip coordinates; None if it is not known.
+        pictures: the address under which there are small pictures of scans.
     """
 
-    def __init__(self, watch: Watch, limits: Region | None) -> None:
+    def __init__(self, watch: Watch, limits: Region | None, pictures: str = "") -> None:
         self._watch = watch
         self._limits = limits
+        self._pictures = pictures
         self._lock = threading.Lock()
         self._content = Content()
         self._made_s = self._drawn_s = -1e9
@@ -95,7 +105,7 @@ class Contents:
                 slow=slow,
                 refusals=refusals_html(overview.refusals),
                 channels=watch.frames.channels,
-                problems=tuple(_flags(overview)),
+                problems=tuple(flags(overview)),
                 processes=tuple(overview.processes.values()),
                 unheard=silent,
                 log=tuple(overview.log),
@@ -114,9 +124,32 @@ class Contents:
             self._watch.tip_to_sample,
             overview.probe_position.xy_m if overview.probe_position else None,
             newest.time_ns if newest else None,
+            overview.targets,
+            self._pictures,
         )
-        time_line = timeline_html(rows_of(overview, silent), None, _now_ns(self._watch, overview))
-        return SlowContent(map_html(content), map_html(content, whole=False), time_line, drift_chart(overview.drift))
+        now_ns = _now_ns(self._watch, overview)
+        folded, unfolded = (
+            timeline_html(rows_of(overview, silent, unfolded=unfolded), None, now_ns, pictures=self._strip(overview))
+            for unfolded in (False, True)
+        )
+        return SlowContent(
+            map_html(content), map_html(content, whole=False), folded, unfolded, drift_chart(overview.drift)
+        )
+
+    def _strip(self, overview: Overview) -> Iterator[tuple[int, str]]:
+        """Yield a picture of each scan for the time line."""
+        number = 0
+        for one in overview.scans:
+            if one.number != number and self._pictures and not one.interrupted:
+                number = one.number
+                title = escape(f"no. {number}: {typeset_area(one.region.size_m)} at {time_of_day(one.time_ns)}")
+                yield (
+                    one.time_ns,
+                    (
+                        f'<img src="{picture_url(self._pictures, one)}" alt="{title}" title="{title}" '
+                        f'data-time="{one.time_ns}" data-channel="{escape(one.channel)}">'
+                    ),
+                )
 
 
 def _now_ns(watch: Watch, overview: Overview) -> int:
@@ -145,8 +178,12 @@ def trouble(watch: Watch) -> str:
     return ""
 
 
-def rows_of(overview: Overview, silent: Mapping[str, int]) -> Iterator[TimelineRow]:
-    """Yield the rows of the time line: control, mode, scope state, each problem, each process."""
+def rows_of(overview: Overview, silent: Mapping[str, int], *, unfolded: bool = True) -> Iterator[TimelineRow]:
+    """Yield the rows of the time line: control, mode, scope state, each problem, processes.
+
+    Args:
+        unfolded: a row for each process; else one for all that have not failed.
+    """
     yield TimelineRow("control", overview.controls.spans, tint_class)
     if overview.notes:
         yield TimelineRow("notes", overview.note_spans, lambda _: "marked")
@@ -155,9 +192,18 @@ def rows_of(overview: Overview, silent: Mapping[str, int]) -> Iterator[TimelineR
     for number, lane in sorted(overview.problem_timelines.items()):
         if lane.spans:
             yield TimelineRow(overview.problems.name(number), lane.spans, lambda label: "problem")
-    for name, lane in overview.process_timelines.items():
-        spans = _until_told(lane, overview.processes_told_ns[name]) if name in silent else lane.spans
-        yield TimelineRow(name, spans, lambda label: f"process-{label.replace(' ', '-')}")
+    rows = {
+        name: tuple(_until_told(lane, overview.processes_told_ns[name]) if name in silent else lane.spans)
+        for name, lane in overview.process_timelines.items()
+    }
+    fine = [] if unfolded else [name for name, spans in rows.items() if not _FAILED & {span.label for span in spans}]
+    for name, spans in rows.items():
+        if name not in fine:
+            yield TimelineRow(name, spans, lambda label: f"process-{label.replace(' ', '-')}")
+    if fine:
+        start_ns = min(span.start_ns for name in fine for span in rows[name])
+        span = Span(f"{len(fine)} without failures", start_ns)
+        yield TimelineRow("processes", (span,), lambda _: "process-alive")
 
 
 def _until_told(lane: Timeline, told_ns: int) -> Iterator[Span]:
@@ -183,12 +229,10 @@ def status_html(watch: Watch, overview: Overview) -> str:
         _chip(f"{who} is in control<small>{since}</small>", "holder"),
         *_microscope(overview, now_ns),
     ]
-    for _, name, by in _flags(overview):
-        parts.append(_chip(f"{escape(name)}{f' (flagged by {escape(by)})' if by else ''}", "problem", "problem"))
     for name, (done, of) in overview.progress.items():
         parts.append(_chip(f"<b>{escape(name)}</b> {done} of {of}", "progress"))
     zone = datetime.fromtimestamp(now_ns / NS_PER_S).astimezone().tzname()
-    parts.append(_chip(f"{day_and_time(now_ns)} {zone}", "clock", "time"))
+    parts.append(_chip(f"{day_and_time(now_ns, seconds=False)} {zone}", "clock", "time"))
     return "".join(parts)
 
 
@@ -202,20 +246,10 @@ def _microscope(overview: Overview, now_ns: int) -> Iterator[str]:
     state = status.state.name.lower().replace("_", " ") if status else NOT_HEARD_OF
     paused = " (paused)" if status and status.paused else ""
     done = overview.scan_progress(now_ns)
-    far = "" if done is None else f" {100 * done[0]:.0f} %, {duration_text(done[1] / NS_PER_S)} left"
+    far = "" if done is None else f" {100 * done[0]:.0f} %<small> ends {ends_text(done[1], now_ns)}</small>"
     yield _chip(f"microscope {state}{paused}{far}", "state", f"state-{state.replace(' ', '-')}")
-    if overview.probe_position is not None:
-        yield _chip(f"probe {typeset_position(overview.probe_position.xy_m)}", "probe", "quiet")
-    feedback = overview.feedback
-    if feedback is not None and feedback.on is not None:
-        at = "" if feedback.setpoint is None else f", setpoint {feedback.setpoint:.4g}"
-        yield _chip(f"{'feedback on' if feedback.on else 'FEEDBACK OFF'}{at}", "feedback", "quiet")
-
-
-def _flags(overview: Overview) -> Iterator[Flag]:
-    for number in overview.control.problems if overview.control else ():
-        now = overview.problem_timelines[number].now if number in overview.problem_timelines else None
-        yield number, overview.problems.name(number), now.by if now else ""
+    if overview.feedback is not None and overview.feedback.on is False:
+        yield _chip("FEEDBACK OFF", "feedback", "problem")
 
 
 def refusals_html(refusals: Iterable[JournalEntry], most: int = 40) -> str:

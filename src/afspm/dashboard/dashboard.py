@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -71,6 +72,7 @@ class Dashboard(Component):
     def on_start(self) -> None:
         from afspm.dashboard.actions import Steering
         from afspm.dashboard.application import application
+        from afspm.dashboard.conditions import Conditions
         from afspm.dashboard.content import Contents
         from afspm.dashboard.page import Services
 
@@ -86,12 +88,13 @@ class Dashboard(Component):
         self._steering = Steering(launch, self.clock, self._watch, access)
         services = Services(
             self._watch,
-            Contents(self._watch, allowed_region(self.run_dir)),
+            Contents(self._watch, allowed_region(self.run_dir), f"/live/thumbnail/{secrets.token_hex(4)}"),
             self._steering,
             Audience(),
             access,
             experiment_name(self.run_dir, "afspm"),
             self.simulated,
+            Conditions(self._watch, self._steering.read),
         )
         encrypted = self._certificate is not None
         app, self._wait_told = application(services, archive, host=self._host, encrypted=encrypted)

@@ -15,7 +15,11 @@ from fastapi import Depends, FastAPI, Response
 from fastapi.responses import PlainTextResponse
 
 from afspm.dashboard.archive import Archive
+from afspm.dashboard.conditions import Conditions
+from afspm.dashboard.frames import ChannelFrame
 from afspm.dashboard.pictures import Look, PictureCache, RenderedFrame, number_or_none
+from afspm.dashboard.scan_facts import Facts, scan_facts, summary_of
+from afspm.dashboard.thumbnails import Thumbnails
 from afspm.dashboard.watch import Bell, Watch
 from afspm.drawing.palette import LEVELS, PALETTES
 from afspm.drawing.profile import profile
@@ -45,13 +49,16 @@ class Live:
 
     Args:
         archive: where scans are that are not in memory any more.
+        conditions: what was set when each scan began.
     """
 
-    def __init__(self, watch: Watch, bell: Bell, archive: Archive) -> None:
+    def __init__(self, watch: Watch, bell: Bell, archive: Archive, conditions: Conditions) -> None:
+        self._conditions = conditions
         self._watch = watch
         self._bell = bell
         self._archive = archive
         self._cache = PictureCache()
+        self._thumbnails = Thumbnails(self._finished)
         self._waiting = 0
         self._closing = False
 
@@ -61,7 +68,8 @@ class Live:
         self._bell.ring()
 
     def add_to(self, app: FastAPI) -> None:
-        """Serve /live/image, /live/value, /live/profile and /live/palette."""
+        """Serve /live/image, /live/thumbnail, /live/value, /live/profile and /live/palette."""
+        app.get("/live/thumbnail/{start}/{time}", response_model=None)(self._thumbnail)
         app.get("/live/palette/{name}.png", response_model=None)(self._palette)
         app.get("/live/image", response_model=None)(self._image)
         app.get("/live/value", response_model=None)(self._value)
@@ -74,7 +82,7 @@ class Live:
         drawn = await asyncio.to_thread(self._drawn, asked)
         if drawn is None:
             return PlainTextResponse("the values of this scan are not kept here any more", 404)
-        headers = {"X-Frame": drawn.head(), "Cache-Control": "no-store"}
+        headers = {"X-Frame": drawn.head(self._facts(drawn.frame)), "Cache-Control": "no-store"}
         return Response(drawn.png, media_type="image/png", headers=headers)
 
     async def _value(self, asked: Asked, column: int, row: int) -> dict[str, object]:
@@ -100,6 +108,17 @@ class Live:
             "values": [number_or_none(value) for value in values.tolist()],
             "unit": drawn.frame.unit,
         }
+
+    async def _thumbnail(self, start: str, time: int, channel: str) -> Response:
+        """Answer with a small picture of a finished scan, which the browser keeps.
+
+        `start` differs from start to start of the dashboard: another simulated night may have the same times.
+        """
+        found = await asyncio.to_thread(self._thumbnails.png, time, channel)
+        if found is None:
+            return PlainTextResponse("the values of this scan are not kept here any more", 404)
+        headers = {"Cache-Control": "private, max-age=86400, immutable"}
+        return Response(found, media_type="image/png", headers=headers)
 
     async def _palette(self, name: str) -> Response:
         """Answer with a colour map as a picture one pixel wide, the highest value on top."""
@@ -132,10 +151,23 @@ class Live:
             return self._watch.frames.newest_number(channel or None)
 
     def _drawn(self, asked: PictureRequest) -> RenderedFrame | None:
-        with self._watch.reading():
-            frames = self._watch.frames
-            frame = frames.kept(asked.time, asked.channel) if asked.time else frames.newest(asked.channel or None)
-        if frame is None and asked.time:
-            frame = self._archive.frame(asked.time, asked.channel)
+        if asked.time:
+            frame = self._finished(asked.time, asked.channel)
+        else:
+            with self._watch.reading():
+                frame = self._watch.frames.newest(asked.channel or None)
         look = Look.named(asked.levelling, asked.contrast, asked.palette)
         return None if frame is None else self._cache.draw(frame, look)
+
+    def _facts(self, frame: ChannelFrame) -> Facts:
+        with self._watch.reading() as overview:
+            began_ns = overview.running.began_ns if overview.running else None
+            if frame.time_ns is not None:
+                summary = summary_of(frame.time_ns, overview)
+                began_ns = summary.began_ns if summary else None
+            return scan_facts(frame, overview, self._conditions.at(began_ns), self._watch.clock.now_ns())
+
+    def _finished(self, time_ns: int, channel: str) -> ChannelFrame | None:
+        with self._watch.reading():
+            frame = self._watch.frames.kept(time_ns, channel)
+        return frame or self._archive.frame(time_ns, channel)

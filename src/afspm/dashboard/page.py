@@ -13,10 +13,12 @@ from nicegui import ui
 
 from afspm.dashboard.access import Access, Visitor
 from afspm.dashboard.actions import Steering
+from afspm.dashboard.conditions import Conditions
 from afspm.dashboard.content import Content, Contents
 from afspm.dashboard.panels import ChartPanel, HealthPanel, LogPanel, SpectraPanel
 from afspm.dashboard.sign_in import SIGN_IN
-from afspm.dashboard.steering_panel import SteeringPanel
+from afspm.dashboard.steering_panel import ModeButtons, ProblemBar, SteeringPanel
+from afspm.dashboard.steering_session import SteeringSession
 from afspm.dashboard.watch import Audience, Watch
 from afspm.drawing import timeline
 from afspm.drawing.palette import PALETTES
@@ -37,6 +39,7 @@ class Services:
     Attributes:
         title: the name of the experiment.
         simulated: True if the microscope is none.
+        conditions: what was set when each scan began.
     """
 
     watch: Watch
@@ -46,6 +49,7 @@ class Services:
     access: Access
     title: str
     simulated: bool
+    conditions: Conditions
 
 
 class Page:
@@ -60,9 +64,12 @@ class Page:
         ui.add_head_html(_HEAD)
         ui.colors(primary="#0b6e72", negative="#b3261e", positive="#2f7d46")
         self._theme = Theme()
-        self._header()
-        with ui.element("main").classes("grid"):
-            self._sections = Sections(services, visitor)
+        self._session = SteeringSession(services.watch, services.steering, visitor)
+        with ui.element("div").classes("top"):
+            self._header()
+        with ui.element("main").classes(f"page{' may-steer' if visitor.may_steer else ''}"):
+            self._sections = Sections(services, self._session)
+        ui.html(_tabs_html(steering=visitor.may_steer), sanitize=False)
         self._timer = ui.timer(REFRESH_S, self._refresh)
 
     def _header(self) -> None:
@@ -72,10 +79,12 @@ class Page:
         with ui.element("header").classes("bar"):
             ui.html(f"<h1>{escape(services.title)}</h1>", sanitize=False)
             self._status = ui.html("", sanitize=False).classes("chips").props('role="status" aria-live="off"')
+            self._mode = ModeButtons(self._session)
             with ui.element("nav").classes("who"):
                 button = ui.button(icon="contrast", on_click=self._theme.next)
                 button.props('flat round dense aria-label="Light or dark"')
                 self._sign_in_or_out()
+        self._problems = ProblemBar(self._session)
         ui.html('<div id="trouble" role="alert" hidden></div>', sanitize=False)
 
     def _sign_in_or_out(self) -> None:
@@ -96,13 +105,16 @@ class Page:
             ui.navigate.to(SIGN_IN)
             return
         content = self._services.contents.get()
+        self._session.content = content
         self._status.set_content(content.status)
-        self._sections.show(content)
+        self._mode.show()
+        self._problems.show()
+        await self._sections.show(content)
         state = {
             "channels": content.channels,
             "trouble": content.trouble,
             "ended": content.ended,
-            "may_measure": self._sections.may_measure,
+            "may_measure": self._session.may_measure,
         }
         try:
             theme = await ui.run_javascript(f"return window.afspm?.update({json.dumps(state)})", timeout=ANSWER_S)
@@ -141,56 +153,72 @@ class Theme:
 
 
 class Sections:
-    """The sections below the header."""
+    """The sections below the header: the first rows fill a screen, the rest is further down. A phone has tabs."""
 
-    def __init__(self, services: Services, visitor: Visitor) -> None:
+    def __init__(self, services: Services, session: SteeringSession) -> None:
         self._content = Content()
-        with _section("Scan", "scan"):
-            ui.html(_image_html(), sanitize=False)
-        with _section("Steering", "steer"):
-            self._steering = SteeringPanel(services.watch, services.steering, visitor)
-        with _section("Sample", "sample"):
-            self._whole_map = ui.switch("with all of the limits", on_change=self._draw_map).props("dense")
-            self._map = ui.html("", sanitize=False)
-        with _section("Time line", "time"):
-            self._time_line = ui.html("", sanitize=False)
-        with _section("Processes", "health"):
-            self._health = HealthPanel(self._steering)
-        with _section("Spectra", "spectra"):
-            self._spectra = SpectraPanel(services.watch)
-        with _section("Drift", "drift"):
-            self._drift = ChartPanel()
-        with _section("Last refusals", "refused"):
-            self._refusals = ui.html("", sanitize=False).classes("scrolled").props('tabindex="0"')
-        with _section("Log", "log"):
-            self._log = LogPanel()
+        self._steering = None
+        with ui.element("div").classes("screen"):
+            with _section("Scan", "scan"):
+                ui.html(_image_html(), sanitize=False)
+            with _section("Sample", "sample"):
+                self._whole_map = ui.switch("all of the limits", on_change=self._draw).props("dense")
+                self._map = ui.html("", sanitize=False).classes("fills")
+            if session.signed_in:
+                with _section("Steering", "steer"):
+                    self._steering = SteeringPanel(session)
+            with _section("Time line", "time"):
+                self._unfolded = ui.switch("all processes", on_change=self._draw).props("dense")
+                self._time_line = ui.html("", sanitize=False).classes("fills")
+            with _section("Log", "log"):
+                self._log = LogPanel()
+        with ui.element("div").classes("further"):
+            with _section("Processes", "health"):
+                self._health = HealthPanel(session)
+            with _section("Spectra", "spectra") as self._spectra_section:
+                self._spectra = SpectraPanel(services.watch)
+            with _section("Drift", "drift") as self._drift_section:
+                self._drift = ChartPanel()
+            with _section("Last refusals", "refused"):
+                self._refusals = ui.html("", sanitize=False).classes("scrolled").props('tabindex="0"')
 
-    @property
-    def may_measure(self) -> bool:
-        return self._steering.may_measure
-
-    def show(self, content: Content) -> None:
+    async def show(self, content: Content) -> None:
         """Bring all of them up to date."""
         self._content = content
-        self._draw_map()
-        self._time_line.set_content(content.slow.time_line)
+        self._draw()
         self._drift.show(content.slow.drift)
+        self._drift_section.set_visibility(content.slow.drift.options is not None)
         self._refusals.set_content(content.refusals)
         self._health.show(content.processes, content.unheard)
         self._log.show(content.log, (process.name for process in content.processes))
-        self._steering.show(content)
-        self._spectra.show()
+        self._spectra_section.set_visibility(self._spectra.show())
+        if self._steering is not None:
+            await self._steering.show(content)
 
-    def _draw_map(self) -> None:
+    def _draw(self) -> None:
         slow = self._content.slow
         self._map.set_content(slow.sample_map if self._whole_map.value else slow.sample_map_near)
+        self._time_line.set_content(slow.time_line_unfolded if self._unfolded.value else slow.time_line)
+
+
+TABS = {"scan": "Scan", "sample": "Sample", "steer": "Steer", "time": "Night", "log": "Log"}
+"""Of a phone: where each section is then is in the style sheet."""
+
+
+def _tabs_html(*, steering: bool) -> str:
+    buttons = "".join(
+        f'<button type="button" role="tab" data-tab="{name}">{text}</button>'
+        for name, text in TABS.items()
+        if steering or name != "steer"
+    )
+    return f'<div class="tabs" role="tablist" aria-label="Parts of the page">{buttons}</div>'
 
 
 @contextmanager
-def _section(title: str, name: str) -> Iterator[None]:
-    with ui.element("section").classes(f"panel {name}").props(f'aria-labelledby="heading-{name}"'):
+def _section(title: str, name: str) -> Iterator[ui.element]:
+    with ui.element("section").classes(f"panel {name}").props(f'aria-labelledby="heading-{name}"') as section:
         ui.html(f'<h2 id="heading-{name}">{title}</h2>', sanitize=False)
-        yield
+        yield section
 
 
 def _image_html() -> str:

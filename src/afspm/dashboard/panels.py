@@ -10,7 +10,8 @@ from nicegui import events, ui
 from afspm.clock import NS_PER_S
 from afspm.dashboard.charts import Chart, spectrum_chart
 from afspm.dashboard.content import NOT_HEARD_OF
-from afspm.dashboard.steering_panel import SteeringPanel
+from afspm.dashboard.steering_panel import ask_restart
+from afspm.dashboard.steering_session import SteeringSession
 from afspm.dashboard.watch import Watch
 from afspm.drawing.timeline import tint_class
 from afspm.formatting import duration_text, time_of_day
@@ -55,8 +56,8 @@ class SpectraPanel:
         self._chart = ChartPanel()
         ui.on("spectrum_picked", self._pick)
 
-    def show(self) -> None:
-        """Bring it up to date."""
+    def show(self) -> bool:
+        """Bring it up to date; returns whether there is a spectrum."""
         with self._watch.reading():
             store = self._watch.spectra
             picked = None if self._picked_ns is None else store.at(self._picked_ns)
@@ -69,6 +70,7 @@ class SpectraPanel:
         if wanted != self._shown:
             self._shown = wanted
             self._chart.show(spectrum_chart(spectra, str(self._variable.value or "")))
+        return bool(spectra)
 
     def _pick(self, event: events.GenericEventArguments) -> None:
         self._picked_ns = int(event.args["time"])
@@ -127,18 +129,23 @@ def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: 
         return '<p class="nothing">No such line.</p>'
     rows = "".join(
         f'<li class="level-{escape(line.level.lower())}"><time>{time_of_day(line.time_ns)}</time>'
-        f'<b class="{tint_class(line.name)}">{escape(line.name)}</b><i>{escape(line.level)}</i>'
-        f"<span>{escape(line.text)}</span></li>"
+        f'<b class="{tint_class(line.name)}">{escape(line.name)}</b>'
+        f"<div>{_level_html(line.level)}<span>{escape(line.text)}</span></div></li>"
         for line in wanted[: -MOST_LINES - 1 : -1]
     )
     return f'<ul class="log">{rows}</ul>'
 
 
+def _level_html(level: str) -> str:
+    """Return the level of a line that is not as usual."""
+    return "" if level == "INFO" else f"<i>{escape(level)}</i> "
+
+
 class HealthPanel:
     """A row for each process, which stays while its words change: a button must not move under the finger."""
 
-    def __init__(self, steering: SteeringPanel) -> None:
-        self._steering = steering
+    def __init__(self, session: SteeringSession) -> None:
+        self._session = session
         self._rows: dict[str, HealthRow] = {}
         self._nothing = ui.html("Nothing has been heard of processes yet.", sanitize=False).classes("nothing")
         self._list = ui.element("div").classes("processes").props('role="table" aria-label="Processes"')
@@ -150,24 +157,24 @@ class HealthPanel:
             row = self._rows.get(state.name)
             if row is None:
                 with self._list:
-                    row = self._rows[state.name] = HealthRow(state.name, self._steering)
+                    row = self._rows[state.name] = HealthRow(state.name, self._session)
             row.show(state, unheard.get(state.name))
 
 
 class HealthRow:
     """The condition of one process, and a button to restart it."""
 
-    def __init__(self, name: str, steering: SteeringPanel) -> None:
+    def __init__(self, name: str, session: SteeringSession) -> None:
         with ui.element("div").classes("process").props('role="row"'):
             self._dot = ui.element("span").classes("dot")
             ui.label(name).classes("name").props('role="rowheader"')
             self._cells = [ui.label().props('role="cell"') for _ in range(3)]
             for cell in self._cells[1:]:
                 cell.classes("quiet")
-            self._button = ui.button("Restart", on_click=lambda: steering.ask_restart(name))
+            self._button = ui.button("Restart", on_click=lambda: ask_restart(session, name))
             self._button.props("flat dense no-caps")
             self._button.props["aria-label"] = f"Restart {name}"  # as text of properties a name could set others
-        self._steering = steering
+        self._session = session
         self._style = ""
 
     def show(self, state: ProcessState, unheard_ns: int | None) -> None:
@@ -179,7 +186,7 @@ class HealthRow:
         if style != self._style:
             self._dot.classes(remove=f"is-{self._style}", add=f"is-{style}")
             self._style = style
-        self._button.set_visibility(self._steering.may_steer)
+        self._button.set_visibility(self._session.may_steer)
 
 
 def process_words(state: ProcessState, unheard_ns: int | None = None) -> tuple[str, str, str]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from afspm.dashboard.frames import ChannelFrame
+from afspm.dashboard.scan_facts import Facts
 from afspm.drawing.levelling import Array, Levelling, levelled
 from afspm.drawing.palette import PALETTES
 from afspm.drawing.raster import Contrast, ValueRange, indices, png, value_range
@@ -50,8 +51,8 @@ class RenderedFrame:
     span: ValueRange
     png: bytes
 
-    def head(self) -> str:
-        """Return what has to be known to draw it with axes, as ASCII JSON. Lengths in m."""
+    def head(self, facts: Facts) -> str:
+        """Return what has to be known to draw it with axes, and facts to show beside it, as ASCII JSON in SI."""
         frame, region = self.frame, self.frame.region
         return json.dumps(
             {
@@ -69,6 +70,7 @@ class RenderedFrame:
                 "newest_row": frame.newest_row,
                 "levelling": self.look.levelling.value,
                 "palette": self.look.palette,
+                "facts": facts,
             }
         )
 

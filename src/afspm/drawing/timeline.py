@@ -12,6 +12,7 @@ from afspm.clock import NS_PER_S
 from afspm.formatting import duration_text, time_of_day
 
 COLUMNS = 720  # stretches narrower than this part of the run are put together
+MOST_PICTURES = 14
 _STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
 _DAY_S = _STEPS_S[-1]
 
@@ -25,6 +26,9 @@ CSS = """
 .lane span.marked{min-width:6px;border-radius:3px;background:currentColor}
 .lane i{display:block;margin:0;height:auto;padding:0 4px;color:#fff;white-space:nowrap}
 .lane i{font-style:normal;font-size:11px;line-height:17px}
+.strip>div{height:auto;aspect-ratio:14/1;background:none}
+.strip span{background:none;padding:1px}
+.strip img{width:100%;height:100%;object-fit:cover;display:block;border-radius:2px;cursor:pointer}
 .lane-axis>div{position:relative;height:18px}
 .lane-axis span{position:absolute;top:1px;font-size:11.5px;color:var(--quiet);transform:translateX(-50%)}
 .lanes{font-variant-numeric:tabular-nums}
@@ -73,12 +77,14 @@ def timeline_html(
     zone: tzinfo | None = None,
     *,
     local_too: bool = False,
+    pictures: Iterable[tuple[int, str]] = (),
 ) -> str:
     """Return rows from `begin_ns` (None: from the first interval on) to `end_ns`, with an axis of times of day.
 
     Args:
         zone: of the axis; None: this computer's.
         local_too: whether there is a second axis with the times of this computer's zone.
+        pictures: the time of each, and its HTML; they stand above the rows. Of those that would overlap, the last does.
     """
     read = [(row, tuple(row.spans)) for row in rows]
     starts = [spans[0].start_ns for _, spans in read if spans]
@@ -89,7 +95,8 @@ def timeline_html(
     body = "".join(_row(row, stretches(spans, begin_ns, end_ns), begin_ns, end_ns, zone) for row, spans in read)
     axes = _axis(begin_ns, end_ns, zone, "UTC" if local_too else "")
     axes += _axis(begin_ns, end_ns, None, "local") if local_too else ""
-    return f'<div class="lanes">{body}{axes}</div>'
+    strip = _pictures(pictures, begin_ns, end_ns)
+    return f'<div class="lanes">{strip}{body}{axes}</div>'
 
 
 def _axis(begin_ns: int, end_ns: int, zone: tzinfo | None, name: str) -> str:
@@ -127,6 +134,19 @@ def stretches(spans: Sequence[Interval], begin_ns: int, end_ns: int) -> list[Str
         end = max(begin + 1, min(COLUMNS, round((until_ns - begin_ns) / width_ns)))
         _add(found, Stretch(begin, end, span.label, span.by, max(0, until_ns - span.start_ns)))
     return found
+
+
+def _pictures(pictures: Iterable[tuple[int, str]], begin_ns: int, end_ns: int) -> str:
+    """Return a row of pictures, each ending at its time."""
+    width = 100.0 / MOST_PICTURES
+    last = {}
+    for time_ns, html in pictures:
+        if begin_ns <= time_ns <= end_ns:
+            at = (time_ns - begin_ns) / (end_ns - begin_ns)
+            last[min(MOST_PICTURES - 1, int(at * MOST_PICTURES))] = html
+    cells = "".join(f'<span style="left:{slot * width:.2f}%;width:{width:.2f}%">{html}</span>'
+                    for slot, html in last.items())  # fmt: skip
+    return f'<div class="lane strip"><b>scans</b><div>{cells}</div></div>' if cells else ""
 
 
 def _add(found: list[Stretch], one: Stretch) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 from typing import Any
 
@@ -41,9 +41,11 @@ from afspm.model import (
 from afspm.model.geometry import XY
 from afspm.record.running_scan import DoneScan, RunningScan
 from afspm.record.timeline import Span, Timeline
+from afspm.units import convert, same_kind
 
 __all__ = [
     "DriftPoint",
+    "FoundPlace",
     "Overview",
     "ProcessRestart",
     "RunningScan",
@@ -56,6 +58,7 @@ __all__ = [
 MOST_LINES = 2_000
 MOST_ENTRIES = 5_000
 MOST_MEASURED = 100_000
+MOST_TARGETS = 1_000
 SOON_NS = 1_000_000_000
 OLD_S = 6.0  # real; a supervisor says how its processes are every 2 s
 OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
@@ -74,6 +77,7 @@ class ScanSummary:
         shape: (rows, columns).
         holder: who was in control; None if nobody was, or it is not known.
         interrupted: only a part of it was taken.
+        number: of the scan in the run, from 1; its channels have the same.
     """
 
     time_ns: int
@@ -85,6 +89,15 @@ class ScanSummary:
     filename: str = ""
     holder: str | None = None
     interrupted: bool = False
+    number: int = 0
+
+    def is_of_scan(self, other: ScanSummary) -> bool:
+        """Return whether both are channels of one scan."""
+        if self.channel == other.channel or self.region != other.region:
+            return False
+        if self.began_ns is not None and other.began_ns is not None:
+            return self.began_ns == other.began_ns
+        return abs(self.time_ns - other.time_ns) <= SOON_NS
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +112,14 @@ class SpectrumSummary:
     units: tuple[str, ...]
     filename: str = ""
     holder: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FoundPlace:
+    """A place that a component has found, with its score if it gave one."""
+
+    xy_m: XY
+    score: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +167,7 @@ class Overview:
         status, control, scan_parameters, feedback, probe_position: the newest of each; None before the first.
         processes, told_progress: by name; `processes_told_ns`: when each process was told of last.
         log, notes, entries, refusals: newest last, bounded.
+        targets: the places that components have found, as each told last.
         controls: lane of who was in control; `modes`, `states`: lanes of mode and scope state, in lower case.
         problem_timelines: by number; `process_timelines`: by name. A process that is busy counts as alive.
         running: the scan that is being taken; None if none is.
@@ -171,6 +193,7 @@ class Overview:
         self.process_timelines: defaultdict[str, Timeline] = defaultdict(Timeline)
         self.restarts: deque[ProcessRestart] = deque(maxlen=most_entries)
         self.running: RunningScan | None = None
+        self._targets: dict[str, tuple[FoundPlace, ...]] = {}
         self._done: deque[DoneScan] = deque(maxlen=20)
         self._scans: dict[tuple[object, ...], ScanSummary] = {}
         self._spectra: dict[tuple[object, ...], SpectrumSummary] = {}
@@ -197,6 +220,11 @@ class Overview:
         """The notes as spans without length, for time lines."""
         spans = [Span(note.text, note.time_ns, note.time_ns, note.who) for note in self.notes]
         return sorted(spans, key=lambda span: span.start_ns)
+
+    @property
+    def targets(self) -> Sequence[FoundPlace]:
+        """Of each channel, those of the newest list."""
+        return tuple(target for found in self._targets.values() for target in found)
 
     @property
     def progress(self) -> dict[str, tuple[int, int]]:
@@ -282,7 +310,13 @@ class Overview:
         )  # fmt: skip
 
     def _add_scan(self, taken: ScanSummary) -> None:
-        _keep(self._scans, (taken.time_ns, taken.channel, taken.region, taken.interrupted), taken)
+        key = (taken.time_ns, taken.channel, taken.region, taken.interrupted)
+        if key in self._scans:
+            return
+        last = next(reversed(self._scans.values()), None)
+        before = 0 if last is None else last.number
+        number = before if last is not None and taken.is_of_scan(last) else before + 1
+        _keep(self._scans, key, replace(taken, number=number))
 
     def _take_spectrum(self, spectrum: Spectrum, time_ns: int) -> None:
         taken_ns, holder = spectrum.time_ns or time_ns, self.control.holder if self.control else None
@@ -373,6 +407,17 @@ class Overview:
         )  # fmt: skip
         _keep(self._drift, at_ns, point)
 
+    def _take_points(self, message: Any, time_ns: int) -> None:
+        found = ((one.spatial.point, one.spatial.units or "m", one) for one in message.spatials[-MOST_TARGETS:])
+        self._targets[message.channel] = tuple(
+            FoundPlace(
+                (convert(point.x, unit, "m"), convert(point.y, unit, "m")),
+                one.score if one.HasField("score") else None,
+            )
+            for point, unit, one in found
+            if same_kind(unit, "m")
+        )
+
     def _take_parameters(self, parameters: ScanParameters, time_ns: int) -> None:
         self.scan_parameters = parameters
 
@@ -409,5 +454,6 @@ _TAKERS: dict[str, Callable[[Overview, Any, int], None]] = {
     "LogLines": Overview._take_log,
     "Progress": Overview._take_progress,
     "Note": Overview._take_note,
+    "SpatialPointWithScoreList": Overview._take_points,
     "DriftMapping": Overview._take_mapping,
 }

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from afspm import wire
 from afspm.clock import ExperimentClock
 from afspm.dashboard.charts import drift_chart, spectrum_chart
 from afspm.dashboard.content import refusals_html, rows_of, unheard
@@ -44,9 +45,12 @@ def taken(time_s: float, region: Region = HERE, channel: str = "Height", **more:
     return ScanSummary(round(time_s * S), None, channel, "m", region, (8, 8), holder="series", **more)
 
 
+def svg(html: str) -> ElementTree.Element:
+    return ElementTree.fromstring(re.search(r"<svg.*?</svg>", html, re.DOTALL).group())  # type: ignore[union-attr]
+
+
 def shapes(html: str, style: str) -> list[ElementTree.Element]:
-    found = ElementTree.fromstring(re.search(r"<svg.*?</svg>", html, re.DOTALL).group())  # type: ignore[union-attr]
-    return [shape for shape in found if style in (shape.get("class") or "").split()]
+    return [shape for shape in svg(html) if style in (shape.get("class") or "").split()]
 
 
 def time_line_html(overview: Overview, now_ns: int, silent: Mapping[str, int] = MappingProxyType({})) -> str:
@@ -92,6 +96,52 @@ def test_squares_of_different_sizes_at_one_place_are_all_on_the_map(center_m: tu
     assert drawn == {str(i * S) for i in range(1, 5)}
 
 
+def test_pictures_lie_where_scans_were_taken_the_newest_on_top() -> None:
+    wide, narrow = Region((0.0, 0.0), (2e-6, 2e-6)), Region((4e-7, 2e-7), (5e-7, 2.5e-7), 0.3)
+    html = map_html(MapContent([taken(1, narrow), taken(2, wide, 'A "B"')], pictures="/p"))
+    pictures = [shape for shape in svg(html) if shape.tag == "image"]
+    assert [shape.get("href") for shape in pictures] == [f"/p/{S}?channel=Height", f"/p/{2 * S}?channel=A%20%22B%22"]
+    outline = corners(next(shape for shape in shapes(html, "scan") if shape.get("data-time") == str(S)))
+    x, y, width, height = (float(pictures[0].get(name) or 0.0) for name in ("x", "y", "width", "height"))
+    assert (x + width / 2, y + height / 2) == pytest.approx(outline.mean(axis=0), abs=0.02)
+    sides = np.hypot(*np.diff(outline, axis=0).T)
+    assert sorted((width, height)) == pytest.approx(sorted(sides[:2]), abs=0.05)
+    assert (pictures[0].get("transform") or "").startswith("rotate(-17.189 ")
+    assert not [shape for shape in svg(map_html(MapContent([taken(1)]))) if shape.tag == "image"]
+
+
+def test_a_small_scan_below_a_newer_large_one_can_still_be_clicked() -> None:
+    small, large = Region((0.0, 0.0), (3e-7, 3e-7)), Region((0.0, 0.0), (2e-6, 2e-6))
+    drawn = shapes(map_html(MapContent([taken(1, small), taken(2, large)])), "scan")
+    assert [shape.get("data-time") for shape in drawn] == [str(2 * S), str(S)], "the last one is on top"
+
+
+@pytest.mark.parametrize(
+    ("probe_m", "side", "distance"), [((5e-6, 0.0), "left:100.00%", "4.4 µm"), ((0.0, -3e-6), "top:100.00%", "2.4 µm")]
+)
+def test_a_probe_outside_the_view_is_shown_by_an_arrow_with_its_distance(
+    probe_m: tuple[float, float], side: str, distance: str
+) -> None:
+    html = map_html(MapContent([taken(1)], probe_m=probe_m), whole=False)
+    (arrow,) = re.findall(r'<span class="map-away"(.*?)</span>', html)
+    assert side in arrow
+    assert f"probe {distance} away" in arrow
+    assert "map-away" not in map_html(MapContent([taken(1)], probe_m=(1e-7, 0.0)), whole=False)
+
+
+def test_places_that_a_component_has_found_are_on_the_map() -> None:
+    overview = Overview()
+    message = wire.message_type("SpatialPointWithScoreList")(channel="Height")
+    for x_nm, score in ((100.0, 0.5), (-200.0, 0.9)):
+        entry = message.spatials.add(score=score)
+        entry.spatial.point.x, entry.spatial.units = x_nm, "nm"
+    message.spatials.add().spatial.units = "parsnips"
+    overview.take("SpatialPointWithScoreList", message, S)
+    assert [target.xy_m for target in overview.targets] == [(1e-7, 0.0), (-2e-7, 0.0)]
+    drawn = shapes(map_html(MapContent([taken(1)], targets=overview.targets)), "target")
+    assert ["score 0.5" in "".join(shape.itertext()) for shape in drawn] == [True, False]
+
+
 def test_ten_thousand_places_are_drawn_as_far_as_that_makes_sense_and_the_rest_is_told() -> None:
     scans = [taken(i, Region((i * 1e-6, 0.0), (1e-6, 1e-6))) for i in range(10_000)]
     html = map_html(MapContent(scans))
@@ -109,7 +159,7 @@ def test_what_is_set_the_limits_the_probe_and_spectra_are_on_it() -> None:
 
 def test_the_part_where_something_was_measured_fills_the_map_unless_all_limits_are_wanted() -> None:
     content = MapContent([taken(1)], limits=Region((0.0, 0.0), (1e-3, 1e-3)))
-    near, whole = (np.ptp(corners(shapes(map_html(content, whole=w), "scan")[0])) for w in (False, True))
+    near, whole = (np.ptp(corners(shapes(map_html(content, whole=w), "scan")[0]), axis=0).max() for w in (False, True))
     assert near > 600
     assert whole < 2
 
@@ -142,6 +192,34 @@ def test_the_time_line_has_control_mode_state_problems_and_processes() -> None:
     html = time_line_html(overview, 10 * S)
     for part in ("series", "automated", "scanning", "tip-shape-changed"):
         assert part in html
+
+
+def test_processes_are_one_row_of_the_time_line_until_one_fails() -> None:
+    overview = Overview()
+
+    def told(time_s: int, condition: ProcessCondition) -> None:
+        states = tuple(
+            ProcessState(name, "component", condition if name == "series" else ProcessCondition.ALIVE, time_s * S)
+            for name in ("scheduler", "series", "metadata")
+        )
+        overview.take("ProcessStates", ProcessStates(time_s * S, "here", states), time_s * S)
+
+    def rows(**how: bool) -> list[str]:
+        return [row.name for row in rows_of(overview, {}, **how)][3:]
+
+    told(1, ProcessCondition.ALIVE)
+    assert rows(unfolded=False) == ["processes"]
+    assert rows(unfolded=True) == ["scheduler", "series", "metadata"]
+    told(2, ProcessCondition.RESTARTING)
+    told(3, ProcessCondition.ALIVE)
+    assert rows(unfolded=False) == ["series", "processes"]
+
+
+def test_scans_are_pictures_on_the_time_line_of_which_the_last_of_those_that_overlap_is_shown() -> None:
+    lane = Overview()
+    lane.take("ScopeStateMsg", ScopeStatus(ScopeState.FREE), S)
+    html = timeline_html(rows_of(lane, {}), 0, 1400 * S, pictures=[(t * S, f"<img {t}>") for t in (10, 20, 700, 2000)])
+    assert re.findall(r"left:([\d.]+)%;[^>]*><img (\d+)>", html) == [("0.00", "20"), ("50.00", "700")]
 
 
 def test_names_from_outside_are_text_and_never_html() -> None:

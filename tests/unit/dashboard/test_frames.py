@@ -135,7 +135,7 @@ def test_the_head_says_what_is_needed_for_axes_and_fits_a_header() -> None:
     store.take_scan(named, 0)
     frame = store.newest()
     assert frame is not None
-    head = PictureCache().draw(frame, Look()).head()
+    head = PictureCache().draw(frame, Look()).head([("Scan", "no. 1")])
     assert head.isascii()
     assert head.isprintable()
     assert '"1763600000123456789"' in head  # as text: JavaScript's numbers are not that exact

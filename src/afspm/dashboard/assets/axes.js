@@ -32,9 +32,8 @@ export function ticks(low, high, about) {
   return Array.from({ length: last - first + 1 }, (_, i) => (first + i) * step);
 }
 
-/** Ticks and numbers below (`side` "x") or to the left ("y") of a box. */
-export function drawAxis(context, box, low, high, unit, side, label) {
-  const found = scale(Math.max(Math.abs(low), Math.abs(high)), unit);
+/** Ticks and numbers below (`side` "x") or to the left ("y") of a box; `found` is a result of `scale`. */
+export function drawAxis(context, box, low, high, found, side, label) {
   const length = side === "x" ? box.width : box.height;
   const values = ticks(low * found.factor, high * found.factor, Math.max(2, length / (side === "x" ? 80 : 48)));
   context.textAlign = side === "x" ? "center" : "right";

@@ -6,6 +6,7 @@ import { Geometry } from "./geometry.js";
 import { drawProfile } from "./profile.js";
 
 const MARGIN = { left: 58, right: 78, top: 22, bottom: 40 };
+const BESIDE = 166; // of the width, for the facts
 const MOST_ZOOM = 64;
 
 export class ImageView {
@@ -23,7 +24,7 @@ export class ImageView {
     this.values = new Questions("/live/value", (found, asked) => this.showValue(found, asked));
     this.profiles = new Questions("/live/profile", (found) => this.showProfile(found));
     this.#listen();
-    new ResizeObserver(() => this.draw()).observe(this.canvas);
+    new ResizeObserver(() => this.draw()).observe(this.find("stage"));
     new MutationObserver(() => this.draw()).observe(document.body, { attributeFilter: ["class"] });
     this.fetch();
   }
@@ -73,9 +74,12 @@ export class ImageView {
       this.line = this.profile = null;
     }
     this.draw();
-    const text = head.time_ns ? "" : `, ${head.rows} of ${head.shape[0]} lines`;
-    this.say(`${head.channel}: ${head.shape[1]} × ${head.shape[0]} px, ${quantity(head.size[0], "m")} × `
-      + `${quantity(head.size[1], "m")}${head.angle ? `, turned by ${plain(head.angle * 180 / Math.PI)}°` : ""}${text}`);
+    this.say("");
+    this.find("facts").replaceChildren(...head.facts.flatMap(([label, text]) => {
+      const [term, fact] = [document.createElement("dt"), document.createElement("dd")];
+      [term.textContent, fact.textContent] = [label, text];
+      return [term, fact];
+    }));
     Object.assign(this.canvas.dataset, { number: head.number, time: head.time_ns ?? "", rows: head.rows, at: Date.now() });
     if (this.cursor) this.#askValue();
     if (this.line) this.#askProfile();
@@ -119,7 +123,7 @@ export class ImageView {
   }
 
   draw() {
-    this.#fitHeight();
+    this.#fit();
     const area = fitted(this.canvas);
     if (!area) return;
     if (!this.head) {
@@ -167,14 +171,19 @@ export class ImageView {
     else if (!this.pinned && channels.length) this.fetch();
   }
 
-  /** As high as the picture needs, within what the window has. */
-  #fitHeight() {
-    if (!this.head) return;
-    const { width } = this.canvas.getBoundingClientRect();
-    const [along, across] = this.head.size;
-    const wanted = MARGIN.top + MARGIN.bottom + ((width - MARGIN.left - MARGIN.right) * across) / along;
-    const height = `${Math.round(Math.min(Math.max(wanted, 180), Math.max(300, window.innerHeight * 0.74)))}px`;
-    if (this.canvas.style.height !== height) this.canvas.style.height = height;
+  /** As large as fits: beside the facts on a screen; on a phone, where the page scrolls, as high as the width needs. */
+  #fit() {
+    const stage = this.find("stage"), { canvas } = this;
+    const [along, across] = this.head?.size ?? [1, 1];
+    const across_px = MARGIN.left + MARGIN.right, up_px = MARGIN.top + MARGIN.bottom;
+    const scrolls = getComputedStyle(stage).flexDirection === "column";
+    const room = stage.clientWidth - (scrolls ? 0 : BESIDE);
+    const most = scrolls ? Infinity : stage.clientHeight;
+    const perMetre = Math.max(0, Math.min((room - across_px) / along, (most - up_px) / across));
+    const size = [across_px + along * perMetre, up_px + across * perMetre];
+    const [width, height] = [Math.min(room, Math.max(size[0], 180)), Math.max(size[1], 160)].map((n) => `${Math.round(n)}px`);
+    if (canvas.style.height !== height) canvas.style.height = height;
+    if (canvas.style.width !== width) canvas.style.width = width;
   }
 
   #measure(area = null) {
@@ -209,8 +218,11 @@ export class ImageView {
     const [[left, right], [low, high]] = this.geometry.range();
     const turned = this.head.angle !== 0;
     const from = turned ? [this.head.size[0] / 2, this.head.size[1] / 2] : this.head.center;
-    drawAxis(context, this.geometry.box, left + from[0], right + from[0], "m", "x", turned ? "along" : "x");
-    drawAxis(context, this.geometry.box, low + from[1], high + from[1], "m", "y", turned ? "across" : "y");
+    const spans = [[left + from[0], right + from[0]], [low + from[1], high + from[1]]];
+    const found = scale(Math.max(...spans.flat().map(Math.abs)), "m"); // one unit for both
+    ["x", "y"].forEach((side, i) => {
+      drawAxis(context, this.geometry.box, ...spans[i], found, side, turned ? ["along", "across"][i] : side);
+    });
     drawScaleBar(context, this.geometry.box, this.geometry.box.width / this.geometry.perMetre);
   }
 

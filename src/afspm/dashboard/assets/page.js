@@ -17,6 +17,7 @@ function update(state) {
   if (!image && root) image = new ImageView(root);
   image?.setChannels(state.channels);
   image?.setSteering(state.may_measure);
+  if (!document.querySelector("[role=tab][aria-selected=true]")) chooseTab(document.body.dataset.tab);
   showTrouble(state.trouble);
   allowSteering(!ended);
   return localStorage.getItem("afspm-theme") ?? "";
@@ -24,7 +25,7 @@ function update(state) {
 
 /** What would reach nobody can't be pressed. */
 function allowSteering(may) {
-  for (const element of document.querySelectorAll(".steer, .processes")) element.inert = !may;
+  for (const element of document.querySelectorAll(".steer, .processes, .problems, .bar > .q-btn")) element.inert = !may;
 }
 
 function showTrouble(text) {
@@ -55,17 +56,41 @@ setInterval(() => {
 }, 1000);
 
 document.addEventListener("click", (event) => {
+  const tab = event.target.closest?.("[role=tab]");
+  if (tab) showTab(tab.dataset.tab);
   const shape = event.target.closest?.("[data-time], [data-spectrum]");
-  if (!shape?.closest(".map")) return;
+  if (!shape?.closest(".map, .strip")) return;
   if (shape.dataset.spectrum) emitEvent("spectrum_picked", { time: shape.dataset.spectrum });
   else {
     image?.pin({ time: shape.dataset.time, channel: shape.dataset.channel });
+    showTab("scan");
     emitEvent("scan_picked", { time: shape.dataset.time, channel: shape.dataset.channel });
   }
 });
 document.addEventListener("click", (event) => {
   if (event.target.dataset?.part === "live") emitEvent("scan_picked", {});
 });
+
+/** A phone shows one part of the page at a time. */
+function chooseTab(name) {
+  document.body.dataset.tab = name;
+  for (const tab of document.querySelectorAll("[role=tab]")) tab.setAttribute("aria-selected", String(tab.dataset.tab === name));
+}
+document.body.dataset.tab = "scan";
+
+function showTab(name) {
+  chooseTab(name);
+  window.scrollTo(0, 0);
+}
+
+/** The style sheet lets the first rows fill what is left of the screen. */
+function observeTop() {
+  const top = document.querySelector(".top");
+  if (!top) return;
+  new ResizeObserver(() => document.documentElement.style.setProperty("--top", `${top.offsetHeight}px`)).observe(top);
+}
+if (document.readyState === "complete") observeTop();
+else window.addEventListener("load", observeTop);
 
 window.afspm = {
   update,

@@ -1,6 +1,6 @@
 // Values along a line.
 
-import { drawAxis, fitted } from "./axes.js";
+import { drawAxis, fitted, scale } from "./axes.js";
 
 export function drawProfile(canvas, { distances_m: distances, values, unit }, label) {
   const area = fitted(canvas);
@@ -13,8 +13,8 @@ export function drawProfile(canvas, { distances_m: distances, values, unit }, la
   low -= around;
   high += around;
   const end = distances.at(-1) || 1;
-  drawAxis(context, box, 0, end, "m", "x", "along the line");
-  drawAxis(context, box, low, high, unit, "y", label);
+  drawAxis(context, box, 0, end, scale(end, "m"), "x", "along the line");
+  drawAxis(context, box, low, high, scale(Math.max(Math.abs(low), Math.abs(high)), unit), "y", label);
   context.strokeRect(box.x, box.y, box.width, box.height);
   context.beginPath();
   let pen = false;

@@ -1,0 +1,117 @@
+"""The dialog of *Scan here*: size and pixels of a scan can be edited before it is taken."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from nicegui import ui
+
+from afspm.dashboard.steering_session import ask_in_dialog
+from afspm.errors import InvalidValue, UnitError
+from afspm.formatting import quantity, typeset_position
+from afspm.model import Region
+from afspm.units import convert, parse_quantity
+
+MOST_PIXELS = 8192
+Shape = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class ScanChoice:
+    """A scan that a person is about to ask for.
+
+    Attributes:
+        shape: (rows, columns).
+    """
+
+    region: Region
+    shape: Shape
+
+    def squared(self) -> ScanChoice:
+        """Return the square of the longer side, with pixels as many along both."""
+        side_m, pixels = max(self.region.size_m), max(self.shape)
+        return ScanChoice(replace(self.region, size_m=(side_m, side_m)), (pixels, pixels))
+
+    def edited(self, width: str, height: str, pixels: str) -> ScanChoice:
+        """Return it with sizes as a person writes them, and so many square pixels along the longer side.
+
+        Raises:
+            UnitError, InvalidValue: a text that is no length, or no number of pixels.
+        """
+        size_m = (_length_m(width), _length_m(height))
+        if not pixels.strip().isdigit() or not 1 <= int(pixels) <= MOST_PIXELS:
+            raise InvalidValue(f"pixels are a whole number from 1 to {MOST_PIXELS}")
+        return ScanChoice(replace(self.region, size_m=size_m), _shape(int(pixels), size_m))
+
+
+class ScanDialog:
+    """Asks for the size and pixels of a scan about a place."""
+
+    def __init__(self, choice: ScanChoice) -> None:
+        self._choice = choice
+
+    @classmethod
+    def of_place(cls, place: Mapping[str, Any]) -> ScanDialog:
+        """Return the dialog for what the picture's script tells: x, y, width, height, angle, rows, columns."""
+        x, y, width, height, angle = (float(place[name]) for name in ("x", "y", "width", "height", "angle"))
+        pixels = max(int(place["rows"]), int(place["columns"]))
+        return cls(ScanChoice(Region((x, y), (width, height), angle), _shape(pixels, (width, height))))
+
+    async def ask(self) -> tuple[Region, Shape] | None:
+        """Return what the person wants; None: no scan."""
+        wanted = await ask_in_dialog("Scan here?", self._fields, "Scan", may=lambda: self._read() is not None)
+        choice = self._read() if wanted else None
+        return None if choice is None else (choice.region, choice.shape)
+
+    def _fields(self) -> None:
+        region = self._choice.region
+        angle = f", turned by {math.degrees(region.angle_rad):.3g}°" if region.angle_rad else ""
+        ui.label(f"Around {typeset_position(region.center_m)}{angle}.")
+        with ui.element("div").classes("acts"):
+            self._width, self._height, self._pixels = (
+                ui.input(name, on_change=self._read).props("dense outlined") for name in ("width", "height", "pixels")
+            )
+            self._square = ui.checkbox("square", on_change=self._snap).props("dense")
+        self._said = ui.label().classes("quiet").props('role="status"')
+        self._fill(self._choice)
+
+    def _fill(self, choice: ScanChoice) -> None:
+        for field, side_m in zip((self._width, self._height), choice.region.size_m, strict=True):
+            field.set_value(quantity(side_m, "m"))
+        self._pixels.set_value(str(max(choice.shape)))
+
+    def _snap(self) -> None:
+        if self._square.value and (choice := self._read()) is not None:
+            self._fill(choice.squared())
+
+    def _read(self) -> ScanChoice | None:
+        """Return what the fields say, and tell it; None if they say nothing that can be scanned."""
+        try:
+            width = str(self._width.value or "")
+            height = width if self._square.value else str(self._height.value or "")
+            choice = self._choice.edited(width, height, str(self._pixels.value or ""))
+        except (UnitError, InvalidValue) as error:
+            self._said.set_text(str(error))
+            return None
+        rows, columns = choice.shape
+        self._said.set_text(f"{columns} × {rows} px of {quantity(choice.region.size_m[0] / columns, 'm', 3)}")
+        return choice
+
+
+def _length_m(text: str) -> float:
+    number, unit = parse_quantity(text)
+    if not unit:
+        raise UnitError(f"{text!r} has no unit", hint='write a length, for example "400 nm"')
+    length_m = convert(number, unit, "m")
+    if not 0.0 < length_m < math.inf:
+        raise InvalidValue(f"{text!r} is no size of a scan", hint="it has to be above zero")
+    return length_m
+
+
+def _shape(most: int, size_m: tuple[float, float]) -> Shape:
+    """Return so many pixels along the longer side, and square ones."""
+    longest = max(size_m)
+    return max(1, round(most * size_m[1] / longest)), max(1, round(most * size_m[0] / longest))

@@ -1,0 +1,71 @@
+"""Facts beside the picture of a scan: its number, time and place, and what was set when it was taken."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from afspm.clock import NS_PER_S
+from afspm.dashboard.frames import ChannelFrame
+from afspm.formatting import duration_text, scale, time_of_day, typeset, typeset_area
+from afspm.model.geometry import XY
+from afspm.record.overview import Overview, ScanSummary
+
+Facts = list[tuple[str, str]]
+"""Pairs of label and text."""
+
+
+def scan_facts(frame: ChannelFrame, overview: Overview, conditions: Mapping[str, str], now_ns: int) -> Facts:
+    """Return what a person wants to know of a scan.
+
+    Args:
+        conditions: label and text of the parameters that were in force.
+    """
+    region, (rows, columns) = frame.region, frame.values.shape
+    size = ("Size", typeset_area(region.size_m))
+    angle = [("Angle", f"{math.degrees(region.angle_rad):.4g}°")] if region.angle_rad else []
+    return [
+        *_when(frame, overview, now_ns),
+        size,
+        ("Centre", _centre(region.center_m)),
+        *angle,
+        ("Pixels", f"{columns} × {rows}"),
+        *conditions.items(),
+    ]
+
+
+def _when(frame: ChannelFrame, overview: Overview, now_ns: int) -> Facts:
+    if frame.time_ns is None:
+        return _growing(frame, overview, now_ns)
+    summary = summary_of(frame.time_ns, overview)
+    facts = [("Scan", "" if summary is None else f"no. {summary.number}"), ("Finished", time_of_day(frame.time_ns))]
+    if summary is not None and summary.began_ns is not None:
+        facts.append(("Took", duration_text((summary.time_ns - summary.began_ns) / NS_PER_S)))
+    if summary is not None and summary.holder:
+        facts.append(("By", summary.holder))
+    return [fact for fact in facts if fact[1]]
+
+
+def _centre(xy_m: XY) -> str:
+    factor, unit = scale(max(map(abs, xy_m)), "m")
+    return typeset(f"({xy_m[0] * factor:.4g}, {xy_m[1] * factor:.4g}) {unit}")
+
+
+def _growing(frame: ChannelFrame, overview: Overview, now_ns: int) -> Facts:
+    number = 1 + (overview.scans[-1].number if overview.scans else 0)
+    facts = [("Scan", f"no. {number}")]
+    if frame.began_ns is not None:
+        facts.append(("Began", time_of_day(frame.began_ns)))
+    if (progress := overview.scan_progress(now_ns)) is not None:
+        facts.append(("Ends", ends_text(progress[1], now_ns)))
+    return [*facts, ("Lines", f"{frame.rows} of {frame.values.shape[0]}")]
+
+
+def ends_text(left_ns: int, now_ns: int) -> str:
+    """Return when something ends, and in how long: "22:14 (in 12 min)"."""
+    return f"{time_of_day(now_ns + left_ns, seconds=left_ns < 600 * NS_PER_S)} (in {duration_text(left_ns / NS_PER_S)})"
+
+
+def summary_of(time_ns: int, overview: Overview) -> ScanSummary | None:
+    """Return the summary of the finished scan of a time; None if there is none."""
+    return next((one for one in reversed(overview.scans) if one.time_ns == time_ns), None)
