@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from html import escape
@@ -24,7 +24,8 @@ ANEW_S = 0.4  # at most that often, however much is published
 SLOWLY_S = 2.0  # for what takes longer to make
 OLD_AFTER_S = 8.0  # a supervisor tells of its processes every 2 s
 NOT_HEARD_OF = "not heard of"
-_FAILED = {"silent", "restarting", "given up", NOT_HEARD_OF}
+_STARTING = "starting"
+_AS_USUAL = {_STARTING, "alive", "ended"}
 
 
 @dataclass(frozen=True)
@@ -196,7 +197,7 @@ def rows_of(overview: Overview, silent: Mapping[str, int], *, unfolded: bool = T
         name: tuple(_until_told(lane, overview.processes_told_ns[name]) if name in silent else lane.spans)
         for name, lane in overview.process_timelines.items()
     }
-    fine = [] if unfolded else [name for name, spans in rows.items() if not _FAILED & {span.label for span in spans}]
+    fine = [] if unfolded else [name for name, spans in rows.items() if not _has_failed(spans)]
     for name, spans in rows.items():
         if name not in fine:
             yield TimelineRow(name, spans, lambda label: f"process-{label.replace(' ', '-')}")
@@ -204,6 +205,11 @@ def rows_of(overview: Overview, silent: Mapping[str, int], *, unfolded: bool = T
         start_ns = min(span.start_ns for name in fine for span in rows[name])
         span = Span(f"{len(fine)} without failures", start_ns)
         yield TimelineRow("processes", (span,), lambda _: "process-alive")
+
+
+def _has_failed(spans: Sequence[Span]) -> bool:
+    """Return whether a process was ever anything else than started once, alive and done."""
+    return any(span.label not in _AS_USUAL for span in spans) or any(span.label == _STARTING for span in spans[1:])
 
 
 def _until_told(lane: Timeline, told_ns: int) -> Iterator[Span]:

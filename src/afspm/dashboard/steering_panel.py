@@ -11,7 +11,7 @@ from nicegui import events, ui
 from afspm.dashboard.actions import Actions
 from afspm.dashboard.content import Content
 from afspm.dashboard.flags import Flag
-from afspm.dashboard.parameter_table import ParameterTable
+from afspm.dashboard.parameter_form import ParameterForm
 from afspm.dashboard.scan_dialog import ScanDialog
 from afspm.dashboard.steering_session import SteeringSession, asked, button
 from afspm.drawing.timeline import tint_class
@@ -105,7 +105,7 @@ class SteeringPanel:
             button("Scan as set", lambda: session.do(lambda a: a.scan()))
             button("Spectrum at the probe", lambda: session.do(lambda a: a.spectrum()))
             ui.label("Or choose Scan here or Spectrum here over the scan.").classes("quiet")
-        self._parameters = ParameterTable(session)
+        self._parameters = ParameterForm(session)
         ui.on("scan_here", self._ask_scan)
         ui.on("spectrum_here", self._ask_spectrum)
 

@@ -210,7 +210,7 @@ def test_processes_are_one_row_of_the_time_line_until_one_fails() -> None:
     told(1, ProcessCondition.ALIVE)
     assert rows(unfolded=False) == ["processes"]
     assert rows(unfolded=True) == ["scheduler", "series", "metadata"]
-    told(2, ProcessCondition.RESTARTING)
+    told(2, ProcessCondition.STARTING)
     told(3, ProcessCondition.ALIVE)
     assert rows(unfolded=False) == ["series", "processes"]
 

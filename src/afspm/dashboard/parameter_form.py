@@ -13,7 +13,7 @@ from afspm.model import names
 PARAMETERS = tuple(names.BASE_PARAMETERS)
 
 
-class ParameterTable:
+class ParameterForm:
     """A field for each parameter that the microscope has: all in MANUAL, in AUTOMATED those that may be adjusted."""
 
     def __init__(self, session: SteeringSession) -> None:
