@@ -16,5 +16,7 @@ class ExitCode(IntEnum):
     """The settings can't work: a restart would fail the same way."""
     ENDED = 80
     """The experiment ended (KILL)."""
+    OWN_FAULT = 82
+    """An exception of the component's own code, told in `<name>.fault.json`: restart it unless it makes no progress."""
     ORPHAN = 81
     """The parent went away, or asked us to stop by closing our standard input."""

@@ -61,4 +61,4 @@ def test_a_typo_is_told_with_the_nearest_name() -> None:
 
 
 def test_after_all_exits_on_purpose_and_no_others_a_process_is_not_started_again() -> None:
-    assert set(ChildPolicy().final_codes) == set(ExitCode) - {ExitCode.CRASHED, ExitCode.ORPHAN}
+    assert set(ChildPolicy().final_codes) == set(ExitCode) - {ExitCode.CRASHED, ExitCode.OWN_FAULT, ExitCode.ORPHAN}

@@ -47,6 +47,16 @@ def end(
     typer.echo("the experiment is ended")
 
 
+def restart(
+    process: Annotated[str, typer.Argument(help="The name of the process, such as `series`.", show_default=False)],
+    where: Where = RUNS,
+) -> None:
+    """End a process of a running experiment and start it anew, also one that was given up; what it keeps stays."""
+    with acting(where) as scope:
+        scope.restart(process)
+    typer.echo(f"{process} is started anew")
+
+
 def problems(
     where: Where = RUNS,
     flag: Annotated[

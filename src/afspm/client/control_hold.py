@@ -21,6 +21,7 @@ class ControlHold:
 
     Attributes:
         held: we are in control.
+        tenures: how often control was given to us.
         why_lost: for a person, why we no longer are.
         gives_back_inherited: give back whatever control an earlier life of this component died with.
         is_unbroken: in this block control that is lost is not waited for: nothing is asked for in a second tenure.
@@ -32,6 +33,7 @@ class ControlHold:
         self._wanted: list[int] = []
         self._was_named = False
         self.held = False
+        self.tenures = 0
         self.why_lost = ""
         self.gives_back_inherited = False
         self.is_unbroken = False
@@ -146,6 +148,7 @@ class ControlHold:
         response = link.request(ControlRequest.REQUEST_CTRL, int(solving), until_s=until_s)
         if response.ok:
             # the state that names us may have come before the answer
+            self.tenures += 1
             self.held, self._was_named = True, link.view.control is not None and link.view.control.holder == link.name
             return None
         if response.code not in WAIT_FOR_CONTROL:

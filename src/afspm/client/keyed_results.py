@@ -102,6 +102,11 @@ class KeyedResults:
         return self._folder / f"{plain}-{zlib.crc32(key.encode()):08x}"
 
 
+def kept_in(state_dir: Path, name: str) -> list[str]:
+    """Return the names of the files that keep a component's measurements."""
+    return sorted(path.name for path in (state_dir / f"{name}.results").glob("*"))
+
+
 def check_key(key: str) -> str:
     """Return a key as it may be used in request ids. Raises InvalidValue: it may not."""
     if not key or len(key.encode()) > LONGEST_KEY or "/" in key or not key.isprintable():

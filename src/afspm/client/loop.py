@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -11,13 +13,16 @@ from afspm.client.backlog import PacketBacklog
 from afspm.client.component import Component
 from afspm.client.dispatch import MessageDispatcher, overrides
 from afspm.client.experiment_link import ExperimentLink
+from afspm.client.keyed_results import kept_in
 from afspm.client.scope import Scope
 from afspm.clock import NS_PER_S, Clock
 from afspm.errors import ConfigError, ExperimentEnded, MeasurementFailed, RequestError
 from afspm.exit_codes import ExitCode
+from afspm.logic.supervision.own_fault import OwnFault
 from afspm.model import Frame, Packet, Problem
 from afspm.process import failure
 from afspm.process.context import ProcessContext
+from afspm.process.fault_file import write_fault
 from afspm.process.memory import Memory
 from afspm.process.parent import StopRequested
 
@@ -37,6 +42,7 @@ class ComponentLoop:
         self._is_script = overrides(component, Component, "run")
         self._backlog = PacketBacklog()
         self._has_begun = False
+        self._has_reacted = False  # a handler that had control has returned
         launch = context.launch
         self._dispatcher = MessageDispatcher(component, Component, launch.envelopes, context.log)
         self._ticker = None if self._is_script else _ticker(component, context.clock)
@@ -44,7 +50,8 @@ class ComponentLoop:
             launch, context.open_port(), context.session, activity=self._activity, log=context.log
         )
         self._link.listen(self._keep)
-        self._give_attributes(Path(launch.state_dir) if launch.state_dir else None)
+        self._state_dir = Path(launch.state_dir) if launch.state_dir else None
+        self._give_attributes(self._state_dir)
 
     def run(self) -> int:
         """Return the exit code."""
@@ -54,10 +61,29 @@ class ComponentLoop:
         except MeasurementFailed as failed:
             self._call_a_person(failed)
             raise
+        except ConfigError:
+            raise
+        except Exception as error:
+            if self._state_dir is None or self._may_pass(error):
+                raise
+            code = self._fail(error, self._state_dir)
         finally:
             self._backlog.close()
             self._link.port.close()
         return code
+
+    def _fail(self, error: Exception, state_dir: Path) -> ExitCode:
+        """Log an error of the component's own code, and tell the supervisor of it."""
+        name = self._context.name
+        failure.log(self._context.log, error, name)
+        kept = json.dumps([self._component.memory.saved_text, *kept_in(state_dir, name)])
+        write_fault(state_dir, name, OwnFault(type(error).__name__, failure.place_of(error), zlib.crc32(kept.encode())))
+        return ExitCode.OWN_FAULT
+
+    def _may_pass(self, error: Exception) -> bool:
+        """Return whether a restart may get over an error: another message arrives, or the microscope is well again."""
+        is_reaction = not self._is_script and self._has_begun
+        return failure.may_pass(error) or (is_reaction and (self._has_reacted or not self._component.scope.tenures))
 
     def _run_to_the_end(self) -> ExitCode:
         try:
@@ -126,8 +152,10 @@ class ComponentLoop:
     @contextlib.contextmanager
     def _handler(self) -> Iterator[None]:
         """Around a handler of the component: what it has put into memory is kept, unless it fails."""
+        tenures = self._component.scope.tenures
         with self._activity.step():
             yield
+            self._has_reacted |= self._component.scope.tenures != tenures
             if not self._is_script:  # a script says itself when what it remembers belongs together
                 self._component.memory.save_changes()
 

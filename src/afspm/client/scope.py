@@ -20,6 +20,7 @@ from afspm.client.targets import ScanTarget, SpectrumTarget
 from afspm.errors import ExperimentEnded, InvalidValue
 from afspm.model import (
     RELAY_REQUEST,
+    RESTART_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -270,6 +271,10 @@ class Scope(ExperimentView):
         """Set MANUAL (nobody has control) or AUTOMATED."""
         self._tell(ControlRequest.SET_CONTROL_MODE, int(mode))
 
+    def restart(self, process: str) -> None:
+        """End a process of the experiment and start it anew, also one that was given up."""
+        self._tell(RESTART_REQUEST, process)
+
     def end_experiment(self) -> None:
         """End the experiment for everybody, this process included: the next call raises ExperimentEnded."""
         self._link.wait_caught_up()  # else the signal might pass before we listen
@@ -326,6 +331,11 @@ class Scope(ExperimentView):
         self.close()
 
     # --- within ---
+
+    @property
+    def tenures(self) -> int:
+        """The number of times that we were given control."""
+        return self._control.tenures
 
     def give_back_inherited(self) -> None:
         """Never keep control that an earlier life of this component died with. Called by the component's loop."""

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import traceback
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from afspm.errors import AfspmError
+from afspm.errors import AfspmError, FileError, Refused, RequestError, TransportError
+from afspm.model import ControlResponse
 
 PACKAGE = Path(__file__).parents[1]  # not resolved: as the paths in tracebacks
 _BELOW_START = 2  # of `python -m`: what Python itself does first
+_REFUSED_AGAIN = {
+    ControlResponse.CMD_NOT_SUPPORTED,
+    ControlResponse.PARAM_NOT_SUPPORTED,
+    ControlResponse.PARAM_ERROR,
+    ControlResponse.ACTION_NOT_SUPPORTED,
+}
+"""What is refused for what was asked, by a limit for example, is refused again."""
 
 
 def describe(error: BaseException, name: str = "", package: Path = PACKAGE) -> str:
@@ -38,6 +47,27 @@ def describe(error: BaseException, name: str = "", package: Path = PACKAGE) -> s
     what = _words(error, name) if isinstance(error, AfspmError) else "".join(trace.format_exception_only()).strip()
     where = trace.format() if is_chained else trace.stack.format()
     return "\n".join([what, *"".join(where).rstrip("\n").splitlines()])
+
+
+def may_pass(error: BaseException) -> bool:
+    """Return whether an error may be a passing one, of the controller or the computer, and not the code's own."""
+    if isinstance(error, Refused):
+        return error.response not in _REFUSED_AGAIN
+    return isinstance(error, (RequestError, FileError, TransportError, OSError, MemoryError))
+
+
+def place_of(error: BaseException, package: Path = PACKAGE) -> str:
+    """Return file and line of the user's code that an exception came from; of ours if there is none."""
+    frames = traceback.extract_tb(error.__traceback__)
+    of_user = [frame for frame in frames if not _is_passage(frame, package)]
+    last = (of_user or frames)[-1]
+    return f"{Path(last.filename).name}:{last.lineno}"
+
+
+def log(logger: logging.Logger, error: BaseException, name: str) -> None:
+    """Log an exception that ends a process."""
+    logger.error("%s", describe(error, name))
+    logger.debug("the same with every step of ours", exc_info=error)
 
 
 def where_now(thread_id: int, package: Path = PACKAGE) -> str:

@@ -68,8 +68,7 @@ def main() -> int:
         if parent.gone:
             logger.debug("while ending: %s", error, exc_info=True)
             return ExitCode.ORPHAN
-        logger.error("%s", failure.describe(error, launch.name))
-        logger.debug("the same with every step of ours", exc_info=True)
+        failure.log(logger, error, launch.name)
         return ExitCode.CRASHED
 
 

@@ -62,6 +62,11 @@ class Memory(MutableMapping[str, Any]):
         if (text := self._text()) != self._saved:
             self._write(text)
 
+    @property
+    def saved_text(self) -> str:
+        """Everything that survives a restart, as JSON."""
+        return self._saved
+
     def _write(self, text: str) -> bool:
         with self._told.trying():
             if (generations := self._generations) is not None:

@@ -12,9 +12,11 @@ import signal
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from afspm.clock import ExperimentClock
 from afspm.errors import AfspmError
+from afspm.exit_codes import ExitCode
 from afspm.logic.supervision.child import ChildPolicy
 from afspm.logic.supervision.process_status import ProcessStatus
 from afspm.logic.supervision.run_end import EndReason
@@ -40,6 +42,7 @@ from afspm.logic.supervision.supervisor_events import (
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import Role
 from afspm.process import signals
+from afspm.process.fault_file import take_fault
 from afspm.supervisor.activity_monitor import ActivityMonitor
 from afspm.supervisor.child_output import OutputDropped, OutputLine
 from afspm.supervisor.clock_check import ClockCheck
@@ -177,7 +180,10 @@ class Supervisor:
         if process is not None and process.pid == exited.pid:
             del self._processes[exited.name]
             self._reaper.forget(exited.pid)
-            self._step(replace(exited, last_error=self._lines[exited.name].last_error))
+            state_dir = self._tasks[exited.name].launch.state_dir
+            is_told = exited.code == ExitCode.OWN_FAULT and state_dir
+            fault = take_fault(Path(state_dir), exited.name) if is_told else None
+            self._step(replace(exited, last_error=self._lines[exited.name].last_error, fault=fault))
 
     def _look(self) -> None:
         """Look at the clock on the wall, and from outside at processes whose beat is late."""

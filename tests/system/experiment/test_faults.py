@@ -129,6 +129,33 @@ budget = 2
     one.wait_for("hopeless was GIVEN UP")
 
 
+SURVEY = """
+from afspm import Component, Region
+
+
+class Survey(Component):
+    def run(self):
+        scans = self.scope.scan(Region((0, 0), (5e-7, 5e-7)), shape=(8, 8))
+        raise ValueError(f"{scans.first.values.std()} nm is too rough")
+"""
+
+
+def test_a_script_that_fails_twice_alike_does_not_measure_a_third_time(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "survey.py").write_text(SURVEY, encoding="utf-8")
+    one = run(more='[survey]\ncomponent = true\nclass = "survey.Survey"\n', scans=1000)
+    one.wait_for(
+        "CRITICAL survey is given up, the rest goes on: failed twice in the same way",
+        r"ValueError at survey.py:8",
+        "`afspm restart survey` starts it again",
+    )
+    with connect(one.folder, "person") as scope:
+        scope.restart("survey")
+    one.wait_for("survey is given up", count=2)
+    assert sum(" survey " in line and "started, process" in line for line in one.lines) == 4, one.output
+    one.process.send_signal(signal.SIGINT)
+    one.end()
+
+
 def test_without_a_microscope_the_run_ends_and_says_so(run: Run) -> None:
     one: AfspmRun = run(more="[restart]\nbudget = 0\n", scans=1000)
     one.wait_for("scan 1 of 1000")

@@ -11,10 +11,21 @@ from client_lab import EPOCH_S, OTHER_REGION, REGION, Lab, Nothing, context_of, 
 
 from afspm import model, wire
 from afspm.client.component import Component
-from afspm.errors import ConfigError, ExperimentEnded, Refused
+from afspm.errors import ConfigError, ExperimentEnded, NoResponse, Refused
 from afspm.exit_codes import ExitCode
 from afspm.launch import Launch
-from afspm.model import ControlResponse, Problem, Response, ResponseDetail, Scan, ScopeState, ScopeStatus
+from afspm.logic.supervision.own_fault import OwnFault
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Problem,
+    Response,
+    ResponseDetail,
+    Scan,
+    ScopeState,
+    ScopeStatus,
+)
+from afspm.process.fault_file import take_fault
 from afspm.wire.generated.analysis_pb2 import SpatialPointWithScoreList
 from afspm.wire.generated.feedback_pb2 import FeedbackAnalysis
 
@@ -498,3 +509,74 @@ def test_what_was_measured_before_the_end_is_handled(who: str) -> None:
     component = Table()
     run(component, lab)
     assert component.rows == ["Height", "Phase"]
+
+
+class Fails(Component):
+    """A script that measures, and fails."""
+
+    def __init__(self, error: Exception, key: str | None = None) -> None:
+        self.error, self.key = error, key
+
+    def run(self) -> None:
+        self.scope.scan(REGION, key=self.key)
+        raise self.error
+
+
+def fault_of(component: Component, folder: Path, lab: Lab | None = None) -> OwnFault | None:
+    """What its supervisor is told of its end."""
+    assert run(component, lab or Lab(), folder) == ExitCode.OWN_FAULT
+    return take_fault(folder, "experiment")
+
+
+def test_a_script_that_fails_tells_of_the_place_and_of_what_it_keeps(tmp_path: Path) -> None:
+    first = fault_of(Fails(ValueError("0.1 nm is too rough")), tmp_path)
+    assert first is not None
+    assert (first.error, first.place.partition(":")[0]) == ("ValueError", "test_component_loop.py")
+    assert fault_of(Fails(ValueError("0.2 nm is too rough")), tmp_path) == first
+    assert fault_of(Fails(KeyError("Height")), tmp_path) != first
+    assert fault_of(Fails(ValueError(), key="tile"), tmp_path) != first
+
+
+def test_what_is_refused_by_a_limit_is_a_fault_of_the_script(tmp_path: Path) -> None:
+    lab = Lab()
+    limit = Response(ControlResponse.PARAM_ERROR, reason="outside the limits")
+    lab.intercept = lambda request: limit if request.kind == ControlRequest.SET_SCAN_PARAMS else "go on"
+    fault = fault_of(Fails(ValueError()), tmp_path, lab)
+    assert fault is not None
+    assert fault.error == "Refused"
+
+
+@pytest.mark.parametrize(
+    "error", [NoResponse("it is silent"), Refused(ControlResponse.FAILURE, "busy"), OSError("no file"), MemoryError()]
+)
+def test_an_error_that_may_pass_is_no_fault(tmp_path: Path, error: Exception) -> None:
+    with pytest.raises(type(error)):
+        run(Fails(error), Lab(), tmp_path)
+
+
+class Reacts(Component):
+    """Fails over each scan of one channel, having done what it was told to before."""
+
+    def __init__(self, *does: str) -> None:
+        self.does = does
+
+    def on_scan(self, scan: Scan) -> None:
+        if scan.channel in self.does:
+            self.scope.set("tip-bias-voltage", 1.0, "V")
+        if scan.channel == "Phase":
+            raise ValueError("I can't read that")
+
+
+@pytest.mark.parametrize(
+    ("does", "is_fault"), [(["Phase"], True), ([], False), (["Height"], False), (["Height", "Phase"], False)]
+)
+def test_a_handler_that_fails_over_a_message_is_at_fault_if_it_had_control_and_none_before_it_had(
+    tmp_path: Path, does: list[str], is_fault: bool
+) -> None:
+    lab = Lab()
+    lab.at(10.0, lambda: lab.publish_scan(REGION))
+    if is_fault:
+        assert fault_of(Reacts(*does), tmp_path, lab) is not None
+    else:
+        with pytest.raises(ValueError, match="read that"):
+            run(Reacts(*does), lab, tmp_path)

@@ -9,6 +9,7 @@ from typing import Protocol
 
 from afspm.exit_codes import ExitCode
 from afspm.logic.supervision.liveness import Liveness, LivenessPolicy, ProcessHealth
+from afspm.logic.supervision.own_fault import OwnFault
 from afspm.logic.supervision.restart import RestartBudget, RestartPolicy
 
 
@@ -101,6 +102,7 @@ class ChildWatch:
         self._began_s = 0.0
         self._again_s = 0.0
         self._is_ordered = False  # its end is, and that it is started again at once
+        self._fault: OwnFault | None = None  # by which the life before ended
         self.phase = ChildPhase.IDLE
 
     @property
@@ -133,7 +135,7 @@ class ChildWatch:
         if self._liveness is not None:
             self._liveness.waits(now_s)
 
-    def exited(self, code: int, now_s: float, how: str = "") -> list[ChildEffect]:
+    def exited(self, code: int, now_s: float, how: str = "", fault: OwnFault | None = None) -> list[ChildEffect]:
         """Take in its end, by an exit code or, below zero, a signal; `how` says it for people."""
         how = how or f"exit code {code}"
         phase, self._liveness = self.phase, None
@@ -146,6 +148,9 @@ class ChildWatch:
         if (phase is not ChildPhase.KILLING or ordered) and code in self._policy.final_codes:
             self.phase = ChildPhase.DONE
             return [ChildLog("DEBUG" if code in self._policy.quiet_codes else "INFO", how)]
+        before, self._fault = self._fault, fault
+        if fault is not None and fault == before:
+            return self._give_up(f"failed twice in the same way without progress ({fault})")
         return self._failed(now_s, how)
 
     def start_failed(self, why: str, now_s: float) -> list[ChildEffect]:
@@ -160,6 +165,7 @@ class ChildWatch:
         """Start it anew by order, whatever it does now. That is no failure: it costs no restart."""
         if self.phase is ChildPhase.STOPPING:
             return []
+        self._fault = None
         said = ChildLog("INFO", "is started anew, as ordered")
         if self.phase in (ChildPhase.RUNNING, ChildPhase.KILLING):
             is_new = not self._is_ordered
@@ -210,12 +216,16 @@ class ChildWatch:
     def _failed(self, now_s: float, what: str) -> list[ChildEffect]:
         delay_s = self._restarts.failed(now_s, now_s - self._began_s)
         if delay_s is None:
-            self.phase = ChildPhase.GIVEN_UP
             restart = self._policy.restart
-            why = f"{what}; it was restarted {restart.budget} times within {restart.window_s:g} s already"
-            return [ChildLog("ERROR", f"given up: {why}"), GiveUpChild(why)]
+            return self._give_up(
+                f"{what}; it was restarted {restart.budget} times within {restart.window_s:g} s already"
+            )
         if delay_s <= 0:
             return [ChildLog("WARNING", f"{what}; it is started again"), *self._start(now_s)]
         self.phase = ChildPhase.WAITING
         self._again_s = now_s + delay_s
         return [ChildLog("WARNING", f"{what}; it is started again in {delay_s:g} s")]
+
+    def _give_up(self, why: str) -> list[ChildEffect]:
+        self.phase = ChildPhase.GIVEN_UP
+        return [ChildLog("ERROR", f"given up: {why}"), GiveUpChild(why)]

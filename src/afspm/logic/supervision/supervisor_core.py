@@ -157,7 +157,8 @@ class SupervisorCore:
             return
         child.life = None
         how = describe_exit(code)
-        child.last_exit = f"{how}: {exited.last_error}" if code == ExitCode.CRASHED and exited.last_error else how
+        has_crashed = code in (ExitCode.CRASHED, ExitCode.OWN_FAULT)
+        child.last_exit = f"{how}: {exited.last_error}" if has_crashed and exited.last_error else how
         if self.ending is not None:
             if child.watch.died(code) and self._may_be_rescued(child):
                 self._log(child.spec.name, "WARNING", f"{how}; it is started again, to finish")
@@ -169,7 +170,7 @@ class SupervisorCore:
             told = f"{how}, before the experiment has ended and without saying that it closes"
             self._apply(child, child.watch.exited(ExitCode.CRASHED, self._now_s, told))
         else:
-            self._apply(child, child.watch.exited(code, self._now_s, how))
+            self._apply(child, child.watch.exited(code, self._now_s, how, exited.fault))
             if code == ExitCode.ENDED:
                 self._end(EndReason.EXPERIMENT_ENDED, "the experiment has ended")
             elif code == ExitCode.CONFIG:
@@ -234,7 +235,8 @@ class SupervisorCore:
             what = f"{name} is given up, and the experiment can't go on without it: {why}"
             self._end(EndReason.LOST, what)
         else:
-            self._log(LOGGED_AS, "CRITICAL", f"{name} is given up, the rest goes on (Ctrl-C ends it): {why}")
+            again = f"`afspm restart {name}` starts it again, Ctrl-C ends the run"
+            self._log(LOGGED_AS, "CRITICAL", f"{name} is given up, the rest goes on: {why}; {again}")
 
     def _end(self, why: EndReason, text: str) -> None:
         self._release()

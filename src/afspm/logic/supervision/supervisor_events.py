@@ -8,6 +8,7 @@ from enum import Enum, auto
 
 from afspm.exit_codes import ExitCode
 from afspm.logic.supervision.child import HeartbeatReport
+from afspm.logic.supervision.own_fault import OwnFault
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +56,7 @@ class Exited:
     pid: int
     code: int
     last_error: str = ""
+    fault: OwnFault | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +142,7 @@ SupervisorEffect = ProcessCommand | ReleaseComponents | WriteLog
 _EXIT_REASONS = {
     ExitCode.DONE: "done",
     ExitCode.CRASHED: "crashed",
+    ExitCode.OWN_FAULT: "crashed",
     ExitCode.CONFIG: "its settings can't work",
     ExitCode.ENDED: "ended with the experiment",
     ExitCode.ORPHAN: "ended as it was asked to",

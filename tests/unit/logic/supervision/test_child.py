@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from afspm.exit_codes import ExitCode
 from afspm.logic.supervision.child import (
     ChildLog,
     ChildPhase,
@@ -18,6 +19,7 @@ from afspm.logic.supervision.child import (
     StartChild,
 )
 from afspm.logic.supervision.liveness import Liveness, LivenessPolicy, ProcessHealth
+from afspm.logic.supervision.own_fault import OwnFault
 from afspm.logic.supervision.restart import RestartBudget, RestartPolicy
 
 
@@ -345,3 +347,45 @@ def test_an_order_does_not_undo_the_end() -> None:
     assert watch.restart(1.1) == []
     assert watch.exited(-9, 1.2) == []
     assert watch.phase is ChildPhase.DONE
+
+
+FAULT = OwnFault("ValueError", "survey.py:12", kept=1)
+CODE = int(ExitCode.OWN_FAULT)
+
+
+def fails(*faults: OwnFault | None) -> ChildWatch:
+    """One that has ended by these faults in a row."""
+    watch = ChildWatch(ChildPolicy())
+    watch.begin(0.0)
+    for number, fault in enumerate(faults, 1):
+        watch.exited(CODE, 100.0 * number, fault=fault)
+        watch.tick(100.0 * number + 50.0)
+    return watch
+
+
+def test_the_same_fault_twice_without_progress_is_not_tried_a_third_time() -> None:
+    assert fails(FAULT).phase is ChildPhase.RUNNING
+    assert fails(FAULT, FAULT).phase is ChildPhase.GIVEN_UP
+
+
+@pytest.mark.parametrize(
+    "second",
+    [
+        OwnFault("ValueError", "survey.py:12", kept=2),
+        OwnFault("ValueError", "survey.py:13", kept=1),
+        OwnFault("KeyError", "survey.py:12", kept=1),
+        None,
+    ],
+    ids=["progress", "another place", "another error", "a passing error"],
+)
+def test_any_other_end_in_between_begins_anew(second: OwnFault | None) -> None:
+    assert fails(FAULT, second, FAULT).phase is ChildPhase.RUNNING
+
+
+def test_one_that_a_person_starts_again_may_fail_once_more() -> None:
+    watch = fails(FAULT, FAULT)
+    assert StartChild() in watch.restart(300.0)
+    watch.exited(CODE, 400.0, fault=FAULT)
+    assert watch.phase is ChildPhase.RUNNING
+    given_up = GiveUpChild(f"failed twice in the same way without progress ({FAULT})")
+    assert given_up in watch.exited(CODE, 500.0, fault=FAULT)
