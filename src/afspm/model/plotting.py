@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
@@ -29,36 +29,54 @@ def draw(scan: Scan, kind: str = "image", axes: Axes | None = None) -> Axes:
         raise InvalidValue(f"the scan {scan.channel!r} has no values to draw")
     import matplotlib.pyplot as plt
 
-    if axes is None:
-        axes = plt.figure(layout="constrained").add_subplot(projection="3d" if kind == "surface" else None)
-        axes.set_title(_title(scan), fontsize=9)
-    _fill(scan, kind, axes)
-    return axes
+    given: Any = axes
+    if given is None:
+        given = plt.figure(layout="constrained").add_subplot(projection="3d" if kind == "surface" else None)
+        given.set_title(_title(scan), fontsize=9)
+    is_first = not given.has_data()
+    drawn = _fill(scan, kind, given)
+    if is_first:
+        _explain(scan, drawn, given)
+    return cast("Axes", given)
 
 
-def _fill(scan: Scan, kind: str, axes: Any) -> None:
-    """Draw in axes: places in the unit that suits the scan's size, values in the one that suits the largest."""
-    ny, nx = scan.shape
-    (left, low), (width, height) = scan.region.top_left_m, scan.region.size_m
-    length, length_unit = scale(max(width, height), "m")
-    x, y = (length * np.linspace(start, start + size, n) for start, size, n in ((left, width, nx), (low, height, ny)))
+def _fill(scan: Scan, kind: str, axes: Any) -> Any:
+    """Draw the values over the places of their pixels, in m."""
+    x, y = scan.region.pixels_m(scan.shape)
     span = value_range(scan.values)
-    factor, unit = scale(max(abs(span.low), abs(span.high)), scan.unit)
-    values, label = np.ma.masked_invalid(scan.values * factor), f"{scan.channel} / {unit}" if unit else scan.channel
+    factor, _ = _value_unit(scan)
+    values = np.ma.masked_invalid(scan.values * factor)
     look = {"cmap": gold(), "vmin": span.low * factor, "vmax": span.high * factor}
-    if kind == "surface":
-        axes.plot_surface(*np.meshgrid(x, y), values, **look)
+    match kind:
+        case "surface":
+            return axes.plot_surface(x, y, values, **look)
+        case "contour":
+            return axes.contour(x, y, values, _LEVELS, **look)
+        case _:
+            return axes.pcolormesh(x, y, values, shading="nearest", **look)
+
+
+def _explain(scan: Scan, drawn: Any, axes: Any) -> None:
+    """Add what the first scan in axes needs: units, a colour bar, a scale bar. Others lie over it as they are."""
+    _, unit = _value_unit(scan)
+    label = f"{scan.channel} / {unit}" if unit else scan.channel
+    factor, length_unit = scale(max(scan.region.size_m), "m")
+    for axis, name in ((axes.xaxis, "x"), (axes.yaxis, "y")):
+        axis.set_major_formatter(lambda place_m, _: f"{place_m * factor:.6g}".replace("-", "−"))
+        axis.set_label_text(f"{name} / {length_unit}")
+    if hasattr(axes, "set_zlabel"):
         axes.set_zlabel(label)
-    else:
-        drawn = (
-            axes.contour(x, y, values, _LEVELS, **look) if kind == "contour" else axes.pcolormesh(x, y, values, **look)
-        )
-        axes.set_facecolor("0.6")  # what was not measured, and behind contour lines
-        axes.set_aspect("equal")
-        axes.figure.colorbar(drawn, ax=axes, label=label)
-        draw_scale_bar(axes, scan.region.size_m, (x[0], y[0]), length)
-    axes.set_xlabel(f"x / {length_unit}")
-    axes.set_ylabel(f"y / {length_unit}")
+        return
+    axes.set_facecolor("0.6")  # what was not measured, and behind contour lines
+    axes.set_aspect("equal")
+    axes.figure.colorbar(drawn, ax=axes, label=label)
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    draw_scale_bar(axes, (right - left, high - low), (left, low), 1.0)
+
+
+def _value_unit(scan: Scan) -> tuple[float, str]:
+    span = value_range(scan.values)
+    return scale(max(abs(span.low), abs(span.high)), scan.unit)
 
 
 def draw_scale_bar(

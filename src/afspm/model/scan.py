@@ -189,10 +189,11 @@ class Scan:
 
         Args:
             kind: "image", "contour" or "surface" (in three dimensions).
-            axes: to draw in; for a surface they need `projection="3d"`. None: a figure of its own.
+            axes: to draw in, over what is there; for a surface they need `projection="3d"`. None: a figure of its own.
 
         Returns:
-            The axes; places and values in the units that suit them, e.g. µm and nm. `axes.figure.savefig("a.png")`.
+            The axes. Their coordinates are in m, with ticks in the unit that suits them: what is drawn into them next,
+            another scan or `axes.plot(*spectrum.position_m, "o")`, lies where it was measured.
 
         Raises:
             InvalidValue: there is no such kind, or nothing was measured.

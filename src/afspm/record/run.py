@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from afspm import wire
 from afspm.errors import FileError, InvalidValue, WireError
@@ -101,8 +101,7 @@ class Run:
         """Return a spectrum: by its place in `spectra` (-1: the last), its key, or its row. Raises as `scan`."""
         row = self.spectra[which] if isinstance(which, str) else which
         row = row if isinstance(row, SpectrumRow) else self._row("spectra", row, spectrum_row)
-        spectrum: Spectrum = self._content(row.file, f"spectrum {row.number}").spectra[0]
-        return spectrum
+        return cast(Spectrum, self._content(row.file, f"spectrum {row.number}").spectra[0])
 
     def about(self, row: ScanRow | SpectrumRow) -> dict[str, Any]:
         """Return what is known beside the values: drift, feedback, the controller's header, notes … See `scan`."""
@@ -292,13 +291,11 @@ class Run:
 
     def numbered(self, number: int) -> ScanRow:
         """Return the scan with a number, as reports and exports show it. Raises InvalidValue: there is none."""
-        found = self._query("SELECT * FROM scans WHERE number = ?", (number,))
-        if not found:
-            last = self._query("SELECT coalesce(max(number), 0) FROM scans")[0][0]
-            raise InvalidValue(
-                f"there is no scan {number}", hint=f"the last is {last}" if last else "there is none yet"
-            )
-        return scan_row(found[0])
+        rows = {row.number: row for row in self.scans}
+        if number not in rows:
+            hint = f"the last is {max(rows)}" if rows else "there is none yet"
+            raise InvalidValue(f"there is no scan {number}", hint=hint)
+        return rows[number]
 
     @property
     def problem_names(self) -> ProblemNames:

@@ -17,13 +17,28 @@ SCAN = Scan(Region((1e-6, 2e-6), (3e-7, 2e-7), 0.1), "Height", "m", VALUES, 1_75
 @pytest.mark.parametrize("kind", ["image", "contour", "surface"])
 def test_a_scan_is_drawn_where_it_is(kind: str) -> None:
     axes = SCAN.plot(kind)
-    assert axes.get_xlim() == pytest.approx((850, 1150), abs=60)
-    assert axes.get_ylim() == pytest.approx((1900, 2100), abs=60)
+    axes.figure.canvas.draw()
+    assert axes.get_xlim() == pytest.approx((850e-9, 1150e-9), abs=80e-9)
+    assert axes.get_ylim() == pytest.approx((1900e-9, 2100e-9), abs=80e-9)
     assert axes.get_xlabel() == "x / nm"
     if kind != "surface":
         assert axes.figure.axes[1].get_ylabel() == "Height / nm"
-        assert [text.get_text() for text in axes.texts] == ["50 nm"]
+        assert axes.texts[0].get_text().endswith("0 nm")
+        assert "1000" in [label.get_text() for label in axes.get_xticklabels()]
+    mpl.pyplot.close(axes.figure)
+
+
+def test_a_scan_over_another_lies_where_it_was_taken_without_a_second_colour_bar() -> None:
+    axes = Scan(Region((0.0, 0.0), (5e-6, 5e-6)), "Height", "m", VALUES).plot()
+    assert SCAN.plot(axes=axes) is axes
     axes.figure.canvas.draw()
+    assert len(axes.figure.axes) == 2
+    assert axes.get_xlabel() == "x / µm"
+    survey, zoom = axes.collections
+    corners = np.asarray(zoom.get_coordinates()).reshape(-1, 2)
+    assert tuple(corners.mean(axis=0)) == pytest.approx(SCAN.region.center_m)
+    assert np.ptp(corners[:, 0]) > 3e-7  # it is turned
+    assert survey.get_zorder() <= zoom.get_zorder()
     mpl.pyplot.close(axes.figure)
 
 

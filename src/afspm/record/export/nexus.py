@@ -1,4 +1,4 @@
-"""NeXus (.h5): the files of the record, with the notes on each scan as NXnote."""
+"""NeXus (.h5): the files of the record, with their keys, and the notes on each scan as NXnote."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
     run.about(row)  # raises where the file is damaged
     content = io.BytesIO((run.folder / row.file).read_bytes())
     with h5py.File(content, "r+") as file:
+        if row.key:
+            file["entry"]["afspm"].attrs["key"] = row.key
         for number, note in enumerate(run.notes_on(row), 1):
             group = file["entry"].create_group(f"note_{number}")
             group.attrs["NX_class"] = "NXnote"
