@@ -108,6 +108,12 @@ class InvalidValue(AfspmError, ValueError):
     code = "invalid-value"
 
 
+class NoSuchItem(AfspmError, KeyError, IndexError):
+    """There is nothing by this name, key or number."""
+
+    code = "no-such-item"
+
+
 class UnitError(AfspmError, ValueError):
     """An unknown unit, or one of the wrong dimension."""
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import linecache
 
+import numpy as np
 import pytest
 
 from afspm import Region
 from afspm.errors import AfspmError, InvalidValue
+from afspm.model import Scan, ScanSet
 
 CELL = "def frame(height):\n    return Region((0, 0), (1e-6, height))\n\nframe(0)\n"
 
@@ -30,6 +32,15 @@ def test_a_notebook_shows_the_error_and_the_lines_of_the_cell_alone(name: str) -
         "  line 2 of the cell: return Region((0, 0), (1e-6, height))",
     ]
     assert not any("geometry.py" in line for line in rest)
+
+
+def test_what_is_not_there_is_missed_as_python_does_and_told_in_a_sentence() -> None:
+    scans = ScanSet([Scan(Region((0, 0), (1, 1)), "Height", "m", np.zeros((2, 2)))])
+    assert scans.get("Z") is None
+    assert "Z" not in scans
+    with pytest.raises(KeyError) as caught:
+        scans["Z"]
+    assert str(caught.value) == "no channel 'Z'; there are Height"
 
 
 def test_a_file_of_the_user_is_named() -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from afspm.errors import InvalidValue
+from afspm.errors import InvalidValue, NoSuchItem
 from afspm.model.geometry import XY, Region, RegionChange
 
 if TYPE_CHECKING:
@@ -289,7 +289,7 @@ class ScanSet(Mapping[str, Scan]):
 
     def __getitem__(self, channel: str) -> Scan:
         if channel not in self._scans:
-            raise KeyError(f"no channel {channel!r}; there are {', '.join(self._scans)}")
+            raise NoSuchItem(f"no channel {channel!r}; there are {', '.join(self._scans)}")
         return self._scans[channel]
 
     def __iter__(self) -> Iterator[str]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from afspm.errors import InvalidValue
+from afspm.errors import InvalidValue, NoSuchItem
 from afspm.model.geometry import XY, Frame
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class Spectrum:
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         """One variable by its name, shape (points,)."""
         if name not in self.names:
-            raise KeyError(f"no variable {name!r}; there are {', '.join(self.names)}")
+            raise NoSuchItem(f"no variable {name!r}; there are {', '.join(self.names)}")
         return self.values[:, self.names.index(name)]
 
     def to_xarray(self) -> xarray.Dataset:

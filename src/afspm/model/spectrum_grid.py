@@ -44,7 +44,7 @@ class PointGrid:
     cells: tuple[tuple[int, int], ...]
 
 
-def stack(spectra: Sequence[Spectrum]) -> xarray.Dataset:
+def stack(spectra: Sequence[Spectrum], *, interpolate: bool = False) -> xarray.Dataset:
     """Return the curves of a grid as arrays over `DIMENSIONS`; see `SpectrumTable.stack`.
 
     Raises:
@@ -52,18 +52,20 @@ def stack(spectra: Sequence[Spectrum]) -> xarray.Dataset:
     """
     import xarray
 
-    first = _alike(spectra)
+    first = _alike(spectra, swept_alike=not interpolate)
     points = grid([spectrum.position_m for spectrum in spectra if spectrum.position_m is not None])
     repeats = _repeats(points.cells)
-    swept, first_ways = ways(first)
-    shape = (len(points.y_m), len(points.x_m), max(repeats) + 1, len(first_ways), len(swept))
+    curves = [ways(spectrum) for spectrum in spectra]
+    swept = common_sweep([own for own, _ in curves]) if interpolate else curves[0][0]
+    directions = DIRECTIONS[: max(len(own_ways) for _, own_ways in curves)]
+    shape = (len(points.y_m), len(points.x_m), max(repeats) + 1, len(directions), len(swept))
     units = dict(zip(first.names, first.units, strict=True))
-    arrays = {name: np.full(shape, np.nan) for name in first_ways[0]}
+    arrays = {name: np.full(shape, np.nan) for name in curves[0][1][0]}
     times = np.full(shape[:3], "NaT", "datetime64[ns]")
-    for spectrum, cell, repeat in zip(spectra, points.cells, repeats, strict=True):
-        for direction, names in enumerate(ways(spectrum)[1]):
+    for spectrum, (own, own_ways), cell, repeat in zip(spectra, curves, points.cells, repeats, strict=True):
+        for direction, names in enumerate(own_ways):
             for name, curve in names.items():
-                arrays[name][(*cell, repeat, direction)] = curve
+                arrays[name][(*cell, repeat, direction)] = at(swept, own, curve) if interpolate else curve
         if spectrum.time_ns is not None:
             times[(*cell, repeat)] = np.datetime64(spectrum.time_ns, "ns")
     swept_attributes = {"long_name": first.names[0], "units": first.units[0]}
@@ -73,7 +75,7 @@ def stack(spectra: Sequence[Spectrum]) -> xarray.Dataset:
             "y": ("y", points.y_m, {"units": "m"}),
             "x": ("x", points.x_m, {"units": "m"}),
             "repeat": range(shape[2]),
-            "direction": list(DIRECTIONS[: len(first_ways)]),
+            "direction": list(directions),
             "z": ("z", swept, swept_attributes),
             "time": (DIMENSIONS[:3], times),
         },
@@ -158,7 +160,7 @@ def _repeats(cells: Sequence[tuple[int, int]]) -> list[int]:
     return found
 
 
-def _alike(spectra: Sequence[Spectrum]) -> Spectrum:
+def _alike(spectra: Sequence[Spectrum], *, swept_alike: bool) -> Spectrum:
     """Return the first, after which all others are measured."""
     if not spectra:
         raise InvalidValue("there are no spectra to stack")
@@ -171,10 +173,10 @@ def _alike(spectra: Sequence[Spectrum]) -> Spectrum:
                 f"spectra of different kinds do not form one array: {_kind(first)} and {_kind(other)}",
                 hint='choose with run.spectra.where(lambda row: row.kind == "IV")',
             )
-        if not _same_sweep(first.values[:, 0], other.values[:, 0]):
+        if swept_alike and not _same_sweep(first.values[:, 0], other.values[:, 0]):
             raise InvalidValue(
                 f"spectrum {number} was swept differently: {_sweep(other)} instead of {_sweep(first)}",
-                hint="choose those that were swept alike with run.spectra.where(…)",
+                hint="choose with run.spectra.where(…), or stack(interpolate=True)",
             )
     return first
 
@@ -191,6 +193,20 @@ def ways(spectrum: Spectrum) -> tuple[Floats, list[dict[str, Floats]]]:
     if not back.keys() <= plain.keys():  # a way back without its way there: they stay under their own names
         return swept, [curves]
     return swept, [plain, back] if back else [plain]
+
+
+def common_sweep(sweeps: Sequence[Floats]) -> Floats:
+    """Return evenly spaced values, ascending, over which all were swept. Raises InvalidValue: there are none."""
+    low, high = max(float(one.min()) for one in sweeps), min(float(one.max()) for one in sweeps)
+    if not low < high:
+        raise InvalidValue("the sweeps have no values in common")
+    return np.linspace(low, high, max(map(len, sweeps)))
+
+
+def at(common: Floats, swept: Floats, values: Floats) -> Floats:
+    """Return a curve at other values of what was swept, linear between its points."""
+    order = np.argsort(swept)
+    return np.interp(common, swept[order], values[order])
 
 
 def _turning_point(swept: Floats) -> int | None:

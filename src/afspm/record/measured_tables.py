@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
+from afspm.errors import NoSuchItem
 from afspm.model import Frame, Region, Spectrum, names
 from afspm.record.tables import ScanRow, SpectrumRow, Table
 
@@ -44,7 +45,7 @@ class KeyedTable(Table[R]):
         found = [row for row in self._rows if row.key == key]
         if not found:
             known = dict.fromkeys(row.key for row in self._rows if row.key)
-            raise KeyError(f"no key {key!r}; {_told(list(known))}")
+            raise NoSuchItem(f"no key {key!r}; {_told(list(known))}")
         return found[-1]
 
     def _with(self, rows: Iterable[R]) -> KeyedTable[R]:
@@ -58,12 +59,16 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
         super().__init__(rows, SpectrumRow)
         self._read = read
 
-    def stack(self) -> xarray.Dataset:
+    def stack(self, *, interpolate: bool = False) -> xarray.Dataset:
         """Return the curves of a grid as arrays over (y, x, repeat, direction, z) (needs the extra `xarray`).
 
         x and y are along the sides of the grid, in m; `angle_rad` and `frame` are in the attributes. z is the variable
         that was swept: its name and unit are in the attributes of the coordinate. Variables that were measured on the
         way back, too ("Current Retrace"), have both directions. NaN where nothing was measured.
+
+        Args:
+            interpolate: bring curves that were not swept over the same values, such as force curves that begin at
+                the surface, to common ones: evenly spaced, linear between the points that were measured.
 
         Raises:
             InvalidValue: these spectra do not form a grid, or were not measured alike.
@@ -71,7 +76,7 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
         """
         from afspm.model.spectrum_grid import stack
 
-        return stack([self._read(row) for row in self._rows])
+        return stack([self._read(row) for row in self._rows], interpolate=interpolate)
 
     def where(self, wanted: Callable[[SpectrumRow], bool]) -> SpectrumTable:
         return self._with(row for row in self._rows if wanted(row))

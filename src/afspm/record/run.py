@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from afspm import wire
-from afspm.errors import FileError, InvalidValue, WireError
+from afspm.errors import FileError, InvalidValue, NoSuchItem, WireError
 from afspm.model import (
     ControlState,
     Frame,
@@ -91,7 +91,7 @@ class Run:
 
         Raises:
             FileError: its file is missing or damaged, or it was interrupted before anything of it was seen.
-            IndexError, KeyError: there is no such scan.
+            NoSuchItem: there is no such scan.
         """
         row = self.scans[which] if isinstance(which, str) else which
         row = row if isinstance(row, ScanRow) else self._row("scans", row, scan_row)
@@ -337,7 +337,7 @@ class Run:
         order, offset = ("ASC", index) if index >= 0 else ("DESC", -index - 1)
         found = self._query(f"SELECT * FROM {table} ORDER BY number {order} LIMIT 1 OFFSET ?", (offset,))
         if not found:
-            raise IndexError(f"there is no number {index} among the {table} of {self.folder.name}")
+            raise NoSuchItem(f"there is no number {index} among the {table} of {self.folder.name}")
         return made(found[0])
 
     def _content(self, file: str, what: str) -> Any:

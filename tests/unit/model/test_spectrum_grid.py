@@ -78,3 +78,18 @@ def test_what_forms_no_grid_is_refused_with_the_reason() -> None:
         stack([iv((0.0, 0.0)), iv((0.0, 0.0), bias=2 * BIAS)])
     with pytest.raises(InvalidValue, match="position of spectrum 1"):
         stack([iv(None)])
+
+
+def test_force_curves_that_begin_at_the_surface_come_to_common_values_if_wanted() -> None:
+    spectra = []
+    for number, place in enumerate(places(2, 1)):
+        z = np.linspace(-1e-8 * number, 1e-7, 30)[::-1]
+        values = np.stack([z, 3.0 * z, 3.0 * z], axis=1)
+        spectra.append(Spectrum(place, "force", ("Z", "Force", "Force [bwd]"), ("m", "N", "N"), values))
+    with pytest.raises(InvalidValue, match=r"swept differently.*interpolate=True"):
+        stack(spectra)
+    stacked = stack(spectra, interpolate=True)
+    assert stacked.z.values[[0, -1]] == pytest.approx([0.0, 1e-7])
+    assert stacked.Force.isel(x=1, direction=1).values.ravel() == pytest.approx(3.0 * stacked.z.values)
+    with pytest.raises(InvalidValue, match="no values in common"):
+        stack([iv((0.0, 0.0)), iv((0.0, 0.0), bias=BIAS + 9.0)], interpolate=True)

@@ -15,7 +15,7 @@ from afspm.errors import AfspmError, InvalidValue
 from afspm.formatting import typeset_position
 from afspm.model import Spectrum
 from afspm.model.geometry import XY
-from afspm.model.spectrum_grid import grid, ways
+from afspm.model.spectrum_grid import at, common_sweep, grid, ways
 from afspm.record.report import markup
 from afspm.record.report.markup import PageTimes
 from afspm.record.run import Run
@@ -132,9 +132,9 @@ def _all(group: SpectrumGroup, x: Axis, y: Axis, name: str) -> str:
     curves = [Curve(one.swept, one.curves[name], "", thin) for one in measured[::step]]
     if (common := _common(measured)) is None:
         return chart(x, y, curves)
-    if back := [_at(common, one.swept, one.back[name]) for one in measured if name in one.back]:
+    if back := [at(common, one.swept, one.back[name]) for one in measured if name in one.back]:
         curves.append(Curve(common, np.mean(back, axis=0), BACKWARD))
-    values = np.stack([_at(common, one.swept, one.curves[name]) for one in measured])
+    values = np.stack([at(common, one.swept, one.curves[name]) for one in measured])
     mean, spread = values.mean(axis=0), values.std(axis=0, ddof=1)
     return chart(x, y, [*curves, Curve(common, mean)], Band(common, mean - spread, mean + spread))
 
@@ -148,14 +148,11 @@ def _both_ways(one: SpectrumCurves, name: str) -> Iterator[Curve]:
 
 def _common(measured: Sequence[SpectrumCurves]) -> Array | None:
     """Return values that all were swept over; None if that is less than half of what any was."""
-    low, high = (max(float(np.min(one.swept)) for one in measured), min(float(np.max(one.swept)) for one in measured))
-    widest = max(float(np.ptp(one.swept)) for one in measured)
-    return np.linspace(low, high, len(measured[0].swept)) if high - low > 0.5 * widest else None
-
-
-def _at(common: Array, swept: Array, values: Array) -> Array:
-    order = np.argsort(swept)
-    return np.interp(common, swept[order], values[order])
+    try:
+        common = common_sweep([one.swept for one in measured])
+    except InvalidValue:
+        return None
+    return common if np.ptp(common) > 0.5 * max(np.ptp(one.swept) for one in measured) else None
 
 
 def _legend(group: SpectrumGroup) -> str:
