@@ -30,8 +30,8 @@ class Survey(Component):
     positions are those of the sample.
 
     Whatever is killed, and whenever, each scan and each curve is taken once. When the experiment ends early the table
-    and the picture hold what there is. Finding particles needs scikit-image (`pip install "afspm[features]"`), the
-    picture matplotlib (`pip install "afspm[plot]"`).
+    and the picture hold what there is. The keys of what was measured are `survey`, `zoom-3`, `curve-top-3` and so on:
+    `run.scan("zoom-3")` finds them in the record.
 
     Args:
         size: (width, height) of the survey, or one length for both.
@@ -56,6 +56,7 @@ class Survey(Component):
         file: name of the table and of the picture in the run folder, without `.csv` and `.png`.
     """
 
+    requires = ("afspm[features]",)
     needs_actions: tuple[str, ...] = (names.START_SCAN,)
     _outage = OutageLog("the table of targets can't be written", logging.getLogger("afspm.records"))
 
@@ -107,7 +108,7 @@ class Survey(Component):
         self.needs_parameters = (*FRAME, *probe, *parameters)
 
     def check(self) -> None:
-        """Raise ConfigError: the function is not there, or a library that is needed."""
+        """Raise ConfigError: the function that finds targets is not there."""
         self.finder.check()
 
     def run(self) -> None:
@@ -131,11 +132,7 @@ class Survey(Component):
             return
         self._keep(self._record)
         path = Path(self.run_dir) / f"{self.file}.png"
-        try:
-            self._record.draw(path, title=self.name, simulated=self.simulated)
-        except ImportError:
-            self.log.error('no picture without matplotlib: pip install "afspm[plot]"')
-            return
+        self._record.draw(path, title=self.name, simulated=self.simulated)
         self.log.info("the survey is drawn: %s", path)
 
     def _set(self, parameters: Mapping[str, str | float]) -> None:

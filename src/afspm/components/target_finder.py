@@ -12,7 +12,7 @@ from afspm.errors import ConfigError
 from afspm.model import Scan
 from afspm.model.geometry import XY
 from afspm.process.loading import find_object
-from afspm.survey.targets import Target, find_particles, nearest, require_skimage
+from afspm.survey.targets import Target, find_particles, nearest
 
 Finder = Callable[[Scan], Iterable[Any]]
 
@@ -38,10 +38,8 @@ class TargetFinder:
     refines: bool
 
     def check(self) -> None:
-        """Raise ConfigError: the function is not there, or scikit-image is not installed."""
-        if self.function is None:
-            require_skimage()
-        else:
+        """Raise ConfigError: the function is not there."""
+        if self.function is not None:
             self._function(self.function)
 
     def targets(self, survey: Scan) -> list[Target]:

@@ -82,7 +82,7 @@ class SurveyRecord:
         write_atomic(Path(path), [text.getvalue().encode()])
 
     def draw(self, path: str | Path, *, title: str = "", simulated: bool = False) -> None:
-        """Draw the survey with its numbered targets, their zooms and their curves (needs the extra `plot`).
+        """Draw the survey with its numbered targets, their zooms and their curves.
 
         Args:
             path: of the picture; its ending names the format.

@@ -5,7 +5,6 @@ A scan is levelled first: a curved surface that particles don't lead astray, the
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -67,7 +66,6 @@ def find_particles(
         ConfigError: scikit-image is not installed.
         InvalidValue: too little was measured to level it.
     """
-    require_skimage()
     pixel_m = _pixel_m(scan)
     widest_m = _WIDEST * min(scan.region.size_m) if widest_m is None else widest_m
     # a particle as wide as the scan can't be told from ground that is bent
@@ -171,7 +169,10 @@ def _without_scars(flat: Floats) -> Floats:
 
 def _tops(above: Floats, scan: Scan, least: float) -> list[Target]:
     """Return every top: its height, and the centre of what stands above half of it, up to the saddles around it."""
-    import skimage
+    try:
+        import skimage
+    except ImportError as error:
+        raise ConfigError("finding particles needs scikit-image", hint='pip install "afspm[features]"') from error
 
     feature: Any = skimage.feature
     segmentation: Any = skimage.segmentation
@@ -201,9 +202,3 @@ def _at(values: Floats, scan: Scan, x_m: Floats, y_m: Floats) -> Floats:
     along, across = (cos * x + sin * y) / region.size_m[0], (cos * y - sin * x) / region.size_m[1]
     places = [(across + 0.5) * (ny - 1), (along + 0.5) * (nx - 1)]
     return np.asarray(ndimage.map_coordinates(values, places, order=1, cval=np.nan))
-
-
-def require_skimage() -> None:
-    """Raise ConfigError: scikit-image is not installed."""
-    if importlib.util.find_spec("skimage") is None:
-        raise ConfigError("finding particles needs scikit-image", hint='pip install "afspm[features]"')

@@ -377,6 +377,28 @@ def test_a_zoom_that_can_not_be_compared_with_the_overview_begins_a_row_of_its_o
     assert None not in asked[-5:], "its place among the others is known"
 
 
+def test_zooms_that_the_overview_does_not_show_clearly_are_not_looked_for_elsewhere() -> None:
+    """In an overview a zoom of a particle fits every particle."""
+    world = World(night(4))
+    following = BankTracker(world)
+    following.add(scan_at(FRAME_S, pixels=64, key="overview"))
+    asked: list[Prior | None] = []
+
+    def refuse(reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
+        asked.append(prior)
+        return Registration.refused("ambiguous")
+
+    world.register = refuse  # type: ignore[method-assign]
+    places = [(x * SIZE_M / 4, y * SIZE_M / 4) for x in (-1, 0, 1) for y in (-1, 1)]
+    updates = [
+        following.add(scan_at(FRAME_S + (k + 1) * 20.0, place, size_m=SIZE_M / 8, pixels=64, key=f"zoom {k}"))
+        for k, place in enumerate(places)
+    ]
+    assert len(asked) == len(places)
+    assert None not in asked
+    assert not any(update.lost for update in updates)
+
+
 def test_without_correction_anchors_follow_each_other() -> None:
     """The region stays in tip coordinates, and the sample drifts out of it."""
     world = World(steady((0.3 * NM, 0.0)))

@@ -73,7 +73,8 @@ class BankTracker:
     mean that all of them may lie anywhere: it is lost, as it is when one has no place while the standard deviation of
     its position is more than half of what a scan may be misplaced and still be compared. It then looks everywhere, and
     is found again when a scan has a place; those adrift are then put right with it. A scan that can be compared with
-    none, a zoom into an overview, begins a row of its own.
+    none, a zoom too fine for the overview, begins a row of its own. A zoom is looked for in an overview only where it
+    is expected, and is not lost because the overview does not show it clearly: a particle looks like the next.
 
     With the transform "similarity", scans are straightened before all that: see `Similarity`.
 
@@ -121,7 +122,10 @@ class BankTracker:
         found = self._compared(newest, tried)
         used = self._believed(newest, found, anywhere=anywhere)
         placed = used is not None and any(self._proves(one.link.number) for one in used.measured)
-        state.unmatched = 0 if placed else state.unmatched + bool(tried)
+        # that a zoom is not recognised in an overview does not mean that the sample is gone
+        state.unmatched = (
+            0 if placed else state.unmatched + any(self._references.is_alike(number, scan) for number in tried)
+        )
         self._learn(newest, used, tried, placed=placed)
         after = self._known(state.filters)
         # a scan that could be compared with none begins a row of its own, which is as far from the others as it is
@@ -220,8 +224,9 @@ class BankTracker:
             tried[number] = self._estimator.register(kept[number].scan, newest.scan, prior)
         firm = [number for number in tried if self._proves(number)]
         if not anywhere and not any(tried[number].accepted for number in firm):
-            # not where it was expected, or not to be recognised: somewhere else?
-            for number in firm[: self._settings.second_looks]:
+            # not where it was expected, or not to be recognised: somewhere else? In an overview a zoom fits many places
+            elsewhere = [number for number in firm if self._references.is_alike(number, newest.scan)]
+            for number in elsewhere[: self._settings.second_looks]:
                 tried[number] = self._estimator.register(kept[number].scan, newest.scan)
         return tried
 

@@ -14,6 +14,8 @@ from afspm.drift.registration import DriftScan
 
 Array = NDArray[np.float64]
 
+_LIKE = 0.5  # least ratio of the resolutions of scans of one kind
+
 
 @dataclass(frozen=True, eq=False)
 class ReferenceScan:
@@ -90,7 +92,7 @@ class ReferenceScans:
                 continue
             shared = overlap_ratio(kept.scan.region, scan.region, drift_m - drifts_m[number])
             if anywhere or shared >= self.choice.overlap_min:
-                other_kind = _alike(kept.scan, scan) < 0.5
+                other_kind = not self.is_alike(number, scan)
                 rank = (
                     kept.adrift,
                     other_kind,
@@ -100,6 +102,10 @@ class ReferenceScans:
                 )
                 fitting.append((rank, number))
         return [number for _, number in sorted(fitting)][: self.choice.compared]
+
+    def is_alike(self, number: int, scan: DriftScan) -> bool:
+        """Return whether a reference has about the resolution of a scan, not that of an overview of it."""
+        return _alike(self.kept[number].scan, scan) >= _LIKE
 
     def judged(self, tried: Table[int, bool], step: int) -> None:
         """Remember which could be registered with the newest scan."""
@@ -119,7 +125,7 @@ class ReferenceScans:
         """True if no anchor stands for what a scan has seen."""
         return not any(
             kept.anchor
-            and _alike(kept.scan, scan) >= 0.5
+            and self.is_alike(number, scan)
             and overlap_ratio(kept.scan.region, scan.region, drift_m - drifts_m[number]) >= self.choice.alike
             for number, kept in enumerate(self.kept)
         )

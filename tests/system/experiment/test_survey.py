@@ -1,0 +1,97 @@
+"""A survey of particles through real processes: killed, resumed, kept waiting by a problem, on a sample that drifts."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+import signal
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from experiment_lab import AfspmRun, Run
+
+import afspm
+from afspm.survey import find_particles, nearest
+
+pytest.importorskip("skimage")
+SAMPLE = Path(__file__).parents[3] / "experiments" / "particle_survey" / "experiment.toml"
+FEWER = """
+[survey]
+count = 4
+zoom_pixels = [64, 64]
+"""
+BY_HAND = '[control]\nsolved_by_hand = ["tip-shape-changed", "device-malfunction"]\n'
+FAST_DRIFT = "[microscope]\ndrift = { velocity_m_per_s = [150e-12, -100e-12, 0.0] }\n"
+
+
+def overlay(folder: Path, text: str) -> str:
+    file = folder / "fewer.toml"
+    file.write_text(text, encoding="utf-8")
+    return str(file)
+
+
+def outcomes(folder: Path) -> list[str]:
+    with (folder / "targets.csv").open(encoding="utf-8", newline="") as file:
+        return [row["outcome"] for row in csv.DictReader(file)]
+
+
+def require_each_once(one: AfspmRun, targets: int, said: str = "") -> None:
+    """The survey, each zoom and each curve was taken once, and the table and the picture are there."""
+    with afspm.open_run(one.folder) as record:
+        scans = [row for row in record.scans if not row.interrupted]
+        spectra = list(record.spectra)
+    numbers = range(1, targets + 1)
+    wanted = ["survey", *(f"zoom-{number}" for number in numbers)]
+    wanted += [f"curve-{name}-{number}" for name in ("top", "beside") for number in numbers]
+    assert (len(scans), len(spectra)) == (1 + targets, 2 * targets), said or one.output
+    keys = Counter(row.key for row in [*scans, *spectra] if row.key)  # that of the last before a kill may be lost
+    assert set(keys) <= set(wanted)
+    assert set(keys.values()) == {1}, one.output
+    assert outcomes(one.folder) == ["measured"] * targets
+    assert (one.folder / "targets.png").stat().st_size > 50_000
+
+
+def test_killed_and_kept_waiting_by_a_changed_tip_it_measures_each_target_once(afspm_run: Run, tmp_path: Path) -> None:
+    one = afspm_run(str(SAMPLE), overlay(tmp_path, FEWER + BY_HAND), "--runs", str(tmp_path / "runs"))
+    one.wait_for("survey .*4 targets found")
+    one.signal("survey", signal.SIGKILL)
+    one.wait_for("target 1 of 4 .*measured")
+    with afspm.connect(one.folder, name="person") as scope:
+        scope.flag("tip-shape-changed")
+        one.wait_for("survey .*waiting for control")
+        one.signal("survey", signal.SIGKILL)
+        one.wait_up("survey", 3)
+        scope.clear("tip-shape-changed")
+        one.wait_for("target 2 of 4 .*measured")
+        one.signal("survey", signal.SIGKILL)
+    assert one.end() == 0, one.output
+    require_each_once(one, 4)
+
+
+def test_a_killed_run_is_resumed_and_measures_only_what_is_left(afspm_run: Run, tmp_path: Path) -> None:
+    first = afspm_run(str(SAMPLE), overlay(tmp_path, FEWER), "--runs", str(tmp_path / "runs"))
+    first.wait_for("target 2 of 4 .*measured")
+    first.process.kill()
+    first.process.wait()
+    again = afspm_run("--resume", str(first.folder))
+    assert again.end() == 0, again.output
+    require_each_once(first, 4, again.output)
+
+
+def test_targets_stay_in_the_middle_of_their_zooms_while_the_sample_drifts(afspm_run: Run, tmp_path: Path) -> None:
+    one = afspm_run(str(SAMPLE), overlay(tmp_path, FEWER + FAST_DRIFT), "--runs", str(tmp_path / "runs"))
+    assert one.end() == 0, one.output
+    off_m = []
+    with afspm.open_run(one.folder) as record:
+        drift = record.drift[-1]
+        for number in range(1, 5):
+            zoom = record.scan(f"zoom-{number}")["Height"]
+            found = find_particles(zoom, min_height=50e-9, separation_m=250e-9, widest_m=5e-6)
+            target = nearest(found, zoom.region.center_m, 250e-9)
+            assert target is not None, f"target {number} is not in its zoom\n{one.output}"
+            off_m.append(math.dist(target.position_m, zoom.region.center_m))
+    assert math.hypot(*drift.translation_m) > 50e-9, "the sample stood still"
+    assert max(off_m) < 40e-9, off_m
+    assert not re.search(" ERROR ", one.output), one.output
