@@ -66,13 +66,15 @@ port = 0
 class Night:
     """`afspm run` of an experiment with a dashboard, as a process of its own."""
 
-    def __init__(self, folder: Path, *, speed: float = 60.0, lines: float = 2.0, more: str = "") -> None:
+    def __init__(
+        self, folder: Path, *, speed: float = 60.0, lines: float = 2.0, more: str = "", options: tuple[str, ...] = ()
+    ) -> None:
         file = folder / "experiment.toml"
         file.write_text(EXPERIMENT.format(speed=speed, lines=lines) + more, encoding="utf-8")
         self._lines: list[str] = []
         self._changed = threading.Condition()
         self.process = subprocess.Popen(
-            (*AFSPM, "run", str(file), "--runs", str(folder / "runs")),
+            (*AFSPM, "run", str(file), "--runs", str(folder / "runs"), *options),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,

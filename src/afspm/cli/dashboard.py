@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,6 +12,7 @@ import typer
 from afspm.cli.arguments import RUNS, Where, opt
 
 if TYPE_CHECKING:
+    from afspm.dashboard.recorded import RecordedSettings
     from afspm.experiment import Experiment
     from afspm.supervisor.resume import ResumableRun
 
@@ -31,12 +34,15 @@ def dashboard(
         bool, typer.Option("--make-password", help="Ask for a name and a password, print their line, and end.")
     ] = False,
 ) -> None:
-    """Show a running experiment in the browser, and steer it.
+    """Show an experiment in the browser: steer one that runs, look through one that has ended.
 
-    It joins the run as a notebook would: the experiment does not notice when it comes and goes. With an experiment file
-    of which nothing runs here it connects to where the file says that the scheduler is. A password for those who only
-    look may be in the environment: AFSPM_DASHBOARD_PASSWORD.
+    It joins the run as a notebook would: the experiment does not notice when it comes and goes. When it ends, the page
+    stays, with a slider through the night, until Ctrl-C; so it is shown for a run that has ended. With an experiment
+    file of which nothing was started here it connects to where the file says that the scheduler is. A password for
+    those who only look may be in the environment: AFSPM_DASHBOARD_PASSWORD.
     """
+    from afspm.record.run_lock import goes_on
+
     if make_password:
         _print_password()
         return
@@ -44,10 +50,40 @@ def dashboard(
         "host": host, "port": port, "certificate": certificate, "certificate_key": certificate_key,
         "people": None if people is None else _people_in(people),
     }  # fmt: skip
-    folder = _running_here(where)
-    if folder is not None:
+    folder = _run_here(where)
+    if folder is None:
+        raise typer.Exit(_start_part(where))
+    if goes_on(folder):
         raise typer.Exit(_join(folder, settings))
-    raise typer.Exit(_start_part(where))
+    _serve_recorded(folder, settings)
+
+
+def stay(folder: Path, name: str, settings: Mapping[str, Any]) -> None:
+    """Show a run that has ended until Ctrl-C.
+
+    Args:
+        name: of the dashboard that it had, with its settings.
+    """
+    import subprocess
+    import sys
+
+    line = f"{_recorded(folder, name, settings).to_json()}\n"
+    command = [sys.executable, "-P", "-m", "afspm.dashboard.recorded"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, text=True, encoding="utf-8") as process:
+        assert process.stdin is not None
+        process.stdin.write(line)
+        process.stdin.flush()
+        with suppress(KeyboardInterrupt):
+            process.wait()
+        # leaving closes its standard input, which ends the page if Ctrl-C has not
+
+
+def dashboard_of(experiment: Experiment, started: Sequence[str]) -> tuple[str, Mapping[str, Any]] | None:
+    """Return name and settings of a dashboard among the processes that were started here; None: there is none."""
+    for process in experiment.resolved.processes.values():
+        if process.class_path.rpartition(".")[2] == NAME_OF_CLASS and process.name in started:
+            return process.name, process.settings
+    return None
 
 
 def with_dashboard(files: list[Path]) -> Experiment:
@@ -100,23 +136,17 @@ def _people_in(file: Path) -> dict[str, str]:
     return table
 
 
-def _running_here(where: Path) -> Path | None:
+def _run_here(where: Path) -> Path | None:
     """Return the folder of the run that is meant; None: the file is of one that was started elsewhere."""
     from afspm.client.connect import find_run
     from afspm.errors import FileError
-    from afspm.record.run_json import ENDED, read_run_json
 
     try:
-        folder = find_run(where)
+        return find_run(where)
     except FileError:
         if where.suffix == ".toml" and where.is_file():
             return None
         raise
-    if not read_run_json(folder).get(ENDED):
-        return folder
-    if where.suffix == ".toml":
-        return None
-    raise FileError("this run has ended", where=str(folder), hint="its report.html tells how it was")
 
 
 def _join(folder: Path, settings: dict[str, Any]) -> int:
@@ -140,7 +170,23 @@ def _join(folder: Path, settings: dict[str, Any]) -> int:
         pass  # somebody is there
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     code = join(folder, Dashboard(**settings), DASHBOARD)
+    if code == ExitCode.ENDED:
+        stay(folder, DASHBOARD, settings)
     return 0 if code in (ExitCode.ENDED, ExitCode.DONE, ExitCode.ORPHAN) else 1
+
+
+def _serve_recorded(folder: Path, settings: dict[str, Any]) -> None:
+    from afspm.dashboard.recorded import serve
+    from afspm.experiment.process_starts import DASHBOARD
+
+    serve(_recorded(folder, DASHBOARD, settings), typer.echo)
+
+
+def _recorded(folder: Path, name: str, settings: Mapping[str, Any]) -> RecordedSettings:
+    from afspm.dashboard.recorded import RecordedSettings
+
+    given: dict[str, Any] = {k: str(v) if isinstance(v, Path) else v for k, v in settings.items() if v is not None}
+    return RecordedSettings(str(folder.resolve()), name, **given)
 
 
 def _start_part(file: Path) -> int:

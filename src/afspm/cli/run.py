@@ -10,7 +10,8 @@ import typer
 from afspm.cli.arguments import RUNS, FilesUnlessResumed, Runs, names_in, opt
 
 if TYPE_CHECKING:
-    from afspm.experiment import ProcessStart
+    from afspm.experiment import Experiment, ProcessStart
+    from afspm.supervisor.run import FinishedRun
 
 
 def run(
@@ -37,6 +38,10 @@ def run(
         bool, typer.Option("--dry-run", help="Check, say what would be started, and start nothing.")
     ] = False,
     report: Annotated[bool, opt("Write report.html when it has ended.", "--report/--no-report")] = True,
+    stay: Annotated[
+        bool | None,
+        opt("Keep the dashboard when it has ended. Default: in a terminal, until Ctrl-C.", "--stay/--no-stay"),
+    ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell details too.")] = False,
 ) -> None:
     """Run an experiment.
@@ -71,7 +76,9 @@ def run(
             found = resumed_with_dashboard(found)
         as_begun = found.options(options)
         require_no_errors(found.experiment, as_begun.only, as_begun.without)
-        raise typer.Exit(resuming.resume(found, options, terminal=sys.stdout).outcome.exit_code)
+        ended = resuming.resume(found, options, terminal=sys.stdout)
+        _stay(found.experiment, ended, stay)
+        raise typer.Exit(ended.outcome.exit_code)
     if not files:
         raise typer.BadParameter("name an experiment file, or a run with --resume", param_hint="FILE")
     experiment = with_dashboard(files) if dashboard else load(*files)
@@ -81,7 +88,22 @@ def run(
             typer.echo(_told(start))
         return
     ended = running.run(experiment, options, terminal=sys.stdout)
+    _stay(experiment, ended, stay)
     raise typer.Exit(ended.outcome.exit_code)
+
+
+def _stay(experiment: Experiment, ended: FinishedRun, wanted: bool | None) -> None:
+    """Keep the page of a dashboard that was started here, unless a person has stopped the run."""
+    import sys
+
+    from afspm.cli.dashboard import dashboard_of, stay
+    from afspm.logic.supervision.run_end import EndReason
+
+    started = [report.name for report in ended.outcome.reports if report.starts]
+    if ended.outcome.why is EndReason.STOPPED or not (sys.stdout.isatty() if wanted is None else wanted):
+        return
+    if (found := dashboard_of(experiment, started)) is not None:
+        stay(ended.folder, *found)
 
 
 def _told(start: ProcessStart) -> str:

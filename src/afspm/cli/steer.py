@@ -117,7 +117,7 @@ def note(
         with acting(folder) as scope:
             scope.note(text, scan=row)
     else:
-        append_note(folder, person(), text, ExperimentClock.real().now_ns(), row)
+        append_note(folder, person(), text, ExperimentClock.real().now_ns(), None if row is None else row.time_ns)
         if (folder / REPORT_FILE).exists():
             write(folder)
     typer.echo("noted" if row is None else f"noted on scan {row.number}")

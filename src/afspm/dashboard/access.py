@@ -63,14 +63,16 @@ class Visitor:
     Attributes:
         person: the name; empty: only looks.
         cookie: of the session; empty for a program that shows its password with each request.
+        recorded: what is shown is a recorded night, in which nothing can be steered.
     """
 
     person: str = ""
     cookie: str = ""
+    recorded: bool = False
 
     @property
     def may_steer(self) -> bool:
-        return bool(self.person)
+        return bool(self.person) and not self.recorded
 
 
 class Access:

@@ -20,13 +20,16 @@ from afspm.errors import AfspmError, UnitError
 from afspm.formatting import quantity, typeset_position
 from afspm.launch import Launch
 from afspm.model import (
+    RELAY_REQUEST,
     RESTART_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
+    Note,
     Parameter,
     ProbePosition,
     Region,
+    RelayedMessage,
     Response,
     ScanParameters,
     ScopeState,
@@ -60,6 +63,9 @@ class ActionResult:
     text: str
     ok: bool = True
     each: Mapping[str, ActionResult] = field(default_factory=dict)
+
+
+NOT_SIGNED_IN = ActionResult("Sign in first: what is done is in the record with a name.", ok=False)
 
 
 class Actions:
@@ -99,6 +105,13 @@ class Actions:
     def restart(self, process: str) -> ActionResult:
         """Have a process ended and started anew."""
         return _result(self._ask(RESTART_REQUEST, process), f"{process} will be started anew")
+
+    def note(self, text: str, scan_ns: int | None = None, time_ns: int | None = None) -> ActionResult:
+        """Write a note on a scan, on a moment, or on now."""
+        now_ns = self._link.clock.now_ns()
+        about_ns = next(one for one in (time_ns, scan_ns, now_ns) if one is not None)
+        note = Note(about_ns, self._link.name, text, scan_ns, now_ns)
+        return _result(self._ask(RELAY_REQUEST, RelayedMessage(*wire.encode(note))), "Noted")
 
     # --- the microscope, in MANUAL ---
 
@@ -287,7 +300,7 @@ class Steering:
         person = check_name(visitor.person)
         if not person or not self._access.is_signed_in(visitor):
             done: Future[ActionResult] = Future()
-            done.set_result(ActionResult("Sign in first: what is done is in the record with a name.", ok=False))
+            done.set_result(NOT_SIGNED_IN)
             return done
         return self._submit(person, action)
 

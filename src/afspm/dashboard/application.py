@@ -20,9 +20,20 @@ from afspm.dashboard.watch import Bell
 
 
 def application(
-    services: Services, archive: Archive, *, host: str, encrypted: bool
+    services: Services,
+    archive: Archive,
+    *,
+    host: str,
+    encrypted: bool,
+    page: Callable[[Services, Visitor], object] = Page,
+    more: Callable[[FastAPI], None] = lambda _: None,
 ) -> tuple[AsgiApp, Callable[[float], None]]:
-    """Return the application, made once a process, and what waits until all pages know the end, within seconds."""
+    """Return the application, made once a process, and what waits until all pages know the end, within seconds.
+
+    Args:
+        page: makes the page of a viewer.
+        more: adds what else is served.
+    """
     bell, access, title = Bell(), services.access, services.title
     services.watch.on_change(bell.ring)
 
@@ -35,14 +46,15 @@ def application(
     add_sign_in(app, access, title, encrypted=encrypted, only_here=is_loopback(host))
     live = Live(services.watch, bell, archive, services.conditions)
     live.add_to(app)
+    more(app)
     app.mount("/assets", StaticFiles(directory=ASSETS))
 
-    def page() -> None:
+    def root() -> None:
         request = ui.context.client.request
-        Page(services, getattr(request.state, VISITOR, Visitor()))
+        page(services, getattr(request.state, VISITOR, Visitor()))
 
     nicegui.on_exception(_log_error)
-    ui.run_with(app, root=page, title=title, show_welcome_message=False, tailwind=False, reconnect_timeout=10.0)
+    ui.run_with(app, root=root, title=title, show_welcome_message=False, tailwind=False, reconnect_timeout=10.0)
 
     def wait_told(within_s: float) -> None:
         services.audience.wait_told(within_s)

@@ -16,8 +16,9 @@ from afspm.dashboard.scan_facts import ends_text
 from afspm.dashboard.watch import Watch
 from afspm.drawing.timeline import TimelineRow, timeline_html, tint_class
 from afspm.formatting import day_and_time, duration_text, time_of_day, typeset_area
-from afspm.model import ControlMode, JournalEntry, LogLine, ProcessState, Region
-from afspm.record.overview import OVER, Overview
+from afspm.model import ControlMode, JournalEntry, LogLine, Note, ProcessState, Region
+from afspm.model.events import PERSON
+from afspm.record.overview import OVER, Overview, ScanSummary
 from afspm.record.timeline import Span, Timeline
 
 ANEW_S = 0.4  # at most that often, however much is published
@@ -57,6 +58,7 @@ class Content:
     trouble: str = ""
     slow: SlowContent = field(default_factory=SlowContent)
     refusals: str = ""
+    notes: str = ""
     channels: tuple[str, ...] = ()
     problems: tuple[Flag, ...] = ()
     processes: tuple[ProcessState, ...] = ()
@@ -105,6 +107,7 @@ class Contents:
                 trouble=trouble(watch),
                 slow=slow,
                 refusals=refusals_html(overview.refusals),
+                notes=notes_html(overview),
                 channels=watch.frames.channels,
                 problems=tuple(flags(overview)),
                 processes=tuple(overview.processes.values()),
@@ -269,3 +272,23 @@ def refusals_html(refusals: Iterable[JournalEntry], most: int = 40) -> str:
         for one in newest
     )
     return f'<ul class="refusals">{rows}</ul>'
+
+
+def notes_html(overview: Overview) -> str:
+    """Return the notes, that of the latest moment first."""
+    scans = {scan.time_ns: scan for scan in reversed(overview.scans)} if overview.notes else {}
+    notes = sorted(overview.notes, key=lambda note: -note.time_ns)
+    rows = "".join(_note(note, scans.get(note.scan_ns or 0)) for note in notes)
+    return f'<ul class="notes">{rows}</ul>' if rows else '<p class="nothing">No notes yet.</p>'
+
+
+def _note(note: Note, scan: ScanSummary | None) -> str:
+    who = note.who.partition(PERSON)[2] or note.who
+    on = ""
+    if scan is not None:
+        data = f'data-time="{scan.time_ns}" data-channel="{escape(scan.channel)}"'
+        on = f'<button type="button" {data}>scan {scan.number}</button>'
+    return (
+        f'<li><time>{time_of_day(note.time_ns)}</time> <b class="{tint_class(note.who)}">{escape(who)}</b> {on} '
+        f"<span>{escape(note.text)}</span></li>"
+    )

@@ -21,7 +21,7 @@ from afspm.dashboard.pictures import Look, PictureCache, RenderedFrame, number_o
 from afspm.dashboard.scan_facts import Facts, scan_facts, summary_of
 from afspm.dashboard.thumbnails import Thumbnails
 from afspm.dashboard.watch import Bell, Watch
-from afspm.drawing.palette import LEVELS, PALETTES
+from afspm.drawing.palette import DIVERGING, LEVELS, PALETTES
 from afspm.drawing.profile import profile
 from afspm.drawing.raster import png
 
@@ -122,7 +122,7 @@ class Live:
 
     async def _palette(self, name: str) -> Response:
         """Answer with a colour map as a picture one pixel wide, the highest value on top."""
-        if name not in PALETTES:
+        if name not in (*PALETTES, DIVERGING):
             return Response(status_code=404)
         return Response(png(np.arange(LEVELS, dtype=np.uint8)[:, None], name), media_type="image/png")
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from typing import ClassVar
 
 from nicegui import ui
 
@@ -15,6 +16,7 @@ from afspm.dashboard.access import Access, Visitor
 from afspm.dashboard.actions import Steering
 from afspm.dashboard.conditions import Conditions
 from afspm.dashboard.content import Content, Contents
+from afspm.dashboard.notes_panel import NotesPanel
 from afspm.dashboard.panels import ChartPanel, HealthPanel, LogPanel, SpectraPanel
 from afspm.dashboard.sign_in import SIGN_IN
 from afspm.dashboard.steering_panel import ModeButtons, ProblemBar, SteeringPanel
@@ -52,8 +54,14 @@ class Services:
     conditions: Conditions
 
 
+TABS = {"scan": "Scan", "sample": "Sample", "steer": "Steer", "time": "Night", "log": "Log"}
+"""Of a phone: where each section is then is in the style sheet."""
+
+
 class Page:
     """The page of one viewer."""
+
+    tabs: ClassVar[Mapping[str, str]] = TABS
 
     def __init__(self, services: Services, visitor: Visitor) -> None:
         self._services = services
@@ -68,9 +76,13 @@ class Page:
         with ui.element("div").classes("top"):
             self._header()
         with ui.element("main").classes(f"page{' may-steer' if visitor.may_steer else ''}"):
-            self._sections = Sections(services, self._session)
-        ui.html(_tabs_html(steering=visitor.may_steer), sanitize=False)
+            self._sections = Sections(services, self._session, visitor)
+            self._add_more()
+        ui.html(_tabs_html(self.tabs, steering=visitor.may_steer), sanitize=False)
         self._timer = ui.timer(REFRESH_S, self._refresh)
+
+    def _add_more(self) -> None:
+        """Add the sections that only another kind of page has."""
 
     def _header(self) -> None:
         services = self._services
@@ -88,8 +100,8 @@ class Page:
         ui.html('<div id="trouble" role="alert" hidden></div>', sanitize=False)
 
     def _sign_in_or_out(self) -> None:
-        if not self._visitor.may_steer:
-            ui.html('<a class="sign" href="/login">Sign in to steer</a>', sanitize=False)
+        if not self._visitor.person:
+            ui.html('<a class="sign" href="/login">Sign in</a>', sanitize=False)
             return
         ui.html(
             f'<form method="post" action="/logout"><span class="person">{escape(self._visitor.person)}</span> '
@@ -110,12 +122,7 @@ class Page:
         self._mode.show()
         self._problems.show()
         await self._sections.show(content)
-        state = {
-            "channels": content.channels,
-            "trouble": content.trouble,
-            "ended": content.ended,
-            "may_measure": self._session.may_measure,
-        }
+        state = self._state(content)
         try:
             theme = await ui.run_javascript(f"return window.afspm?.update({json.dumps(state)})", timeout=ANSWER_S)
         except TimeoutError:
@@ -123,6 +130,15 @@ class Page:
         self._theme.remember(theme)
         if content.ended:
             self._stop()
+
+    def _state(self, content: Content) -> dict[str, object]:
+        """Return what the browser's scripts have to know."""
+        return {
+            "channels": content.channels,
+            "trouble": content.trouble,
+            "ended": content.ended,
+            "may_measure": self._session.may_measure,
+        }
 
     def _stop(self) -> None:
         self._timer.deactivate()
@@ -155,31 +171,33 @@ class Theme:
 class Sections:
     """The sections below the header: the first rows fill a screen, the rest is further down. A phone has tabs."""
 
-    def __init__(self, services: Services, session: SteeringSession) -> None:
+    def __init__(self, services: Services, session: SteeringSession, visitor: Visitor) -> None:
         self._content = Content()
         self._steering = None
         with ui.element("div").classes("screen"):
-            with _section("Scan", "scan"):
+            with section("Scan", "scan"):
                 ui.html(_image_html(), sanitize=False)
-            with _section("Sample", "sample"):
+            with section("Sample", "sample"):
                 self._whole_map = ui.switch("all of the limits", on_change=self._draw).props("dense")
                 self._map = ui.html("", sanitize=False).classes("fills")
             if session.signed_in:
-                with _section("Steering", "steer"):
+                with section("Steering", "steer"):
                     self._steering = SteeringPanel(session)
-            with _section("Time line", "time"):
+            with section("Time line", "time"):
                 self._unfolded = ui.switch("all processes", on_change=self._draw).props("dense")
                 self._time_line = ui.html("", sanitize=False).classes("fills")
-            with _section("Log", "log"):
+            with section("Log", "log"):
                 self._log = LogPanel()
         with ui.element("div").classes("further"):
-            with _section("Processes", "health"):
+            with section("Notes", "noted"):
+                self._notes = NotesPanel(services.watch, services.steering, visitor)
+            with section("Processes", "health"):
                 self._health = HealthPanel(session)
-            with _section("Spectra", "spectra") as self._spectra_section:
+            with section("Spectra", "spectra") as self._spectra_section:
                 self._spectra = SpectraPanel(services.watch)
-            with _section("Drift", "drift") as self._drift_section:
+            with section("Drift", "drift") as self._drift_section:
                 self._drift = ChartPanel()
-            with _section("Last refusals", "refused"):
+            with section("Last refusals", "refused"):
                 self._refusals = ui.html("", sanitize=False).classes("scrolled").props('tabindex="0"')
 
     async def show(self, content: Content) -> None:
@@ -191,6 +209,7 @@ class Sections:
         self._refusals.set_content(content.refusals)
         self._health.show(content.processes, content.unheard)
         self._log.show(content.log, (process.name for process in content.processes))
+        self._notes.show(content.notes)
         self._spectra_section.set_visibility(self._spectra.show())
         if self._steering is not None:
             await self._steering.show(content)
@@ -201,21 +220,17 @@ class Sections:
         self._time_line.set_content(slow.time_line_unfolded if self._unfolded.value else slow.time_line)
 
 
-TABS = {"scan": "Scan", "sample": "Sample", "steer": "Steer", "time": "Night", "log": "Log"}
-"""Of a phone: where each section is then is in the style sheet."""
-
-
-def _tabs_html(*, steering: bool) -> str:
+def _tabs_html(tabs: Mapping[str, str], *, steering: bool) -> str:
     buttons = "".join(
         f'<button type="button" role="tab" data-tab="{name}">{text}</button>'
-        for name, text in TABS.items()
+        for name, text in tabs.items()
         if steering or name != "steer"
     )
     return f'<div class="tabs" role="tablist" aria-label="Parts of the page">{buttons}</div>'
 
 
 @contextmanager
-def _section(title: str, name: str) -> Iterator[ui.element]:
+def section(title: str, name: str) -> Iterator[ui.element]:
     with ui.element("section").classes(f"panel {name}").props(f'aria-labelledby="heading-{name}"') as section:
         ui.html(f'<h2 id="heading-{name}">{title}</h2>', sanitize=False)
         yield section

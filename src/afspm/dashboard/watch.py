@@ -78,6 +78,11 @@ class Watch:
         self._changed = threading.Condition()
         self._callbacks: list[Callable[[], None]] = []
 
+    @property
+    def moment_ns(self) -> int | None:
+        """The recorded moment that is shown; None: it is now."""
+        return None
+
     @contextlib.contextmanager
     def reading(self) -> Iterator[Overview]:
         """Keep everything as it is while in the block; be brief in it."""

@@ -15,9 +15,12 @@ UNMEASURED: Final = 255
 _STOPS: Final[dict[str, tuple[tuple[float, int, int, int], ...]]] = {
     "gold": ((0.0, 18, 6, 4), (0.25, 92, 36, 8), (0.5, 172, 92, 22), (0.75, 232, 172, 72), (1.0, 255, 250, 224)),
     "grey": ((0.0, 8, 8, 8), (1.0, 250, 250, 250)),
+    "change": ((0.0, 33, 86, 160), (0.5, 247, 247, 247), (1.0, 170, 30, 40)),
     "ice": ((0.0, 4, 8, 26), (0.3, 16, 56, 120), (0.6, 48, 132, 186), (0.85, 158, 214, 226), (1.0, 244, 252, 250)),
 }
-PALETTES: Final = tuple(_STOPS)
+DIVERGING: Final = "change"
+"""For differences: its middle is nothing."""
+PALETTES: Final = tuple(name for name in _STOPS if name != DIVERGING)
 
 CATEGORICAL: Final = ("#4477AA", "#228833", "#AA3377", "#66CCEE", "#CCBB44")
 """P. Tol's bright scheme, which everybody can tell apart. Its red is kept for problems."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from afspm import wire
 from afspm.errors import FileError
-from afspm.model import HasTime, Note, Packet
+from afspm.model import Note, Packet
 from afspm.record.journal import SCHEDULER
 from afspm.record.run import open_run
 from afspm.record.run_json import STATE_DIR
@@ -19,14 +19,17 @@ from afspm.wire import Topic
 _STEP_NS = 1_000
 
 
-def append_note(folder: Path, who: str, text: str, written_ns: int, scan: HasTime | None = None) -> Note:
+def append_note(
+    folder: Path, who: str, text: str, written_ns: int, scan_ns: int | None = None, time_ns: int | None = None
+) -> Note:
     """Append a note to the record of a run that is over, in the form in which the scheduler publishes it.
 
     Args:
         folder: of the run.
         who: the author.
         written_ns: real time.
-        scan: that it belongs to; None: it is about the end of the run.
+        scan_ns: of the scan that it belongs to.
+        time_ns: the moment that it is about; None: when the scan was finished, or the end of the run.
 
     Raises:
         InvalidValue: the text is empty or too long.
@@ -34,8 +37,8 @@ def append_note(folder: Path, who: str, text: str, written_ns: int, scan: HasTim
     """
     with open_run(folder) as run:
         folder, end_ns = run.folder, run.newest_ns
-    scan_ns = None if scan is None else scan.time_ns
-    note = Note(end_ns if scan_ns is None else scan_ns, who, text, scan_ns, written_ns)
+    about_ns = next(one for one in (time_ns, scan_ns, end_ns) if one is not None)
+    note = Note(about_ns, who, text, scan_ns, written_ns)
     packet = Packet(Topic.NOTE, wire.encode(note)[1], end_ns + _STEP_NS)
     try:
         (folder / STATE_DIR).mkdir(exist_ok=True)  # a copy of a run may lack it

@@ -235,6 +235,11 @@ class Run:
         """
         yield from packets(self._query, self.folder, since_ns, messages, tell)
 
+    def messages(self, messages: Sequence[str] | None = None) -> Iterator[tuple[Packet, str, Any]]:
+        """Yield packets, the names of their messages, and what is in them, without reading files: scans have NaN for
+        values, lines of running scans are left out."""
+        yield from without_reading_files(self._query, self.frame, messages)
+
     def overview(self, messages: Sequence[str] | None = None, problems: ProblemNames | None = None) -> Overview:
         """Return the overview that the dashboard shows. Files of scans are not read for it.
 
@@ -245,7 +250,7 @@ class Run:
         from afspm.record.overview import Overview
 
         overview = Overview(problems or self.problem_names)
-        for packet, message, thing in without_reading_files(self._query, self.frame, messages):
+        for packet, message, thing in self.messages(messages):
             overview.take(message, thing, packet.time_ns or 0, packet.envelope)
         return overview
 

@@ -83,7 +83,7 @@ def test_after_the_end_a_note_is_appended_in_the_same_form(noted: Path, store: R
     store.close()
     with afspm.open_run(noted) as run:
         end_ns, first = run.newest_ns, run.numbered(1)
-    append_note(noted, "terminal:ada", "double tip", 7, first)
+    append_note(noted, "terminal:ada", "double tip", 7, first.time_ns)
     append_note(noted, "terminal:ada", "a good night", 8)
     with afspm.open_run(noted) as run:
         new = [note for note in run.notes if note.text in ("double tip", "a good night")]

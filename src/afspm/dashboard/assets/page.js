@@ -40,7 +40,7 @@ function tellLost() {
   allowSteering(false);
   image?.setSteering(false);
   const seconds = Math.round((Date.now() - updated) / 1000);
-  showTrouble(ended ? "The experiment has ended, and the dashboard with it. What is shown is how it ended."
+  showTrouble(ended ? "The experiment has ended. What is shown is how it ended; \"afspm dashboard\" shows the whole night."
     : `The connection to the dashboard is lost: what is shown is ${seconds} s old. It is tried again.`);
 }
 
@@ -59,7 +59,7 @@ document.addEventListener("click", (event) => {
   const tab = event.target.closest?.("[role=tab]");
   if (tab) showTab(tab.dataset.tab);
   const shape = event.target.closest?.("[data-time], [data-spectrum]");
-  if (!shape?.closest(".map, .strip")) return;
+  if (!shape?.closest(".map, .strip, .notes")) return;
   if (shape.dataset.spectrum) emitEvent("spectrum_picked", { time: shape.dataset.spectrum });
   else {
     image?.pin({ time: shape.dataset.time, channel: shape.dataset.channel });

@@ -1,0 +1,88 @@
+// Pictures of finished scans, and how they are drawn beside each other.
+
+import { drawScaleBar, fitted, plain, scale, ticks } from "./axes.js";
+
+const KEPT = 120;
+
+/** {head, bitmap} of finished scans by what is asked for; the newest are kept. */
+export class FinishedPictures {
+  #kept = new Map();
+
+  get(path, query) {
+    const key = `${path}?${new URLSearchParams(query)}`;
+    const found = this.#kept.get(key) ?? this.#fetch(key);
+    this.#kept.delete(key);
+    this.#kept.set(key, found);
+    if (this.#kept.size > KEPT) this.#kept.delete(this.#kept.keys().next().value);
+    return found;
+  }
+
+  async #fetch(key) {
+    try {
+      const answer = await fetch(key);
+      if (!answer.ok) return { trouble: await answer.text() };
+      const [head, words] = ["X-Frame", "X-Words"].map((name) => JSON.parse(answer.headers.get(name)));
+      return { head, words, bitmap: await createImageBitmap(await answer.blob()) };
+    } catch {
+      this.#kept.delete(key);
+      return { trouble: "The connection to the dashboard is lost." };
+    }
+  }
+}
+
+const bars = new Map();
+
+/** A colour map as a picture; `loaded` is called once it is there. */
+function colourBar(palette, loaded) {
+  if (!bars.has(palette)) {
+    const bar = new Image();
+    bar.src = `/live/palette/${palette}.png`;
+    bars.set(palette, bar);
+  }
+  const bar = bars.get(palette);
+  if (!bar.complete) bar.addEventListener("load", loaded, { once: true });
+  return bar.complete && bar.naturalWidth ? bar : null;
+}
+
+/** Draw a picture as large as fits, with scale bar, colour bar and a title. */
+export function drawPicture(canvas, picture, title, again) {
+  const area = fitted(canvas);
+  if (!area) return;
+  const { context, width, height } = area;
+  context.textBaseline = "top";
+  context.fillText(title, 2, 4);
+  if (!picture?.head) {
+    context.fillText(picture?.trouble ?? "…", 2, 26);
+    return;
+  }
+  const { head, bitmap } = picture, room = [width - 84, height - 30];
+  const perMetre = Math.min(room[0] / head.size[0], room[1] / head.size[1]);
+  const box = { x: 0.5, y: 24.5, width: head.size[0] * perMetre, height: head.size[1] * perMetre };
+  context.imageSmoothingEnabled = box.width < bitmap.width;
+  context.drawImage(bitmap, box.x, box.y, box.width, box.height);
+  context.strokeRect(box.x, box.y, box.width, box.height);
+  drawScaleBar(context, box, head.size[0]);
+  drawColours(context, box, head, again);
+}
+
+function drawColours(context, box, { low, high, unit, palette }, again) {
+  const x = box.x + box.width + 10, wide = 12, bar = colourBar(palette, again);
+  if (bar) context.drawImage(bar, x, box.y, wide, box.height);
+  context.strokeRect(x, box.y, wide, box.height);
+  const found = scale(Math.max(Math.abs(low), Math.abs(high)), unit);
+  context.textAlign = "left";
+  context.textBaseline = "middle";
+  for (const value of ticks(low * found.factor, high * found.factor, Math.max(2, box.height / 48))) {
+    const at = (value / found.factor - low) / (high - low);
+    context.fillText(plain(value), x + wide + 5, box.y + box.height * (1 - at));
+  }
+  context.textBaseline = "bottom";
+  context.fillText(found.unit ? `[${found.unit}]` : "", x, box.y - 4);
+}
+
+/** Fill a select; what was chosen stays if it can. */
+export function offer(select, options) {
+  const before = select.value;
+  select.replaceChildren(...options.map(([value, text]) => new Option(text, value)));
+  if (options.some(([value]) => value === before)) select.value = before;
+}
