@@ -78,6 +78,8 @@ class Launch:
     retracts: bool = False
     """Of a translator: it retracts the tip when its standard input ends and a request of the run has switched the
     feedback off."""
+    adjustable: tuple[str, ...] = ()
+    """Of a translator: parameters that are set during a scan, too."""
 
     def to_json(self) -> str:
         """Return one line, without the newline at its end."""

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from ui_lab import Night, Opened
 
-from afspm.model import ControlMode, ControlResponse, ProcessCondition, ScopeState
+import afspm
+from afspm.model import ControlMode, ControlResponse, ProcessCondition, ScopeState, names
 
 ADA = "dashboard:Ada"
 
@@ -127,6 +128,26 @@ def test_the_microscope_refuses_what_it_has_not(night: Night, page: Any) -> None
     page.wait_for_selector(".outcomes .refused")
     assert "Refused" in page.inner_text(".outcomes")
     assert night.entry(ADA, "scan-size-x", after=after).refused
+
+
+def test_what_the_file_names_is_adjusted_while_a_component_measures(night: Night, page: Any, keep: Any) -> None:
+    field(page, "zctrl-setpoint").wait_for()
+    assert page.locator(".parameters input").count() == 2
+    number, unit = read(page, "zctrl-setpoint").split()
+    with afspm.connect(night.folder, "holder") as scope, scope.control():
+        scope.set("scan-speed", "50 nm/s")
+        scope.action(names.START_SCAN)
+        night.until(lambda: night.follower.overview.status.state is ScopeState.SCANNING)
+        after = seen(night)
+        fill(page, "zctrl-setpoint", f"{0.9 * float(number):g} {unit}")
+        press(page, "Set")
+        said(page, "zctrl-setpoint is now")
+        assert not night.entry(ADA, "zctrl-setpoint", after=after).refused
+        assert night.control().holder == "holder"
+        keep(page, "adjusted")
+        assert night.follower.overview.status.state is ScopeState.SCANNING, "the scan goes on"
+        scope.action(names.STOP_SCAN)
+        scope.set("scan-speed", "4 um/s")
 
 
 def test_a_number_without_its_unit_is_not_sent(night: Night, page: Any) -> None:

@@ -47,6 +47,8 @@ scans = 20
 [control]
 solved_by_hand = ["tip-shape-changed", "device-malfunction", "drop-on-the-table"]
 
+adjustable = ["zctrl-setpoint", "zctrl-pgain"]
+
 [problems]
 drop-on-the-table = 9
 

@@ -134,12 +134,15 @@ class Actions:
         """Return the values of parameters that are in force, with their units; one that is refused is not ok."""
         return ActionResult("", each={name: self._read(name) for name in parameters})
 
-    def set(self, wanted: Mapping[str, str]) -> ActionResult:
+    def set(self, wanted: Mapping[str, str], shown: Mapping[str, str]) -> ActionResult:
         """Set parameters to quantities as a person writes them: "0.5 V", "2 um/s", "12". Each is asked for by itself.
 
         If one of them can't be what is meant, nothing is sent.
+
+        Args:
+            shown: the values that the person saw, with their units.
         """
-        checked = {name: unclear(name, text) for name, text in wanted.items()}
+        checked = {name: unclear(name, text, shown.get(name, "")) for name, text in wanted.items()}
         if wrong := {name: ActionResult(why, ok=False) for name, why in checked.items() if why}:
             text = " ".join(("Nothing was set.", *(one.text for one in wrong.values())))
             return ActionResult(text, ok=False, each=wrong)
@@ -224,13 +227,13 @@ def _in_force(parameter: str, response: Response) -> str:
     return f"{math.degrees(value):.6g} deg" if unit == "rad" else quantity(value, unit, 6)
 
 
-def unclear(parameter: str, text: str) -> str:
+def unclear(parameter: str, text: str, shown: str) -> str:
     """Return why a text can't be the value of a parameter; empty: it can. A number must have its unit, if there is one.
 
-    >>> unclear("scan-speed", "8")
-    'scan-speed: write the unit as well, for example "8 m/s".'
+    >>> unclear("scan-speed", "8", "4 µm/s")
+    'scan-speed: write the unit as well, for example "8 µm/s".'
     """
-    unit = names.BASE_PARAMETERS.get(parameter)
+    unit = _unit_of(shown) or names.BASE_PARAMETERS.get(parameter)
     if not text.strip():
         return f"{parameter}: write a value."
     try:
@@ -240,6 +243,13 @@ def unclear(parameter: str, text: str) -> str:
     if given or not unit or unit == "px":
         return ""
     return f'{parameter}: write the unit as well, for example "{text.strip()} {unit}".'
+
+
+def _unit_of(shown: str) -> str:
+    try:
+        return parse_quantity(shown)[1]
+    except UnitError:
+        return ""
 
 
 def _number_or(text: str) -> float | str:

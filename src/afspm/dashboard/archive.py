@@ -75,11 +75,24 @@ class Archive:
 def allowed_region(folder: Path) -> Region | None:
     """Return the region of [limits] in the expanded experiment file, in tip coordinates; None if there is none."""
     try:
-        table = tomllib.loads((folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
-        box = table.get("limits", {}).get("region")
+        box = _section(folder, "limits").get("region")
         return None if box is None else _region(box)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, AfspmError):
+    except (ValueError, KeyError, TypeError, AttributeError, AfspmError):
         return None  # it is only drawn: the scheduler, which enforces it, has read it by itself
+
+
+def adjustable_parameters(folder: Path) -> tuple[str, ...]:
+    """Return what [control] adjustable of the expanded experiment file offers; the scheduler decides about it."""
+    offered = _section(folder, "control").get("adjustable", ())
+    return tuple(map(str, offered)) if isinstance(offered, list) else ()
+
+
+def _section(folder: Path, name: str) -> dict[str, Any]:
+    try:
+        section = tomllib.loads((folder / EXPERIMENT_FILE).read_text(encoding="utf-8")).get(name)
+    except (OSError, ValueError):
+        return {}
+    return section if isinstance(section, dict) else {}
 
 
 def _region(box: dict[str, Any]) -> Region:

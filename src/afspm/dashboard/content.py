@@ -74,11 +74,15 @@ class Contents:
 
     Args:
         limits: where scans may lie at all, in tip coordinates; None if it is not known.
+        adjustable: parameters that a person may set in AUTOMATED, too.
         pictures: the address under which there are small pictures of scans.
     """
 
-    def __init__(self, watch: Watch, limits: Region | None, pictures: str = "") -> None:
+    def __init__(
+        self, watch: Watch, limits: Region | None, adjustable: tuple[str, ...] = (), pictures: str = ""
+    ) -> None:
         self._watch = watch
+        self._adjustable = adjustable
         self._limits = limits
         self._pictures = pictures
         self._lock = threading.Lock()
@@ -114,6 +118,7 @@ class Contents:
                 unheard=silent,
                 log=tuple(overview.log),
                 is_manual=control is not None and control.mode is ControlMode.MANUAL,
+                adjustable=self._adjustable,
                 ended=watch.ended,
             )
 

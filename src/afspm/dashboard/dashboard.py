@@ -11,7 +11,7 @@ from afspm.addresses import Listens
 from afspm.client.component import Component
 from afspm.clock import ExperimentClock
 from afspm.dashboard.access import Access, is_loopback
-from afspm.dashboard.archive import Archive, allowed_region
+from afspm.dashboard.archive import Archive, adjustable_parameters, allowed_region
 from afspm.dashboard.server import USUAL_PORT, PageServer, listening, url_of
 from afspm.dashboard.sessions import Sessions
 from afspm.dashboard.watch import Audience, Watch
@@ -88,7 +88,12 @@ class Dashboard(Component):
         self._steering = Steering(launch, self.clock, self._watch, access)
         services = Services(
             self._watch,
-            Contents(self._watch, allowed_region(self.run_dir), f"/live/thumbnail/{secrets.token_hex(4)}"),
+            Contents(
+                self._watch,
+                allowed_region(self.run_dir),
+                adjustable_parameters(self.run_dir),
+                f"/live/thumbnail/{secrets.token_hex(4)}",
+            ),
             self._steering,
             Audience(),
             access,

@@ -68,7 +68,8 @@ class ParameterForm:
         if not wanted:
             self._session.say(ActionResult("Nothing was changed: edit a value first.", ok=False))
             return
-        result = await self._session.carry_out(lambda a: a.set(wanted))
+        shown = dict(self._in_force)
+        result = await self._session.carry_out(lambda a: a.set(wanted, shown))
         if self._rows.is_deleted:
             return
         self._session.say(result)

@@ -18,6 +18,11 @@ from afspm.drawing.timeline import tint_class
 from afspm.formatting import time_of_day, typeset_position
 from afspm.model import ControlMode
 
+_TAKE_OVER = "In MANUAL you can set parameters, scan and take spectra here."
+_ADJUST = (
+    "These hold from the next line on, while a component measures. In MANUAL you can set all parameters, and scan."
+)
+
 
 class ModeButtons:
     """Take over and hand back, which are always to be seen."""
@@ -100,7 +105,7 @@ class SteeringPanel:
             self._problem = ui.select(options, label="problem", value=next(iter(options))).props("dense outlined")
             button("Raise", lambda: session.do(partial(Actions.flag, problem=int(self._problem.value))))
         ui.html("<h3>Microscope</h3>", sanitize=False)
-        self._not_by_hand = ui.label("In MANUAL you can set parameters, scan and take spectra here.").classes("quiet")
+        self._not_by_hand = ui.label().classes("quiet")
         with ui.element("div").classes("acts") as self._by_hand:
             button("Scan as set", lambda: session.do(lambda a: a.scan()))
             button("Spectrum at the probe", lambda: session.do(lambda a: a.spectrum()))
@@ -113,6 +118,7 @@ class SteeringPanel:
         """Bring it up to date."""
         self._by_hand.set_visibility(content.is_manual)
         self._not_by_hand.set_visibility(not content.is_manual)
+        self._not_by_hand.set_text(_ADJUST if content.adjustable else _TAKE_OVER)
         await self._parameters.show()
 
     async def _ask_end(self) -> None:

@@ -156,6 +156,7 @@ def _start(
         controller=resolved.controller_of(name, chosen) if role is Role.TRANSLATOR else "",
         sample_coordinates=role is Role.COMPONENT and _in_sample_coordinates(resolved),
         retracts=role is Role.TRANSLATOR and _retracts(resolved),
+        adjustable=control.adjustable if role is Role.TRANSLATOR else (),
     )
     if command[:1] == ("python",):  # the one that runs us, wherever that is
         command = (sys.executable, *command[1:])

@@ -23,6 +23,8 @@ class Section(pydantic.BaseModel):
 
 
 DangerousState = Literal["MOVING", "SCANNING", "COARSE_MOTOR", "BUSY_PARAM", "SPEC", "feedback-off"]
+AdjustableParameter = Literal["zctrl-setpoint", "zctrl-pgain", "zctrl-igain", "tip-bias-voltage"]
+"""What a person may be allowed to set while a component measures: none of it moves the tip elsewhere."""
 PositiveDuration = Annotated[Duration, Field(gt=0)]
 
 
@@ -62,6 +64,8 @@ class ControlSection(Section):
     """Whether the tip is retracted when control is left in a dangerous state, where the microscope can."""
     dangerous: tuple[DangerousState, ...] | None = None
     """Those states; None: what the watchdog takes for dangerous by itself."""
+    adjustable: tuple[AdjustableParameter, ...] = ()
+    """Parameters that who may operate sets in AUTOMATED mode, too, beside the component in control."""
     spectra_by_variable: bool = False
     """Whether the translator sends the values of a spectrum variable after variable, as some of version 1 do."""
     roles: RolesSection = RolesSection()

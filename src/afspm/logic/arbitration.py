@@ -27,6 +27,7 @@ class ArbitrationEvent(Enum):
     SET_MODE = "sets the mode"
     END = "ends the experiment"
     COMMAND = "commands the microscope"
+    ADJUST = "sets a parameter of [control] adjustable"
     READ = "asks the microscope for a value"
     DEAD = "is dead"
     IDLE = "has let its lease run out"
@@ -110,10 +111,16 @@ class RoleTable:
 
 @dataclass(frozen=True)
 class Rules:
-    """The part of the experiment file that the table needs: roles, and the known problems."""
+    """The part of the experiment file that the table needs.
+
+    Attributes:
+        problems: those that are known.
+        adjustable: parameters that a person may set while a component is in control.
+    """
 
     roles: RoleTable = RoleTable()
     problems: ProblemNames = field(default_factory=ProblemNames)
+    adjustable: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -167,6 +174,10 @@ IS_MANUAL = Condition("the mode is manual", lambda c, a, r: c.mode is ControlMod
 IS_OPERATOR = Condition(
     "the mode is manual and it has the role `operate`",
     lambda c, a, r: c.mode is ControlMode.MANUAL and may(r.roles.operate, a.who),
+)
+IS_ADJUSTER = Condition(
+    "it has the role `operate` and no problem is flagged",
+    lambda c, a, r: may(r.roles.operate, a.who) and not c.problems,
 )
 ASKER_HOLDS = Condition("it is in control", lambda c, a, r: c.holder == a.who)
 OTHER_HOLDS = Condition("another is in control", lambda c, a, r: c.holder not in (None, a.who))
@@ -292,6 +303,17 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
         _happen(ASKER_HOLDS, (_D.FORWARD,), "only who is in control commands the microscope"),
         _happen(IS_OPERATOR, (_D.FORWARD,), "in manual mode a person may, by a component"),
         _refuse(OTHERWISE, _R.NOT_IN_CONTROL, "{who} is not in control, {holder} is"),
+    ),
+    ArbitrationEvent.ADJUST: (
+        _happen(ASKER_HOLDS, (_D.FORWARD,), "only who is in control commands the microscope"),
+        _happen(IS_OPERATOR, (_D.FORWARD,), "in manual mode a person may, by a component"),
+        _happen(IS_ADJUSTER, (_D.FORWARD,), "the experiment file lets a person adjust it beside the holder"),
+        _refuse(
+            OTHERWISE,
+            _R.NOT_IN_CONTROL,
+            "{who} is not in control, {holder} is; beside it only the role 'operate' adjusts this,"
+            " and while no problem is flagged",
+        ),
     ),
     ArbitrationEvent.READ: (_happen(OTHERWISE, (_D.FORWARD,), "it disturbs nothing, so anybody may, at any time"),),
     ArbitrationEvent.DEAD: (

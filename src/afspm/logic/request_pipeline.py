@@ -10,7 +10,7 @@ import json
 from functools import partial
 
 from afspm.logic import answers, control_change, publishing, safety_commands
-from afspm.logic.arbitration import ArbitrationEvent, ControlInput
+from afspm.logic.arbitration import ArbitrationEvent, ControlInput, Rules
 from afspm.logic.coordinate_frame import MappedRequest
 from afspm.logic.event_log import SCHEDULER
 from afspm.logic.events import Reply, RequestIn
@@ -154,9 +154,16 @@ def authorise(draft: StateDraft, event: RequestIn) -> bool:
     elif (control_event := _CONTROL_EVENTS.get(kind)) is not None:
         return control_change.decide(draft, ControlInput(control_event, event.name, int(subject or 0)), event)
     else:
-        wanted = ArbitrationEvent.READ if reads(event.request) else ArbitrationEvent.COMMAND
+        wanted = _microscope_event(event.request, draft.env.settings.rules)
         return control_change.decide(draft, ControlInput(wanted, event.name), event)
     return False
+
+
+def _microscope_event(request: Request, rules: Rules) -> ArbitrationEvent:
+    if reads(request):
+        return ArbitrationEvent.READ
+    is_adjustable = request.kind == _PARAM and request.subject.name in rules.adjustable
+    return ArbitrationEvent.ADJUST if is_adjustable else ArbitrationEvent.COMMAND
 
 
 def _tell_time(draft: StateDraft, event: RequestIn) -> None:
@@ -191,10 +198,16 @@ def check_limits(draft: StateDraft, event: RequestIn, deadline_s: float = 0.0) -
         return None
     if draft.forwarder.up and not _is_within_limits(draft, event, mapped):
         return None  # if not, there is nobody to tell what is in force, as the asker will hear
-    draft.lease = draft.lease.used(draft.now_ns)
+    _use_lease(draft, event.name)
     if request.kind == _ACTION and not _may_act_here(draft, event):
         return None
     return job
+
+
+def _use_lease(draft: StateDraft, client: str) -> None:
+    """Begin the lease anew; what a person adjusts beside the holder is no sign of life of the holder."""
+    if client == draft.control.holder:
+        draft.lease = draft.lease.used(draft.now_ns)
 
 
 def _tip_comes_first(draft: StateDraft) -> str | None:
@@ -234,7 +247,7 @@ def _reads_first(draft: StateDraft, event: RequestIn) -> bool:
             reason = f"{min(both)} is being changed by {who}"
             answers.refuse(draft, event, Response(int(ControlResponse.PARAM_ERROR), b"", reason))
             return True
-    draft.lease = draft.lease.used(draft.now_ns)
+    _use_lease(draft, event.name)
     draft.idempotency = draft.idempotency.noted(event.name, event.request, RequestStatus.PENDING)
     number = draft.forwarder.number
     read = PendingRead(number, event, frozenset(unread), draft.now_s + draft.forwarder.timeout_s)
@@ -431,8 +444,8 @@ def _learn(draft: StateDraft, job: ForwardedRequest, response: Response) -> Resp
         _action_started(draft, job, is_certain=True)
     elif (feedback := feedback_of(request)) is not None:
         draft.microscope = draft.microscope.with_feedback(feedback)
-    if job.command and job.client == draft.control.holder:
-        draft.lease = draft.lease.used(now_ns)
+    if job.command:
+        _use_lease(draft, job.client)
     return response
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.model import Feedback
 from afspm.simulation.feedback import Loop
 from afspm.simulation.fields import Array
 from afspm.simulation.imaging import SampleGrid, Sampler, across_m, felt, reach_m
@@ -127,6 +128,24 @@ class Measured:
     channels: Channels
     last_z_m: float
     pressed_m: float
+
+    def continued(self, anew: Measured, rows: NDArray[np.bool_]) -> Measured:
+        """Return it with these rows of another one, which ends it."""
+        channels = {
+            name: (unit, np.where(rows[:, None], anew.channels[name][1], values))
+            for name, (unit, values) in self.channels.items()
+        }
+        share = float(rows.mean())
+        return Measured(channels, anew.last_z_m, share * anew.pressed_m + (1.0 - share) * self.pressed_m)
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """A change during a scan: when, and what is set from then on."""
+
+    t_s: float
+    feedback: Feedback | None
+    bias_v: float
 
 
 def measure(course: Course, tips: TipTimes, setup: Setup, random: np.random.Generator) -> Measured:

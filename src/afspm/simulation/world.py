@@ -8,7 +8,7 @@ stopped: tip changes, wear) is taken back. The same seed and the same calls give
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -22,7 +22,7 @@ from afspm.simulation import chance, spectra
 from afspm.simulation.drift import DriftSettings, ScannerCompensation
 from afspm.simulation.feedback import FeedbackSettings, Loop
 from afspm.simulation.fields import Array
-from afspm.simulation.measuring import Felt, Setup, SignalSettings, TipTimes, at_rest, feel, measure
+from afspm.simulation.measuring import Adjustment, Felt, Setup, SignalSettings, TipTimes, at_rest, feel, measure
 from afspm.simulation.noise import NoiseSettings
 from afspm.simulation.sample import Sample, SurfaceMark
 from afspm.simulation.scanning import Course, ScannerPlace, ScannerSettings, SimulatedScan
@@ -154,6 +154,7 @@ class World:
         *,
         direction: str = "up",
         slope: tuple[float, float] = (0.0, 0.0),
+        adjusted: Sequence[Adjustment] = (),
     ) -> SimulatedScan:
         """Scan a region, from `start_s` on.
 
@@ -164,6 +165,7 @@ class World:
             feedback: what it says overrides the settings.
             direction: of the slow axis, "up" (small y first) or "down".
             slope: compensation of the sample's tilt, (x, y) in m/m.
+            adjusted: what was set during the scan; it holds from the next line on.
 
         Raises:
             InvalidValue: what cannot be scanned, or feedback without sense.
@@ -178,6 +180,10 @@ class World:
         tips += [(change.t_s, change.tip) for change in self._tip.between(start_s, course.end_s)]
         setup = self._setup(loop, bias_v, slope, start_s)
         measured = measure(course, tips, setup, chance.generator(self.seed, 2, call))
+        for one in adjusted:  # each line as if the whole scan had been taken so, with the same noise
+            setup = self._setup(Loop.of(self.settings.feedback, one.feedback), one.bias_v, slope, start_s)
+            anew = measure(course, tips, setup, chance.generator(self.seed, 2, call))
+            measured = measured.continued(anew, course.row_times_s(0.0) >= one.t_s)
         self._held_z_m = measured.last_z_m
         self._wear(course, loop)
         drift = self.sample.drift.at(course.row_times_s(0.25))

@@ -104,7 +104,8 @@ class Commands:
         return CommandOutcome(Response(ControlResponse.SUCCESS, payload, id=request.id))
 
     def _set(self, request: Request, values: Mapping[str, Value]) -> CommandOutcome:
-        self._refuse_if_busy(all(self._driver.table[name].while_busy for name in values))
+        driver = self._driver
+        self._refuse_if_busy(all(name in driver.adjustable or driver.table[name].while_busy for name in values))
         if values:
             apply(self._driver, values, lambda: self._about_to_act(request))
         steps = self._sequence.begin(ScopeState.MOVING) if MOVES & values.keys() else []

@@ -139,6 +139,7 @@ class Driver(ABC):
         wake: call it, from any thread, to have the controller looked at now rather than at the next poll.
         for_a_while: sets parameters by their generic names, in SI, and has them put back after so many experiment
             seconds: for actions that are made of settings. The microscope is busy meanwhile.
+        adjustable: parameters that may be set during a scan, whatever their row says: [control] adjustable.
         controller_at: where the controller is: to be set by the constructor, and read by `connect`, since an experiment
             with an emulator puts the emulator's address there. One run at a time commands it. Empty: there is none that
             others can reach.
@@ -190,6 +191,7 @@ class Driver(ABC):
         self.poll_period_s = poll_period_s
         self.result_timeout_s = result_timeout_s
         self.live_lines_s = live_lines_s
+        self.adjustable: frozenset[str] = frozenset()
         self.prove: Callable[[], None] = _nothing_to_prove
         self._told: dict[str, Value] = {}
 

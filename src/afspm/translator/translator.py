@@ -187,6 +187,7 @@ def _run_alone(driver: Driver, context: ProcessContext, make: Callable[..., Tran
     context.when_stopping(lambda: port.wake_up(ParentGone()))
     run_dir = Path(launch.run_dir or ".")
     step = context.activity.step
+    driver.adjustable = frozenset(launch.adjustable)
     told = {"retracts": launch.retracts, "run": launch.run, "simulated": launch.simulated}
     translator = make(driver, port, memory, run_dir, context.log, step, **told)
     context.tip_in_danger(translator.leaves_danger)

@@ -20,13 +20,15 @@ CHOICE = ScanChoice(Region((1e-6, 2e-6), (4e-7, 2e-7), 0.3), (32, 64))
     [("scan-speed", "4 µm/s"), ("scan-resolution-x", "64"), ("zctrl-setpoint", "0.5"), ("tip-bias-voltage", "-0.1 V")],
 )
 def test_a_value_with_its_unit_can_be_meant(parameter: str, text: str) -> None:
-    assert unclear(parameter, text) == ""
+    assert unclear(parameter, text, "") == ""
 
 
 def test_a_number_without_its_unit_is_not_taken_for_metres() -> None:
-    assert unclear("scan-speed", "8") == 'scan-speed: write the unit as well, for example "8 m/s".'
-    assert "write a value" in unclear("scan-speed", " ")
-    assert "number" in unclear("scan-speed", "fast")
+    wanted = 'scan-speed: write the unit as well, for example "8 µm/s".'
+    assert unclear("scan-speed", "8", "4 µm/s") == wanted
+    assert "0.5 mV" in unclear("zctrl-setpoint", "0.5", "700 mV"), "its unit is that of the microscope"
+    assert "write a value" in unclear("scan-speed", " ", "4 µm/s")
+    assert "number" in unclear("scan-speed", "fast", "4 µm/s")
 
 
 def test_a_scan_is_edited_with_units_and_has_square_pixels() -> None:

@@ -186,6 +186,15 @@ def test_the_scheduler_is_given_what_it_enforces(write: Write) -> None:
     assert Launch.from_json(launch.to_json()) == launch
 
 
+def test_scheduler_and_translator_are_told_what_a_person_may_adjust(write: Write) -> None:
+    started = starts(write(CORRECTOR + '[control]\nadjustable = ["zctrl-setpoint"]\n'))
+    assert started["scheduler"].launch.settings["control"]["adjustable"] == ["zctrl-setpoint"]
+    assert started["microscope"].launch.adjustable == ("zctrl-setpoint",)
+    assert started["repair"].launch.adjustable == ()
+    with pytest.raises(ConfigError, match="adjustable"):
+        starts(write(CORRECTOR + '[control]\nadjustable = ["scan-size-x"]\n'))
+
+
 def test_a_file_with_errors_starts_nothing(write: Write) -> None:
     with pytest.raises(ConfigError, match="no setting 'volage'"):
         starts(write(CORRECTOR + "volage = 3\n"))

@@ -229,6 +229,20 @@ def test_an_operator_commands_in_manual_only() -> None:
     assert after(mode(MANUAL), command)[1].response is ControlResponse.NOT_IN_CONTROL
 
 
+def test_an_operator_adjusts_beside_the_holder_while_no_problem_is_flagged() -> None:
+    rules = Rules(RoleTable(operate={"console"}))
+
+    def response(who: str, *before: ControlInput) -> ControlResponse | None:
+        return after(*before, ControlInput(ArbitrationEvent.ADJUST, who), rules=rules)[1].response
+
+    assert response("console", request("experiment")) is None
+    assert response("experiment", request("experiment")) is None
+    assert response("console", mode(MANUAL)) is None
+    assert response("other", request("experiment")) is ControlResponse.NOT_IN_CONTROL
+    assert response("console", flag("c", TIP), request("corrector", TIP)) is ControlResponse.NOT_IN_CONTROL
+    assert response("corrector", flag("c", TIP), request("corrector", TIP)) is None
+
+
 def test_roles_say_who_may_end_and_switch() -> None:
     rules = Rules(RoleTable(end={"boss"}, mode={"boss"}))
     assert after(ControlInput(ArbitrationEvent.END, "other"), rules=rules)[1].response is ControlResponse.FAILURE

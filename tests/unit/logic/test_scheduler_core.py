@@ -521,6 +521,17 @@ def test_an_operator_commands_in_manual() -> None:
     assert kinds(lab.ask("console", ACTION, "start-scan")) == ["Forward"]
 
 
+def test_only_what_the_file_names_is_adjusted_beside_the_holder() -> None:
+    lab = Lab(SchedulerSettings(rules=Rules(RoleTable(operate={"console"}), adjustable=frozenset({"zctrl-setpoint"}))))
+    lab.translator()
+    lab.take_control("experiment")
+    setpoint, bias = Parameter("zctrl-setpoint", "0.5"), Parameter("tip-bias-voltage", "1", "V")
+    assert kinds(lab.ask("console", ControlRequest.PARAM, setpoint)) == ["Forward"]
+    assert lab.says("console", ControlRequest.PARAM, bias) is NOT_IN_CONTROL
+    assert lab.says("other", ControlRequest.PARAM, setpoint) is NOT_IN_CONTROL
+    assert lab.says("console", ACTION, "start-scan") is NOT_IN_CONTROL
+
+
 def test_a_stop_that_fails_is_said_loudly(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.scope_is(ScopeState.SCANNING)

@@ -13,6 +13,7 @@ import pytest
 from afspm.errors import ConfigError, ConfigErrors, InvalidValue
 from afspm.model import Feedback, Region
 from afspm.simulation import World
+from afspm.simulation.measuring import Adjustment
 from afspm.simulation.tip import Chances, TipChangeSettings, crash_times, pulse_times
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))
@@ -37,6 +38,21 @@ def test_the_same_seed_and_calls_give_the_same_night() -> None:
     for one, again in zip(night(3), night(3), strict=True):
         np.testing.assert_array_equal(one, again)
     assert not np.array_equal(night(3)[0], night(4)[0])
+
+
+def test_what_is_adjusted_during_a_scan_holds_from_the_next_line_on() -> None:
+    late = Adjustment(20.5, Feedback(setpoint=0.95, proportional_gain=0.01, integral_gain=5.0), 0.1)
+    whole, changed = (
+        world().scan(REGION, SHAPE, 1.0, 0.0, adjusted=adjusted).channels()["Height"][1] for adjusted in ((), (late,))
+    )
+    np.testing.assert_array_equal(changed[:21], whole[:21])
+    assert np.abs(changed[21:] - whole[21:]).max() > 1e-9
+    down = [
+        world().scan(REGION, SHAPE, 1.0, 0.0, direction="down", adjusted=adjusted).channels()["Height"][1]
+        for adjusted in ((), (late,))
+    ]
+    np.testing.assert_array_equal(down[0][27:], down[1][27:])
+    assert not np.array_equal(down[0][:27], down[1][:27])
 
 
 def test_a_restored_world_goes_on_as_if_nothing_had_happened() -> None:

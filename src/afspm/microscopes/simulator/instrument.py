@@ -23,6 +23,7 @@ from afspm.microscopes.simulator.faults import Faults
 from afspm.microscopes.simulator.truth import Truth
 from afspm.model import ControlResponse, ScanLines, ScopeState, Spectrum, names
 from afspm.simulation import SimulatedScan, World
+from afspm.simulation.measuring import Adjustment
 from afspm.storage.atomic import write_atomic
 from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 from afspm.translator.parameters import ParameterTable, Value
@@ -30,6 +31,8 @@ from afspm.translator.setting_groups import feedback, frame
 from afspm.translator.state import Kept
 
 LISTED_RESULTS = 16
+ADJUSTED: Final = (names.ZCTRL_SETPOINT, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN, names.TIP_BIAS_VOLTAGE)
+"""What holds from the next line on, when it is set during a scan."""
 
 _STATES: Final = {
     "scan": ScopeState.SCANNING,
@@ -189,6 +192,8 @@ class Instrument:
         if rate_m_s != (float(before[names.DRIFT_RATE_X]), float(before[names.DRIFT_RATE_Y])):
             self._world.compensate(rate_m_s, now_s)
             self._settle()
+        if any(before[name] != after[name] for name in ADJUSTED):
+            self._adjust(values, now_s)
         speed_m_s = float(after[names.MOVE_SPEED])
         distance_m = max(
             _distance(before, after, names.PROBE_POS_X, names.PROBE_POS_Y),
@@ -197,6 +202,16 @@ class Instrument:
         if distance_m > 0.0:
             self.stop(now_s)  # as far as that is allowed, it ends what is being measured
             self._begin("move", now_s, distance_m / speed_m_s)
+
+    def _adjust(self, values: dict[str, Value], now_s: float) -> None:
+        """Draw the rest of a running scan with new values; as before a restart, from the world before the scan."""
+        doing = self._kept["doing"]
+        if doing is None or doing["what"] != "scan" or self._scan is None:
+            return
+        wait([self._scan])
+        doing["adjusted"] = [*doing.get("adjusted", ()), {"t_s": now_s, "values": values}]
+        self._world.restore(self._kept["world"])
+        self._scan = self._drawn_meanwhile(doing)
 
     def start_scan(self, now_s: float) -> None:
         """Scan the frame: every line there and back at the scan speed."""
@@ -299,7 +314,16 @@ class Instrument:
             float(values[names.TIP_BIAS_VOLTAGE]),
             direction=str(values[names.SCAN_DIRECTION]),
             slope=(float(values[names.SAMPLE_SLOPE_X]), float(values[names.SAMPLE_SLOPE_Y])),
+            adjusted=self._adjustments(doing),
         )
+
+    def _adjustments(self, doing: Kept) -> list[Adjustment]:
+        values, found = dict(doing["values"]), []
+        for change in doing.get("adjusted", ()):
+            values.update(change["values"])
+            now = self._si(values)
+            found.append(Adjustment(change["t_s"], feedback(now), float(now[names.TIP_BIAS_VOLTAGE])))
+        return found
 
     def _save_scan(self, scan: SimulatedScan, doing: Kept) -> None:
         content = encode_scan(scan.course.region, scan.channels(), self._facts(doing))
