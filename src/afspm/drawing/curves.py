@@ -28,11 +28,20 @@ def thinned(x: Array, y: Array, most: int = MOST_POINTS) -> tuple[Array, Array]:
 
 
 def round_ticks(low: float, high: float, about: int = 5) -> list[float]:
-    """Return round numbers between two, about so many."""
+    """Return round numbers between two, about so many, and two at least where there are any."""
     if not high > low:
         return [low]
-    step = 10.0 ** math.floor(math.log10((high - low) / about))
-    step *= next((factor for factor in (1, 2, 5, 10) if (high - low) / (step * factor) <= about), 10)
-    first = math.ceil(low / step - 1e-9)
-    last = math.floor(high / step + 1e-9)
-    return [round(i * step, 15 - math.floor(math.log10(abs(i * step) or 1.0))) for i in range(first, last + 1)]
+    power = 10.0 ** math.floor(math.log10((high - low) / about))
+    found: list[float] = []
+    for factor in (0.5, 1, 2, 5, 10):  # the widest steps that leave two, or the first that are few enough
+        before, found = found, _multiples(power * factor, low, high)
+        if len(found) < 2 <= len(before):
+            return before
+        if (high - low) / (power * factor) <= about:
+            break
+    return found
+
+
+def _multiples(step: float, low: float, high: float) -> list[float]:
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [round(i * step, 14 - math.floor(math.log10(abs(i * step) or 1.0))) for i in range(first, last + 1)]

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
 
 from afspm.drawing.curves import round_ticks, thinned
 
@@ -22,3 +24,8 @@ def test_ticks_are_round_and_inside() -> None:
     ]
     for low, high in ((1e-9, 3e-9), (-7.0, 1000.0), (5.0, 5.0)):
         assert all(low - 1e-9 * high <= tick <= high * (1 + 1e-9) for tick in round_ticks(low, high))
+
+
+@given(st.floats(-1e3, 1e3), st.floats(1e-6, 1e3), st.integers(3, 8))
+def test_there_are_never_too_few_or_too_many_ticks(low: float, extent: float, about: int) -> None:
+    assert 2 <= len(round_ticks(low, low + extent, about)) <= 2 * about + 2
