@@ -56,6 +56,20 @@ def test_a_request_is_written_down_with_its_answer_and_how_long_that_took(lab: L
     assert scan.time_ns >= control.time_ns
 
 
+def test_a_measurement_is_written_down_with_its_key_and_the_time_at_which_it_was_passed_on(lab: Lab) -> None:
+    lab.take_control("survey")
+    lab.ask("survey", R.ACTION, "start-scan", "survey/key/tile-1/2")
+    sent_ns = lab.now_ns
+    lab.later(0.05, 0.05)
+    lab.answer(lab.forwarded[-1])
+    lab.ask("stranger", R.ACTION, "start-scan", "stranger/key/tile-2/1")
+    control, scan, refused = (entry for entry in lab.entries() if entry.kind == "request")
+    assert (scan.key, scan.sent_ns) == ("tile-1", sent_ns)
+    assert scan.sent_ns < scan.time_ns
+    assert (control.key, control.sent_ns) == ("", None)
+    assert (refused.key, refused.sent_ns) == ("tile-2", None)
+
+
 def test_a_refusal_is_written_down_with_its_reason(lab: Lab) -> None:
     lab.ask("stranger", R.ACTION, "start-scan")
     (entry,) = lab.entries()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from record_lab import Given, Night
@@ -11,6 +12,7 @@ from record_lab import Given, Night
 import afspm
 from afspm.errors import InvalidValue
 from afspm.model import ControlResponse, JournalEntries, JournalEntry, names
+from afspm.record.export import export
 from afspm.record.store import RecordStore
 
 
@@ -84,3 +86,15 @@ def test_spectra_of_one_place_are_repeats(night: Night, store: RecordStore, tmp_
     stacked = afspm.open_run(tmp_path).spectra.stack()
     assert dict(stacked.sizes) == {"y": 1, "x": 1, "repeat": 1, "direction": 1, "z": 20}
     assert np.isfinite(stacked.Current.values).all()
+
+
+def test_an_export_has_the_key_of_a_scan(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    store.take([start(night, "tile-1"), *night.whole_scan(1), *night.whole_scan(2)])
+    with afspm.open_run(tmp_path) as run:
+        first, second = (path for path in export(run, "h5", tmp_path / "h5"))
+        list(export(run, "csv", tmp_path / "csv"))
+    with h5py.File(first) as file:
+        assert file["entry/afspm"].attrs["key"] == "tile-1"
+    with h5py.File(second) as file:
+        assert "key" not in file["entry/afspm"].attrs
+    assert ",tile-1" in (tmp_path / "csv" / "scans.csv").read_text(encoding="utf-8")
