@@ -15,12 +15,14 @@ MOST_ROWS: Final = 60
 _ENDS: Final = 10
 """Rows that are shown at both ends of a longer table."""
 _UNITS: Final = {"_m_s": "m/s", "_m": "m", "_rad": "rad", "_s": "s"}
-_CELL: Final = 'style="text-align:left;white-space:nowrap"'
+_FIRST: Final = ("number", "key")
+_CELL: Final = 'style="text-align:left;white-space:nowrap;max-width:18em;overflow:hidden;text-overflow:ellipsis"'
 
 
 def table_html(columns: Mapping[str, Sequence[Any]], count: int) -> str:
     """Return columns of `count` rows each; those in which nothing stands are left out."""
     shown = range(count) if count <= MOST_ROWS else [*range(_ENDS), None, *range(count - _ENDS, count)]
+    columns = {name: columns[name] for name in sorted(columns, key=lambda name: name not in _FIRST)}
     told = [_column(name, values) for name, values in columns.items() if any(map(_says, values))]
     head = "".join(f"<th {_CELL}>{escape(name)}</th>" for name, _ in told)
     body = "".join(_row(told, number) for number in shown)
