@@ -1,7 +1,8 @@
 """Photographs the dashboard of a simulated night: `python tools/dashboard_picture.py [FOLDER]`.
 
-Without a folder it draws docs/pictures/dashboard.png; with one it leaves there what a person sees on three screens,
-light and dark, signed in and not. Needs chromium and playwright, as the tests in tests/ui do.
+Without a folder it draws docs/pictures/dashboard.png, and recorded-night.png of the same night when it is over; with
+one it leaves there what a person sees on three screens, light and dark, signed in and not. Needs chromium and
+playwright, as the tests in tests/ui do.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from typing import Any
 from playwright.sync_api import Browser, sync_playwright
 
 ROOT = Path(__file__).resolve().parents[1]
-PICTURE = ROOT / "docs" / "pictures" / "dashboard.png"
+ADDRESS = r"the dashboard (?:is|stays) at (\S+?);?\s"
+PICTURES = ROOT / "docs" / "pictures"
 SCREENS = {"wide": (1440, 900), "tablet": (1024, 768), "phone": (390, 844)}
 AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
 EXPERIMENT = """
@@ -81,12 +83,18 @@ def running_night(folder: Path) -> Iterator[str]:
     """Run the experiment; gives the address of its dashboard."""
     (folder / "survey.toml").write_text(EXPERIMENT, encoding="utf-8")
     shutil.copy(ROOT / "experiments" / "best_points" / "points.py", folder)
-    command = (*AFSPM, "run", str(folder / "survey.toml"), "--runs", str(folder / "runs"))
+    with serving((*AFSPM, "run", str(folder / "survey.toml"), "--runs", str(folder / "runs")), folder) as url:
+        yield url
+
+
+@contextmanager
+def serving(command: tuple[str, ...], folder: Path) -> Iterator[str]:
+    """Run a command; gives the address of its dashboard."""
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         assert process.stdout is not None
         lines = iter(process.stdout)
         try:
-            yield next(found[1] for line in lines if (found := re.search(r"the dashboard is at (\S+)", line)))
+            yield next(found[1] for line in lines if (found := re.search(ADDRESS, line)))
         finally:
             process.terminate()
             process.communicate()
@@ -138,17 +146,29 @@ def parts_of(page: Any, screen: str) -> Iterator[str]:
         yield "further"
 
 
+def photograph_recorded(browser: Browser, url: str) -> None:
+    """Draw the page of a recorded night, at a moment in its middle."""
+    page = open_page(browser, url, "wide")
+    page.wait_for_function("window.afspm.scrubber")
+    page.evaluate("window.afspm.scrubber.go(0.6 * window.afspm.scrubber.last)")
+    page.wait_for_timeout(3000)
+    page.screenshot(path=PICTURES / "recorded-night.png")
+
+
 def main() -> None:
-    with tempfile.TemporaryDirectory() as scratch, running_night(Path(scratch)) as url, sync_playwright() as playwright:
+    with tempfile.TemporaryDirectory() as scratch, sync_playwright() as playwright:
+        folder = Path(scratch)
         program = shutil.which("chromium") or shutil.which("google-chrome")
         browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        page = open_page(browser, url, "wide")
-        wait_for_scans(page, 7)
-        if len(sys.argv) > 1:
-            photograph_all(browser, url, Path(sys.argv[1]))
-        else:
-            page.screenshot(path=PICTURE)
-        browser.close()
+        with running_night(folder) as url:
+            page = open_page(browser, url, "wide")
+            wait_for_scans(page, 7)
+            if len(sys.argv) > 1:
+                photograph_all(browser, url, Path(sys.argv[1]))
+                return
+            page.screenshot(path=PICTURES / "dashboard.png")
+        with serving((*AFSPM, "dashboard", str(folder / "runs"), "--port", "0"), folder) as url:
+            photograph_recorded(browser, url)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
@@ -123,8 +123,19 @@ class NightWatch(Watch):
         """False once a note was added."""
         return self._events is self._night.events
 
+    @contextmanager
+    def reading(self) -> Iterator[Overview]:
+        with super().reading():
+            if not self.is_current:
+                self._go(self.moment.time_ns)
+            yield self.overview
+
     def go(self, time_ns: int) -> None:
         """Show the night as it was at a time."""
+        with super().reading():
+            self._go(time_ns)
+
+    def _go(self, time_ns: int) -> None:
         if time_ns < self.moment.time_ns or not self.is_current:
             self._events, self._taken = self._night.events, 0
             self.overview, self.frames = Overview(self.problems), ChannelNames()

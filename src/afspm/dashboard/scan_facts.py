@@ -31,6 +31,7 @@ def scan_facts(frame: ChannelFrame, overview: Overview, conditions: Mapping[str,
         *angle,
         ("Pixels", f"{columns} × {rows}"),
         *conditions.items(),
+        *(("Note", note.text) for note in overview.notes if frame.time_ns and note.scan_ns == frame.time_ns),
     ]
 
 
