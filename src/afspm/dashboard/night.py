@@ -168,7 +168,7 @@ class NightContents(Contents):
     """Makes the page of one viewer, whenever the moment changes."""
 
     def __init__(self, watch: NightWatch, limits: Region | None, pictures: str) -> None:
-        super().__init__(watch, limits, pictures)
+        super().__init__(watch, limits, pictures=pictures)
         self._moment = watch
         self._made_of = -1
 
