@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from datetime import UTC
-from typing import Any
+from typing import Any, Literal
 
 from afspm.client.component import Component
 from afspm.client.parameter_values import to_parameter
 from afspm.clock import NS_PER_S
 from afspm.components.scan_plan import XY, PlanStep, RoundSchedule, ScanPlan, grid_centers, rounds_within
-from afspm.errors import ConfigError, InvalidValue, UnitError
+from afspm.errors import ConfigError, InvalidValue, RequestError, UnitError
 from afspm.formatting import day_and_time
 from afspm.model import Region, names
 from afspm.units import Angle, Duration, Length
 
 Pixels = tuple[int, int]
 FRAME = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
+
+
+Missed = Literal["extend", "catch-up", "skip"]
+_MISSED: dict[Missed, str] = {
+    "extend": "to be taken at the end",
+    "catch-up": "to be taken now, one after the other",
+    "skip": "skipped",
+}
 
 
 class PlannedScans(Component):
@@ -31,26 +39,29 @@ class PlannedScans(Component):
         keep_control: whether to keep control between the scans; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment after the last scan.
         parameters: set before the first scan, e.g. {scan-speed = "2 um/s"}.
+        missed: what becomes of scans that were due while control was lost (MANUAL, the repair of a tip). "extend": they
+            are taken after the others, with the same period; "catch-up": at once, one after the other; "skip": never.
 
     Attributes:
         plan: the regions, and how often.
         beat_s: between the beginnings of two rounds, experiment time; 0 for one right after the other.
-        missed_count: whether rounds that are left out, because one takes longer than the period or control was lost,
-            count as taken, so that the plan ends when it should. Those while nothing ran, before a restart, don't.
+        ends_on_time: whether rounds that are left out since one takes longer than the period count as taken, so that
+            the plan ends when it should. Those while nothing ran, before a restart, don't.
     """
 
     needs_actions = (names.START_SCAN,)
     plan: ScanPlan
     beat_s = 0.0
-    missed_count = False
+    ends_on_time = False
 
     def __init__(
         self,
         keep_control: bool = False,
         end_when_done: bool = False,
         parameters: dict[str, str | float] | None = None,
+        missed: Missed = "extend",
     ) -> None:
-        self.keep_control, self.end_when_done = keep_control, end_when_done
+        self.keep_control, self.end_when_done, self.missed = keep_control, end_when_done, missed
         self.parameters = dict(parameters or {})
         for name, quantity in self.parameters.items():
             try:
@@ -61,6 +72,7 @@ class PlannedScans(Component):
 
     def run(self) -> None:
         self._began_s = self.clock.now_s()
+        self._round_began_s: float | None = None  # None: it was interrupted, or begun in an earlier life
         self.memory.setdefault("start_s", self._began_s)
         rhythm = RoundSchedule(float(self.memory["start_s"]), self.beat_s)
         self.memory.save()
@@ -73,7 +85,8 @@ class PlannedScans(Component):
                 if not self._await(step, rhythm):
                     break
                 self._take(step)
-        self.log.info("all %d scans are taken", self._total)
+        left_out = (self.plan.total or 0) - (self._total or 0)
+        self.log.info("all %d scans are taken%s", self._total, f", {left_out} were left out" if left_out else "")
         if self.end_when_done:
             self.scope.end_experiment()
 
@@ -88,13 +101,18 @@ class PlannedScans(Component):
             return True
         due_s = rhythm.next_due_s(self.memory.get("done_s"))
         before_s = float(self.memory.get("due_s", due_s))
-        if left_out := rhythm.left_out(before_s, due_s):
-            count = left_out * len(self.plan.regions)
-            said = "a scan was due meanwhile; it is" if count == 1 else f"{count} scans were due meanwhile; they are"
-            self.log.warning("%s not made up for", said)
-        if self.missed_count:
-            missed = rhythm.left_out(max(before_s, self._began_s), due_s)
-            self.memory["missed"] = int(self.memory.get("missed", 0)) + missed
+        left_out = rhythm.left_out(max(before_s, self._began_s), due_s)
+        too_slow = rhythm.too_slow_for(left_out, float(self.memory.get("pace_s", 0.0)))
+        if too_slow and not self.memory.setdefault("is_slow", False):
+            self.memory["is_slow"] = True
+            self.log.warning(
+                "a round takes %.0f s, longer than its period of %.0f s", self.memory["pace_s"], self.beat_s
+            )
+        self._add("missed", too_slow if self.ends_on_time else 0)
+        self._on_missed(left_out - too_slow)
+        if self.memory.get("owed"):
+            self._add("owed", -1)
+            due_s -= self.beat_s  # begun at once, in place of a round that was missed
         is_left = self._total is None or step.index < self._total
         if is_left:
             self.scope.sleep(max(0.0, due_s - self.clock.now_s()))
@@ -104,8 +122,32 @@ class PlannedScans(Component):
         self.memory.save()
         return is_left
 
+    def _on_missed(self, rounds: int) -> None:
+        """Do as wanted about rounds that were due while control was lost, and tell log and record."""
+        if not rounds:
+            return
+        if self.missed == "skip":
+            self._add("missed", rounds)
+        elif self.missed == "catch-up":
+            self._add("owed", rounds)
+        count = rounds * len(self.plan.regions)
+        told = f"missed {count} scan{'s' if count > 1 else ''} while control was lost; {_MISSED[self.missed]}"
+        self.log.warning("%s", told)
+        with suppress(RequestError):  # a scheduler of version 1 knows no notes
+            self.scope.note(told)
+
+    def _add(self, counter: str, rounds: int) -> None:
+        self.memory[counter] = int(self.memory.get(counter, 0)) + rounds
+
     def _take(self, step: PlanStep) -> None:
+        if step.starts_round:
+            self._round_began_s = self.clock.now_s()
         scans = self.scope.scan(step.region, shape=step.shape, key=step.key)
+        if scans.interruptions:
+            self._round_began_s = None
+        if self._round_began_s is not None and (step.index + 1) % len(self.plan.regions) == 0:
+            round_s = self.clock.now_s() - self._round_began_s
+            self.memory["pace_s"] = min(round_s, float(self.memory.get("pace_s", round_s)))
         self.memory["done"], self.memory["done_s"] = step.index + 1, self.clock.now_s()
         if self.memory.save():  # else a restart asks for it again
             self.scope.forget(step.key)
@@ -165,7 +207,7 @@ class ScanSeries(PlannedScans):
             raise ConfigError("`end_when_done` without an end", hint="give `scans` or `duration`")
         self.plan = _plan((Region(pair(center), pair(size), angle),), pixels, rounds)
         self.beat_s = every
-        self.missed_count = duration is not None
+        self.ends_on_time = duration is not None
 
 
 @dataclass(frozen=True)

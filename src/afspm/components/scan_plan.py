@@ -73,8 +73,8 @@ class ScanPlan:
 class RoundSchedule:
     """The times when the rounds of a plan are due: multiples of a period after the beginning, in experiment time.
 
-    Rounds whose time goes by while one is taken, or waits for the repair of a tip, are not made up for in a burst: the
-    next is due on the old beat.
+    Rounds whose time goes by while one is taken, or waits for the repair of a tip, are missed: the next is due on the
+    old beat.
 
     Attributes:
         start_s: when the first is due.
@@ -98,6 +98,10 @@ class RoundSchedule:
     def left_out(self, due_s: float, next_due_s: float) -> int:
         """Return how many rounds lie between two that were due one after the other."""
         return max(0, round((next_due_s - due_s) / self.period_s) - 1) if self.period_s else 0
+
+    def too_slow_for(self, left_out: int, pace_s: float) -> int:
+        """Return how many of these rounds were left out since one takes `pace_s`, longer than the period."""
+        return min(left_out, max(0, math.ceil(pace_s / self.period_s - 1e-9) - 1)) if self.period_s else 0
 
 
 def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad: float = 0.0) -> tuple[XY, ...]:

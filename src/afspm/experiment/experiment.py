@@ -35,6 +35,7 @@ class ProcessStart:
         beats: whether it sends heartbeats; a command that does not (`heartbeats = false`) is only known by its exit.
         python_path: to be put before PYTHONPATH, so that modules beside the file are found.
         leaves_last: whether it stays until the other components have ended, to record what they say at the end.
+        acts: whether it follows a plan of its own, as a series does, or that is not known; the others react.
         hidden: environment variables that hold secrets of others.
     """
 
@@ -45,6 +46,7 @@ class ProcessStart:
     python_path: tuple[str, ...]
     beats: bool = True
     leaves_last: bool = False
+    acts: bool = False
     hidden: tuple[str, ...] = ()
 
 

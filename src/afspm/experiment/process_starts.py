@@ -163,7 +163,8 @@ def _start(
     folders = resolved.document.folders
     beats = process.part.own.get("heartbeats") is not False
     hidden, is_last = _hidden(resolved, process), process.says(RECORDS)
-    return ProcessStart(launch, role, command, folders[0], tuple(map(str, folders)), beats, is_last, hidden)
+    acts = role is Role.COMPONENT and process.acts
+    return ProcessStart(launch, role, command, folders[0], tuple(map(str, folders)), beats, is_last, acts, hidden)
 
 
 def _hidden(resolved: ResolvedExperiment, process: ResolvedProcess) -> tuple[str, ...]:

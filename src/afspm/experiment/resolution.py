@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from afspm.client.component import Component
 from afspm.errors import AfspmError, InvalidValue, individual_errors
 from afspm.experiment import (
     cache_section,
@@ -59,6 +60,13 @@ class ResolvedProcess:
     @property
     def name(self) -> str:
         return self.part.name
+
+    @property
+    def acts(self) -> bool:
+        """Whether it follows a plan of its own: a script, but for one that solves problems; of a command: unknown."""
+        if self.component is None or not issubclass(self.component, Component):
+            return self.component is None
+        return self.component.run is not Component.run and not self.declared.solves
 
     def says(self, attribute: str) -> bool:
         """Return whether its class has an attribute that is true."""

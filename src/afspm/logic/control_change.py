@@ -156,6 +156,10 @@ def _tell_people(draft: StateDraft, change: _Change, wanted: list[str]) -> None:
         why = f"{before.holder} had died in control" if change.had_died else cause.value if cause else ""
         draft.log("WARNING", f"{action} {is_sent}, since {why}")
     from_hand = before.mode is ControlMode.MANUAL and after.mode is not ControlMode.MANUAL
+    if from_hand:
+        draft.by_hand, left = draft.by_hand.handed_back()
+        if left:
+            draft.log("WARNING", f"set by hand, and still in force: {', '.join(left)}")
     if (cause is None and not from_hand) or draft.watchdog.owes_retract:
         return
     draft.microscope, danger = draft.microscope.telling()

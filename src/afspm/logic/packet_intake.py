@@ -10,7 +10,17 @@ from afspm.logic.events import PacketIn, Publish
 from afspm.logic.publishing import CONTROL_STATE
 from afspm.logic.request_pipeline import act_when_moved
 from afspm.logic.state import StateDraft
-from afspm.model import Feedback, Packet, PacketHeader, ProbePosition, Problem, ScanParameters, ScopeState, ScopeStatus
+from afspm.model import (
+    ControlMode,
+    Feedback,
+    Packet,
+    PacketHeader,
+    ProbePosition,
+    Problem,
+    ScanParameters,
+    ScopeState,
+    ScopeStatus,
+)
 
 SPECTRUM = "Spec1d"
 _TELLING = frozenset({"ScopeStateMsg", "ZCtrlParameters", "ScanParameters2d", "ProbePosition"})
@@ -69,6 +79,8 @@ def _learn(draft: StateDraft, told: object) -> None:
         _take_state(draft, told.state)
     elif isinstance(told, Feedback):
         before, draft.microscope = draft.microscope, draft.microscope.with_feedback(told)
+        is_manual = draft.control.mode is ControlMode.MANUAL
+        draft.by_hand = draft.by_hand.published(told, is_manual=is_manual)
         if draft.microscope.risk != before.risk:
             safety_commands.send(draft)
     if isinstance(told, Feedback | ScanParameters | ProbePosition):

@@ -28,6 +28,7 @@ from afspm.model import (
     OTHER_RUN_RESPONSE,
     RELAY_REQUEST,
     RESTART_REQUEST,
+    ControlMode,
     ControlRequest,
     ControlResponse,
     Parameter,
@@ -446,6 +447,8 @@ def _learn(draft: StateDraft, job: ForwardedRequest, response: Response) -> Resp
         draft.microscope = draft.microscope.with_feedback(feedback)
     if job.command:
         _use_lease(draft, job.client)
+        if draft.control.mode is ControlMode.MANUAL:
+            draft.by_hand = draft.by_hand.requested(request)
     return response
 
 

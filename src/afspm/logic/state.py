@@ -13,6 +13,7 @@ from afspm.logic.event_log import EventLog
 from afspm.logic.events import Codec, Effect, Log, SaveState
 from afspm.logic.forwarder import Forwarder
 from afspm.logic.frozen import replace
+from afspm.logic.hand_settings import HandSettings
 from afspm.logic.holder_timeout import HolderTimeout, Lease
 from afspm.logic.idempotency_cache import IdempotencyCache, SentAction
 from afspm.logic.lifecycle import ExperimentEnd, StartupBarrier
@@ -80,6 +81,7 @@ class SchedulerState:
     event_log: EventLog
     barrier: StartupBarrier
     end: ExperimentEnd
+    by_hand: HandSettings
     logged: frozenset[str]
 
     @classmethod
@@ -100,6 +102,7 @@ class SchedulerState:
             event_log=EventLog(),
             barrier=StartupBarrier(settings.catch_up_s),
             end=ExperimentEnd(),
+            by_hand=HandSettings(),
             logged=frozenset(),
         )
 
@@ -153,6 +156,7 @@ class StateParts:
     event_log: EventLog
     barrier: StartupBarrier
     end: ExperimentEnd
+    by_hand: HandSettings
     logged: frozenset[str]
 
 

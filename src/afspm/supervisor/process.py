@@ -52,6 +52,7 @@ class Task:
     environment: Mapping[str, str] = field(default_factory=dict)
     beats: bool = True
     leaves_last: bool = False
+    acts: bool = False
     hidden: tuple[str, ...] = ()
 
     @property
@@ -77,6 +78,7 @@ def from_start(start: ProcessStart) -> Task:
         environment={**python_environment(), **({"PYTHONPATH": os.pathsep.join(before)} if before else {})},
         beats=start.beats,
         leaves_last=start.leaves_last,
+        acts=start.acts,
         hidden=start.hidden,
     )
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from client_lab import SCAN_S, Kill9, Lab, LabPort, context_of, run
@@ -12,10 +14,10 @@ from afspm.client.component import Component
 from afspm.components.planned_scans import ScanList, ScanSeries
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
 from afspm.exit_codes import ExitCode
-from afspm.model import RELAY_REQUEST, ControlRequest, Problem, Progress
+from afspm.model import RELAY_REQUEST, ControlRequest, Note, Problem, Progress, Request
 
 
-def series(scans: int = 3, *, keep_control: bool = False, end_when_done: bool = True) -> ScanSeries:
+def series(scans: int = 3, *, keep_control: bool = False, end_when_done: bool = True, **planned: Any) -> ScanSeries:
     return ScanSeries(
         size=(1e-6, 1e-6),
         pixels=(8, 8),
@@ -23,6 +25,7 @@ def series(scans: int = 3, *, keep_control: bool = False, end_when_done: bool = 
         scans=scans,
         keep_control=keep_control,
         end_when_done=end_when_done,
+        **planned,
     )
 
 
@@ -58,20 +61,53 @@ def test_a_scan_that_a_problem_interrupts_is_taken_again_and_said(caplog: pytest
     assert "was interrupted and taken again" in caplog.text
 
 
-def test_rounds_missed_while_control_was_lost_are_not_made_up_for(caplog: pytest.LogCaptureFixture) -> None:
-    lab = Lab("series")
+def lasting(duration_s: float, every_s: float, **planned: Any) -> ScanSeries:
+    return ScanSeries(
+        size=(1e-6, 1e-6), pixels=(8, 8), every=every_s, duration=duration_s, end_when_done=True, **planned
+    )
+
+
+def at_times(series: ScanSeries, lab: Lab) -> list[int]:
+    """When each scan was begun, in periods of 900 s; control is lost from 150 s to 3000 s."""
+    begun: list[int] = []
+
+    def note(request: Request) -> str:
+        if request.subject == "start-scan":
+            begun.append(int(lab.clock.passed_s // 900.0))
+        return "go on"
+
+    lab.intercept = note
     lab.at(150.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
     lab.at(3000.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
-    with caplog.at_level("WARNING"):
-        run(series(), lab)
-    assert len(lab.finished) == 3
-    # the second was due at 900 s and is taken at 3000 s, the third on the old beat
-    assert 3600.0 < lab.clock.passed_s < 3600.0 + 2 * SCAN_S
-    assert "2 scans were due meanwhile; they are not made up for" in caplog.text
+    assert run(series, lab) == ExitCode.ENDED
+    return begun
 
 
-def lasting(duration_s: float, every_s: float) -> ScanSeries:
-    return ScanSeries(size=(1e-6, 1e-6), pixels=(8, 8), every=every_s, duration=duration_s, end_when_done=True)
+@pytest.mark.parametrize(
+    ("missed", "begun", "told"),
+    [
+        ("extend", [0, 3, 4, 5, 6], "missed 2 scans while control was lost; to be taken at the end"),
+        ("catch-up", [0, 3, 3, 3, 4], "missed 2 scans while control was lost; to be taken now, one after the other"),
+        ("skip", [0, 3, 4], "missed 2 scans while control was lost; skipped"),
+    ],
+)
+@pytest.mark.parametrize("make", [lambda **p: series(5, **p), lambda **p: lasting(4 * 900.0, 900.0, **p)])
+def test_the_file_says_what_becomes_of_scans_missed_while_control_was_lost(
+    make: Callable[..., ScanSeries], missed: str, begun: list[int], told: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    lab = Lab("series")
+    assert at_times(make(missed=missed), lab) == begun
+    assert told in caplog.messages
+    assert [note.text for note in notes_of(lab)] == [told]
+
+
+def notes_of(lab: Lab) -> list[Note]:
+    relayed = [request.subject for request in lab.requests if request.kind == RELAY_REQUEST]
+    return [wire.decode(one.message, one.payload) for one in relayed if one.message == "Note"]
+
+
+def test_by_default_no_scan_is_lost() -> None:
+    assert len(at_times(lasting(4 * 900.0, 900.0), Lab("series"))) == 5
 
 
 def test_a_series_for_a_time_ends_then_however_long_a_scan_takes(caplog: pytest.LogCaptureFixture) -> None:
@@ -80,15 +116,8 @@ def test_a_series_for_a_time_ends_then_however_long_a_scan_takes(caplog: pytest.
         assert run(lasting(600.0, every_s=60.0), lab) == ExitCode.ENDED  # each takes longer than that
     assert len(lab.finished) == 6  # at 0, 120, 240 … 600 s
     assert lab.clock.passed_s < 600.0 + 2 * SCAN_S
-    assert "all 6 scans are taken" in caplog.text
-
-
-def test_a_series_for_a_time_ends_then_though_a_problem_kept_it_from_scanning() -> None:
-    lab = Lab("series")
-    lab.at(150.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
-    lab.at(3000.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
-    run(lasting(4 * 900.0, every_s=900.0), lab)
-    assert len(lab.finished) == 3  # at 0, 3000 and 3600 s
+    assert "all 6 scans are taken, 5 were left out" in caplog.messages
+    assert caplog.messages.count("a round takes 101 s, longer than its period of 60 s") == 1
 
 
 def test_time_in_which_nothing_ran_is_not_that_of_a_series_for_a_time(tmp_path: Path) -> None:
@@ -107,7 +136,7 @@ def test_one_missed_scan_is_told_as_one(caplog: pytest.LogCaptureFixture) -> Non
     lab.at(2000.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
     with caplog.at_level("WARNING"):
         run(series(), lab)
-    assert "a scan was due meanwhile; it is not made up for" in caplog.text
+    assert "missed 1 scan while control was lost; to be taken at the end" in caplog.text
 
 
 def _killed_at(call: int, make: type[Component] | object, state_dir: Path, *, is_late: bool) -> Lab:

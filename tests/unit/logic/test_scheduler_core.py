@@ -532,6 +532,35 @@ def test_only_what_the_file_names_is_adjusted_beside_the_holder() -> None:
     assert lab.says("console", ACTION, "start-scan") is NOT_IN_CONTROL
 
 
+def test_what_is_set_by_hand_and_stays_in_force_is_said_when_components_go_on() -> None:
+    lab = Lab(SchedulerSettings(rules=Rules(RoleTable(operate={"console"}))))
+    lab.translator()
+    lab.publish("ZCtrlParameters", Feedback(on=True, setpoint=1e-9))
+    lab.mode("console", ControlMode.MANUAL)
+    for value in ("0.2", "0.5"):
+        lab.ask("console", PARAM, Parameter("tip-bias-voltage", value, "V"))
+        lab.answer(lab.forwarded[-1])
+    lab.publish("ZCtrlParameters", Feedback(on=True, setpoint=2e-9))  # changed at the controller's panel
+
+    def said() -> list[str]:
+        lab.mode("console", ControlMode.AUTOMATED)
+        return [one.text for one in lab.effects if isinstance(one, Log) and "by hand" in one.text]
+
+    assert said() == ["set by hand, and still in force: tip-bias-voltage = 0.5 V, setpoint = 2e-09"]
+    lab.mode("console", ControlMode.MANUAL)
+    assert len(said()) == 1  # told once, and nothing was set this time
+
+
+def test_a_feedback_that_is_set_back_by_hand_is_not_worth_a_word() -> None:
+    lab = Lab()
+    lab.translator()
+    for mode, setpoint in [(ControlMode.AUTOMATED, 1.0), (ControlMode.MANUAL, 2.0), (ControlMode.MANUAL, 1.0)]:
+        lab.mode("person", mode)
+        lab.publish("ZCtrlParameters", Feedback(setpoint=setpoint))
+    lab.mode("person", ControlMode.AUTOMATED)
+    assert not [one for one in lab.effects if isinstance(one, Log) and "by hand" in one.text]
+
+
 def test_a_stop_that_fails_is_said_loudly(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.scope_is(ScopeState.SCANNING)

@@ -19,12 +19,14 @@ class ChildSpec:
     Attributes:
         beats: whether it sends heartbeats; one that does not is only known by its exit.
         leaves_last: whether it stays until the other components have ended, to record what they say at the end.
+        acts: whether it follows a plan of its own, as a series does, or that is not known; the others react.
     """
 
     name: str
     role: Role = Role.COMPONENT
     beats: bool = True
     leaves_last: bool = False
+    acts: bool = False
 
     @property
     def essential(self) -> bool:

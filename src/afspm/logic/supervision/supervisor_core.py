@@ -177,6 +177,13 @@ class SupervisorCore:
                 self._give_up(child, exited.last_error or "its settings can't work")
             elif code == ExitCode.DONE and child.spec.essential:
                 self._end(EndReason.EXPERIMENT_ENDED, f"{child.spec.name} is done")
+            self._tell_if_nothing_is_left(child)
+
+    def _tell_if_nothing_is_left(self, last: SupervisedChild) -> None:
+        """Tell that all plans are done, if the last has just ended: the experiment itself goes on until it is ended."""
+        plans_are_over = all(child.is_over for child in self.children.values() if child.spec.acts)
+        if self.ending is None and last.spec.acts and plans_are_over:
+            self._log(LOGGED_AS, "INFO", "nothing is left to run; Ctrl-C or `afspm end` ends the experiment")
 
     def _on_order(self, name: str) -> None:
         child = self.children.get(name)

@@ -230,6 +230,22 @@ def test_exits_are_described() -> None:
     assert describe_exit(3) == "exit code 3"
 
 
+def test_when_the_last_plan_is_done_it_is_said_how_to_end_the_experiment() -> None:
+    def said() -> int:
+        return sum("nothing is left to run" in line.text for line in run.lines)
+
+    plans = [ChildSpec("series", acts=True), ChildSpec("grid", acts=True)]
+    run = Run(*SPECS[:2], *plans, ChildSpec("classifier"))
+    run.exits("series", ExitCode.DONE)
+    assert said() == 0
+    run.exits("grid", ExitCode.CRASHED)
+    assert said() == 0
+    run.exits("grid", ExitCode.DONE)
+    run.exits("classifier", ExitCode.DONE)
+    assert said() == 1
+    assert run.core.ending is None
+
+
 def test_the_recorder_leaves_after_the_other_components_and_before_the_scheduler() -> None:
     run = Run(*SPECS, ChildSpec("recorder", leaves_last=True))
     run.beat(*run.pids)
