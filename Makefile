@@ -7,7 +7,7 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 SETUP := .venv/.made
 
-.PHONY: demo demo-drift test mutants test-samples test-ui test-translators check bench bench-drift soak chaos simulate power-cut docs clean
+.PHONY: demo demo-drift test mutants test-samples test-ui test-translators test-windows check bench bench-drift soak chaos simulate power-cut docs clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -66,6 +66,11 @@ test-translators: $(TEST)
 	  $(BIN)/afspm test-translator experiments/every_microscope/$$name.toml --frame "500 nm" --runs build/translators \
 	    --report build/translators/$$name.json || failed="$$failed $$name"; \
 	done; test -z "$$failed" || { echo "not as they should be:$$failed"; exit 1; }
+
+## tests with a Windows Python under Wine, on Debian: see docs/how-to/windows.md. TESTS="tests/unit/wire"
+TESTS ?= $(shell cat tools/windows/tests.txt)
+test-windows: $(SETUP)
+	@$(PYTHON) tools/windows/python.py -m pytest -n 2 -p no:cacheprovider $(TESTS)
 
 ## style, types, and who may import whom
 check: $(SETUP)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
@@ -49,6 +50,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Who does which test, with pytest-xdist."""
+    if sys.platform == "win32":  # a test that takes too long ends its whole process there, which this can't replace
+        return None
     from xdist.scheduler import LoadScopeScheduling
 
     @cache

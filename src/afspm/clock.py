@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Protocol
@@ -26,12 +26,19 @@ from afspm.file_lock import locked
 NS_PER_S = 1_000_000_000
 
 
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def utc_time(time_ns: int) -> datetime:
+    """Return a time, ns since the Unix epoch, to the microsecond. Python's own refuses those before it on Windows."""
+    return _EPOCH + timedelta(microseconds=time_ns // 1000)
+
+
 def iso_utc(time_ns: int | None) -> str:
     """Return a time, ns since the Unix epoch, as ISO 8601 in UTC, to the microsecond; empty for none."""
     if time_ns is None:
         return ""
-    seconds, rest_ns = divmod(time_ns, NS_PER_S)
-    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns // 1000:06d}Z"
+    return f"{utc_time(time_ns):%Y-%m-%dT%H:%M:%S.%f}Z"
 
 
 class Clock(Protocol):

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from datetime import UTC, datetime, tzinfo
 
-from afspm.clock import NS_PER_S
+from afspm.clock import utc_time
 
 _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"),
              (1e-12, "p"), (1e-15, "f"))  # fmt: skip
@@ -104,7 +104,11 @@ def _zone(zone: tzinfo | None) -> str:
 
 
 def _moment(time_ns: int, zone: tzinfo | None) -> datetime:
-    return datetime.fromtimestamp(time_ns / NS_PER_S, UTC).astimezone(zone)
+    time = utc_time(time_ns)
+    try:
+        return time.astimezone(zone)
+    except OSError:  # Windows knows no local time before 1970
+        return time
 
 
 def scale(largest: float, unit: str) -> tuple[float, str]:

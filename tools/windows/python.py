@@ -1,18 +1,20 @@
 """Sets up a Windows Python under Wine in build/windows, and runs it: `python3 tools/windows/python.py -m pytest …`.
 
-Needs Debian's packages wine, wine64 and maven (as root they are installed), 700 MB of disk for the packages and as much
-for Wine itself. Everything is fetched once; the package's wheel is built anew at every run.
+Needs Debian's packages wine, wine64, maven and gcc-mingw-w64-x86-64-win32 (as root they are installed), 700 MB of disk
+for the packages and as much for Wine itself. Everything is fetched once; the wheel is built anew at every run.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import struct
 import subprocess
 import sys
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,6 +30,11 @@ REQUIREMENTS = Path(__file__).with_name("requirements.txt")
 WINE = Path("/usr/lib/wine/wine64")
 CPYTHON = "org.bytedeco:cpython:3.11.3-1.5.9:jar:windows-x86_64"
 CPYTHON_SHA256 = "3263a50b256447bb7b9e604d6587627e419891370fc33b94469e6a06ff4de834"
+GCC, OBJDUMP = (Path(f"/usr/bin/x86_64-w64-mingw32-{name}") for name in ("gcc", "objdump"))
+MATH, OUR_MATH = "api-ms-win-crt-math-l1-1-0.dll", "mingws-and-crt-math-l1-1-0.dll"
+assert len(MATH) == len(OUR_MATH)  # it is written over the other
+_COMPLEX = re.compile(r"c(a?(sin|cos|tan)h?|exp|log|sqrt|pow|arg|abs)[fl]?")
+_IMPORT = re.compile(r"^\t[0-9a-f]+\t\s*\d+\s+(\S+)", re.MULTILINE)
 IN_JAR = "org/bytedeco/cpython/windows-x86_64/"
 ENVIRONMENT = {
     "WINEPREFIX": str(PREFIX),
@@ -64,7 +71,8 @@ def main() -> None:
 
 
 def _install_programs() -> None:
-    missing = [package for package, found in (("wine64", WINE.exists()), ("maven", shutil.which("mvn"))) if not found]
+    programs = {"wine64": WINE.exists(), "maven": shutil.which("mvn"), "gcc-mingw-w64-x86-64-win32": GCC.exists()}
+    missing = [package for package, found in programs.items() if not found]
     if not missing:
         return
     packages = ["wine", *missing] if "wine64" in missing else missing
@@ -104,8 +112,7 @@ def _unpack_python() -> None:
                 target.write_bytes(archive.read(name))
     # extensions for any Python 3 (psutil's) look for its stable functions there
     stable = _symbols((PYTHON / "libs" / "python3.lib").read_bytes())
-    forwarded = forwarding_library("python3.dll", {name: f"python311.{name}" for name in stable})
-    (PYTHON / "python3.dll").write_bytes(forwarded)
+    _build_library(PYTHON / "python3.dll", [f"{name} = python311.{name}" for name in stable])
 
 
 def _symbols(library: bytes) -> list[str]:
@@ -121,7 +128,28 @@ def _install_packages() -> None:
         return
     _pip("--requirement", str(REQUIREMENTS))
     _pip("--no-deps", "nanonis-spm")
+    _add_complex_functions()
     shutil.copyfile(REQUIREMENTS, installed)
+
+
+def _add_complex_functions() -> None:
+    """Build the functions of complex numbers that Wine lacks, and lead the packages that call them there."""
+    names: set[str] = set()
+    for package in [*PACKAGES.rglob("*.pyd"), *PACKAGES.rglob("*.dll")]:
+        imported = _imported(package, MATH)
+        if any(map(_COMPLEX.fullmatch, imported)):
+            names |= imported
+            package.write_bytes(package.read_bytes().replace(MATH.encode(), OUR_MATH.encode()))
+    ours = {name: f"wine_{name.removesuffix('l')}" for name in names if _COMPLEX.fullmatch(name)}
+    exports = [f"{name} = {ours.get(name, f'ucrtbase.{name}')}" for name in names]
+    _build_library(PYTHON / OUR_MATH, exports, str(Path(__file__).with_name("complex.c")))
+
+
+def _imported(program: Path, library: str) -> set[str]:
+    """Return the names of the functions that a program for Windows takes from a library."""
+    listed = subprocess.run([str(OBJDUMP), "-p", str(program)], capture_output=True, text=True, check=True).stdout
+    blocks = listed.split("DLL Name: ")[1:]
+    return {name for block in blocks if block.startswith(library) for name in _IMPORT.findall(block)}
 
 
 def _install_afspm() -> None:
@@ -129,8 +157,11 @@ def _install_afspm() -> None:
 
 
 def _pip(*arguments: str) -> None:
+    # copies, since some files are changed: a link would change those in the cache
     for_windows = ["--python-platform", "x86_64-pc-windows-msvc", "--python-version", "3.11", "--target", str(PACKAGES)]
-    subprocess.run([find_uv(), "pip", "install", "--quiet", *for_windows, *arguments], check=True)
+    subprocess.run(
+        [find_uv(), "pip", "install", "--quiet", "--link-mode", "copy", *for_windows, *arguments], check=True
+    )
 
 
 def _make_prefix() -> None:
@@ -140,41 +171,17 @@ def _make_prefix() -> None:
         subprocess.run([str(WINE), "wineboot", "-i"], env={**os.environ, **ENVIRONMENT}, check=True)
     library = system / "bcryptprimitives.dll"
     if not library.exists():  # pydantic's core asks it for random numbers
-        library.write_bytes(forwarding_library(library.name, {"ProcessPrng": "advapi32.SystemFunction036"}))
+        _build_library(library, ["ProcessPrng = advapi32.SystemFunction036"])
 
 
-def forwarding_library(name: str, exports: dict[str, str]) -> bytes:
-    """Return a DLL that only forwards: each of its functions to `library.function` (PE/COFF, forwarder exports)."""
-    base, table = 0x1000, 40
-    names = sorted(exports)
-    count = len(names)
-    functions, pointers, ordinals = table, table + 4 * count, table + 8 * count
-    section = bytearray(table + 10 * count)
-
-    def text(string: str) -> int:
-        place = len(section)
-        section.extend(string.encode() + b"\0")
-        return base + place
-
-    title = text(name)
-    for index, export in enumerate(names):
-        struct.pack_into("<I", section, pointers + 4 * index, text(export))
-        struct.pack_into("<H", section, ordinals + 2 * index, index)
-        struct.pack_into("<I", section, functions + 4 * index, text(exports[export]))
-    directory = (0, 0, 0, 0, title, 1, count, count, base + functions, base + pointers, base + ordinals)
-    struct.pack_into("<IIHHIIIIIII", section, 0, *directory)
-    size = len(section)
-    padded = -(-size // 512) * 512
-    image = base + -(-size // 0x1000) * 0x1000
-    dos = b"MZ" + bytes(58) + struct.pack("<I", 64)
-    coff = struct.pack("<HHIIIHH", 0x8664, 1, 0, 0, 0, 240, 0x2022)
-    optional = struct.pack("<HBBIIIII", 0x20B, 14, 0, 0, padded, 0, 0, base)
-    optional += struct.pack("<QIIHHHHHHIIIIHHQQQQII", 0x180000000, 0x1000, 0x200, 6, 0, 0, 0, 6, 0, 0, image, 0x200, 0,
-                            2, 0x100, 0x100000, 0x1000, 0x100000, 0x1000, 0, 16)  # fmt: skip
-    optional += struct.pack("<II", base, size) + bytes(8 * 15)
-    header = struct.pack("<8sIIIIIIHHI", b".edata", size, base, padded, 0x200, 0, 0, 0, 0, 0x40000040)
-    head = dos + b"PE\0\0" + coff + optional + header
-    return head.ljust(512, b"\0") + bytes(section).ljust(padded, b"\0")
+def _build_library(path: Path, exports: Iterable[str], *sources: str) -> None:
+    """Build a DLL from C, or one that only forwards: an export is `name = function` or `name = library.function`."""
+    definitions = path.with_suffix(".def")
+    definitions.write_text("\n".join(["EXPORTS", *sorted(exports)]), encoding="utf-8")
+    start = [] if sources else ["-nostdlib", "-Wl,--entry,0"]
+    subprocess.run(
+        [str(GCC), "-O2", "-shared", "-static-libgcc", "-o", str(path), *start, *sources, str(definitions)], check=True
+    )
 
 
 if __name__ == "__main__":

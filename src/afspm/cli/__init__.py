@@ -14,6 +14,8 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):  # a terminal that lacks a character must not cost the line
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
+            if sys.platform == "win32" and not stream.isatty():  # else it is in the code page of that computer
+                stream.reconfigure(encoding="utf-8")
     try:
         app()
     except AfspmError as error:

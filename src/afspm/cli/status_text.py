@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from afspm.clock import NS_PER_S
+from afspm.clock import NS_PER_S, utc_time
 from afspm.formatting import area_text, day_and_time, duration_text, time_of_day
 from afspm.model import LogLine, ProcessCondition, ProcessState, Region, ScopeState
 from afspm.record.overview import OLD_S, OVER, Overview
@@ -269,4 +268,4 @@ def _seconds(ns: int | None) -> float | None:
 
 
 def _iso(time_ns: int | None) -> str | None:
-    return None if time_ns is None else datetime.fromtimestamp(time_ns / NS_PER_S, UTC).isoformat()
+    return None if time_ns is None else utc_time(time_ns).isoformat()

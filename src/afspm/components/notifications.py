@@ -7,10 +7,10 @@ import os
 import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Literal
 
+from afspm.clock import utc_time
 from afspm.errors import AfspmError, ConfigError
 
 END: Final = "end"
@@ -52,7 +52,7 @@ class Notification:
 
     def body(self) -> bytes:
         """As JSON: what, experiment, run, time (ISO 8601, UTC), text, simulated."""
-        time = datetime.fromtimestamp(self.time_ns / 1e9, UTC).isoformat()
+        time = utc_time(self.time_ns).isoformat()
         told = {**asdict(self), "time": time}
         del told["time_ns"]
         return json.dumps(told, ensure_ascii=False).encode()

@@ -5,9 +5,10 @@ from __future__ import annotations
 import operator
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
+from afspm.clock import utc_time
 from afspm.errors import InvalidValue, NoSuchItem
 from afspm.model.geometry import XY, Region, RegionChange
 
@@ -133,7 +134,7 @@ class Scan:
     @property
     def time(self) -> datetime | None:
         """When it was finished, UTC."""
-        return None if self.time_ns is None else datetime.fromtimestamp(self.time_ns / 1e9, UTC)
+        return None if self.time_ns is None else utc_time(self.time_ns)
 
     @property
     def lines_missing(self) -> int:

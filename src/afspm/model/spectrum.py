@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
+from afspm.clock import utc_time
 from afspm.errors import InvalidValue, NoSuchItem
 from afspm.model.geometry import XY, Frame
 
@@ -53,7 +54,7 @@ class Spectrum:
     @property
     def time(self) -> datetime | None:
         """When it was taken, UTC."""
-        return None if self.time_ns is None else datetime.fromtimestamp(self.time_ns / 1e9, UTC)
+        return None if self.time_ns is None else utc_time(self.time_ns)
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         """One variable by its name, shape (points,)."""

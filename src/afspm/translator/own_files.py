@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 
 import numpy as np
 
+from afspm.clock import utc_time
 from afspm.files import netcdf, simulator
 from afspm.files.netcdf import Attributes, Variable
 from afspm.model import Region, Spectrum
@@ -64,7 +64,7 @@ def encode_spectrum(spectrum: Spectrum, facts: FileFacts) -> bytes:
 
 def _header(content: str, facts: FileFacts) -> dict[str, str | float]:
     # as text: a float64 has no room for nanoseconds since 1970
-    when = datetime.fromtimestamp(facts.time_ns / 1e9, UTC).isoformat()
+    when = utc_time(facts.time_ns).isoformat()
     return {"Conventions": simulator.CONVENTIONS, "content": content, "time": when, "time_ns": str(facts.time_ns)}
 
 

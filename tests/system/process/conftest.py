@@ -68,7 +68,7 @@ class Child:
 
     @property
     def error_text(self) -> str:
-        return self.errors.decode()
+        return self.errors.decode().replace("\r\n", "\n")
 
     def close(self) -> None:
         self.popen.kill()

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from datetime import UTC, datetime
+from datetime import UTC
 from html import escape
 
-from afspm.clock import NS_PER_S
+from afspm.clock import NS_PER_S, utc_time
 from afspm.formatting import day, day_and_time, period_text, time_of_day
 
 _DAY_NS = 86_400 * NS_PER_S
@@ -23,7 +23,7 @@ class PageTimes:
         self._start_ns, self._end_ns = start_ns, end_ns
         self._days = end_ns - start_ns > _DAY_NS
         self.is_local = any(_offset_s(time_ns) for time_ns in (start_ns, end_ns))
-        self.zone = datetime.fromtimestamp(start_ns / NS_PER_S, UTC).astimezone().strftime("%Z") or "local"
+        self.zone = utc_time(start_ns).astimezone().strftime("%Z") or "local"
 
     def utc(self, time_ns: int) -> str:
         """Return a time in UTC; with the day, where there are several."""
@@ -101,5 +101,5 @@ def _lines(rows: Sequence[Sequence[str]]) -> Iterator[str]:
 
 
 def _offset_s(time_ns: int) -> float:
-    offset = datetime.fromtimestamp(time_ns / NS_PER_S, UTC).astimezone().utcoffset()
+    offset = utc_time(time_ns).astimezone().utcoffset()
     return offset.total_seconds() if offset else 0.0
