@@ -111,7 +111,7 @@ CUTS ?= 100
 power-cut: $(TEST)
 	@$(BIN)/python tests/system/record/power_cut.py --cuts $(CUTS) --seed $(SEED)
 
-## the documentation as a site with API reference and search: build/site/index.html. A broken link fails
+## the documentation as a site with search: build/site/index.html. A broken link fails
 docs:
 	@$(PYTHON) tools/build_docs.py
 

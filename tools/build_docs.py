@@ -1,4 +1,4 @@
-"""Builds the documentation as a site in build/site, with an API reference, and checks every link in it.
+"""Builds the documentation as a site in build/site, and checks every link in it.
 
 Run by `make docs`. The pages stay as they are in docs/ and experiments/: they are copied, the files and folders that
 they link to become pages of code, and the navigation is what docs/README.md lists.
@@ -6,7 +6,6 @@ they link to become pages of code, and the navigation is what docs/README.md lis
 
 from __future__ import annotations
 
-import ast
 import json
 import os
 import posixpath
@@ -24,7 +23,6 @@ import bootstrap
 ROOT = Path(__file__).resolve().parents[1]
 BUILD = ROOT / "build"
 SOURCE, SITE, ENVIRONMENT = BUILD / "site-source", BUILD / "site", BUILD / "docs-env"
-API = "docs/reference/api"
 LINK = re.compile(r"(?<!!)\]\((?!\w+:|#)([^)#\s]+)(#[^)]*)?\)")
 SECTION = re.compile(r"^- \*\*(.+?)\*\*:(.*?)(?=^- \*\*|\Z)", re.MULTILINE | re.DOTALL)
 FENCES = {".py": "python", ".toml": "toml", ".proto": "protobuf", ".json": "json", ".md": "markdown"}
@@ -42,8 +40,6 @@ def main() -> None:
     for page in [*pages, *(ROOT / "src").rglob("README.md")]:
         _write(page.relative_to(ROOT).as_posix(), _for_site(page))
     shutil.copytree(ROOT / "docs" / "pictures", SOURCE / "docs" / "pictures")
-    for name, home in _public_names().items():
-        _write(f"{API}/{name}.md", f"# {name}\n\n::: {home}\n    options:\n      show_root_heading: false\n")
     config = (ROOT / "zensical.toml").read_text(encoding="utf-8")
     config = config.replace("[project]\n", f"[project]\nnav = {_nav()}\n", 1)
     (BUILD / "zensical.toml").write_text(config, encoding="utf-8")
@@ -100,19 +96,6 @@ def _code_page(target: Path) -> str:
     return f"{name}/index.md" if target.is_dir() else f"{name}.md"
 
 
-def _public_names() -> dict[str, str]:
-    """Return what `afspm` exports and the run that `open_run` returns, each with its full name."""
-    tree = ast.parse((ROOT / "src/afspm/__init__.py").read_text(encoding="utf-8"))
-    homes = {
-        alias.name: f"{node.module}.{alias.name}"
-        for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("afspm")
-        for alias in node.names
-    }
-    homes.setdefault("Run", homes["open_run"].replace("open_run", "Run"))
-    return dict(sorted(homes.items(), key=lambda item: item[0].lower()))
-
-
 def _nav() -> str:
     """Return the navigation as TOML: the sections of docs/README.md."""
     listing = (ROOT / "docs/README.md").read_text(encoding="utf-8")
@@ -120,8 +103,6 @@ def _nav() -> str:
     for title, text in SECTION.findall(listing):
         pages = [posixpath.normpath(f"docs/{target}") for target, _ in LINK.findall(text)]
         shown = [_group(page) if page.endswith("/README.md") else json.dumps(page) for page in pages]
-        if title == "Reference":
-            shown.append(f'{{ "Python API" = {json.dumps([f"{API}/{name}.md" for name in _public_names()])} }}')
         entries.append(f"{{ {json.dumps(title)} = [{', '.join(shown)}] }}")
     return "[\n  " + ",\n  ".join(entries) + ",\n]"
 

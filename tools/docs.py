@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import python_api
+
 from afspm import components
 from afspm.dashboard import Dashboard
 from afspm.logic import arbitration, diagram
@@ -193,6 +195,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "transition-table": transition_table,
     "components": component_pages,
     "simulator": simulator_page,
+    "python-api": python_api.python_api,
 }
 
 

@@ -23,13 +23,16 @@ def require(class_: object) -> None:
         ConfigError: a package is missing, or is of another version; the hint is the command that installs it.
     """
     wanted = getattr(class_, ATTRIBUTE, ())
-    wanted = (wanted,) if isinstance(wanted, str) else tuple(wanted)
-    lacking = {one: missing for one in wanted if (missing := list(_missing(one)))}
+    require_installed(getattr(class_, "__name__", str(class_)), *((wanted,) if isinstance(wanted, str) else wanted))
+
+
+def require_installed(what: str, *requirements: str) -> None:
+    """Check that `what` has the packages that it requires. Raises as `require` does."""
+    lacking = {one: missing for one in requirements if (missing := list(_missing(one)))}
     if lacking:
-        packages = dict.fromkeys(package for missing in lacking.values() for package in missing)
-        name = getattr(class_, "__name__", str(class_))
+        packages = ", ".join(dict.fromkeys(package for missing in lacking.values() for package in missing))
         command = "pip install " + " ".join(f'"{one}"' for one in lacking)
-        raise ConfigError(f"{name} needs what is not installed: {', '.join(packages)}", hint=command)
+        raise ConfigError(f"{what} needs what is not installed: {packages}", hint=command)
 
 
 def _missing(requirement: str) -> Iterator[str]:

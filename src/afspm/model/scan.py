@@ -146,7 +146,7 @@ class Scan:
         return int(np.isnan(self.values).all(axis=1).sum())
 
     def undistorted(self, velocity_m_s: XY, duration_s: float, *, upwards: bool = True) -> Scan:
-        """Return the scan as at the middle of its acquisition, without the drift meanwhile (needs scipy).
+        """Return the scan as at the middle of its acquisition, without the drift meanwhile.
 
         Args:
             velocity_m_s: (x, y) of the sample under the tip, e.g. from an up frame followed by a down frame
@@ -278,14 +278,17 @@ class ScanSet(Mapping[str, Scan]):
 
     @property
     def region(self) -> Region:
+        """Where it was taken."""
         return self.first.region
 
     @property
     def time(self) -> datetime | None:
+        """When it was finished, UTC."""
         return self.first.time
 
     @property
     def time_ns(self) -> int | None:
+        """When it was finished, ns since the Unix epoch."""
         return self.first.time_ns
 
     def __getitem__(self, channel: str) -> Scan:

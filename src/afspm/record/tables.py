@@ -166,11 +166,11 @@ class Table(Sequence[T], Generic[T]):
         return xarray.Dataset({name: ("row", _array(name, values)) for name, values in self.columns().items()})
 
     def to_pandas(self) -> pandas.DataFrame:
-        """A DataFrame: columns as of `to_numpy`, which pandas' own methods filter, group and plot (needs pandas)."""
+        """A DataFrame with the columns of `to_numpy`, to filter, group and plot (needs the extra `xarray`)."""
         try:
             import pandas
         except ImportError:
-            raise FileError("to_pandas needs pandas", hint="pip install pandas") from None
+            raise FileError("to_pandas needs pandas", hint='pip install "afspm[xarray]"') from None
         return pandas.DataFrame({name: _array(name, values) for name, values in self.columns().items()})
 
     def _repr_html_(self) -> str:

@@ -13,10 +13,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.errors import ConfigError
 from afspm.model import Scan
 from afspm.model.geometry import XY
 from afspm.model.levelling import levelled
+from afspm.requirements import require_installed
 
 Floats = NDArray[np.float64]
 
@@ -169,10 +169,8 @@ def _without_scars(flat: Floats) -> Floats:
 
 def _tops(above: Floats, scan: Scan, least: float) -> list[Target]:
     """Return every top: its height, and the centre of what stands above half of it, up to the saddles around it."""
-    try:
-        import skimage
-    except ImportError as error:
-        raise ConfigError("finding particles needs scikit-image", hint='pip install "afspm[features]"') from error
+    require_installed("finding particles", "afspm[features]")
+    import skimage
 
     feature: Any = skimage.feature
     segmentation: Any = skimage.segmentation
