@@ -40,7 +40,7 @@ class Component:
 
     Or write `run` instead, a plain script that may block as long as it likes::
 
-        class Survey(Component):
+        class Tiles(Component):
             def run(self):
                 for i, region in enumerate(self.regions):
                     scans = self.scope.scan(region, shape=(256, 256), key=f"tile-{i}")

@@ -122,7 +122,10 @@ class Survey(Component):
             self._visit(visit)
             self._keep(self._record)
             self.scope.progress(visit.number, len(visits))
-            self._tell(visit, self._record.outcome(visit))
+            if visit.number > int(self.memory.get("done", 0)):  # else it was told in an earlier life
+                self._tell(visit, self._record.outcome(visit))
+                self.memory["done"] = visit.number
+                self.memory.save()
         if self.end_when_done:
             self.scope.end_experiment()
 

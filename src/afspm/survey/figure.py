@@ -15,8 +15,9 @@ from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
+from afspm.drawing.image_html import round_length_m
 from afspm.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM
-from afspm.formatting import scale, typeset_area
+from afspm.formatting import scale, typeset_area, typeset_length
 from afspm.model import Scan, Spectrum
 from afspm.model.geometry import XY
 from afspm.model.plotting import draw_scale_bar, gold
@@ -35,7 +36,7 @@ _LEFT_IN, _TOP_IN, _BOTTOM_IN, _RIGHT_IN = 0.15, 0.42, 0.5, 0.75
 _BAR_IN, _GAP_IN, _ROW_IN = 0.1, 0.08, 0.22
 _TEXT: Final = 7.5
 _MARK: Final = CATEGORICAL[3]
-_CURVES: Final = (CATEGORICAL[0], PROBLEM, CATEGORICAL[1], CATEGORICAL[2])
+_CURVES: Final = (CATEGORICAL[0], CATEGORICAL[2], CATEGORICAL[1], CATEGORICAL[4])
 _OUTLINE: Final = [withStroke(linewidth=2.0, foreground="black")]
 _SAYS: Final = {Outcome.REFUSED: "refused", Outcome.NOT_REACHED: "not reached", Outcome.INCOMPLETE: "incomplete"}
 
@@ -97,9 +98,18 @@ class _Picture:
         scan = self._record.survey
         values = flattened(scan, 2)
         factor, colours = self._colour_bar([values], scan.unit, _LEFT_IN + _SURVEY_IN + _GAP_IN, _SURVEY_IN)
-        axes = self._image(scan, values * factor, colours, (_LEFT_IN, 0.0, _SURVEY_IN), font=9.0)
+        axes = self._image(scan, values * factor, colours, (_LEFT_IN, 0.0, _SURVEY_IN))
+        self._bar_below(scan, axes)
         for visit in self._record.visits:
             self._mark(axes, visit)
+
+    def _bar_below(self, scan: Scan, axes: Axes) -> None:
+        """Draw the scale bar of the survey under it, where it hides no target."""
+        width, height = _shown_size(scan)
+        bar_m = round_length_m(scan.region.size_m[0] / 4.0)
+        low = -0.14 / _SURVEY_IN * max(width, height)
+        axes.plot([0.0, 1e9 * bar_m], [low, low], color="black", linewidth=3.0, solid_capstyle="butt", clip_on=False)
+        axes.text(1e9 * bar_m + 0.02 * width, low, typeset_length(bar_m), size=9, va="center")
 
     def _mark(self, axes: Axes, visit: Visit) -> None:
         """Draw the outline of a zoom in its place, or a cross, and its number."""
@@ -127,7 +137,8 @@ class _Picture:
                 axes.set(facecolor="#F4F4F4", xticks=[], yticks=[])
             else:
                 values = flattened(visit.zoom, 1) * factor
-                axes = self._image(visit.zoom, values, colours, place, font=6.5, named=index == 0)
+                axes = self._image(visit.zoom, values, colours, place)
+                draw_scale_bar(axes, visit.zoom.region.size_m, (0.0, 0.0), 1e9, font=6.5, named=index == 0)
                 self._mark_curves(axes, visit)
             self._label(axes, visit)
             if spectra:
@@ -179,18 +190,14 @@ class _Picture:
     def _colours(self) -> list[str]:
         return [_CURVES[index % len(_CURVES)] for index in range(len(self._record.curves))]
 
-    def _image(
-        self, scan: Scan, values: Floats, colours: Normalize, place: tuple[float, float, float], *, font: float,
-        named: bool = True,
-    ) -> Axes:  # fmt: skip
-        """Draw a scan with its scale bar in a square, in the lengths of `_within`."""
+    def _image(self, scan: Scan, values: Floats, colours: Normalize, place: tuple[float, float, float]) -> Axes:
+        """Draw a scan in a square, in the lengths of `_within`."""
         left_in, top_in, side_in = place
         axes = self._axes(left_in, top_in, side_in, side_in)
         axes.set(facecolor=NEUTRAL, xticks=[], yticks=[])
         width, height = _shown_size(scan)
         axes.imshow(values, origin="lower", extent=(0.0, width, 0.0, height), cmap=self._map, norm=colours,
                     interpolation="nearest")  # fmt: skip
-        draw_scale_bar(axes, scan.region.size_m, (0.0, 0.0), 1e9, font=font, named=named)
         axes.set(xlim=(0.0, width), ylim=(0.0, height))
         axes.set_anchor("NW")
         return axes

@@ -6,6 +6,8 @@ import csv
 import math
 import re
 import signal
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -16,12 +18,16 @@ import afspm
 from afspm.survey import find_particles, nearest
 
 pytest.importorskip("skimage")
-SAMPLE = Path(__file__).parents[3] / "experiments" / "particle_survey" / "experiment.toml"
+ROOT = Path(__file__).parents[3]
+SAMPLE = ROOT / "experiments" / "particle_survey" / "experiment.toml"
+TUTORIAL = ROOT / "docs" / "tutorials" / "particle-survey.md"
 FEWER = """
 [survey]
 count = 4
 zoom_pixels = [64, 64]
 """
+# what is killed and started again must not cost so much simulated time that the sample has drifted away
+SLOWER = "[clock]\nspeed = 100.0\n[microscope]\ndrift = { velocity_m_per_s = [5e-12, -3e-12, 0.0] }\n"
 BY_HAND = '[control]\nsolved_by_hand = ["tip-shape-changed", "device-malfunction"]\n'
 FAST_DRIFT = "[microscope]\ndrift = { velocity_m_per_s = [150e-12, -100e-12, 0.0] }\n"
 
@@ -54,7 +60,7 @@ def require_each_once(one: AfspmRun, targets: int, said: str = "") -> None:
 
 
 def test_killed_and_kept_waiting_by_a_changed_tip_it_measures_each_target_once(afspm_run: Run, tmp_path: Path) -> None:
-    one = afspm_run(str(SAMPLE), overlay(tmp_path, FEWER + BY_HAND), "--runs", str(tmp_path / "runs"))
+    one = afspm_run(str(SAMPLE), overlay(tmp_path, FEWER + SLOWER + BY_HAND), "--runs", str(tmp_path / "runs"))
     one.wait_for("survey .*4 targets found")
     one.signal("survey", signal.SIGKILL)
     one.wait_for("target 1 of 4 .*measured")
@@ -71,7 +77,7 @@ def test_killed_and_kept_waiting_by_a_changed_tip_it_measures_each_target_once(a
 
 
 def test_a_killed_run_is_resumed_and_measures_only_what_is_left(afspm_run: Run, tmp_path: Path) -> None:
-    first = afspm_run(str(SAMPLE), overlay(tmp_path, FEWER), "--runs", str(tmp_path / "runs"))
+    first = afspm_run(str(SAMPLE), overlay(tmp_path, FEWER + SLOWER), "--runs", str(tmp_path / "runs"))
     first.wait_for("target 2 of 4 .*measured")
     first.process.kill()
     first.process.wait()
@@ -95,3 +101,19 @@ def test_targets_stay_in_the_middle_of_their_zooms_while_the_sample_drifts(afspm
     assert math.hypot(*drift.translation_m) > 50e-9, "the sample stood still"
     assert max(off_m) < 40e-9, off_m
     assert not re.search(" ERROR ", one.output), one.output
+
+
+def test_the_script_of_the_tutorial_does_the_same_in_under_thirty_lines(afspm_run: Run, tmp_path: Path) -> None:
+    (script,) = re.findall(r"```python\n(# by_hand.py\n.*?)```", TUTORIAL.read_text(encoding="utf-8"), re.DOTALL)
+    assert script.count("\n") < 30
+    (tmp_path / "by_hand.py").write_text(script.replace("(wide, 10,", "(wide, 2,"), encoding="utf-8")
+    one = afspm_run(str(SAMPLE), overlay(tmp_path, SLOWER), "--without", "survey", "--runs", str(tmp_path / "runs"))
+    one.wait_up("microscope", 1)
+    one.wait_up("scheduler", 1)
+    done = subprocess.run([sys.executable, "by_hand.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr + one.output
+    assert one.end() == 0, one.output
+    assert outcomes(tmp_path) == ["measured"] * 2
+    assert (tmp_path / "targets.png").stat().st_size > 50_000
+    with afspm.open_run(one.folder) as record:
+        assert [row.key for row in record.scans] == ["survey", "zoom-1", "zoom-2"]
