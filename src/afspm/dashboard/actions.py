@@ -184,7 +184,8 @@ class Actions:
     def _set(self, parameter: str, text: str) -> ActionResult:
         response = self._ask(ControlRequest.PARAM, to_parameter(parameter, _number_or(text), None))
         if not response.ok:
-            return ActionResult(f"{parameter}: {refusal(response)}.", ok=False)
+            which = "" if parameter in response.reason else f"{parameter}: "
+            return ActionResult(f"{which}{refusal(response)}.", ok=False)
         now = _in_force(parameter, response) if response.payload else text
         return ActionResult(f"{parameter} is now {now}.")
 

@@ -12,10 +12,9 @@ from afspm.clock import NS_PER_S
 from afspm.dashboard.charts import Chart, drift_chart
 from afspm.dashboard.flags import Flag, flags
 from afspm.dashboard.sample_map import MapContent, map_html, picture_url
-from afspm.dashboard.scan_facts import ends_text
 from afspm.dashboard.watch import Watch
 from afspm.drawing.timeline import TimelineRow, timeline_html, tint_class
-from afspm.formatting import day_and_time, duration_text, time_of_day, typeset_area
+from afspm.formatting import duration_text, time_of_day, typeset_area
 from afspm.model import ControlMode, JournalEntry, LogLine, Note, ProcessState, Region
 from afspm.model.events import PERSON
 from afspm.record.overview import OVER, Overview, ScanSummary
@@ -233,9 +232,7 @@ def status_html(watch: Watch, overview: Overview) -> str:
     if control is None:
         return '<span class="chip">waiting for the scheduler</span>'
     since_ns, now_ns = overview.control_since_ns, _now_ns(watch, overview)
-    since = (
-        "" if since_ns is None else f" since {time_of_day(since_ns)} ({duration_text((now_ns - since_ns) / NS_PER_S)})"
-    )
+    since = "" if since_ns is None else f" for {duration_text((now_ns - since_ns) / NS_PER_S)}"
     mode = control.mode.name
     who = f'<b class="{tint_class(control.holder)}">{escape(control.holder)}</b>' if control.holder else "nobody"
     parts = [
@@ -246,7 +243,7 @@ def status_html(watch: Watch, overview: Overview) -> str:
     for name, (done, of) in overview.progress.items():
         parts.append(_chip(f"<b>{escape(name)}</b> {done} of {of}", "progress"))
     zone = datetime.fromtimestamp(now_ns / NS_PER_S).astimezone().tzname()
-    parts.append(_chip(f"{day_and_time(now_ns, seconds=False)} {zone}", "clock", "time"))
+    parts.append(_chip(f"{time_of_day(now_ns, seconds=False)} {zone}", "clock", "time"))
     return "".join(parts)
 
 
@@ -260,7 +257,7 @@ def _microscope(overview: Overview, now_ns: int) -> Iterator[str]:
     state = status.state.name.lower().replace("_", " ") if status else NOT_HEARD_OF
     paused = " (paused)" if status and status.paused else ""
     done = overview.scan_progress(now_ns)
-    far = "" if done is None else f" {100 * done[0]:.0f} %<small> ends {ends_text(done[1], now_ns)}</small>"
+    far = "" if done is None else f" {100 * done[0]:.0f} %<small>ends {time_of_day(now_ns + done[1])}</small>"
     yield _chip(f"microscope {state}{paused}{far}", "state", f"state-{state.replace(' ', '-')}")
     if overview.feedback is not None and overview.feedback.on is False:
         yield _chip("FEEDBACK OFF", "feedback", "problem")

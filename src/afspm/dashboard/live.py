@@ -18,7 +18,7 @@ from afspm.dashboard.archive import Archive
 from afspm.dashboard.conditions import Conditions
 from afspm.dashboard.frames import ChannelFrame
 from afspm.dashboard.pictures import Look, PictureCache, RenderedFrame, number_or_none
-from afspm.dashboard.scan_facts import Facts, scan_facts, summary_of
+from afspm.dashboard.scan_facts import Facts, began_ns, scan_facts
 from afspm.dashboard.thumbnails import Thumbnails
 from afspm.dashboard.watch import Bell, Watch
 from afspm.drawing.palette import DIVERGING, LEVELS, PALETTES
@@ -161,11 +161,8 @@ class Live:
 
     def _facts(self, frame: ChannelFrame) -> Facts:
         with self._watch.reading() as overview:
-            began_ns = overview.running.began_ns if overview.running else None
-            if frame.time_ns is not None:
-                summary = summary_of(frame.time_ns, overview)
-                began_ns = summary.began_ns if summary else None
-            return scan_facts(frame, overview, self._conditions.at(began_ns), self._watch.clock.now_ns())
+            conditions = self._conditions.at(began_ns(frame, overview))
+            return scan_facts(frame, overview, conditions, self._watch.clock.now_ns())
 
     def _finished(self, time_ns: int, channel: str) -> ChannelFrame | None:
         with self._watch.reading():

@@ -70,7 +70,7 @@ class ScanDialog:
         region = self._choice.region
         angle = f", turned by {math.degrees(region.angle_rad):.3g}°" if region.angle_rad else ""
         ui.label(f"Around {typeset_position(region.center_m)}{angle}.")
-        with ui.element("div").classes("acts"):
+        with ui.element("div").classes("fields"):
             self._width, self._height, self._pixels = (
                 ui.input(name, on_change=self._read).props("dense outlined") for name in ("width", "height", "pixels")
             )

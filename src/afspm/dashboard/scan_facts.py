@@ -47,13 +47,25 @@ def _when(frame: ChannelFrame, overview: Overview, now_ns: int) -> Facts:
     return [fact for fact in facts if fact[1]]
 
 
+def began_ns(frame: ChannelFrame, overview: Overview) -> int | None:
+    """Return when the scan of a frame began; None if that was not seen."""
+    if frame.time_ns is not None:
+        summary = summary_of(frame.time_ns, overview)
+    elif overview.running is not None:
+        return overview.running.began_ns
+    else:
+        summary = overview.scans[-1] if overview.scans and overview.scans[-1].interrupted else None
+    return None if summary is None else summary.began_ns
+
+
 def _centre(xy_m: XY) -> str:
-    factor, unit = scale(max(map(abs, xy_m)), "m")
+    factor, unit = scale(max(*map(abs, xy_m), 1e-9), "m")
     return typeset(f"({xy_m[0] * factor:.4g}, {xy_m[1] * factor:.4g}) {unit}")
 
 
 def _growing(frame: ChannelFrame, overview: Overview, now_ns: int) -> Facts:
-    number = 1 + (overview.scans[-1].number if overview.scans else 0)
+    # one that was interrupted is in the list already
+    number = (overview.scans[-1].number if overview.scans else 0) + (overview.running is not None)
     facts = [("Scan", f"no. {number}")]
     if frame.began_ns is not None:
         facts.append(("Began", time_of_day(frame.began_ns)))

@@ -14,6 +14,8 @@ from afspm.dashboard.content import Content
 from afspm.dashboard.watch import Watch
 from afspm.formatting import time_of_day
 
+_CLOSE = [{"label": "Close", "color": "white"}]
+
 
 class SteeringSession:
     """Carries out what a viewer asks for, and shows the result, with the reason of a refusal."""
@@ -68,7 +70,7 @@ class SteeringSession:
         if result.ok:
             ui.notify(result.text, position="bottom-right", timeout=4000, classes="toast done")
         else:  # stays until it is read
-            ui.notify(result.text, position="bottom-right", timeout=0, close_button="Close", classes="toast refused")
+            ui.notify(result.text, position="bottom-right", timeout=0, classes="toast refused", actions=_CLOSE)
 
 
 def button(text: str, on_click: Callable[..., object], colour: str | None = None) -> ui.button:
