@@ -71,12 +71,12 @@ MOMENTS = (
     (r"processes, into", 3.0, 2),
     (r"processes, into", 25.0, 6),
     (r" series .*scan {scan} of {scans}", 1.0, 6),
-    (r"tip-shape-changed is flagged", 1.5, 3),
+    (r"flagged tip-shape-changed", 1.5, 3),
     (r"tip_corrector is in control", 1.0, 3),
-    (r"is started again", 0.6, 3),
+    (r"; restarting", 0.6, 3),
     (r" series .*scan {scans} of {scans}", 0.3, 2),
     (r"all {scans} scans are taken", 0.1, 3),
-    (r"the experiment is ended by", 0.6, 4),
+    (r"ended the experiment", 0.6, 4),
 )
 
 

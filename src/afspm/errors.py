@@ -169,7 +169,7 @@ class Refused(RequestError):
 
 
 class NoResponse(RequestError):
-    """A request was not answered in time: whether it was carried out is not known."""
+    """A request was not answered in time: it may or may not have been carried out."""
 
     code = "no-response"
 

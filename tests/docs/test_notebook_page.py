@@ -42,6 +42,6 @@ def test_the_script_of_the_page_measures_and_ends_the_experiment(tmp_path: Path)
             assert "Bias" in script.stdout or "bias" in script.stdout
             rest = run.stdout.read()
             assert run.wait(DEADLINE_S) == 0, rest
-            assert "the experiment is ended by notebook" in rest
+            assert "notebook ended the experiment" in rest
         finally:
             run.kill()

@@ -11,6 +11,7 @@ from afspm.logic.event_log import CONTROL, ENTRIES, PERIOD_S, SCHEDULER
 from afspm.logic.events import Effect, Input, Publish, Reply
 from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.model import (
+    ControlEvent,
     ControlMode,
     ControlResponse,
     JournalEntries,
@@ -39,25 +40,24 @@ class _Derived:
 
     holder: str | None = None
     mode: str = ControlMode.AUTOMATED.name
-    problems: dict[str, str] = field(default_factory=dict)
+    problems: dict[int, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, control: ArbitrationState, names: ProblemNames) -> _Derived:
-        problems = {names.name(number): who for number, who in control.problems.items()}
-        return cls(control.holder, control.mode.name, problems)
+    def of(cls, control: ArbitrationState) -> _Derived:
+        return cls(control.holder, control.mode.name, dict(control.problems))
 
     def take(self, entry: JournalEntry) -> None:
-        verb, _, rest = entry.what.partition(" ")
-        if entry.what == "no longer in control":
-            self.holder = None
-        elif verb == "in":
-            self.holder = entry.who
-        elif verb == "mode":
-            self.mode = rest
-        elif verb == "flagged":
-            self.problems[rest] = entry.who
-        elif verb == "cleared":
-            self.problems.pop(rest, None)
+        match entry.event:
+            case ControlEvent.CONTROL_LOST:
+                self.holder = None
+            case ControlEvent.CONTROL_GAINED:
+                self.holder = entry.who
+            case ControlEvent.MODE_CHANGED if entry.mode is not None:
+                self.mode = entry.mode.name
+            case ControlEvent.PROBLEM_FLAGGED if entry.problem is not None:
+                self.problems[entry.problem] = entry.who
+            case ControlEvent.PROBLEM_CLEARED if entry.problem is not None:
+                self.problems.pop(entry.problem, None)
 
 
 class Written:
@@ -103,7 +103,7 @@ class Written:
         if host.life != self._life:
             self._begin(host)
         if any(isinstance(effect, Publish) and effect.packet.envelope == ENTRIES for effect in effects):
-            is_so = _Derived.of(host.core.control, self._names)
+            is_so = _Derived.of(host.core.control)
             self._must(self._derived == is_so, f"by what is written {self._derived}, in truth {is_so}")
         now_s = self._timeline.monotonic_s()
         if self._awaited:
@@ -116,7 +116,7 @@ class Written:
         self._answered.clear()
         self._awaited.clear()
         self._spare.clear()
-        self._derived = _Derived.of(host.core.control, self._names)
+        self._derived = _Derived.of(host.core.control)
         self._published_s = -1.0
         if self._newest is not None and self.is_certain:
             kept = [packet for packet, *_ in host.core.cached() if packet.time_ns == self._newest.time_ns]

@@ -31,8 +31,8 @@ _ASKED_FOR: dict[int, str] = {
     RELAY_REQUEST: "the note",
 }
 _NO_STATE = (
-    "waiting for the microscope, which has published no state yet: is its translator running? One of version 1 that "
-    "was there before the scheduler publishes its state at the next change: start it anew, or scan once by hand"
+    "waiting for the microscope, which has published no state yet: is its translator running? One of version 1 "
+    "that started before the scheduler publishes its state at the next change: restart it, or scan once by hand"
 )
 NOT_IN_CONTROL = {ControlResponse.NOT_IN_CONTROL, ControlResponse.WRONG_CONTROL_MODE}
 
@@ -63,7 +63,7 @@ class CommandRetry:
                 response = self.send(kind, subject, request_id=request_id, until_s=until_s)
             except KeyboardInterrupt:
                 if kind == ControlRequest.ACTION:
-                    told = "interrupted before the answer: the action %s may have been carried out"
+                    told = "interrupted before the answer: the microscope may have carried out %s"
                     self._link.log.warning(told, subject)
                 raise
             if response.ok:
@@ -75,7 +75,7 @@ class CommandRetry:
                 raise NoResponse(
                     f"control was lost before the action was answered: {self._control.why_lost}",
                     where=self._link.name,
-                    hint="whether it was carried out is not known",
+                    hint="it may or may not have been carried out",
                 )
 
     def in_control(self, kind: ControlRequest, subject: object, until_s: float | None) -> Response:
@@ -140,7 +140,7 @@ class CommandRetry:
                 raise NoResponse(
                     f"the microscope does not answer {kind.name}: {response.reason or 'no reason given'}",
                     where=link.name,
-                    hint="is its translator running? whether it was carried out is not known",
+                    hint="is its translator running? it may or may not have been carried out",
                 )
             if not is_repeated:
                 link.log.warning("the microscope does not answer %s; asking again", kind.name)

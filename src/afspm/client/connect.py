@@ -53,7 +53,7 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
     try:
         if not link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S)):
             hint = cut_off_message(folder) or "is the experiment still running?"
-            raise NoResponse("nobody is there", where=str(folder), hint=hint)
+            raise NoResponse("the scheduler does not answer", where=str(folder), hint=hint)
         link.wait_caught_up(link.until(JOINED_WITHIN_S))  # so that the first look at the scope tells its state
         frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
         scope = Scope(link, ProblemNames(launch.problems), folder / STATE_DIR, frame=frame)

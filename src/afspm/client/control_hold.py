@@ -184,7 +184,7 @@ class ControlHold:
         elif state.holder == self._link.name:
             self._was_named = True
         elif self._was_named:
-            self.lost(self.obstacle(self._solving) or "it was taken away")
+            self.lost(self.obstacle(self._solving) or "it was revoked")
 
     def _end_block(self, *, quietly: bool) -> None:
         """Give control back at the end of the outermost block; `quietly`: another exception is on its way."""

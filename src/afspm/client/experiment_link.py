@@ -148,7 +148,7 @@ class ExperimentLink:
     def leave(self) -> None:
         """Close the port: nothing is heard any more, and nobody can be asked."""
         hint = "afspm.connect() joins it again"
-        self._over = NoResponse("the experiment was left, by close()", where=self.name, hint=hint)
+        self._over = NoResponse("close() has left the experiment", where=self.name, hint=hint)
         self.port.close()
 
     def wait_caught_up(self, until_s: float | None = None) -> None:
@@ -235,13 +235,13 @@ class ExperimentLink:
                 # a connection that was lost is the scheduler's restart, not its silence; one of version 1 may have
                 # ended over just this request
                 sent += connections == self.connections or self.version is wire.Version.ONE
-                self.log.debug("%s (%s) is asked again", request_name(kind), request.id)
+                self.log.debug("asking %s (%s) again", request_name(kind), request.id)
         finally:
             requests.expect("")
         raise NoResponse(
             f"{request_name(kind)} was not answered, asked {max(sent, 1)} times",
             where=self.name,
-            hint="whether it was carried out is not known",
+            hint="it may or may not have been carried out",
         )
 
     def send_only(self, kind: ControlRequest, subject: object = None) -> None:
@@ -261,9 +261,9 @@ class ExperimentLink:
     def _wait_for_scheduler(self, until_s: float | None) -> None:
         if self.wait(lambda: self.connected, self.earlier(self.request_timeout_s, until_s)):
             return
-        self.log.warning("the scheduler is not there; waiting for it")
+        self.log.warning("the scheduler does not answer; waiting for it")
         if not self.wait(lambda: self.connected, until_s):
-            raise NoResponse("the scheduler is not there", where=self.name, hint="is the experiment running?")
+            raise NoResponse("the scheduler does not answer", where=self.name, hint="is the experiment running?")
 
     def _tries(self, kind: int) -> int:
         # a scheduler of version 1 does not know ids: what it may have done must not be asked for twice

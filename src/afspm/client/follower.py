@@ -80,7 +80,7 @@ class Follower:
             self.pump(left_s)
         if self.heard_s is None and not self._link.is_caught_up():
             hint = self.cut_off() or "is the experiment still running?"
-            raise NoResponse("nobody is there", where=str(self.folder), hint=hint)
+            raise NoResponse("the scheduler does not answer", where=str(self.folder), hint=hint)
 
     def silent_s(self) -> float:
         """Return the real seconds since anything came."""

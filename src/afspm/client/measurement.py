@@ -155,7 +155,7 @@ class MeasurementRunner:
         task.interruptions = intent["interruptions"]
         task.watch = watch
         if watch is not None:
-            self._link.log.info("%s %s: taken up where it was", task.target.what, task.key)
+            self._link.log.info("%s %s: resumed", task.target.what, task.key)
 
     def _finish(self, task: _MeasurementTask) -> list[Any]:
         """Return the newest result of each name: a restarted translator may have published one twice."""
@@ -298,7 +298,7 @@ class MeasurementRunner:
         else:
             why = self._why_failed(target, cycle)
         task.interruptions.append(f"{day_and_time(self._link.clock.now_ns(), UTC)}: {why}")
-        self._link.log.warning("%s interrupted: %s; it will be taken again", target.what, why)
+        self._link.log.warning("%s interrupted: %s; retrying", target.what, why)
         # losing control explains itself and is waited for; all else must not go on for a night
         task.failures = task.failures + 1 if self._control.held else 0
         if task.failures >= MOST_FAILURES:
@@ -309,11 +309,11 @@ class MeasurementRunner:
         if not self._control.held:
             return f"control was lost: {self._control.why_lost}"
         if cycle.outcome is CycleOutcome.INTERRUPTED:
-            return "it was stopped, not by us"
+            return "something else stopped it"
         if cycle.outcome is CycleOutcome.ANOTHER:
             other = target.describe(cycle.other)
             return f"not what was asked for was measured, but {other}; who else sets the microscope?"
-        return "the microscope is free again without a result; was it started anew?"
+        return "the microscope is free again without a result; was it restarted?"
 
 
 def _may_have_begun(response: Response, *, is_new: bool) -> bool:

@@ -80,7 +80,7 @@ class MissingChannels:
         if len(self._times) >= ENOUGH_SCANS:
             missing, there = " and ".join(sorted(self._missing)), ", ".join(self._others)
             self._log.error(
-                "the scans have no channel %s, so nothing is judged. There are %s: set which", missing, there
+                "the scans have no channel %s, so nothing is judged. They have %s: set one of them", missing, there
             )
             self._missing.clear()
 

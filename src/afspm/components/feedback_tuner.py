@@ -118,7 +118,7 @@ class FeedbackTuner(FeedbackObserver):
         """Set the gain that is to be left behind, and let the experiment go on."""
         self._set_back()
         if why:
-            self.log.error("the feedback can't be made better: %s. It goes on as before; a person should look", why)
+            self.log.error("the feedback can't be improved: %s. Its setting is as before; please check it", why)
         self.scope.clear(Problem.FEEDBACK_NON_OPTIMAL)
 
     def _leave_behind(self) -> None:

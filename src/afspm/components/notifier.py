@@ -64,7 +64,7 @@ class Notifier(Component):
         self.on = tuple(OCCASIONS if on is None else on)
         self.unsolved_after = unsolved_after
         if not self.targets.ways:
-            raise ConfigError("nobody to tell", where="[notify]", hint="it needs a `command` or a `webhook`")
+            raise ConfigError("there is no recipient", where="[notify]", hint="it needs a `command` or a `webhook`")
         if unknown := [one for one in self.on if one not in OCCASIONS]:
             raise ConfigError(f"[notify] on: {unknown[0]!r} never happens", hint=f"known: {', '.join(OCCASIONS)}")
 
@@ -103,7 +103,7 @@ class Notifier(Component):
         for number, since_ns in self.memory["flagged"].items():
             if now_ns - since_ns >= self.unsolved_after * 1e9:
                 name, since = self.scope.problems.name(int(number)), duration_text((now_ns - since_ns) * 1e-9)
-                text = f"{name} has been flagged for {since}, and nobody has solved it"
+                text = f"{name} has been flagged for {since}, and is not solved"
                 self._tell(UNSOLVED, f"{number} {since_ns}", text)
         self._deliver_what_is_due()
 
@@ -138,10 +138,10 @@ class Notifier(Component):
             waiting["tries"] += 1
             self._due_s[key] = self.clock.monotonic_s() + notifications.delay_s(waiting["tries"])
             if waiting["tries"] < MOST_TRIES:
-                self.log.info("nobody told by the %s yet, it is tried again: %s", way, error)
+                self.log.info("the %s failed; retrying: %s", way, error)
                 self.memory.save()
                 return
-            self.log.error("given up telling of it: %s", error)
+            self.log.error("gave up a notification: %s", error)
         self.memory["waiting"] = [one for one in self.memory["waiting"] if _key(one) != key]
         self.memory.save()
         self._due_s.pop(key, None)

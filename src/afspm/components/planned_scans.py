@@ -152,7 +152,7 @@ class PlannedScans(Component):
         if self.memory.save():  # else a restart asks for it again
             self.scope.forget(step.key)
         for interruption in scans.interruptions:
-            self.log.warning("%s was interrupted and taken again: %s", step.key, interruption)
+            self.log.warning("%s was interrupted, and taken again: %s", step.key, interruption)
         if (total := self._total) is not None:
             self.scope.progress(step.index + 1, total, left_s=self._left_s(step.index + 1, total))
         at = "" if scans.time is None else f"at {day_and_time(round(scans.time.timestamp() * NS_PER_S), UTC)}"
@@ -176,7 +176,7 @@ class PlannedScans(Component):
 class ScanSeries(PlannedScans):
     """The same region every so often, for as long or as many scans as wanted.
 
-    With neither `scans` nor `duration` it goes on until the experiment is ended by somebody else.
+    With neither `scans` nor `duration` it goes on until another component or a person ends the experiment.
 
     Args:
         size: (width, height) of the region, e.g. ["2 um", "2 um"].

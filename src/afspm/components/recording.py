@@ -164,7 +164,7 @@ class RecordWriter:
             file = self._folder / f"{JOURNAL_FILE}{suffix}"
             if file.exists():
                 file.replace(self._folder / f"{JOURNAL_FILE}.damaged-{number}{suffix}")
-        self._logger.critical("%s; it is put aside, and a new one is begun", error)
+        self._logger.critical("%s; moved it aside, and began a new one", error)
         self._progress.begin_again()
         with self._changed:
             self._wants_replay = True
@@ -257,7 +257,7 @@ class RecordWriter:
             with self._step():
                 self._progress.commit(store.sync)
         except OSError as error:
-            self._logger.debug("what is recorded can't be said: %s", error)
+            self._logger.debug("the progress of the record can't be saved: %s", error)
 
 
 class LogProgress:

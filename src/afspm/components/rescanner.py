@@ -59,7 +59,7 @@ class Rescanner(Component):
                 try:
                     self._obey(event.message, told)
                 except ControlLost as lost:
-                    self.log.info("no more to be scanned again: %s", lost.what)
+                    self.log.info("the rescan was given up: %s", lost.what)
                 self._put_back_at_last()
                 self.memory["done_ns"] = self.clock.now_ns()
                 self.memory.save()
@@ -67,7 +67,7 @@ class Rescanner(Component):
     def _obey(self, message: Any, told: Events) -> None:
         parameters: ScanParameters = wire.decode("ScanParameters2d", message.params.SerializeToString())
         if not isinstance(parameters.region, Region):
-            self.log.error("asked to scan again, but not where: %s", message.reason)
+            self.log.error("a request for a rescan names no region: %s", message.reason)
             return
         self.log.info("%s: %s", _IN_WORDS.get(message.kind, "a scan"), message.reason)
         if not self._is_flagged():
@@ -81,12 +81,12 @@ class Rescanner(Component):
                 found = False
             if not found and message.kind == RescanKind.SEARCH:
                 # before the other flag is gone: nobody is to go on in between
-                self.log.critical("the sample is not found again: a person has to look, nothing is scanned until then")
+                self.log.critical(
+                    "the sample can't be found again; nothing is scanned until a person clears the problem"
+                )
                 self.scope.flag(Problem.DEVICE_MALFUNCTION)
             elif not found:
-                self.log.error(
-                    "%d scans did not help: the experiment goes on as it is. A person should look", self.attempts
-                )
+                self.log.error("%d rescans did not help; the experiment goes on, please check it", self.attempts)
             self.scope.clear(self.problem)
 
     def _take(self, message: Any, parameters: ScanParameters, told: Events) -> bool:
@@ -176,7 +176,7 @@ class Rescanner(Component):
         for event in told:
             mapping = event.message
         if mapping is None:
-            self.log.warning("nothing was told of the drift in the scan")
+            self.log.warning("the scheduler reported no drift for the scan")
             return False
         if kind == RescanKind.SEARCH:
             return not mapping.lost

@@ -108,7 +108,7 @@ class TipCorrector(Component):
         if self.memory.get("given_up"):
             if self.scope.is_flagged(self.problem) and self.scope.is_flagged(Problem.DEVICE_MALFUNCTION):
                 return
-            self.log.info("somebody has looked after the tip: it may be repaired again")
+            self.log.info("a person cleared the problem: the tip may be repaired again")
             self._begin_anew()
         if not self.scope.is_flagged(self.problem):
             if self.memory.get("tried"):
@@ -123,7 +123,7 @@ class TipCorrector(Component):
     def _repair(self) -> None:
         region, shape = self._of_experiment()
         if region is None:
-            self._give_up("the microscope does not say where the experiment scans: no place is known to be safe")
+            self._give_up("the microscope does not report its scan region: no place is known to be safe")
             return
         test = region if self.test_center is None else region.moved_to(self.test_center)
         looks = (test, region, region) if self.test_center else (region,) * 3
@@ -206,7 +206,7 @@ class TipCorrector(Component):
             verdict = read_verdict(event.message) if event.envelope.startswith(tip_verdict.MESSAGE) else None
             if verdict is not None and verdict[0] in times:
                 return verdict[1]
-        self.log.warning("nobody judged the test scan within %.0f s: taken for bad", VERDICT_WITHIN_S)
+        self.log.warning("no verdict on the test scan within %.0f s: taken as bad", VERDICT_WITHIN_S)
         return tip_verdict.BAD
 
     def _learn(self, scan: Scan, problems: tuple[int, ...]) -> None:
@@ -227,7 +227,7 @@ class TipCorrector(Component):
             self.log.warning("the experiment's region could not be set again: %s", refused.reason)
 
     def _give_up(self, why: str) -> None:
-        self.log.error("the tip can't be repaired: %s. A person has to look; nothing is scanned until then", why)
+        self.log.error("the tip can't be repaired: %s; nothing is scanned until a person clears the problem", why)
         self.scope.flag(Problem.DEVICE_MALFUNCTION)
         self._wait_flag(Problem.DEVICE_MALFUNCTION, flagged=True)
         self.memory["given_up"] = True

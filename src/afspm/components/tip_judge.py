@@ -80,7 +80,7 @@ class TipTolerance:
         shares = (self.detail, self.ghost, self.worn, self.margin)
         if not all(0 < share < 1 for share in shares) or self.unrest <= 1 or self.sigmas < 0:
             raise ConfigError(
-                f"these tolerances make no sense: {asdict(self)}",
+                f"the tolerances are out of range: {asdict(self)}",
                 hint="detail, ghost, worn and margin between 0 and 1, unrest above 1, sigmas not below 0",
             )
 
@@ -268,7 +268,7 @@ class TipJudge:
             )
         if place is None and self._state.suspect:
             # what was found by comparing like with like can only be found to be over in the same way
-            return Verdict(Opinion.UNCLEAR, "nothing wrong here, but only a place known from before can tell", seen)
+            return Verdict(Opinion.UNCLEAR, "nothing wrong, but there is no reference of this place", seen)
         self._state.suspect = False
         return Verdict(Opinion.GOOD, _summary(seen, place.usual if place else reference.usual_anywhere()), seen)
 

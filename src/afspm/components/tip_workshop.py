@@ -43,19 +43,19 @@ class TipWorkshop:
                 with self._scope.control(unbroken=True):
                     return self._treat_at(place, treatment, safe)
             except Refused as refused:
-                self._log.warning("no %s, it was refused: %s", treatment, refused.reason)
+                self._log.warning("%s was refused: %s", treatment, refused.reason)
                 return False
             except ControlLost as lost:
                 if not self._scope.is_flagged(self._problem):
                     raise
-                self._log.warning("no %s yet: %s; it is begun again at a fresh place", treatment, lost.what)
+                self._log.warning("%s was interrupted: %s; retrying at a fresh place", treatment, lost.what)
 
     def _fresh_place(self, number: int) -> XY:
         """Return where to try the `number`-th treatment. It is counted before: a kill must not make it happen twice."""
         places = int(self._memory.get("places", 0))
         self._memory["tried"], self._memory["places"] = number, places + 1
         if not self._memory.save():
-            raise FileError("the disk is full: a treatment that can't be written down would be done again by a restart")
+            raise FileError("the disk is full: after a restart the treatment would be done again")
         return fresh_place(self._center, self._spacing, places)
 
     def _treat_at(self, place: XY, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
@@ -63,18 +63,20 @@ class TipWorkshop:
         if parameters is not None and isinstance(parameters.region, Region) and parameters.region != self._frame:
             safe = (*safe, parameters.region)
         if (away := min(clearance_m(place, region) for region in safe)) < self._keep_away:
-            self._log.error("no %s: its place is only %.0f nm away from what is scanned", treatment, away * 1e9)
+            self._log.error(
+                "%s was not done: its place is only %.0f nm away from a scanned region", treatment, away * 1e9
+            )
             return False
         action = names.PULSE if isinstance(treatment, Pulse) else names.CRASH
         if not self._scope.supports(action):
-            self._log.warning("no %s: the microscope has no %s", treatment, action)
+            self._log.warning("%s was not done: the microscope has no %s", treatment, action)
             return False
         self._go_to(place)
         self._prepare(treatment)
         if not self._scope.wait_until(
             lambda: self._stands_at(place) or not self._scope.in_control, timeout_s=SETTLED_WITHIN_S
         ):
-            self._log.error("no %s: the probe is %s, and not at %s", treatment, self._where(), nm(place))
+            self._log.error("%s was not done: the probe is %s, and not at %s", treatment, self._where(), nm(place))
             return False
         where = self._where()
         self._act(action)
@@ -90,7 +92,7 @@ class TipWorkshop:
             parameters = self._scope.scan_parameters
             if parameters is None or not isinstance(parameters.region, Region):
                 raise
-            self._log.debug("the frame goes along to %s: %s", nm(place), refused.reason)
+            self._log.debug("moving the scan frame along to %s: %s", nm(place), refused.reason)
             size_m = (self._spacing, self._spacing)
             self._frame = replace(parameters.region, center_m=place, size_m=size_m)
             self._scope.set_scan_region(self._frame)
@@ -103,7 +105,7 @@ class TipWorkshop:
 
     def _where(self) -> str:
         position = self._scope.probe_position
-        return "nobody knows where" if position is None else f"at {nm(position.xy_m)}"
+        return "an unknown place" if position is None else f"at {nm(position.xy_m)}"
 
     def _act(self, action: str) -> None:
         """Do it, and let it end: what is asked of a busy microscope it refuses."""
@@ -111,7 +113,7 @@ class TipWorkshop:
             try:
                 self._scope.action(action)
             except NoResponse as silent:
-                self._log.warning("%s: it counts as done, %s", silent.what, silent.hint)
+                self._log.warning("%s; it counts as done: %s", silent.what, silent.hint)
                 return
             was_busy = False
             for event in states:

@@ -54,10 +54,10 @@ class Cause(Enum):
     RELEASED = "it gave control back"
     PROBLEM = "a problem was flagged"
     SOLVED = "the problem it solved was cleared"
-    MANUAL = "the mode is manual"
-    DEAD = "it is dead"
+    MANUAL = "the mode changed to MANUAL"
+    DEAD = "its process died"
     IDLE = "it did nothing for longer than its lease"
-    ENDED = "the experiment ends"
+    ENDED = "the experiment ended"
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ IS_ADJUSTER = Condition(
     lambda c, a, r: may(r.roles.operate, a.who) and not c.problems,
 )
 ASKER_HOLDS = Condition("it is in control", lambda c, a, r: c.holder == a.who)
-OTHER_HOLDS = Condition("another is in control", lambda c, a, r: c.holder not in (None, a.who))
+OTHER_HOLDS = Condition("another component is in control", lambda c, a, r: c.holder not in (None, a.who))
 SOLVES_NONE = Condition("problems are flagged and it names none", lambda c, a, r: not a.number and bool(c.problems))
 SOLVES_UNFLAGGED = Condition(
     "it names a problem that is not flagged", lambda c, a, r: bool(a.number) and a.number not in c.problems
@@ -193,20 +193,25 @@ UNKNOWN_PROBLEM = Condition("the experiment knows no such problem", lambda c, a,
 IS_FLAGGED = Condition("it is flagged already", lambda c, a, r: a.number in c.problems)
 NOT_FLAGGED = Condition("it is not flagged", lambda c, a, r: a.number not in c.problems)
 HOLDER_SOLVES_NOTHING = Condition(
-    "one is in control that solves no problem", lambda c, a, r: c.holder is not None and not c.solving
+    "a component is in control that solves no problem", lambda c, a, r: c.holder is not None and not c.solving
 )
 MALFUNCTION_IS_NEW_TO_HOLDER = Condition(
-    "it is device-malfunction and one is in control",
+    "it is device-malfunction and a component is in control",
     lambda c, a, r: a.number == Problem.DEVICE_MALFUNCTION and c.holder is not None,
 )
 HOLDER_SOLVES_IT = Condition(
-    "one is in control to solve it", lambda c, a, r: c.holder is not None and c.solving == a.number
+    "a component is in control to solve it", lambda c, a, r: c.holder is not None and c.solving == a.number
 )
 MAY_NOT_CLEAR = Condition(
-    "another flagged it, and it has not the role `clear`", lambda c, a, r: not _may_clear(c, a, r)
+    "another component flagged it, and the asker does not have the role `clear_problems`",
+    lambda c, a, r: not _may_clear(c, a, r),
 )
-MAY_NOT_SET_MODE = Condition("it has not the role `mode`", lambda c, a, r: not may(r.roles.mode, a.who))
-MAY_NOT_END = Condition("it has not the role `end`", lambda c, a, r: not may(r.roles.end, a.who))
+MAY_NOT_SET_MODE = Condition(
+    "the asker does not have the role `set_mode`", lambda c, a, r: not may(r.roles.mode, a.who)
+)
+MAY_NOT_END = Condition(
+    "the asker does not have the role `end_experiment`", lambda c, a, r: not may(r.roles.end, a.who)
+)
 NO_SUCH_MODE = Condition(
     "neither manual nor automated", lambda c, a, r: a.number not in (ControlMode.MANUAL, ControlMode.AUTOMATED)
 )
@@ -231,20 +236,19 @@ def _happen(when: Condition, do: tuple[ControlChange, ...], why: str, cause: Cau
 
 TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
     ArbitrationEvent.REQUEST_CONTROL: (
-        _refuse(IS_MANUAL, _R.WRONG_CONTROL_MODE, "the mode is manual: the person at the microscope is in control"),
+        _refuse(IS_MANUAL, _R.WRONG_CONTROL_MODE, "the mode is MANUAL: a person is in control"),
         _refuse(SOLVES_UNFLAGGED, _R.WRONG_EXP_PROBLEM, "{problem} is not flagged; flagged: {problems}"),
         _refuse(
             SOLVES_OTHER_THAN_MALFUNCTION,
             _R.WRONG_EXP_PROBLEM,
-            "flagged: {problems}; device-malfunction comes first:"
-            " until that is cleared, control is only for who solves it",
+            "flagged: {problems}; until device-malfunction is cleared, only components that solve it get control",
         ),
         _refuse(
             SOLVES_NONE,
             _R.WRONG_EXP_PROBLEM,
-            "flagged: {problems}; until that is cleared, control is only for who solves it",
+            "flagged: {problems}; until that is cleared, only components that solve it get control",
         ),
-        _refuse(OTHER_HOLDS, _R.ALREADY_UNDER_CONTROL, "{holder} is in control until it gives that back"),
+        _refuse(OTHER_HOLDS, _R.ALREADY_UNDER_CONTROL, "{holder} is in control"),
         _accept(ASKER_HOLDS, (_D.GRANT,), "asked for again: it stays in control, for the problem it now names"),
         _accept(OTHERWISE, (_D.GRANT,), "nobody is in control: the first to ask gets it"),
     ),
@@ -254,26 +258,28 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
     ),
     ArbitrationEvent.FLAG: (
         _refuse(UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, "this experiment knows no problem with the number {number}"),
-        _accept(IS_FLAGGED, (), "what was asked for is so: two may notice the same"),
+        _accept(IS_FLAGGED, (), "it is flagged already: two components may notice the same"),
         _accept(
             HOLDER_SOLVES_NOTHING,
             (_D.FLAG, _D.TAKE),
-            "from now on only who solves a flagged problem may have control",
+            "from now on only components that solve a flagged problem get control",
             Cause.PROBLEM,
         ),
         _accept(
             MALFUNCTION_IS_NEW_TO_HOLDER,
             (_D.FLAG, _D.TAKE),
-            "nothing else can be solved with a microscope that can't be used, or a tip that was in danger",
+            "nothing else can be solved while the microscope can't be used, or after its tip was in danger",
             Cause.PROBLEM,
         ),
         _accept(OTHERWISE, (_D.FLAG,), "a solver stays in control while its own problem is flagged"),
     ),
     ArbitrationEvent.CLEAR: (
         _refuse(UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, "this experiment knows no problem with the number {number}"),
-        _accept(NOT_FLAGGED, (), "what was asked for is so: classifier and corrector may both clear"),
+        _accept(NOT_FLAGGED, (), "nothing to clear: classifier and corrector may both clear"),
         _refuse(
-            MAY_NOT_CLEAR, _R.FAILURE, "{who} has not flagged {problem} and has not the role 'clear' ([control] roles)"
+            MAY_NOT_CLEAR,
+            _R.FAILURE,
+            "{who} did not flag {problem}, and does not have the role clear_problems ([control.roles])",
         ),
         _accept(
             HOLDER_SOLVES_IT,
@@ -281,47 +287,47 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
             "solved: its solver has no more reason to be in control",
             Cause.SOLVED,
         ),
-        _accept(OTHERWISE, (_D.UNFLAG,), "who solves another problem stays in control"),
+        _accept(OTHERWISE, (_D.UNFLAG,), "a component that solves another problem stays in control"),
     ),
     ArbitrationEvent.SET_MODE: (
-        _refuse(MAY_NOT_SET_MODE, _R.FAILURE, "{who} has not the role 'mode' ([control] roles)"),
+        _refuse(MAY_NOT_SET_MODE, _R.FAILURE, "{who} does not have the role set_mode ([control.roles])"),
         _refuse(NO_SUCH_MODE, _R.WRONG_CONTROL_MODE, "there is no control mode {number}: 1 manual, 2 automated"),
-        _accept(SAME_MODE, (), "what was asked for is so"),
+        _accept(SAME_MODE, (), "nothing changes"),
         _accept(
             TO_MANUAL,
             (_D.SET_MODE, _D.TAKE),
-            "a person takes over: whoever is in control is disengaged",
+            "a person takes over, and the holder loses control",
             Cause.MANUAL,
         ),
         _accept(OTHERWISE, (_D.SET_MODE,), "components ask for control again, and go on"),
     ),
     ArbitrationEvent.END: (
-        _refuse(MAY_NOT_END, _R.FAILURE, "{who} has not the role 'end' ([control] roles)"),
+        _refuse(MAY_NOT_END, _R.FAILURE, "{who} does not have the role end_experiment ([control.roles])"),
         _accept(OTHERWISE, (_D.END,), "all receivers close"),
     ),
     ArbitrationEvent.COMMAND: (
-        _happen(ASKER_HOLDS, (_D.FORWARD,), "only who is in control commands the microscope"),
-        _happen(IS_OPERATOR, (_D.FORWARD,), "in manual mode a person may, by a component"),
+        _happen(ASKER_HOLDS, (_D.FORWARD,), "the holder of control commands the microscope"),
+        _happen(IS_OPERATOR, (_D.FORWARD,), "in MANUAL mode a person may, through a component"),
         _refuse(OTHERWISE, _R.NOT_IN_CONTROL, "{who} is not in control, {holder} is"),
     ),
     ArbitrationEvent.ADJUST: (
-        _happen(ASKER_HOLDS, (_D.FORWARD,), "only who is in control commands the microscope"),
-        _happen(IS_OPERATOR, (_D.FORWARD,), "in manual mode a person may, by a component"),
+        _happen(ASKER_HOLDS, (_D.FORWARD,), "the holder of control commands the microscope"),
+        _happen(IS_OPERATOR, (_D.FORWARD,), "in MANUAL mode a person may, through a component"),
         _happen(IS_ADJUSTER, (_D.FORWARD,), "the experiment file lets a person adjust it beside the holder"),
         _refuse(
             OTHERWISE,
             _R.NOT_IN_CONTROL,
-            "{who} is not in control, {holder} is; beside it only the role 'operate' adjusts this,"
+            "{who} is not in control, {holder} is; beside it only the role operate may adjust this,"
             " and while no problem is flagged",
         ),
     ),
-    ArbitrationEvent.READ: (_happen(OTHERWISE, (_D.FORWARD,), "it disturbs nothing, so anybody may, at any time"),),
+    ArbitrationEvent.READ: (_happen(OTHERWISE, (_D.FORWARD,), "reading disturbs nothing, and is always allowed"),),
     ArbitrationEvent.DEAD: (
-        _happen(ASKER_HOLDS, (_D.TAKE,), "control never stays with the dead", Cause.DEAD),
+        _happen(ASKER_HOLDS, (_D.TAKE,), "a component that has died does not keep control", Cause.DEAD),
         _happen(OTHERWISE, (), "it was not in control"),
     ),
     ArbitrationEvent.IDLE: (
-        _happen(ASKER_HOLDS, (_D.TAKE,), "a greedy component can't block the night", Cause.IDLE),
+        _happen(ASKER_HOLDS, (_D.TAKE,), "an idle component must not block the others", Cause.IDLE),
         _happen(OTHERWISE, (), "it was not in control"),
     ),
 }

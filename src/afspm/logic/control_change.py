@@ -166,4 +166,4 @@ def _tell_people(draft: StateDraft, change: _Change, wanted: list[str]) -> None:
     if danger is not None:
         expected = cause in (None, Cause.RELEASED, Cause.SOLVED, Cause.MANUAL)
         why = cause.value if cause else "the mode is automated again"
-        draft.log("WARNING" if expected else "CRITICAL", f"{danger}, and nobody looks after it: {why}")
+        draft.log("WARNING" if expected else "CRITICAL", f"{danger}, and no component is in control: {why}")

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from afspm.formatting import area_text, lengths_text, position_text
-from afspm.logic.arbitration import ArbitrationEvent, ArbitrationState, ControlInput, Rules, Transition
+from afspm.logic.arbitration import ArbitrationEvent, ArbitrationState, Cause, ControlInput, Rules, Transition
 from afspm.model import (
     RESTART_REQUEST,
     ControlMode,
@@ -42,14 +42,25 @@ def said(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, r
             parts.append(f"to solve {rules.problems.name(after.solving)}")
     for number in sorted(after.problems.keys() ^ before.problems.keys()):
         done = "flagged" if number in after.problems else "cleared"
-        parts.append(f"{rules.problems.name(number)} is {done} by {ask.who};")
+        parts.append(f"{ask.who} {done} {rules.problems.name(number)};")
     if after.mode is not before.mode:
-        parts.append(f"the mode is {after.mode.name} by {ask.who};")
+        parts.append(f"{ask.who} switched to {after.mode.name};")
     if after.ended and not before.ended:
-        parts.append(f"the experiment is ended by {ask.who};")
+        parts.append(f"{ask.who} ended the experiment;")
     if before.holder is not None and after.holder is None and row.cause is not None:
-        parts.append(f"{before.holder} is no longer in control: {row.cause.value}")
+        parts.append(_ended_control(before.holder, row.cause))
     return " ".join(parts).rstrip(";") or f"{ask.who} {ask.event.value}"
+
+
+def _ended_control(holder: str, cause: Cause) -> str:
+    """Return how a holder lost control; what caused it stands before, unless it is its own end."""
+    match cause:
+        case Cause.RELEASED:
+            return f"{holder} gave control back"
+        case Cause.DEAD | Cause.IDLE:
+            return f"{holder} lost control: {cause.value}"
+        case _:
+            return f"{holder} lost control"
 
 
 def asked(request: Request, problems: ProblemNames) -> str:

@@ -36,7 +36,7 @@ LONGEST = 1000
 """Characters of what was asked, and of the reason."""
 
 REQUEST, CONTROL, ORDER = "request", "control", "order"
-LATE = "late: it had been told that there was no answer"
+LATE = "late: the client had been told that there was no answer"
 """Of an answer of the translator that came after all."""
 SCHEDULER = "scheduler"
 """Who asks for what nobody else did."""
@@ -119,7 +119,7 @@ class EventLog:
 
 def unreadable_entry(now_ns: int, who: str, response: Response) -> JournalEntry:
     """Return the entry of a request that could not be read."""
-    return JournalEntry(now_ns, REQUEST, who, "what can't be read", response.code, response.reason[:LONGEST], 0.0)
+    return JournalEntry(now_ns, REQUEST, who, "an unreadable request", response.code, response.reason[:LONGEST], 0.0)
 
 
 def start_entry(now_ns: int, control: ArbitrationState, *, is_restart: bool) -> JournalEntry:
@@ -143,7 +143,7 @@ def control_entries(
     entries = []
     if before.holder is not None and after.holder != before.holder:
         cause = row.cause.value if row.cause is not None else ""
-        entries.append(entry(before.holder, "no longer in control", reason=cause, event=ControlEvent.CONTROL_LOST))
+        entries.append(entry(before.holder, "lost control", reason=cause, event=ControlEvent.CONTROL_LOST))
     for number in sorted(after.problems.keys() - before.problems.keys()):
         flagged = ControlEvent.PROBLEM_FLAGGED
         entries.append(entry(ask.who, f"flagged {name(number)}", event=flagged, problem=number))

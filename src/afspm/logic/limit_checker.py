@@ -218,13 +218,14 @@ class LimitChecker:
             return
         error = ControlResponse.ACTION_ERROR if what == "action" else ControlResponse.PARAM_ERROR
         if limit.only is not None and not {who, component_of(who)} & set(limit.only):
-            allowed = ", ".join(sorted(limit.only)) or "nobody"
-            raise _Breach(error, f"{who} may not use the {what} {name}, only {allowed} ({limit.source})")
+            rule = f"only {', '.join(sorted(limit.only))} may" if limit.only else "no component may"
+            raise _Breach(error, f"{who} may not use the {what} {name}: {rule} ({limit.source})")
         last_ns = self.state.usage.last_ns(name, who, request_id)
         if limit.interval_s is not None and last_ns is not None and now_ns - last_ns < limit.interval_s * 1e9:
             ago_s = (now_ns - last_ns) / 1e9
             raise _Breach(
-                error, f"{name} was used {ago_s:.3g} s ago, and may be every {limit.interval_s:g} s ({limit.source})"
+                error,
+                f"{name} was used {ago_s:.3g} s ago, its shortest interval is {limit.interval_s:g} s ({limit.source})",
             )
 
     def _check_value(self, name: str, value: float, limit: Limit, now_ns: int) -> None:
@@ -251,7 +252,7 @@ class LimitChecker:
         if allowed is not None and moved_since > allowed * (1 + _REACH):
             ago_s = (now_ns - known.since_ns) / 1e9
             raise _param_error(
-                f"{said} changes by {moved_since:g}{unit} since {ago_s:.3g} s ago, now allowed is {allowed:.3g}{unit},"
+                f"{said} changes by {moved_since:g}{unit} within {ago_s:.3g} s, allowed is at most {allowed:.3g}{unit},"
                 f" at {limit.rate_per_s:g}{unit} per second ({limit.source})"
             )
 
@@ -260,7 +261,9 @@ class LimitChecker:
         if isinstance(shape, ShapeChange):
             shape = shape.onto(self.state.position.shape or (1, 1))
         if shape is not None and shape[0] * shape[1] > self.limits.most_pixels:
-            raise _param_error(f"a scan of {shape[1]} x {shape[0]} pixels; the most are {self.limits.most_pixels}")
+            raise _param_error(
+                f"a scan of {shape[1]} x {shape[0]} pixels; the highest number allowed is {self.limits.most_pixels}"
+            )
         if isinstance(region, RegionChange):
             region = self._region_after(region)
         allowed = self.limits.region
@@ -284,7 +287,7 @@ class LimitChecker:
         if self.state.position.region is not None:
             return change.onto(self.state.position.region)
         if self.limits.region is not None:
-            raise _param_error("where the scan is now is not known, so a part of its place can't be checked")
+            raise _param_error("the microscope has not reported its scan region, so a part of it can't be checked")
         return None
 
     def _check_point(self, xy_m: XY, reach: float = _REACH) -> None:
@@ -302,18 +305,18 @@ class LimitChecker:
             return
         if action == names.START_SCAN:
             if self.state.position.region is None:
-                raise _param_error("where the scan is now is not known")
+                raise _param_error("the microscope has not reported its scan region")
             self._check_scan(ScanParameters(self.state.position.region), _TOLD_REACH)
         elif action in names.AT_PROBE:
             if self.state.position.probe_m is None:
-                raise _param_error("where the probe is now is not known")
+                raise _param_error("the microscope has not reported its probe position")
             self._check_point(self.state.position.probe_m, _TOLD_REACH)
 
     def _check_move(self, change: PositionChange) -> None:
         if self.limits.region is None:
             return
         if self.state.position.probe_m is None:
-            raise _param_error("where the probe is now is not known, so a part of its place can't be checked")
+            raise _param_error("the microscope has not reported its probe position, so a part of it can't be checked")
         self._check_point(moved(self.state.position.probe_m, change))
 
 

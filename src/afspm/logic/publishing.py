@@ -61,10 +61,10 @@ def order_restart(draft: StateDraft, event: RequestIn) -> None:
     if may(draft.env.settings.rules.roles.restart, event.name):
         draft.supervisors, why = draft.supervisors.order(process, draft.now_s)
     else:
-        why = f"{event.name} has not the role 'restart' ([control] roles)"
+        why = f"{event.name} does not have the role restart ([control.roles])"
     if why:
         answers.answer(draft, event, ControlResponse.FAILURE, why)
         return
     draft.save()
-    draft.log("INFO", f"{process} is to be started anew, as {event.name} wishes")
+    draft.log("INFO", f"{event.name} ordered a restart of {process}")
     answers.answer(draft, event, ControlResponse.SUCCESS)

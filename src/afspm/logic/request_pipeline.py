@@ -39,7 +39,7 @@ from afspm.model import (
 )
 
 _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
-_ANOTHER_RUN = "this scheduler is that of another run: two experiments have the same address"
+_ANOTHER_RUN = "this is the scheduler of another run: two experiments have the same address"
 _TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of its own"
 _CONTROL_EVENTS = {
     int(ControlRequest.REQUEST_CTRL): ArbitrationEvent.REQUEST_CONTROL,
@@ -87,7 +87,7 @@ def admit(draft: StateDraft, event: RequestIn) -> bool:
 def _may_speak(draft: StateDraft, event: RequestIn) -> bool:
     name, request_id, run = event.name, event.request.id, draft.env.settings.run
     if not name:
-        answers.refuse_peer(draft, event, "say who you are: set the socket's identity to the component's name")
+        answers.refuse_peer(draft, event, "a client without a name: set the socket's identity to the component's name")
         return False
     if event.user is not None and event.user != component_of(name):
         answers.refuse_peer(draft, event, f"the key is that of {event.user}, not of {name}")
@@ -222,7 +222,9 @@ def _tip_comes_first(draft: StateDraft) -> str | None:
         return "the tip is being retracted, as it was left in danger"
     if sees_to_tip:
         return None
-    return "the tip was left in danger and is not retracted yet; only who solves device-malfunction may see to it"
+    return (
+        "the tip is in danger and not retracted yet; until then only components that solve device-malfunction may act"
+    )
 
 
 def _is_within_limits(draft: StateDraft, event: RequestIn, mapped: MappedRequest | None) -> bool:
@@ -417,7 +419,7 @@ def _settle_late(draft: StateDraft, job: ForwardedRequest, response: Response) -
     if status is None and not response.ok:
         answers.take_back(draft, job)
     answers.write_down(draft, job.client, job.request, response, job.heard_s, sent_ns=job.sent_ns, late=True)
-    draft.log("WARNING", f"the translator answered {job.client} late; asked again, it gets that answer")
+    draft.log("WARNING", f"the translator answered {job.client} late; the answer is kept for its retry")
 
 
 def _see_feedback(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:

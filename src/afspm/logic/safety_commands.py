@@ -55,5 +55,9 @@ def settle(draft: StateDraft, job: ForwardedRequest, end: ForwardOutcome, respon
         draft.log("INFO", f"{subject}: done")
     elif result is SafetyResult.FAILED:
         due_s = draft.watchdog.due_s
-        again = "" if due_s is None else f"; it is asked again in {due_s - now_s:.0f} s, unless somebody sees to it"
+        again = (
+            ""
+            if due_s is None
+            else f"; it is asked again in {due_s - now_s:.0f} s, unless a component or a person takes over"
+        )
         draft.log("ERROR", f"the microscope does not {subject}: {response.reason or response.code}{again}")

@@ -192,7 +192,9 @@ def _on_disconnected(draft: StateDraft, event: Disconnected) -> None:
         request_pipeline.handle(draft, waiting)
     elif name == draft.control.holder and draft.now_s >= timeout.told_again_s:
         draft.holder_timeout = timeout.told(draft.now_s)
-        draft.log("WARNING", f"{name} is in control and gone; it has {timeout.grace_s:g} s to come back")
+        draft.log(
+            "WARNING", f"lost contact with {name}, which is in control; it has {timeout.grace_s:g} s to come back"
+        )
 
 
 def _on_greeted(draft: StateDraft, event: Greeted) -> None:
@@ -271,7 +273,7 @@ def _end_when_safe(draft: StateDraft) -> None:
         return
     draft.end = draft.end.ended(draft.now_s)
     if owes_retract:
-        draft.log("CRITICAL", "the experiment ends, and the tip was left in danger: the microscope did not retract it")
+        draft.log("CRITICAL", "the experiment ended with the tip in danger: the microscope did not retract it")
     for event, code, why, detail in kept:
         answers.answer(draft, event, code, why, detail=detail)
     draft.send_forwards()

@@ -121,7 +121,7 @@ class SupervisorRegistry:
         having = {name: one for name, one in self.supervisors.items() if process in one.processes}
         if not having:
             known = sorted({process for one in self.supervisors.values() for process in one.processes})
-            return self, f"no supervisor has a process {process!r}; known: {', '.join(known) or 'none'}"
+            return self, f"there is no process {process!r}; known: {', '.join(known) or 'none'}"
         name, newest = max(having.items(), key=lambda item: now_s if item[1].told_s is None else item[1].told_s)
         if newest.told_s is not None and now_s - newest.told_s > SILENT_S:
             return self, f"the supervisor of {process} has not been heard of for {duration_text(now_s - newest.told_s)}"
@@ -163,9 +163,9 @@ def announcement(event: RequestIn, codec: Codec) -> Announcement:
     """Check something that is to be published for a process: who may speak of what."""
     told = event.request.subject
     if not isinstance(told, RelayedMessage):
-        return Announcement("", "nothing is told")
+        return Announcement("", "an empty announcement")
     if len(told.payload) > LONGEST:
-        return Announcement("", f"{len(told.payload)} bytes are told at once, at most {LONGEST} may be")
+        return Announcement("", f"{len(told.payload)} bytes in one announcement, at most {LONGEST} are allowed")
     thing = codec.decode_packet(told.message, told.payload)
     if isinstance(thing, Progress) and told.message == "Progress":
         mine = thing.name in (event.name, component_of(event.name))
@@ -174,9 +174,9 @@ def announcement(event: RequestIn, codec: Codec) -> Announcement:
         mine = thing.who == event.name
         return Announcement(told.message) if mine else Announcement("", f"{event.name} is not {thing.who[:80]!r}")
     if not isinstance(thing, ProcessStates | LogLines) or type(thing).__name__ != told.message:
-        return Announcement("", f"a {told.message[:80]} is not published for others, or can't be read")
+        return Announcement("", f"a {told.message[:80]} can't be relayed, or can't be read")
     if event.user not in (None, SUPERVISOR):
-        return Announcement("", f"it takes the key of {SUPERVISOR!r} to speak of processes, not that of {event.user}")
+        return Announcement("", f"only the key of {SUPERVISOR!r} may report processes, not that of {event.user}")
     spoken_of = thing.lines if isinstance(thing, LogLines) else thing.processes
     if wrong := [one.name for one in spoken_of if not is_process_name(one.name)]:
         return Announcement("", f"{wrong[0][:LONGEST_PROCESS_NAME]!r} can't be the name of a process")
@@ -188,5 +188,5 @@ def announcement(event: RequestIn, codec: Codec) -> Announcement:
 
 def _named(message: str, whose: str) -> Announcement:
     if not all(map(is_process_name, whose.split(PERSON))):
-        return Announcement("", f"a {message} does not say whose it is: {whose[:LONGEST_PROCESS_NAME]!r}")
+        return Announcement("", f"a {message} does not name its owner: {whose[:LONGEST_PROCESS_NAME]!r}")
     return Announcement(f"{message}_{whose}")

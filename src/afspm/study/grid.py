@@ -59,7 +59,7 @@ class SettingsGrid:
             if not any(_is_in_force(name, settings) for _, settings in nights):
                 part = name.rpartition(".")[0]
                 raise ConfigError(
-                    f"{name} is told to nobody: no night has an estimator or tracker {part!r}",
+                    f"{name} has no effect: no night has an estimator or tracker {part!r}",
                     hint='name it as well, e.g. tracker = "paper" and paper.queue = 5',
                 )
         told: list[NightSettings] = []

@@ -22,6 +22,6 @@ class ClockCheck:
         self._is_done = True
         way = "ahead of" if ahead_s > 0.0 else "behind"
         return (
-            f"the clock on the wall is {duration_text(abs(ahead_s))} {way} that of the run: it was set, or the "
-            "computer slept; the run goes on by its own, in all that it records"
+            f"the computer's clock is {duration_text(abs(ahead_s))} {way} that of the run: it was set, or the "
+            "computer slept; the record keeps the run's own time"
         )

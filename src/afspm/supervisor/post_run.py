@@ -80,7 +80,7 @@ def summary(outcome: RunOutcome, folder: Path) -> list[str]:
         if (restarts := report.starts - 1 - report.ordered) > 0:
             told.append(f"{report.name} was restarted {_times(restarts)}")
         if report.ordered:
-            told.append(f"{report.name} was started anew {_times(report.ordered)}, as ordered")
+            told.append(f"{report.name} was restarted {_times(report.ordered)}, as ordered")
         if report.given_up:
             told.append(f"{report.name} was GIVEN UP: {report.last_exit or 'it never started'}")
     try:
@@ -175,13 +175,13 @@ def _tell(notice: Notification, targets: Targets, way: Way, clock: Clock, until_
             targets.deliver(notice, way)
             return
         except ConfigError as error:
-            log.write(LOGGED_AS, logging.ERROR, f"nobody is told by the {way}: {error}")
+            log.write(LOGGED_AS, logging.ERROR, f"the {way} failed: {error}")
             return
         except NotDelivered as error:
             tries += 1
             delay_s = notifications.delay_s(tries)
             if clock.monotonic_s() + delay_s >= until_s:
-                log.write(LOGGED_AS, logging.ERROR, f"nobody could be told by the {way}: {error}")
+                log.write(LOGGED_AS, logging.ERROR, f"the {way} failed: {error}")
                 return
         threading.Event().wait(delay_s)
 

@@ -111,7 +111,7 @@ class ReportQueue:
         batch, size = [], 0
         with self._lock:
             if self._dropped:
-                what = f"dropped {self._dropped} lines: the scheduler did not take them"
+                what = f"dropped {self._dropped} lines that the scheduler did not take"
                 batch.append(LogLine(self._lines[0].time_ns, self._name, "WARNING", what))
                 self._dropped = 0
             while self._lines and size < _BATCH_BYTES:
@@ -242,7 +242,7 @@ class Reporter:
     def _fail(self, why: str) -> None:
         if why not in self._failures and len(self._failures) < _MOST_FAILURES:
             self._failures.add(why)
-            self.post(ReportFailed(f"the scheduler is not told how it is with the processes here: {why}"))
+            self.post(ReportFailed(f"the scheduler refused the report on the processes here: {why}"))
 
 
 class _OpenRequest:

@@ -80,7 +80,7 @@ def find(where: Path) -> ResumableRun:
     if REPLAY_OF in facts:
         raise ConfigError("this is a replay, and not a run", where=str(folder), hint=f"it is of {facts[REPLAY_OF]}")
     if facts.get(HOW) in _OVER:
-        raise ConfigError("this run has ended as it should", where=str(folder), hint="`afspm run FILE` begins another")
+        raise ConfigError("this run has ended normally", where=str(folder), hint="`afspm run FILE` begins another")
     file = folder / EXPERIMENT_FILE
     if not file.is_file() or not (folder / STATE_DIR).is_dir():
         raise FileError("this is not the folder of a run", where=str(folder), hint="it lacks its experiment or state")

@@ -60,7 +60,7 @@ def test_killed_in_the_middle_the_scheduler_and_its_worker_know_where_the_sample
     run.wait_for("surveyor .*round 2 is done")
     run.signal("scheduler", signal.SIGKILL)
     assert run.end() == 0, run.output
-    assert "is started again: exit code -9" in run.output
+    assert "is restarted: exit code -9" in run.output
     require_it_stood_still(surveyed(run), 5)
     rows = table(run)
     assert [row["matched"] for row in rows] == ["yes"] * len(rows), rows
@@ -82,7 +82,7 @@ def test_at_the_start_a_scan_up_and_one_down_tell_the_velocity(rig: Rig) -> None
     run = rig.start('at_start = "up-down", rescan = { rule = "never" }', scans=3)
     assert run.end() == 0, run.output
     run.wait_for("rescanner is in control to solve thermal-drift")
-    run.wait_for("thermal-drift is cleared by rescanner")
+    run.wait_for("rescanner cleared thermal-drift")
     found = surveyed(run)
     assert (away_m(found.said_m, found.true_m) < KNOWN_M).all(), found
     assert (away_m(found.true_m[1:], np.zeros(2)) < PLACED_M).all(), found  # without it the first is 60 nm off
@@ -93,7 +93,7 @@ def test_a_scan_that_lies_too_far_off_is_taken_again(rig: Rig) -> None:
     run = rig.start('rescan = { tolerance = "40 nm" }', scans=2)
     assert run.end() == 0, run.output
     run.wait_for("rescanner .*the same region again: it is .* nm off")
-    run.wait_for("thermal-drift is cleared by rescanner")
+    run.wait_for("rescanner cleared thermal-drift")
     found, rows = surveyed(run), table(run)
     assert away_m(found.true_m[1:], np.zeros(2))[0] > 40e-9
     assert len(rows) == 3

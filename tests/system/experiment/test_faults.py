@@ -88,7 +88,7 @@ def test_what_dies_or_freezes_at_the_end_is_started_again_to_finish(run: Run) ->
     for name, fault in faults.items():
         one.signal(name, fault)
     for name in faults:
-        one.wait_for(f" {name} ", "it is started again, to finish")
+        one.wait_for(f" {name} ", "restarting it, to finish")
     assert one.end() == 0, one.output
     for name in faults:
         assert (one.folder / f"{name} has finished.txt").exists(), one.output
@@ -108,7 +108,7 @@ begun = '{tmp_path / "late has begun.txt"}'
 """
     one = run(more=more, scans=2)
     assert one.end() == 0, one.output
-    one.wait_for(" late ", "it is started again, to finish")
+    one.wait_for(" late ", "restarting it, to finish")
     assert (one.folder / "late has them all.txt").exists(), one.output
 
 
@@ -125,7 +125,7 @@ budget = 2
     one = run(more=more)
     assert one.end() == 0, one.output
     require_each_once(one, 4)
-    one.wait_for("CRITICAL hopeless is given up, the rest goes on")
+    one.wait_for("CRITICAL gave up hopeless; the rest goes on")
     one.wait_for("hopeless was GIVEN UP")
 
 
@@ -161,7 +161,7 @@ def test_without_a_microscope_the_run_ends_and_says_so(run: Run) -> None:
     one.wait_for("scan 1 of 1000")
     one.signal("microscope", signal.SIGKILL)
     assert one.end() == 1, one.output
-    one.wait_for("CRITICAL microscope is given up, and the experiment can't go on without it")
+    one.wait_for("CRITICAL gave up microscope; the experiment can't go on without it")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="what a descriptor is open on is found in /proc")

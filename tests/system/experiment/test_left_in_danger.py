@@ -92,8 +92,8 @@ def test_a_tip_that_was_left_in_danger_is_retracted_and_nobody_measures_before_i
     steps = [
         "x-retract is sent to the microscope, since ",
         "x-retract: done",
-        "device-malfunction is flagged by scheduler",
-        "device-malfunction is cleared by doctor",
+        "scheduler flagged device-malfunction",
+        "doctor cleared device-malfunction",
     ]
     found = [one.output.index(step) for step in steps]
     assert found == sorted(found), one.output
@@ -134,7 +134,7 @@ def test_with_the_tip_retracted_by_ctrl_c_a_run_is_resumed_when_that_was_seen_to
     assert RETRACTED in one.output
     assert not engaged(one)
     again = afspm_run("--resume", str(one.folder))
-    steps = ("device-malfunction is flagged by scheduler", "is cleared by doctor", "series is in control")
+    steps = ("scheduler flagged device-malfunction", "is cleared by doctor", "series is in control")
     for step in steps:
         again.wait_for(" scheduler ", step)
     found = [again.output.index(step) for step in steps]

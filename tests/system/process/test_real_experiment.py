@@ -147,7 +147,7 @@ def test_a_notebook_joins_by_the_folder_of_the_run(experiment: Experiment, monke
             scope.wait_until(lambda: False, timeout_s=20.0)
     experiment.scheduler.exit_code()  # it stays for a moment, to tell those who come late
     monkeypatch.setattr(connect, "JOINED_WITHIN_S", 1.0)
-    with pytest.raises(NoResponse, match="nobody is there"):
+    with pytest.raises(NoResponse, match="the scheduler does not answer"):
         afspm.connect(experiment.folder)
 
 

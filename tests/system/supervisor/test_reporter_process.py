@@ -187,7 +187,7 @@ def test_a_supervisor_whose_scheduler_is_not_there_works_and_ends_as_ever(run_ta
     nowhere = Launch("supervisor:lab", sockets=Sockets(control=FreePorts().address()))
     crashing = peer("one", first="crash")
     running = run_tasks(crashing, peer("two"), reporter=Reporter(nowhere, CLOCK, "lab"))
-    running.terminal.wait_for("CRITICAL", "one is given up")
+    running.terminal.wait_for("CRITICAL", "gave up one")
     _, two = running.stop().reports
     assert two.last_exit == "ended as it was asked to"
 

@@ -109,7 +109,7 @@ def test_one_that_is_busy_longer_than_it_declared_is_killed(run_tasks: RunTasks,
 
 def test_what_always_crashes_is_given_up_and_the_rest_goes_on(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("bad", first="crash"), peer("good"))
-    running.terminal.wait_for("CRITICAL", "bad is given up", "the rest goes on")
+    running.terminal.wait_for("CRITICAL", "gave up bad", "the rest goes on")
     assert running.thread.is_alive()
     outcome = running.stop()
     bad, good = outcome.reports
@@ -131,7 +131,7 @@ def test_when_nothing_could_be_kept_running_the_run_is_lost(run_tasks: RunTasks)
 
 def test_wrong_settings_are_not_tried_again(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("a", first="exit", code=78), peer("b"))
-    running.terminal.wait_for("CRITICAL", "a is given up")
+    running.terminal.wait_for("CRITICAL", "gave up a")
     report = running.stop().reports[0]
     assert (report.starts, report.given_up) == (1, True)
 
@@ -139,7 +139,7 @@ def test_wrong_settings_are_not_tried_again(run_tasks: RunTasks) -> None:
 def test_a_program_that_is_not_there_does_not_end_the_rest(run_tasks: RunTasks) -> None:
     missing = replace(peer("missing"), command=("no-such-program",))
     running = run_tasks(missing, peer("good"))
-    running.terminal.wait_for("CRITICAL", "missing is given up")
+    running.terminal.wait_for("CRITICAL", "gave up missing")
     running.terminal.wait_for(" good ", "life 1")
     assert not running.stop().reports[1].given_up
 
@@ -253,5 +253,5 @@ def test_a_program_that_sends_no_heartbeats_is_not_waited_for(run_tasks: RunTask
 @posix_only
 def test_a_scheduler_that_somebody_asks_to_end_is_started_again(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("scheduler", Role.SCHEDULER, first="exit", code=int(ExitCode.ORPHAN)))
-    running.terminal.wait_for(" scheduler ", "it is started again")
+    running.terminal.wait_for(" scheduler ", "restarting")
     assert running.stop().why is EndReason.STOPPED

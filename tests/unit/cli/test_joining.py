@@ -27,7 +27,7 @@ def test_a_run_that_was_cut_off_says_how_it_goes_on_and_one_that_runs_what_may_b
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     def nobody(*_: object) -> None:
-        raise NoResponse("nobody is there")
+        raise NoResponse("the scheduler does not answer")
 
     (tmp_path / "night-1" / "state").mkdir(parents=True)
     (tmp_path / "night-1" / "run.json").write_text(
@@ -53,7 +53,7 @@ def test_a_run_of_another_computer_is_not_said_to_be_cut_off(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def nobody(*_: object) -> None:
-        raise NoResponse("nobody is there")
+        raise NoResponse("the scheduler does not answer")
 
     folder = tmp_path / "night-1"
     (folder / "state").mkdir(parents=True)

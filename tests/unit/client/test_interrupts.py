@@ -112,7 +112,7 @@ def test_an_action_that_is_not_answered_is_said_to_have_been_sent(
     with pytest.raises(KeyboardInterrupt):
         scope.action("x-pulse")
     assert lab.control.holder is None
-    assert caplog.messages[-1] == "interrupted before the answer: the action x-pulse may have been carried out"
+    assert caplog.messages[-1] == "interrupted before the answer: the microscope may have carried out x-pulse"
 
 
 def test_a_program_that_handles_ctrl_c_itself_is_left_alone(lab: Lab, scope: Scope) -> None:

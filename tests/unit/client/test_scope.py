@@ -128,7 +128,7 @@ def test_a_translator_that_starts_anew_in_the_middle_costs_one_attempt(lab: Lab,
     lab.at(50.0, lab.restart_translator)
     scans = scope.scan(REGION)
     assert lab.begun_scans == 2
-    assert "started anew" in scans.interruptions[0]
+    assert "restarted" in scans.interruptions[0]
 
 
 def test_a_scan_that_was_accepted_and_never_begins_is_asked_for_anew(lab: Lab, scope: Scope) -> None:
@@ -530,7 +530,7 @@ def test_after_it_was_closed_a_scope_says_that_it_was(lab: Lab, scope: Scope) ->
     scope.scan(REGION)
     scope.close()
     for call in (lambda: scope.scan(REGION), lambda: scope.state, lambda: next(scope.events())):
-        with pytest.raises(NoResponse, match=r"left, by close\(\)"):
+        with pytest.raises(NoResponse, match=r"close\(\) has left"):
             call()
 
 

@@ -93,7 +93,7 @@ def test_where_no_gain_is_good_the_first_is_set_again_and_the_experiment_goes_on
     assert max(lab.gains) == 10.0
     assert lab.gains[-1] == BEFORE
     assert lab.problems == ()
-    assert "can't be made better: no gain is good" in caplog.text
+    assert "can't be improved: no gain is good" in caplog.text
 
 
 @pytest.mark.parametrize(("values", "setpoint"), [(np.full((10, 10), np.nan), SETPOINT), (off_by(0.0), 0.0)])

@@ -58,7 +58,7 @@ def test_a_scan_that_a_problem_interrupts_is_taken_again_and_said(caplog: pytest
     with caplog.at_level("WARNING"):
         assert run(series(keep_control=True), lab) == ExitCode.ENDED
     assert len(lab.finished) == 3
-    assert "was interrupted and taken again" in caplog.text
+    assert "was interrupted, and taken again" in caplog.text
 
 
 def lasting(duration_s: float, every_s: float, **planned: Any) -> ScanSeries:

@@ -204,7 +204,7 @@ def test_a_damaged_journal_is_put_aside_and_told(bench: Bench, caplog: pytest.Lo
     writer.finish(ended=True)
     assert bench.times() == [1]
     assert (bench.folder / f"{JOURNAL_FILE}.damaged-1").exists()
-    assert any(record.levelname == "CRITICAL" and "put aside" in record.message for record in caplog.records)
+    assert any(record.levelname == "CRITICAL" and "moved it aside" in record.message for record in caplog.records)
 
 
 @pytest.mark.parametrize("table", ["packets", "packets_once", "packets_by_message"])
@@ -226,7 +226,7 @@ def test_a_journal_that_is_damaged_further_in_is_put_aside_too(
     bench.publish(control(1000))
     again.finish(ended=True)
     assert (bench.folder / f"{JOURNAL_FILE}.damaged-1").exists()
-    assert any("put aside" in record.message for record in caplog.records)
+    assert any("moved it aside" in record.message for record in caplog.records)
     assert bench.times() == [*range(1, 400), 1000], "the log still has what was lost with it"
     assert again.wants_replay()
 

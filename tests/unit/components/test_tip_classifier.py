@@ -156,4 +156,4 @@ def test_that_nothing_is_judged_for_want_of_a_channel_is_said_once(caplog: pytes
     run(classifier(), lab)
     (told,) = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
     assert "no channel Height and Height Retrace" in told
-    assert "There are Z Forward, Z Backward" in told
+    assert "They have Z Forward, Z Backward" in told

@@ -351,7 +351,7 @@ def test_a_region_that_a_person_has_chosen_over_the_workshop_is_kept_away_from(
     just_before(lab, ControlRequest.PARAM, person)
     run(corrector(crash_depths=(), pulse_voltages=(3.0,)), lab)
     assert lab.actions == []
-    assert "away from what is scanned" in caplog.text
+    assert "away from a scanned region" in caplog.text
     assert MALFUNCTION in lab.problems
 
 
@@ -368,7 +368,7 @@ def test_nothing_is_done_where_the_probe_is_not_published_to_stand(caplog: pytes
     lab.intercept = somebody
     run(corrector(), lab)
     assert lab.actions == []
-    assert "no pulse of +3 V, 50 ms: the probe is at (0, 0) nm, and not at (8000, 0) nm" in caplog.text
+    assert "pulse of +3 V, 50 ms was not done: the probe is at (0, 0) nm, and not at (8000, 0) nm" in caplog.text
     assert lab.problems == (TIP, MALFUNCTION)
 
 

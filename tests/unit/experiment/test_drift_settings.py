@@ -55,9 +55,9 @@ def test_settings_reach_the_scheduler_in_si_and_a_table_with_a_class_is_left_to_
         ('compensate = { x = "x-drift-rate-x", y = "x-rate" }', "needs the parameter 'x-rate'"),
         (
             'tracker = "paper", compensate = { x = "x-drift-rate-x", y = "x-drift-rate-y" }',
-            "the tracker does not reckon with a controller that compensates",
+            "this tracker can't follow a controller that compensates",
         ),
-        ("rescan = { tolerance = 0.0 }", "a tolerance of 0.0 m is none"),
+        ("rescan = { tolerance = 0.0 }", "tolerance = 0.0 m is not above zero"),
     ],
 )
 def test_what_is_wrong_with_it_is_told_before_it_runs(write: Write, drift: str, said: str) -> None:

@@ -115,15 +115,15 @@ def test_every_change_of_control_is_written_down_with_who_and_why(lab: Lab) -> N
     entries = lab.entries()
     assert said(entries, "control") == [
         ("series", "in control"),
-        ("series", "no longer in control"),
+        ("series", "lost control"),
         ("classifier", "flagged tip-shape-changed"),
         ("corrector", "in control to solve tip-shape-changed"),
-        ("corrector", "no longer in control"),
+        ("corrector", "lost control"),
         ("corrector", "cleared tip-shape-changed"),
         ("boss", "mode MANUAL"),
     ]
     reasons = {entry.what: entry.reason for entry in entries if entry.kind == "control"}
-    assert reasons["no longer in control"] == "the problem it solved was cleared"
+    assert reasons["lost control"] == "the problem it solved was cleared"
     assert reasons["cleared tip-shape-changed"] == "it was flagged by classifier"
 
 

@@ -174,7 +174,7 @@ def test_the_probe_stays_in_the_region_and_goes_to_real_places() -> None:
 def test_a_scan_moved_by_single_parameters_stays_in_the_region_too() -> None:
     g = checker(ExperimentLimits(region=STAGE))
     move = set_("4", "um", "scan-top-left-x")
-    assert "not known" in why(g, move)
+    assert "not reported" in why(g, move)
     g.in_force(ScanParameters(Region((0, 0), (2e-6, 2e-6)), (64, 64)), 0)
     assert why(g, move)
     assert not why(g, set_("3", "um", "scan-top-left-x"))
@@ -184,7 +184,7 @@ def test_a_scan_moved_by_single_parameters_stays_in_the_region_too() -> None:
 
 def test_a_part_of_a_region_is_checked_with_the_rest_of_it() -> None:
     g = checker(ExperimentLimits(region=STAGE))
-    assert "not known" in why(g, scan(RegionChange(left_m=0.0)))
+    assert "not reported" in why(g, scan(RegionChange(left_m=0.0)))
     g.in_force(ScanParameters(Region((0, 0), (2e-6, 2e-6)), (64, 64)), 0)
     assert not why(g, scan(RegionChange(left_m=3e-6)))
     assert why(g, scan(RegionChange(left_m=3.5e-6)))
@@ -208,7 +208,7 @@ def test_absurd_numbers_of_pixels_are_refused() -> None:
 def test_a_part_of_a_position_is_checked_with_the_rest_of_it() -> None:
     limits = checker(ExperimentLimits(region=STAGE))
     half = Request(int(ControlRequest.SET_PROBE_POS), PositionChange(x_m=4e-6))
-    assert "not known" in why(limits, half)
+    assert "not reported" in why(limits, half)
     limits.in_force(ProbePosition((0.0, 4.9e-6)), 0)
     assert why(limits, half) == ""
     limits.carried_out(half, 0)
@@ -249,7 +249,7 @@ def restarted(limits: ExperimentLimits, before: Held[LimitChecker]) -> Held[Limi
 
 def test_nothing_is_scanned_outside_the_region_whoever_set_the_frame() -> None:
     g = checker(ExperimentLimits(region=STAGE, region_source="toml:9"))
-    assert "not known" in here(g, "start-scan")
+    assert "not reported" in here(g, "start-scan")
     g.in_force(ScanParameters(Region((4.9e-6, 0), (1e-6, 1e-6)), (8, 8)), 0)
     assert "toml:9" in here(g, "start-scan")
     assert here(g, "stop-scan") == here(g, "x-retract") == ""
@@ -261,7 +261,7 @@ def test_nothing_is_scanned_outside_the_region_whoever_set_the_frame() -> None:
 @pytest.mark.parametrize("action", ["start-spec", "x-pulse", "x-crash"])
 def test_nothing_is_done_at_the_probe_outside_the_region_whoever_moved_it(action: str) -> None:
     g = checker(ExperimentLimits(region=STAGE, region_source="toml:9"))
-    assert "not known" in here(g, action)
+    assert "not reported" in here(g, action)
     g.in_force(ProbePosition((9e-6, 0.0)), 0)
     assert "(9e-06, 0)" in here(g, action)
     assert "toml:9" in here(g, action)
@@ -377,7 +377,7 @@ def test_who_may_set_counts_for_switches_and_texts_too() -> None:
         assert "only corrector" in why(g, request, "experiment")
         assert not why(g, request, "corrector")
     g.carried_out(requests[2], 0)
-    assert "every 10 s" in why(g, Request(int(ControlRequest.PARAM), requests[2].subject), "corrector", NS)
+    assert "interval is 10 s" in why(g, Request(int(ControlRequest.PARAM), requests[2].subject), "corrector", NS)
 
 
 HIGH = {"x-high": (Parameter(BIAS, "8", "V"),)}
@@ -466,7 +466,7 @@ def test_a_parameter_that_may_be_set_every_so_often_counts_from_when_it_is_sent(
     again = restarted(limits, g)
     other = Request(int(ControlRequest.PARAM), Parameter(BIAS, "2", "V"), id="2")
     for one in (g, again):
-        assert "every 600 s" in why(one, other, now_ns=NS)
+        assert "interval is 600 s" in why(one, other, now_ns=NS)
     g.not_done("experiment", request)
     assert not why(g, other, now_ns=NS)
 

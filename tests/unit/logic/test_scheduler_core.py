@@ -268,7 +268,7 @@ def test_who_is_authenticated_as_another_is_refused(lab: Lab) -> None:
 
 
 def test_the_nameless_are_told_to_say_who_they_are(lab: Lab) -> None:
-    assert "who you are" in replies(lab.ask("", ControlRequest.REQUEST_CTRL, 0))[0].response.reason
+    assert "without a name" in replies(lab.ask("", ControlRequest.REQUEST_CTRL, 0))[0].response.reason
 
 
 def test_a_repeated_request_is_answered_and_not_done_again(lab: Lab) -> None:

@@ -104,7 +104,7 @@ def test_nothing_else_is_published_for_others(lab: Lab, thing: Any) -> None:
 def test_what_is_too_long_or_nobodys_is_refused(lab: Lab) -> None:
     told = RelayedMessage("LogLines", b"0" * (LONGEST + 1))
     assert "at most" in replies(lab.ask(HOST, RELAY_REQUEST, told))[-1].response.reason
-    assert "whose" in tell(lab, states("a", supervisor="")).reason
+    assert "owner" in tell(lab, states("a", supervisor="")).reason
 
 
 @pytest.mark.parametrize("name", ["", "a\" autofocus onfocus='steal()'", "<b>", "a\0b", "x" * 101])
@@ -167,7 +167,7 @@ def test_an_unknown_process_is_refused_with_those_that_are_known(lab: Lab) -> No
     refused = order(lab, "c")
     assert (refused.code, refused.reason) == (
         ControlResponse.FAILURE,
-        "no supervisor has a process 'c'; known: a",
+        "there is no process 'c'; known: a",
     )
     assert lab.entries()[0].refused
 
@@ -181,7 +181,7 @@ def test_a_supervisor_that_is_silent_is_given_no_orders(lab: Lab) -> None:
 def test_it_takes_the_role_to_order() -> None:
     lab = Lab(SchedulerSettings(rules=Rules(RoleTable(restart={"dashboard"}))))
     tell(lab, states("a"))
-    assert order(lab, "a", "stranger:Ada").reason == "stranger:Ada has not the role 'restart' ([control] roles)"
+    assert order(lab, "a", "stranger:Ada").reason == "stranger:Ada does not have the role restart ([control.roles])"
     assert order(lab, "a", "dashboard:Ada").code == OK
 
 

@@ -156,14 +156,14 @@ def test_whoever_gives_control_back_with_the_feedback_off_is_heard_of_once() -> 
     lab.says("experiment", ControlRequest.RELEASE_CTRL)
     lab.take_control("experiment")
     lab.says("experiment", ControlRequest.RELEASE_CTRL)
-    assert said(lab, "WARNING") == ["the feedback is off, and nobody looks after it: it gave control back"]
+    assert said(lab, "WARNING") == ["the feedback is off, and no component is in control: it gave control back"]
     assert sent(lab) == []
 
 
 def test_a_person_who_takes_over_is_told_and_not_disturbed_nor_when_the_experiment_ends() -> None:
     lab = feedback_off()
     lab.mode("person", ControlMode.MANUAL)
-    assert said(lab, "WARNING") == ["the feedback is off, and nobody looks after it: the mode is manual"]
+    assert said(lab, "WARNING") == ["the feedback is off, and no component is in control: the mode changed to MANUAL"]
     lab.effects.clear()
     assert any(isinstance(effect, Kill) for effect in lab.ask("person", END))
     assert sent(lab) == []
@@ -175,7 +175,7 @@ def test_what_can_not_be_retracted_is_critical() -> None:
     lab.take_control("experiment")
     lab.publish("ZCtrlParameters", OFF)
     lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
-    assert said(lab, "CRITICAL") == ["the feedback is off, and nobody looks after it: a problem was flagged"]
+    assert said(lab, "CRITICAL") == ["the feedback is off, and no component is in control: a problem was flagged"]
     assert sent(lab) == []
 
 
@@ -211,7 +211,8 @@ def not_retracted(settings: SchedulerSettings) -> Lab:
     lab.step(Tick())
     assert Problem.DEVICE_MALFUNCTION in lab.core.control.problems
     assert said(lab, "ERROR") == [
-        "the microscope does not x-retract: a dialog is open; it is asked again in 10 s, unless somebody sees to it"
+        "the microscope does not x-retract: a dialog is open; "
+        "it is asked again in 10 s, unless a component or a person takes over"
     ]
     return lab
 
@@ -250,7 +251,7 @@ def test_who_solves_something_else_is_not_let_at_a_tip_in_danger() -> None:
     lab.answer(lab.forwarded[-1], ControlResponse.ACTION_ERROR)
     (reply,) = replies(lab.ask("corrector", ACTION, "x-pulse", "corrector/a/1"))
     assert reply.response.code == ControlResponse.NOT_FREE
-    assert "only who solves device-malfunction" in reply.response.reason
+    assert "only components that solve device-malfunction" in reply.response.reason
     lab.clear("corrector", Problem.TIP_SHAPE_CHANGED)
     assert lab.holder is None
     lab.step(Tick())  # people are called
@@ -297,7 +298,7 @@ def test_a_retract_that_waits_for_the_translator_is_dropped_by_who_sees_to_the_t
     lab = feedback_off()
     lab.step(TranslatorDown())
     lab.give_up("experiment")
-    assert said(lab, "WARNING")[-1] == "x-retract will be sent when the translator is back, since it is dead"
+    assert said(lab, "WARNING")[-1] == "x-retract will be sent when the translator is back, since its process died"
     lab.later(real_s=10.0)
     lab.step(Tick())
     assert said(lab, "CRITICAL") == ["the tip was left in danger and can't be retracted: its translator is not there"]
@@ -381,7 +382,9 @@ def test_what_was_done_by_hand_is_told_when_the_mode_is_automated_again() -> Non
     lab.mode("person", ControlMode.MANUAL)
     lab.publish("ZCtrlParameters", OFF)
     lab.mode("person", ControlMode.AUTOMATED)
-    assert said(lab, "WARNING")[-1] == "the feedback is off, and nobody looks after it: the mode is automated again"
+    assert (
+        said(lab, "WARNING")[-1] == "the feedback is off, and no component is in control: the mode is automated again"
+    )
 
 
 def test_an_experiment_that_ends_with_such_a_tip_tries_until_it_is_time_and_leaves_it_to_the_translator() -> None:

@@ -105,7 +105,11 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def recorded(into: Path) -> Path:
     folder = into / "night-1"
     folder.mkdir()
-    facts = {"name": "night", "clock": {"origin_s": 0.0, "start_s": START / S, "speed": 60.0}, "ended": "all is done"}
+    facts = {
+        "name": "night",
+        "clock": {"origin_s": 0.0, "start_s": START / S, "speed": 60.0},
+        "ended": "all components are done",
+    }
     (folder / "run.json").write_text(json.dumps(facts), encoding="utf-8")
     store = RecordStore(folder, RecordSettings({"experiment": "night", "simulated": True}))
     packets = []
@@ -179,7 +183,7 @@ def test_the_page_needs_nothing_else_and_is_whole(report: Path) -> None:
     [
         "SIMULATED",
         "3 scans, 1 interrupted, tip-shape-changed flagged once, 1 restart",
-        "1 h 00 min (1 min 00 s real); all is done",
+        "1 h 00 min (1 min 00 s real); all components are done",
         "2 × pulse",
         "<b>interrupted</b>",
         "prefers-color-scheme:dark",

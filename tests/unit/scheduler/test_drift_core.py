@@ -118,7 +118,7 @@ def test_a_scan_without_the_channel_goes_out_as_predicted_at_its_end(lab: Lab) -
     lab.scan(channels=("Amplitude", "Phase"))
     assert centers(lab) == [pytest.approx(BACK, abs=1e-16)] * 2
     assert not lab.worker.jobs
-    assert "can't be seen" in logged(lab, "WARNING")[0]
+    assert "can't be used for drift" in logged(lab, "WARNING")[0]
 
 
 def test_the_channel_may_be_said() -> None:

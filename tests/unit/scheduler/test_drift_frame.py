@@ -97,7 +97,7 @@ def test_a_part_of_a_region_that_is_not_known_is_refused_with_a_hint() -> None:
     lab.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(RegionChange(left_m=0.0)))
     (reply,) = lab.replies()
     assert reply.code == ControlResponse.PARAM_ERROR
-    assert "give it whole" in reply.reason
+    assert "set the whole region" in reply.reason
     assert not lab.forwards()
 
 
@@ -175,7 +175,7 @@ def test_half_a_position_where_the_other_half_is_not_known_is_refused() -> None:
     lab.take_control()
     lab.effects.clear()
     lab.ask(ControlRequest.PARAM, Parameter(names.PROBE_POS_X, "1", "um"))
-    assert "give x and y" in lab.replies()[0].reason
+    assert "set x and y" in lab.replies()[0].reason
     assert not lab.forwards()
 
 

@@ -233,7 +233,7 @@ def test_where_nothing_can_be_saved_scans_are_registered_all_the_same(
     for number in range(2):
         heard.registrar.register(job(number, 30, 30))
     heard.next(Registered, 2)
-    (told,) = (record.message for record in caplog.records if "lost in a kill" in record.message)
+    (told,) = (record.message for record in caplog.records if "can't be saved" in record.message)
     assert "drift.npz" in told
 
 

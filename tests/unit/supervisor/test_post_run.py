@@ -80,12 +80,12 @@ def test_what_can_not_be_told_is_tried_again_and_then_left(monkeypatch: pytest.M
     monkeypatch.setattr(notifications, "FIRST_DELAY_S", 0.01)
     log, count = Log(), tmp_path / "count"
     code = "import sys; open(sys.argv[1], 'a').write('x'); sys.exit('no network')"
-    ended = EndedRun("night", tmp_path, RunOutcome(EndReason.ALL_DONE, "all is done", (), 1.0), False)
+    ended = EndedRun("night", tmp_path, RunOutcome(EndReason.ALL_DONE, "all components are done", (), 1.0), False)
     targets = Targets([sys.executable, "-c", code, str(count)])
     post_run.tell(ended, targets, ("end",), TenSeconds(), log)  # type: ignore[arg-type]
     assert count.read_text() == "xxx"
     assert [level for level, _ in log.lines] == [logging.ERROR]
-    assert "nobody could be told by the command" in log.lines[0][1]
+    assert "the command failed" in log.lines[0][1]
 
 
 def test_the_report_is_written_by_another_process(tmp_path: Path) -> None:
@@ -122,6 +122,6 @@ def test_people_are_told_before_the_report_is_made(monkeypatch: pytest.MonkeyPat
     file.write_text("\n".join(parts))
     experiment = load(file)
     starts = experiment.launches(take_address=FreePorts().address)
-    ended = EndedRun("night", tmp_path, RunOutcome(EndReason.ALL_DONE, "all is done", (), 1.0), True)
+    ended = EndedRun("night", tmp_path, RunOutcome(EndReason.ALL_DONE, "all components are done", (), 1.0), True)
     post_run.follow(experiment, ended, starts, ExperimentClock.real(), Log(), with_report=True)  # type: ignore[arg-type]
     assert done == ["told", "reported"]

@@ -25,7 +25,7 @@ def test_the_oldest_lines_go_and_that_is_said(reporter: Reporter) -> None:
     for n in range(reporting.MOST_LINES + 7):
         reporter.line("one", logging.INFO, f"line {n}")
     lines = reporter._queue.take_lines()
-    assert lines[0].text == "dropped 7 lines: the scheduler did not take them"
+    assert lines[0].text == "dropped 7 lines that the scheduler did not take"
     assert lines[0].level == "WARNING"
     assert lines[1].text == "line 7"
     assert reporter._queue.take_lines()[0].text == f"line {len(lines) + 6}"

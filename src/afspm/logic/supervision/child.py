@@ -87,8 +87,8 @@ ChildEffect = StartChild | KillChild | GiveUpChild | ChildLog
 _WHY = {
     ProcessHealth.SLOW_START: "it sent no first heartbeat within {start_s:g} s",
     ProcessHealth.SILENT: "no heartbeat for {silence_s:g} s: it hangs",
-    ProcessHealth.FROZEN: "a step takes longer than it said that one may: it is frozen",
-    ProcessHealth.NOT_CLOSING: "it said that it is closing and was still there {closing_s:g} s later",
+    ProcessHealth.FROZEN: "a step took longer than its declared longest time: it is frozen",
+    ProcessHealth.NOT_CLOSING: "it announced its end and was still running {closing_s:g} s later",
 }
 
 
@@ -166,7 +166,7 @@ class ChildWatch:
         if self.phase is ChildPhase.STOPPING:
             return []
         self._fault = None
-        said = ChildLog("INFO", "is started anew, as ordered")
+        said = ChildLog("INFO", "is restarted, as ordered")
         if self.phase in (ChildPhase.RUNNING, ChildPhase.KILLING):
             is_new = not self._is_ordered
             self.phase, self._is_ordered = ChildPhase.KILLING, True
@@ -221,10 +221,10 @@ class ChildWatch:
                 f"{what}; it was restarted {restart.budget} times within {restart.window_s:g} s already"
             )
         if delay_s <= 0:
-            return [ChildLog("WARNING", f"{what}; it is started again"), *self._start(now_s)]
+            return [ChildLog("WARNING", f"{what}; restarting"), *self._start(now_s)]
         self.phase = ChildPhase.WAITING
         self._again_s = now_s + delay_s
-        return [ChildLog("WARNING", f"{what}; it is started again in {delay_s:g} s")]
+        return [ChildLog("WARNING", f"{what}; restarting in {delay_s:g} s")]
 
     def _give_up(self, why: str) -> list[ChildEffect]:
         self.phase = ChildPhase.GIVEN_UP

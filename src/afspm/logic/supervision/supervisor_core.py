@@ -161,13 +161,13 @@ class SupervisorCore:
         child.last_exit = f"{how}: {exited.last_error}" if has_crashed and exited.last_error else how
         if self.ending is not None:
             if child.watch.died(code) and self._may_be_rescued(child):
-                self._log(child.spec.name, "WARNING", f"{how}; it is started again, to finish")
+                self._log(child.spec.name, "WARNING", f"{how}; restarting it, to finish")
                 self._rescue(child)
             else:
                 self._log(child.spec.name, "DEBUG", child.last_exit)
         elif code == ExitCode.DONE and child.spec.role is Role.TRANSLATOR and not life.is_closing:
             # one of version 1 that has caught an error of its own ends like that; one that closes on purpose says so
-            told = f"{how}, before the experiment has ended and without saying that it closes"
+            told = f"{how} before the end of the experiment, without announcing it"
             self._apply(child, child.watch.exited(ExitCode.CRASHED, self._now_s, told))
         else:
             self._apply(child, child.watch.exited(code, self._now_s, how, exited.fault))
@@ -202,9 +202,9 @@ class SupervisorCore:
             self._apply(child, child.watch.tick(self._now_s, works=works))
         if self.ending is None and all(child.is_over for child in self.children.values()):
             if all(child.given_up for child in self.children.values()):
-                self._end(EndReason.LOST, "everything is given up")
+                self._end(EndReason.LOST, "all processes are given up")
             else:
-                self._end(EndReason.ALL_DONE, "all is done")
+                self._end(EndReason.ALL_DONE, "all components are done")
 
     def _await_scheduler(self) -> None:
         """A scheduler that beats and does not answer us, for want of a key perhaps, may answer components."""
@@ -215,7 +215,7 @@ class SupervisorCore:
         lives = [child.life for child in self._with_role(Role.SCHEDULER)]
         if any(life and life.beat and self._now_s - life.started_s >= SCHEDULER_ANSWERS_WITHIN_S for life in lives):
             self._release()
-            self._log(LOGGED_AS, "WARNING", "the scheduler does not answer; the components begin all the same")
+            self._log(LOGGED_AS, "WARNING", "the scheduler does not answer; the components are started nevertheless")
 
     # --- one child ---
 
@@ -239,11 +239,11 @@ class SupervisorCore:
         child.given_up = True
         name = child.spec.name
         if child.spec.essential:
-            what = f"{name} is given up, and the experiment can't go on without it: {why}"
+            what = f"gave up {name}; the experiment can't go on without it: {why}"
             self._end(EndReason.LOST, what)
         else:
             again = f"`afspm restart {name}` starts it again, Ctrl-C ends the run"
-            self._log(LOGGED_AS, "CRITICAL", f"{name} is given up, the rest goes on: {why}; {again}")
+            self._log(LOGGED_AS, "CRITICAL", f"gave up {name}; the rest goes on: {why}; {again}")
 
     def _end(self, why: EndReason, text: str) -> None:
         self._release()

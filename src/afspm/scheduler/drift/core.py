@@ -135,7 +135,9 @@ class DriftCore(SchedulerCore):
             return self._registered(event, now_s, now_ns)
         if isinstance(event, NotRegistered):
             self._ends = 0
-            told = Log("ERROR", f"a scan could not be registered, it goes out as predicted: {event.reason}")
+            told = Log(
+                "ERROR", f"a scan could not be registered, and is published at the predicted position: {event.reason}"
+            )
             return [told, *self._give_up(event.key, event.reason, now_s, now_ns)]
         if isinstance(event, WorkerGone):
             return self._gone(event, now_s, now_ns)
@@ -225,7 +227,7 @@ class DriftCore(SchedulerCore):
         return scan.channel == self._channel
 
     def _without_channel(self, key: str, now_s: float, now_ns: int) -> list[Effect]:
-        why = f"a scan without the channel {self._channel or 'in a unit of length'}: drift can't be seen in it"
+        why = f"a scan without the channel {self._channel or 'in a unit of length'}: it can't be used for drift"
         effects: list[Effect] = [] if self._told_channel else [Log("WARNING", why)]
         self._told_channel = True
         return effects + self._give_up(key, why, now_s, now_ns)
@@ -297,7 +299,7 @@ class DriftCore(SchedulerCore):
         try:
             self.knowledge.learn(forecast)
         except AfspmError as error:
-            return [Log("ERROR", f"the forecast of the drift can't be understood: {error}")]
+            return [Log("ERROR", f"the drift forecast can't be read: {error}")]
         return []
 
     def _slow(self, held: HeldScan, now_s: float) -> list[Effect]:
@@ -307,8 +309,8 @@ class DriftCore(SchedulerCore):
         if self._told_slow or took_s < limit_s / 3:
             return []
         self._told_slow = True
-        text = f"a scan was registered in {took_s:.1f} s, and is not waited for longer than longest_registration = "
-        return [Log("WARNING", f"{text}{limit_s:g} s: fewer pixels are as good, or allow more")]
+        text = f"registering a scan took {took_s:.1f} s, and is given up after longest_registration = {limit_s:g} s"
+        return [Log("WARNING", f"{text}: use fewer pixels, or raise it")]
 
     def _give_up(self, key: str, why: str, now_s: float, now_ns: int) -> list[Effect]:
         """A scan goes out with the prediction; too many of them, and the prediction is not to be relied on."""
@@ -336,7 +338,7 @@ class DriftCore(SchedulerCore):
         why = f"a scan was not registered within {limit_s:g} s"
         effects: list[Effect] = []
         if held.asked:
-            effects.append(Log("ERROR", f"{why}, it goes out as predicted"))
+            effects.append(Log("ERROR", f"{why}, and is published at the predicted position"))
             self._jobs.clear()
             self._worker.start()
         return effects + self._give_up(held.key, why, now_s, now_ns)
@@ -345,10 +347,10 @@ class DriftCore(SchedulerCore):
         self._ends += 1
         held = self._gate.held
         if self._ends >= _MOST_ENDS:
-            effects: list[Effect] = [Log("CRITICAL", f"drift is not followed any more: {event.reason}")]
+            effects: list[Effect] = [Log("CRITICAL", f"drift is no longer followed: {event.reason}")]
             self._following.append((now_s, self._wait_for_a_person))
             return effects if held is None else effects + self._publish_as_predicted(held, now_s, now_ns)
-        effects = [Log("ERROR", f"what registers scans has ended and is started again: {event.reason}")]
+        effects = [Log("ERROR", f"the process that registers scans ended and is restarted: {event.reason}")]
         self._worker.start()
         if held is None or not held.asked:
             return effects

@@ -186,7 +186,7 @@ class DriftFrame:
             return change
         if self.region.current is None:
             raise AfspmError(
-                "where the scan is now is not known, so a part of its place can't be mapped; give it whole"
+                "the microscope has not reported its scan region, so a part of it can't be mapped; set the whole region"
             )
         return change.onto(self.region.current.sample)
 
@@ -195,7 +195,7 @@ class DriftFrame:
             return change
         if self.probe.current is None:
             raise AfspmError(
-                "where the probe is now is not known, so a part of its place can't be mapped; give x and y"
+                "the microscope has not reported its probe position, so a part of it can't be mapped; set x and y"
             )
         x_m, y_m = self.probe.current.sample.xy_m
         return ProbePosition((x_m if change.x_m is None else change.x_m, y_m if change.y_m is None else change.y_m))

@@ -29,7 +29,7 @@ RESCAN = "DriftRescan"
 _DRIFT, _MALFUNCTION = int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFUNCTION)
 _MOST_UNREGISTERED = 3
 """So many scans in a row that nobody could register are as good as a sample that is lost: that of the trackers."""
-_AT_START = "drift is not known until a scan in the other direction has told the velocity"
+_AT_START = "the drift is unknown until a scan in the other direction gives its velocity"
 
 Step = Callable[[Input], list[Effect]]
 
@@ -109,7 +109,8 @@ class DriftResponse:
         """The first scan is there: nobody goes on before it has been taken in the other direction."""
         self._started = True
         if upwards is None:
-            return [Log("WARNING", f"the microscope does not tell its {names.SCAN_DIRECTION}: no scan up and down")]
+            why = f"the microscope does not report {names.SCAN_DIRECTION}"
+            return [Log("WARNING", f"{why}: the first scan is not taken in both directions")]
         effects = step(ProblemSeen(_DRIFT, flagged=True, name=self._name))
         return effects + self._want(RescanKind.OPPOSITE, _AT_START, step, now_ns, upwards=not upwards)
 
@@ -125,10 +126,10 @@ class DriftResponse:
     ) -> list[Effect]:
         place = self._frame.region.current
         if place is None:
-            return [Log("ERROR", f"{reason}, and where to scan again is not known")]
+            return [Log("ERROR", f"{reason}, and the region to scan again is unknown")]
         wanted = RescanWanted(kind, place.said, self._frame.shape, reason, now_ns, upwards)
         return [
-            Log("WARNING", f"a scan is wanted again: {reason}"),
+            Log("WARNING", f"requesting a rescan: {reason}"),
             *step(Announced(RESCAN, self._codec.encode_rescan(wanted))),
         ]
 
@@ -195,4 +196,4 @@ class DriftResponse:
 def _refusal(axis: str, response: Response) -> list[Effect]:
     if response.ok or response.code == ControlResponse.NOT_FREE:
         return []  # a scan has begun already: it is handed over after the next
-    return [Log("ERROR", f"the controller does not take the rate of the drift, {axis}: {response.reason}")]
+    return [Log("ERROR", f"the controller refused the drift rate, {axis}: {response.reason}")]

@@ -69,7 +69,7 @@ class DriftCompensatedScheduler(Scheduler):
         made = tracker(self.drift.tracker, estimator(self.drift.estimator))
         if self.drift.compensate is not None and not hasattr(made, "compensated"):
             raise ConfigError(
-                "the tracker does not reckon with a controller that compensates by itself",
+                "this tracker can't follow a controller that compensates by itself",
                 where="drift: compensate",
                 hint='tracker = "bank", or leave compensate out',
             )

@@ -31,9 +31,9 @@ class RescanRule:
 
     def __post_init__(self) -> None:
         if self.tolerance is not None and not self.tolerance > 0.0:
-            raise InvalidValue(f"a tolerance of {self.tolerance} m is none", where="rescan")
+            raise InvalidValue(f"tolerance = {self.tolerance} m is not above zero", where="rescan")
         if not 0.0 <= self.f_rescan <= 1.0:
-            raise InvalidValue(f"f_rescan = {self.f_rescan} is no part of an area", where="rescan", hint="0 to 1")
+            raise InvalidValue(f"f_rescan = {self.f_rescan} is not a part of an area", where="rescan", hint="0 to 1")
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class DriftCompensationSettings:
         for name in ("correct_after", "longest_registration"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
-                raise InvalidValue(f"{name} = {value} s can't be", where="drift")
+                raise InvalidValue(f"{name} = {value} s is not zero or more", where="drift")
 
     @classmethod
     def from_table(cls, table: dict[str, Any]) -> DriftCompensationSettings:
@@ -94,4 +94,4 @@ class DriftCompensationSettings:
                 plain["compensate"] = Compensate(**compensate)
             return cls(**plain)
         except TypeError as error:
-            raise ConfigError(f"the table makes no sense: {error}", where="drift") from error
+            raise ConfigError(f"the table can't be used: {error}", where="drift") from error

@@ -92,7 +92,7 @@ class _Worker:
             self._estimation.restore(state)
         except (AfspmError, LookupError, TypeError, ValueError) as error:
             reason = f"the saved state is of another tracker, or damaged: {error}"
-            hint = "go on with the tracker that it is of, or remove the file: then where the sample is is not known"
+            hint = "use the tracker that wrote it, or remove the file: the position of the sample is then unknown"
             raise FileError(reason, where=str(self._store.path), hint=hint) from error
 
     def _save(self, state: dict[str, Any]) -> None:
@@ -103,7 +103,7 @@ class _Worker:
             self._store.save(state)
         except FileError as error:  # what is known of the drift now is worth more than what a kill would lose
             if not self._told_full:
-                self._complain(f"what is known of the drift would be lost in a kill: {error}")
+                self._complain(f"the state of the drift can't be saved: {error}")
             self._told_full = True
         else:
             self._told_full = False
