@@ -67,7 +67,7 @@ def place_of(error: BaseException, package: Path = PACKAGE) -> str:
 def log(logger: logging.Logger, error: BaseException, name: str) -> None:
     """Log an exception that ends a process."""
     logger.error("%s", describe(error, name))
-    logger.debug("the same with every step of ours", exc_info=error)
+    logger.debug("the full traceback", exc_info=error)
 
 
 def where_now(thread_id: int, package: Path = PACKAGE) -> str:

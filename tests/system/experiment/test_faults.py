@@ -144,7 +144,7 @@ def test_a_script_that_fails_twice_alike_does_not_measure_a_third_time(run: Run,
     (tmp_path / "survey.py").write_text(SURVEY, encoding="utf-8")
     one = run(more='[survey]\ncomponent = true\nclass = "survey.Survey"\n', scans=1000)
     one.wait_for(
-        "CRITICAL survey is given up, the rest goes on: failed twice in the same way",
+        "CRITICAL gave up survey; the rest goes on: failed twice in the same way",
         r"ValueError at survey.py:8",
         "`afspm restart survey` starts it again",
     )
