@@ -34,7 +34,7 @@ component = true
 class = "Simulator"
 seed = 7
 surface = { kind = "particles" }
-tip_changes = { schedule = [[2_000, "double"]], pulse_cures = 0.3 }
+tip_changes = { schedule = [[1_500, "double"]], pulse_cures = 1.0 }
 initial = { scan-speed = "10 um/s" }
 live_lines_s = 20.0
 

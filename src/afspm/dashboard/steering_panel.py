@@ -18,6 +18,7 @@ from afspm.drawing.timeline import tint_class
 from afspm.formatting import time_of_day, typeset_position
 from afspm.model import ControlMode
 
+_MANUAL = "Scan here and Spectrum here, over the scan, measure where you point."
 _TAKE_OVER = "In MANUAL you can set parameters, scan and take spectra here."
 _ADJUST = (
     "These hold from the next line on, while a component measures. In MANUAL you can set all parameters, and scan."
@@ -97,28 +98,28 @@ class SteeringPanel:
         self._session = session
         with ui.element("div").classes("acts"):
             button("Stop the scan", self._ask_stop)
-            button("End the experiment …", self._ask_end, "negative").props("outline")
+            self._by_hand = [
+                button("Scan as set", lambda: session.do(lambda a: a.scan())),
+                button("Spectrum at the probe", lambda: session.do(lambda a: a.spectrum())),
+            ]
+        self._hint = ui.label().classes("quiet")
         session.results()
+        self._parameters = ParameterForm(session)
         ui.html("<h3>Flag a problem</h3>", sanitize=False)
         with ui.element("div").classes("acts"):
             options = {number: name for name, number in session.watch.problems.items()}
             self._problem = ui.select(options, label="problem", value=next(iter(options))).props("dense outlined")
             button("Raise", lambda: session.do(partial(Actions.flag, problem=int(self._problem.value))))
-        ui.html("<h3>Microscope</h3>", sanitize=False)
-        self._not_by_hand = ui.label().classes("quiet")
-        with ui.element("div").classes("acts") as self._by_hand:
-            button("Scan as set", lambda: session.do(lambda a: a.scan()))
-            button("Spectrum at the probe", lambda: session.do(lambda a: a.spectrum()))
-            ui.label("Or choose Scan here or Spectrum here over the scan.").classes("quiet")
-        self._parameters = ParameterForm(session)
+        with ui.element("div").classes("acts"):
+            button("End the experiment …", self._ask_end, "negative").props("outline")
         ui.on("scan_here", self._ask_scan)
         ui.on("spectrum_here", self._ask_spectrum)
 
     async def show(self, content: Content) -> None:
         """Bring it up to date."""
-        self._by_hand.set_visibility(content.is_manual)
-        self._not_by_hand.set_visibility(not content.is_manual)
-        self._not_by_hand.set_text(_ADJUST if content.adjustable else _TAKE_OVER)
+        for one in self._by_hand:
+            one.set_visibility(content.is_manual)
+        self._hint.set_text(_MANUAL if content.is_manual else _ADJUST if content.adjustable else _TAKE_OVER)
         await self._parameters.show()
 
     async def _ask_end(self) -> None:
