@@ -46,9 +46,9 @@ def ended(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ni
         page.wait_for_function("window.afspm?.scrubber", timeout=60_000)  # the page that was open is there again
         context.close()
         yield night
-    finally:
         night.process.send_signal(signal.SIGINT)
         assert night.process.wait(20.0) == 0
+    finally:
         night.close()
 
 

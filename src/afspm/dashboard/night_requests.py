@@ -19,7 +19,7 @@ from afspm.drawing.levelling import Levelling
 from afspm.drawing.palette import DIVERGING
 from afspm.drawing.raster import ValueRange, indices, png, value_range
 from afspm.errors import InvalidValue
-from afspm.formatting import area_text, time_of_day
+from afspm.formatting import time_of_day, typeset_area
 from afspm.record.report import REPORT_FILE
 from afspm.record.tables import ScanRow
 
@@ -93,7 +93,7 @@ def _scan(row: ScanRow) -> dict[str, Any]:
     return {
         "time": str(row.time_ns),
         "number": row.number,
-        "text": f"{time_of_day(row.time_ns)}, {area_text(row.region.size_m)}{cut}",
+        "text": f"{time_of_day(row.time_ns)}, {typeset_area(row.region.size_m)}{cut}",
         "channels": [name for name, _ in row.channels],
         "size": row.region.size_m,
         "angle": row.region.angle_rad,

@@ -55,9 +55,9 @@ export function drawPicture(canvas, picture, title, again) {
     context.fillText(picture?.trouble ?? "…", 2, 26);
     return;
   }
-  const { head, bitmap } = picture, room = [width - 84, height - 30];
+  const { head, bitmap } = picture, room = [width - 84, height - 46];
   const perMetre = Math.min(room[0] / head.size[0], room[1] / head.size[1]);
-  const box = { x: 0.5, y: 24.5, width: head.size[0] * perMetre, height: head.size[1] * perMetre };
+  const box = { x: 0.5, y: 40.5, width: head.size[0] * perMetre, height: head.size[1] * perMetre };
   context.imageSmoothingEnabled = box.width < bitmap.width;
   context.drawImage(bitmap, box.x, box.y, box.width, box.height);
   context.strokeRect(box.x, box.y, box.width, box.height);
