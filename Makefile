@@ -67,10 +67,12 @@ test-translators: $(TEST)
 	    --report build/translators/$$name.json || failed="$$failed $$name"; \
 	done; test -z "$$failed" || { echo "not as they should be:$$failed"; exit 1; }
 
-## tests with a Windows Python under Wine, on Debian: see docs/how-to/windows.md. TESTS="tests/unit/wire"
-TESTS ?= $(shell cat tools/windows/tests.txt)
-test-windows: $(SETUP)
-	@$(PYTHON) tools/windows/python.py -m pytest -n 2 -p no:cacheprovider $(TESTS)
+## tests with a Windows Python under Wine, on Debian, two folders at a time: make test-windows TESTS="tests/unit/wire"
+# (a test that takes too long or crashes ends its process there, and with it the tests of its folder)
+TESTS ?= $(wildcard tests/unit/*/ tests/unit/*.py) $(addprefix tests/system/,process supervisor record experiment)
+test-windows: $(TEST)
+	@$(PYTHON) tools/windows/python.py
+	@printf '%s\n' $(TESTS) | grep -v __ | xargs -P 2 -n 1 $(PYTHON) tools/windows/python.py -m pytest -q -p no:cacheprovider
 
 ## style, types, and who may import whom
 check: $(SETUP)

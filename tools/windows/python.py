@@ -1,7 +1,7 @@
-"""Sets up a Windows Python under Wine in build/windows, and runs it: `python3 tools/windows/python.py -m pytest …`.
+"""Sets up a Windows Python under Wine in build/windows: `python3 tools/windows/python.py`; with arguments, runs it.
 
 Needs Debian's packages wine, wine64, maven and gcc-mingw-w64-x86-64-win32 (as root they are installed), 700 MB of disk
-for the packages and as much for Wine itself. Everything is fetched once; the wheel is built anew at every run.
+for the packages and as much for Wine itself. Everything is fetched once; the wheel is built each time.
 """
 
 from __future__ import annotations
@@ -46,12 +46,14 @@ ENVIRONMENT = {
 
 
 def main() -> None:
-    """Set up whatever is missing, install the package, and run Python with our arguments."""
-    _install_programs()
-    _unpack_python()
-    _install_packages()
-    _make_prefix()
-    _install_afspm()
+    """Without arguments, set up what is missing and install the package; with arguments, run Python with them."""
+    if not sys.argv[1:]:
+        _install_programs()
+        _unpack_python()
+        _install_packages()
+        _make_prefix()
+        _install_afspm()
+        return
     # Wine's server is started apart, else it would say things of its own on our output
     environment = {**os.environ, **ENVIRONMENT}
     subprocess.run([str(WINE.with_name("wineserver")), "-p60"], env=environment, stderr=subprocess.DEVNULL, check=False)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import shutil
 import sqlite3
 import tempfile
-import weakref
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path, PurePath
 
 from afspm.errors import FileError
@@ -128,9 +129,14 @@ class _OfCopy(sqlite3.Connection):
 
     remove: Callable[[], object] = staticmethod(lambda: None)
 
+    def remove_at_end(self, folder: Path) -> None:
+        self.remove = partial(shutil.rmtree, folder, ignore_errors=True)
+        atexit.register(self.remove)
+
     def close(self) -> None:
         super().close()  # first: Windows removes no file that is open
         self.remove()
+        atexit.unregister(self.remove)
 
     __del__ = close
 
@@ -151,7 +157,7 @@ def _checked_copy(path: Path) -> sqlite3.Connection:
         if isinstance(error, OSError):
             raise FileError(f"can't be read, no copy can be made of it: {error}", where=str(path)) from error
         raise
-    connection.remove = weakref.finalize(connection, shutil.rmtree, folder, ignore_errors=True)
+    connection.remove_at_end(folder)
     return connection
 
 

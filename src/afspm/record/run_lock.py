@@ -7,7 +7,7 @@ import platform
 import shlex
 import sys
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from afspm.errors import FileError
 from afspm.file_lock import lock
@@ -65,12 +65,12 @@ def describe_state(folder: Path) -> str:
     return cut_off_message(folder) or ("it goes on" if known else "it goes on, or was cut off")
 
 
-def resume_command(folder: Path) -> str:
+def resume_command(folder: PurePath) -> str:
     """Return the command that resumes a run."""
     return f"`afspm run --resume {quoted(folder)}`"
 
 
-def quoted(path: Path) -> str:
+def quoted(path: PurePath) -> str:
     """Return a path as it may be typed into a shell."""
     if sys.platform != "win32":
         return shlex.quote(str(path))

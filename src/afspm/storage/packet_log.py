@@ -61,6 +61,7 @@ class PacketLog:
         self._most_unrecorded_bytes = most_unrecorded_bytes
         self._segment: SegmentWriter | None = None
         self._full = deque((path, path.stat().st_size) for path in segments(folder))
+        self._done_with: list[Path] = []
         self._spare = sorted(folder.glob(f"*{_SPARE_SUFFIX}"))
         used = [number_of(path) for path in (*self._spare, *(path for path, _ in self._full))]
         self._number = max([*used, (committed(folder) or START).segment])
@@ -104,7 +105,8 @@ class PacketLog:
             all_recorded = all_recorded and is_recorded
             self._carry_forward(path, live)
             self._full.popleft()
-            self._free(path)
+            self._done_with.append(path)
+        self._free()
         return all_recorded
 
     def close(self) -> None:
@@ -135,12 +137,18 @@ class PacketLog:
         if carried:
             SYNCER.now(SYNCED_WITHIN_S)  # before the only other copy is written over
 
-    def _free(self, path: Path) -> None:
+    def _free(self) -> None:
+        """Keep some of the files that are needed no more, to write over, and remove the others."""
+        files, self._done_with = self._done_with, []
+        for path in files:
+            try:
+                self._spare.append(path.replace(path.with_suffix(_SPARE_SUFFIX)))
+            except OSError:  # Windows renames no file that is still open, to be read or synced: next time
+                self._done_with.append(path)
         with contextlib.suppress(OSError):
-            self._spare.append(path.replace(path.with_suffix(_SPARE_SUFFIX)))
-        if len(self._spare) > SPARE_BYTES // SEGMENT_BYTES:
-            with contextlib.suppress(OSError):
-                self._spare.pop(0).unlink()
+            while len(self._spare) > SPARE_BYTES // SEGMENT_BYTES:
+                self._spare[0].unlink()
+                del self._spare[0]
 
 
 class LogReader:
@@ -232,6 +240,8 @@ def discard_if_recorded(folder: Path) -> None:
     position = committed(folder)
     if position is not None and LogReader(folder, position).read(1):
         return
+    with contextlib.suppress(OSError):
+        SYNCER.now(SYNCED_WITHIN_S)  # Windows removes no file that is open
     for pattern in (f"*{SUFFIX}", f"*{_SPARE_SUFFIX}", COMMITTED_FILE):
         for file in folder.glob(pattern):
             with contextlib.suppress(OSError):

@@ -180,7 +180,7 @@ def test_a_damaged_file_costs_what_is_in_it_alone(run: Run, tmp_path: Path, to: 
     told: list[str] = []
     assert 0 < len(list(export(run, to, tmp_path / "out", tell=told.append))) < whole
     (said,) = told
-    assert run.scans[1].file in said
+    assert str(Path(run.scans[1].file)) in said
     with pytest.raises(FileError, match="damaged"):
         list(export(run, to, tmp_path / "out"))
 
@@ -189,7 +189,7 @@ def test_packets_of_a_damaged_file_are_left_out_if_wanted(run: Run, tmp_path: Pa
     (tmp_path / run.scans[1].file).unlink()
     told: list[str] = []
     packets = list(run.packets(tell=told.append))
-    assert [row.file for row in run.scans if any(row.file in said for said in told)] == [run.scans[1].file]
+    assert [row.file for row in run.scans if any(str(Path(row.file)) in said for said in told)] == [run.scans[1].file]
     assert len({packet.envelope for packet in packets if packet.envelope.startswith("Scan2d")}) == 2
     with pytest.raises(FileError):
         list(run.packets())

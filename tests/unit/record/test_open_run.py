@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import sqlite3
+import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import closing
@@ -123,6 +124,8 @@ def test_the_newest_of_a_folder_of_runs_is_meant(night: Night, tmp_path: Path) -
 )
 def test_a_record_on_a_network_share_is_named_so_that_it_is_opened(path: str, said: str, tmp_path: Path) -> None:
     assert read_only(PureWindowsPath(path)) == said
+    if sys.platform == "win32":
+        return  # there the form with four slashes is a share, which this computer may not have
     with closing(sqlite3.connect(tmp_path / JOURNAL_FILE)) as made:
         made.execute("CREATE TABLE about (name)")
     in_that_form = read_only(tmp_path / JOURNAL_FILE).replace("file:///", "file:////")

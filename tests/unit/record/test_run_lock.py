@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import pytest
@@ -23,7 +23,7 @@ def folder_of(tmp_path: Path, **facts: Any) -> Path:
 
 def test_a_run_is_cut_off_if_nobody_runs_it_and_it_has_not_ended(tmp_path: Path) -> None:
     folder = folder_of(tmp_path)
-    assert cut_off_message(folder) == f"it was cut off; `afspm run --resume '{folder}'` goes on with it"
+    assert cut_off_message(folder) == f"it was cut off; {resume_command(folder)} goes on with it"
     with lock_run(folder):
         assert cut_off_message(folder) == ""
     assert cut_off_message(folder), "who ran it is gone"
@@ -75,4 +75,5 @@ def test_the_command_that_resumes_can_be_typed_as_it_is_told(
     monkeypatch: pytest.MonkeyPatch, system: str, folder: str, said: str
 ) -> None:
     monkeypatch.setattr(run_lock.sys, "platform", system)
-    assert resume_command(Path(folder)) == said
+    path = PureWindowsPath(folder) if system == "win32" else PurePosixPath(folder)
+    assert resume_command(path) == said

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from pathlib import Path
 
@@ -86,7 +87,8 @@ def test_what_was_written_is_on_the_disk_a_moment_later_though_it_was_closed(tmp
             file.write(b"x")
             syncer.soon(file.fileno())
     syncer.folder_soon(tmp_path)
-    wanted = {path.stat().st_ino for path in (tmp_path / "a", tmp_path / "b", tmp_path)}
+    folder = () if sys.platform == "win32" else (tmp_path,)  # Windows syncs no folders
+    wanted = {path.stat().st_ino for path in (tmp_path / "a", tmp_path / "b", *folder)}
     while set(synced) != wanted and not done.wait(0.01):
         pass
 
