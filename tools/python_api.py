@@ -43,7 +43,7 @@ GROUPS = {
     "Errors": [
         *(f"afspm.errors.{name}" for name in ("AfspmError", "Refused", "NoResponse", "MeasurementFailed")),
         *(f"afspm.errors.{name}" for name in ("ControlLost", "ExperimentEnded", "InvalidValue")),
-        *(f"afspm.errors.{name}" for name in ("UnitError", "FileError", "ConfigError")),
+        *(f"afspm.errors.{name}" for name in ("NoSuchItem", "UnitError", "FileError", "ConfigError")),
     ],
 }
 """What users write with, by its full name."""
