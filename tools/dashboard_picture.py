@@ -111,7 +111,7 @@ def open_page(browser: Browser, url: str, screen: str, theme: Any = "light", per
         page.fill("#person", person)
         page.click("button")
     page.wait_for_selector("text=is in control")
-    page.wait_for_function("document.querySelector('.picture').dataset.number > 0")
+    page.wait_for_function("document.querySelector('.picture').dataset.number")
     return page
 
 
