@@ -74,11 +74,13 @@ class SurveyRecord:
     def write(self, path: str | Path) -> None:
         """Write the table: a row for each target, with the controller's files of its zoom and curves.
 
+        Files in the folder of the table, or below it, are named from there.
+
         Raises:
             OSError: the disk is full …
         """
         text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows(self._rows())
+        csv.writer(text, lineterminator="\n").writerows(self._rows(Path(path).absolute().parent))
         write_atomic(Path(path), [text.getvalue().encode()])
 
     def draw(self, path: str | Path, *, title: str = "", simulated: bool = False) -> None:
@@ -92,7 +94,7 @@ class SurveyRecord:
 
         draw(self, Path(path), title=title, simulated=simulated)
 
-    def _rows(self) -> Iterator[list[str]]:
+    def _rows(self, folder: Path) -> Iterator[list[str]]:
         yield ["number", "x", "y", "length_units", "height", "height_units", "outcome", "reason", "zoom", *self.curves]
         for visit in self.visits:
             height = visit.target.height
@@ -103,6 +105,14 @@ class SurveyRecord:
                 *(("", "") if height is None else (f"{height:.6g}", self.survey.unit)),
                 self.outcome(visit).value,
                 "; ".join(visit.refusals),
-                visit.zoom.filename if visit.zoom else "",
-                *(visit.curves[name].filename if name in visit.curves else "" for name in self.curves),
+                _within(visit.zoom, folder),
+                *(_within(visit.curves.get(name), folder) for name in self.curves),
             ]
+
+
+def _within(measured: Scan | Spectrum | None, folder: Path) -> str:
+    """Return the file of a measurement, from a folder if it lies there; empty if there is none."""
+    if measured is None or not measured.filename:
+        return ""
+    file = Path(measured.filename)
+    return file.relative_to(folder).as_posix() if file.is_relative_to(folder) else measured.filename

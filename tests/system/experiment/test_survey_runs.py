@@ -117,3 +117,16 @@ def test_the_script_of_the_tutorial_does_the_same_in_under_thirty_lines(afspm_ru
     assert (tmp_path / "targets.png").stat().st_size > 50_000
     with afspm.open_run(one.folder) as record:
         assert [row.key for row in record.scans] == ["survey", "zoom-1", "zoom-2"]
+
+
+def test_zooms_outside_the_limits_are_told_as_refused_and_an_early_end_leaves_table_and_picture(
+    afspm_run: Run, tmp_path: Path
+) -> None:
+    narrow = '[limits]\nregion = { x = ["-2.5 um", "2.5 um"], y = ["-2.5 um", "2.5 um"] }\n'
+    one = afspm_run(str(SAMPLE), overlay(tmp_path, FEWER + SLOWER + narrow), "--runs", str(tmp_path / "runs"))
+    one.wait_for("WARNING target 3 of 4 .*refused: zoom: .*lies outside the region allowed")
+    with afspm.connect(one.folder, name="person") as scope:
+        scope.end_experiment()
+    assert one.end() == 0, one.output
+    assert outcomes(one.folder) == ["measured", "refused", "refused", "not-reached"]
+    assert (one.folder / "targets.png").stat().st_size > 50_000

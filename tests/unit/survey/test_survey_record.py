@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,12 +44,16 @@ def test_each_target_has_an_outcome(record: SurveyRecord) -> None:
 
 
 def test_the_table_says_where_how_high_and_which_files(record: SurveyRecord, tmp_path: Path) -> None:
+    record.visits[0].curves["beside"] = replace(
+        record.visits[0].curves["beside"], filename=str(tmp_path / "a" / "b.dat")
+    )
     record.write(tmp_path / "targets.csv")
     with (tmp_path / "targets.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["number"] for row in rows] == ["1", "2", "3", "4"]
     assert (rows[0]["x"], rows[0]["y"], rows[0]["length_units"]) == ("-1e-06", "0", "m")
     assert (rows[0]["height"], rows[0]["height_units"], rows[0]["top"]) == ("1.2e-07", "m", "top.dat")
+    assert rows[0]["beside"] == "a/b.dat", "the folder may be copied"
     assert (rows[1]["outcome"], rows[1]["reason"]) == ("refused", "zoom: outside")
     assert (rows[2]["top"], rows[2]["beside"]) == ("top.dat", "")
 
