@@ -68,11 +68,10 @@ class _Picture:
     def save(self, path: Path, title: str, *, simulated: bool) -> None:
         self._head(title, simulated=simulated)
         self._survey()
-        zooms = [flattened(visit.zoom, 1) for visit in self._shown if visit.zoom]
+        zooms = [visit.zoom for visit in self._shown if visit.zoom]
         if zooms:
-            unit = next(visit.zoom.unit for visit in self._shown if visit.zoom)
-            colours = self._colour_bar(zooms, unit, self._zooms_in + self._columns * (_ZOOM_IN + _GAP_IN), _ZOOM_IN)
-            self._zooms(*colours)
+            images, left_in = [flattened(zoom, 1) for zoom in zooms], self._columns * (_ZOOM_IN + _GAP_IN)
+            self._zooms(*self._colour_bar(images, zooms[0], self._zooms_in + left_in, _ZOOM_IN))
         self._figure.savefig(path, dpi=200)
 
     def _axes(self, left_in: float, top_in: float, width_in: float, height_in: float) -> Axes:
@@ -97,7 +96,7 @@ class _Picture:
     def _survey(self) -> None:
         scan = self._record.survey
         values = flattened(scan, 2)
-        factor, colours = self._colour_bar([values], scan.unit, _LEFT_IN + _SURVEY_IN + _GAP_IN, _SURVEY_IN)
+        factor, colours = self._colour_bar([values], scan, _LEFT_IN + _SURVEY_IN + _GAP_IN, _SURVEY_IN)
         axes = self._image(scan, values * factor, colours, (_LEFT_IN, 0.0, _SURVEY_IN))
         self._bar_below(scan, axes)
         for visit in self._record.visits:
@@ -203,21 +202,28 @@ class _Picture:
         return axes
 
     def _colour_bar(
-        self, images: Sequence[Floats], unit: str, left_in: float, height_in: float
+        self, images: Sequence[Floats], scan: Scan, left_in: float, side_in: float
     ) -> tuple[float, Normalize]:
-        """Draw the bar; return the factor to the unit that it is labelled with, and the colours of its values."""
+        """Draw a bar as high as the scan in its square.
+
+        Returns:
+            The factor to the unit that it is labelled with, and the colours of its values.
+        """
         known = np.concatenate([image[np.isfinite(image)] for image in images])
         low, high = (float(value) for value in np.percentile(known, (0.5, 99.9)))
-        factor, shown = scale(max(abs(low), abs(high)), unit)
+        factor, shown = scale(max(abs(low), abs(high)), scan.unit)
         colours = Normalize(low * factor, high * factor)
-        axes = self._axes(left_in, 0.0, _BAR_IN, height_in)
+        width, height = scan.region.size_m
+        axes = self._axes(left_in, 0.0, _BAR_IN, side_in * min(1.0, height / width))
         gradient = np.linspace(low * factor, high * factor, 256)[:, None]
         axes.imshow(gradient, aspect="auto", origin="lower", cmap=self._map, norm=colours,
                     extent=(0.0, 1.0, low * factor, high * factor))  # fmt: skip
         axes.set_xticks([])
         axes.yaxis.tick_right()
         axes.yaxis.set_label_position("right")
-        axes.set_ylabel(f"height / {shown}" if unit == "m" else shown, size=_TEXT, labelpad=1)
+        axes.set_ylabel(
+            f"height / {shown}" if scan.unit == "m" else f"{scan.channel} / {shown}", size=_TEXT, labelpad=1
+        )
         return factor, colours
 
 
