@@ -23,7 +23,7 @@ CSS = """
 .lane b{overflow:hidden;text-overflow:ellipsis;white-space:nowrap}
 .lane>div{position:relative;height:17px;background:var(--lane);border-radius:2px;overflow:hidden}
 .lane span{position:absolute;top:0;bottom:0;min-width:1px;background:var(--quiet);overflow:hidden}
-.lane span.marked{min-width:6px;border-radius:3px;background:currentColor}
+.lane span.marked{min-width:6px;margin-left:-3px;border-radius:3px;background:currentColor}
 .lane i{display:block;margin:0;height:auto;padding:0 4px;color:#fff;white-space:nowrap}
 .lane i{font-style:normal;font-size:11px;line-height:17px}
 .strip>div{height:auto;aspect-ratio:14/1;background:none}
