@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from site_folder import EXAMPLE_PLUGIN, install
 
 from afspm import plugins
 from afspm.drift.estimators import estimator
@@ -18,10 +19,6 @@ from afspm.errors import ConfigError, FileError
 from afspm.experiment import load
 from afspm.files import read
 from afspm.model import Region
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
-
-from site_folder import EXAMPLE_PLUGIN, install
 
 EXPERIMENT = """
 [clock]

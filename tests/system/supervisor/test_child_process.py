@@ -13,6 +13,7 @@ from dataclasses import replace
 from queue import Queue
 
 import pytest
+from systems import not_on_wine
 
 from afspm.errors import AfspmError
 from afspm.launch import Launch
@@ -129,6 +130,7 @@ def test_output_is_not_held_back(start: Start, events: Queue[ChildEvent]) -> Non
     assert printed.line == "at once"
 
 
+@not_on_wine("200,000 writes to a pipe take minutes")
 def test_a_child_that_prints_without_end_is_not_kept_in_memory(start: Start, events: Queue[ChildEvent]) -> None:
     start("for i in range(200_000): print('waiting', i)\nraise SystemExit('no stage')")
     got = [events.get(timeout=DEADLINE_S)]

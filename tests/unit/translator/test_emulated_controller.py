@@ -81,7 +81,7 @@ def test_the_address_of_an_emulator_that_was_killed_is_worth_nothing(file: Path)
     command = [sys.executable, "-c", TELLS, str(file), RUN]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as emulator:
         assert emulator.stdout is not None
-        assert emulator.stdout.readline() == b"told\n"
+        assert emulator.stdout.readline().strip() == b"told"
         vendor = Vendor()
         reached = reach(file, vendor)
         emulator.kill()
