@@ -176,6 +176,20 @@ def si(value: str | float, unit: str) -> float:
     return converted
 
 
+def si_or_text(value: float | str, unit: str) -> float:
+    """Return a number, which is in the SI unit `unit`, or a quantity as text, which must name its unit.
+
+    Raises:
+        UnitError: text without a unit, or one that is not understood.
+        TypeError, ValueError: neither a number nor text.
+    """
+    if not isinstance(value, str):
+        return float(value)
+    if not parse_quantity(value)[1]:
+        raise UnitError(f"{value!r} has no unit", hint=_hint(unit) or f"in {unit} give a number, not text")
+    return si(value, unit)
+
+
 def require_unit(number: float, unit: str) -> None:
     """Refuse a number given without a unit if it is too large in `unit` to be meant so.
 

@@ -59,8 +59,8 @@ class Worrier(Component):
 class Fixer(Component):
     """Repairs the tip whenever it is flagged."""
 
-    def on_problem(self, problem: int, flagged: bool) -> None:
-        if flagged and problem == TIP:
+    def on_problem(self, problem: str, flagged: bool) -> None:
+        if flagged and problem == "tip-shape-changed":
             self.fix()
 
     def fix(self) -> None:

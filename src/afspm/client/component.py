@@ -116,10 +116,10 @@ class Component:
     def on_control(self, control_state: ControlState) -> None:
         """Mode, holder or problems have changed."""
 
-    def on_problem(self, problem: int, flagged: bool) -> None:
+    def on_problem(self, problem: str, flagged: bool) -> None:
         """A problem was flagged (True) or removed (False). At the start, for each that is flagged already.
 
-        `problem` is a `Problem`, or the number of one named in the experiment file.
+        `problem` is its name, such as "tip-shape-changed", or one named in the experiment file.
         """
 
     def on_scan_parameters(self, parameters: ScanParameters) -> None:

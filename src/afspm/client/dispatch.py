@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from afspm import wire
 from afspm.errors import WireError
-from afspm.model import ControlState, Packet, Problem
+from afspm.model import ControlState, Packet
 
 if TYPE_CHECKING:
     from afspm.client.component import Component
@@ -79,8 +79,7 @@ class MessageDispatcher:
         before, self._problems = self._problems, frozenset(state.problems)
         if self._has("on_problem"):
             for number in sorted(before ^ self._problems):
-                problem = Problem(number) if number in Problem._value2member_map_ else number
-                self._component.on_problem(problem, number in self._problems)
+                self._component.on_problem(self._component.scope.problems.name(number), number in self._problems)
 
     def _wants_message(self, message: str) -> bool:
         return self._handler(message) is not None or (message == "ControlState" and self._has("on_problem"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from afspm.client.command_retry import CommandRetry
 from afspm.client.published_state import PublishedState
-from afspm.client.targets import FITS, SAME, XY, ScanTarget, Target, is_set, xy_of
+from afspm.client.targets import FITS, SAME, XY, ScanTarget, Target, is_set
 from afspm.model import ControlRequest, Frame, Parameter, ProbePosition, Region, ScanParameters, names
 
 
@@ -32,7 +32,6 @@ class MeasurementSetup:
 
     def move_probe(self, xy_m: XY, until_s: float | None) -> None:
         """Move the probe to (x, y) in m, unless it stands there."""
-        xy_m = xy_of(xy_m)
         now = self._view.probe_position
         if now is None or now.xy_m != xy_m:
             self._commands.set(ControlRequest.SET_PROBE_POS, ProbePosition(xy_m), "ProbePosition", until_s)

@@ -16,7 +16,7 @@ from afspm.client.keyed_results import KeyedResults, check_key
 from afspm.client.measurement import MeasurementRunner
 from afspm.client.measurement_setup import MeasurementSetup
 from afspm.client.parameter_values import Value, to_parameter, value_in
-from afspm.client.targets import ScanTarget, SpectrumTarget
+from afspm.client.targets import ScanTarget, SpectrumTarget, xy_of
 from afspm.errors import ExperimentEnded, InvalidValue
 from afspm.model import (
     RELAY_REQUEST,
@@ -40,6 +40,7 @@ from afspm.model import (
 
 __all__ = ["Events", "PublishedEvent", "Scope"]
 
+Place = tuple[float | str, float | str]
 ANSWER_S = 60.0  # by default; what waits for control or for a measurement has no limit by default
 
 
@@ -109,7 +110,7 @@ class Scope(ExperimentView):
 
     def spectrum(
         self,
-        at: tuple[float, float] | None = None,
+        at: Place | None = None,
         *,
         kind: str | None = None,
         key: str | None = None,
@@ -118,7 +119,7 @@ class Scope(ExperimentView):
         """Take a spectrum; interruptions and `key` as with `scan`.
 
         Args:
-            at: (x, y) in m, where the probe is moved to; None: where it stands.
+            at: (x, y) in m or as text, ("1 um", "0 nm"), where the probe is moved to; None: where it stands.
             kind: e.g. "IV" (the parameter `x-spec-kind`); None: what is set.
         """
         with self._call():
@@ -161,7 +162,13 @@ class Scope(ExperimentView):
         setpoint: float | None = None,
         timeout_s: float | None = None,
     ) -> None:
-        """Set what is given of the z feedback; the rest stays as it is."""
+        """Set what is given of the z feedback; the rest stays as it is. It returns when `feedback` tells it.
+
+        Args:
+            on: whether the feedback regulates; off, the tip is held at its height.
+            proportional_gain, integral_gain: in the controller's own units.
+            setpoint: in the unit of the operating mode: A for a tunnelling current, V, m, Hz or N in force microscopy.
+        """
         with self._call():
             feedback = Feedback(on, proportional_gain, integral_gain, setpoint)
             view, count = self._link.view, self._link.view.count("ZCtrlParameters")
@@ -170,12 +177,12 @@ class Scope(ExperimentView):
             if changes:  # so that `feedback` then tells it
                 self._link.wait(lambda: view.count("ZCtrlParameters") != count, self._link.until(SETTLED_WITHIN_S))
 
-    def move_probe(self, xy_m: tuple[float, float], *, timeout_s: float | None = None) -> None:
-        """Move the probe to (x, y) in m; returns when it stands there."""
+    def move_probe(self, xy_m: Place, *, timeout_s: float | None = None) -> None:
+        """Move the probe to (x, y), in m or as text, ("1 um", "0 nm"); returns when it stands there."""
         with self._call():
             until_s = self._link.until(timeout_s)
             with self._control.hold(until_s=until_s):
-                self._setup.move_probe(xy_m, until_s)
+                self._setup.move_probe(xy_of(xy_m), until_s)
 
     def set_scan_region(
         self, region: Region, *, shape: tuple[int, int] | None = None, timeout_s: float | None = None
@@ -195,7 +202,10 @@ class Scope(ExperimentView):
             self._commands.in_control(ControlRequest.ACTION, name, self._link.until(timeout_s))
 
     def supports(self, action: str, *, timeout_s: float | None = ANSWER_S) -> bool:
-        """Return whether the microscope has an action of this name."""
+        """Return whether the microscope has an action of this name, such as "x-retract"; nothing is done.
+
+        Ask before `action`, which raises Refused for one that the microscope does not have.
+        """
         with self._call():
             response = self._commands.read(ControlRequest.ACTION_SUPPORT, action, self._link.until(timeout_s))
             if response.code in (ControlResponse.ACTION_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED):

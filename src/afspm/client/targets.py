@@ -6,10 +6,11 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-from afspm.errors import InvalidValue
+from afspm.errors import InvalidValue, UnitError
 from afspm.formatting import area_text, position_text
 from afspm.model import Frame, Region, Scan, ScanParameters, ScopeState, Spectrum, names
 from afspm.model.snapshot import Plain, from_plain, to_plain
+from afspm.units import si_or_text
 
 XY = tuple[float, float]
 
@@ -123,12 +124,16 @@ def target_from(facts: Plain) -> Target:
 
 
 def xy_of(xy_m: Any) -> XY:
-    """Return two numbers as a tuple: an array of numpy is not compared as a tuple is. Raises InvalidValue."""
+    """Return a place, in numbers or as text with units, as two numbers in m. Raises InvalidValue, UnitError."""
     try:
         x, y = xy_m
-        return float(x), float(y)
+        return si_or_text(x, "m"), si_or_text(y, "m")
+    except UnitError:
+        raise
     except (TypeError, ValueError) as error:
-        raise InvalidValue(f"a place is (x, y) in metres, not {xy_m!r}", hint="e.g. (1e-7, 0)") from error
+        raise InvalidValue(
+            f"a place is (x, y) in metres, not {xy_m!r}", hint='e.g. (1e-7, 0) or ("100 nm", 0)'
+        ) from error
 
 
 def is_set(wanted: ScanParameters, now: ScanParameters | None, tolerance: float) -> bool:

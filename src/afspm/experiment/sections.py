@@ -60,6 +60,8 @@ class ControlSection(Section):
     """Real seconds that the microscope may be lost, before that is a malfunction and nobody stays in control."""
     solved_by_hand: tuple[str, ...] = ("device-malfunction",)
     """Problems that a person puts right: they may be flagged though no component solves them."""
+    end_on: tuple[str, ...] = ()
+    """Problems that end the experiment when they are flagged."""
     retract: bool = True
     """Whether the tip is retracted when control is left in a dangerous state, where the microscope can."""
     dangerous: tuple[DangerousState, ...] | None = None

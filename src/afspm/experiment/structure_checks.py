@@ -194,8 +194,9 @@ def check_listens_to(resolved: ResolvedExperiment) -> None:
 
 
 def check_problems(resolved: ResolvedExperiment) -> None:
-    """Require that problems exist, and that each one flagged is solved by somebody."""
-    by_hand = resolved.sections.control.solved_by_hand
+    """Require that problems exist, and that each one flagged is solved by somebody, or ends the experiment."""
+    control = resolved.sections.control
+    by_hand = (*control.solved_by_hand, *control.end_on)
     solvers = (problem for process in resolved.processes.values() for problem in process.declared.solves)
     solved = {_number(resolved, problem) for problem in (*solvers, *by_hand)}
     for name, process in resolved.processes.items():
@@ -207,12 +208,13 @@ def check_problems(resolved: ResolvedExperiment) -> None:
                     resolved.document.error(f"[{name}] {verb} {problem!r}, which is no problem", name, hint=hint)
                 elif verb == "flags" and number not in solved:
                     what = f"[{name}] flags {problem!r}, which nobody solves: the experiment would stand still"
-                    hint = "add a component that solves it, or [control] solved_by_hand"
+                    hint = "add a component that solves it, or name it in [control] end_on or solved_by_hand"
                     resolved.document.error(what, name, hint=hint)
-    for i, problem in enumerate(by_hand):
-        if _number(resolved, problem) is None:
-            hint = nearest(problem, resolved.problems)
-            resolved.document.error(f"{problem!r} is no problem", "control", "solved_by_hand", i, hint=hint)
+    for key in ("solved_by_hand", "end_on"):
+        for i, problem in enumerate(getattr(control, key)):
+            if _number(resolved, problem) is None:
+                hint = nearest(problem, resolved.problems)
+                resolved.document.error(f"{problem!r} is no problem", "control", key, i, hint=hint)
 
 
 def _number(resolved: ResolvedExperiment, problem: str) -> int | None:

@@ -116,11 +116,13 @@ class Rules:
     Attributes:
         problems: those that are known.
         adjustable: parameters that a person may set while a component is in control.
+        end_on: problems that end the experiment.
     """
 
     roles: RoleTable = RoleTable()
     problems: ProblemNames = field(default_factory=ProblemNames)
     adjustable: frozenset[str] = frozenset()
+    end_on: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -191,6 +193,7 @@ SOLVES_OTHER_THAN_MALFUNCTION = Condition(
 )
 UNKNOWN_PROBLEM = Condition("the experiment knows no such problem", lambda c, a, r: a.number not in r.problems.values())
 IS_FLAGGED = Condition("it is flagged already", lambda c, a, r: a.number in c.problems)
+ENDS_EXPERIMENT = Condition("[control] end_on names it", lambda c, a, r: a.number in r.end_on)
 NOT_FLAGGED = Condition("it is not flagged", lambda c, a, r: a.number not in c.problems)
 HOLDER_SOLVES_NOTHING = Condition(
     "a component is in control that solves no problem", lambda c, a, r: c.holder is not None and not c.solving
@@ -259,6 +262,7 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
     ArbitrationEvent.FLAG: (
         _refuse(UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, "this experiment knows no problem with the number {number}"),
         _accept(IS_FLAGGED, (), "it is flagged already: two components may notice the same"),
+        _accept(ENDS_EXPERIMENT, (_D.FLAG, _D.END), "the experiment ends instead of waiting for a solver"),
         _accept(
             HOLDER_SOLVES_NOTHING,
             (_D.FLAG, _D.TAKE),

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING
 
-from afspm.errors import InvalidValue
+from afspm.errors import InvalidValue, UnitError
+from afspm.units import si_or_text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,8 +40,11 @@ class Region:
         angle_rad: counter-clockwise.
         frame: tip or sample coordinates.
 
+    Each value may be given as text with a unit: `Region(("1 um", 0), ("500 nm", "500 nm"), "30 deg")`.
+
     Raises:
         InvalidValue: a value is not finite, or a size not above zero.
+        UnitError: text that is no length or angle, or has no unit.
     """
 
     center_m: XY
@@ -52,11 +56,14 @@ class Region:
         try:
             x, y = self.center_m
             width, height = self.size_m
-            values = (float(x), float(y), float(width), float(height), float(self.angle_rad))
+            lengths_m = (si_or_text(value, "m") for value in (x, y, width, height))
+            values = (*lengths_m, si_or_text(self.angle_rad, "rad"))
+        except UnitError:
+            raise
         except (TypeError, ValueError) as error:
             raise InvalidValue(
                 f"a region needs (x, y) and (width, height), not centre {self.center_m!r} and size {self.size_m!r}",
-                hint="numbers in metres, e.g. Region(center_m=(0, 0), size_m=(1e-6, 1e-6))",
+                hint='numbers in metres or text, e.g. Region((0, 0), (1e-6, 1e-6)) or Region((0, 0), ("1 um", "1 um"))',
             ) from error
         if not all(map(math.isfinite, values)):
             raise InvalidValue(

@@ -8,7 +8,14 @@ from enum import IntEnum
 from afspm.model.geometry import XY
 
 
-class ScopeState(IntEnum):
+class _NamedEnum(IntEnum):
+    """An enumeration that is shown by its names."""
+
+    def __str__(self) -> str:
+        return self.name
+
+
+class ScopeState(_NamedEnum):
     """The states of a microscope."""
 
     UNDEFINED = 0
@@ -21,7 +28,7 @@ class ScopeState(IntEnum):
     SPEC = 7
 
 
-class ControlMode(IntEnum):
+class ControlMode(_NamedEnum):
     """Components control the microscope (AUTOMATED), or only the person at it (MANUAL)."""
 
     UNDEFINED = 0

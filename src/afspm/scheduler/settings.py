@@ -22,12 +22,17 @@ def scheduler_settings(
 ) -> SchedulerSettings:
     """All of them. Raises ConfigError, naming the section."""
     known = {"lease_s", "grace_s", "malfunction_after_s", "stop_scan_on_problem", "stop_scan_on_manual"}
-    known |= {"retract", "dangerous", "roles", "spectra_by_variable", "adjustable"}
+    known |= {"retract", "dangerous", "roles", "spectra_by_variable", "adjustable", "end_on"}
     if unknown := control.keys() - known:
         raise ConfigError(f"unknown settings {sorted(unknown)}", where="[control]", hint=f"known: {sorted(known)}")
     try:
         return SchedulerSettings(
-            rules=Rules(_roles(control.get("roles") or {}), problems, frozenset(control.get("adjustable") or ())),
+            rules=Rules(
+                _roles(control.get("roles") or {}),
+                problems,
+                frozenset(control.get("adjustable") or ()),
+                frozenset(map(problems.number, control.get("end_on") or ())),
+            ),
             lease_s=control.get("lease_s"),
             request_timeout_s=request_timeout_s,
             watchdog=_watchdog(control),

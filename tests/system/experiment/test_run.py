@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from experiment_lab import Run, require_each_once, require_recorded_once
 
+import afspm
 from afspm.supervisor.ports import FreePorts
 
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
@@ -53,6 +54,15 @@ def test_a_dry_run_says_what_it_would_start(run: Run, tmp_path: Path) -> None:
     assert one.end() == 0
     assert [line.split(" ")[0] for line in one.lines if "(" in line] == ["microscope", "scheduler", "recorder"]
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_problem_ends_the_experiment_where_the_file_says_so(run: Run) -> None:
+    one = run(more='[control]\nend_on = ["tip-shape-changed"]\n', scans=1000)
+    one.wait_for("scan 1 of 1000")
+    with afspm.connect(one.folder, "person") as scope:
+        scope.flag("tip-shape-changed")
+    assert one.end() == 0
+    one.wait_for("tip-shape-changed is flagged by person; the experiment is ended by person")
 
 
 def test_part_of_an_experiment_can_be_left_out(run: Run) -> None:

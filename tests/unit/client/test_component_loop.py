@@ -29,7 +29,7 @@ from afspm.process.fault_file import take_fault
 from afspm.wire.generated.analysis_pb2 import SpatialPointWithScoreList
 from afspm.wire.generated.feedback_pb2 import FeedbackAnalysis
 
-TIP = Problem.TIP_SHAPE_CHANGED
+TIP, TIP_NAME = Problem.TIP_SHAPE_CHANGED, "tip-shape-changed"
 
 
 class Sharpness(Component):
@@ -57,7 +57,7 @@ class Diary(Component):
     def on_state(self, status: ScopeStatus) -> None:
         self.lines.append(status.state)
 
-    def on_problem(self, problem: int, flagged: bool) -> None:
+    def on_problem(self, problem: str, flagged: bool) -> None:
         self.lines.append((problem, flagged))
 
     def on_end(self) -> None:
@@ -84,7 +84,7 @@ def test_handlers_are_called_in_the_order_of_what_happened() -> None:
     diary = Diary()
     run(diary, lab)
     assert diary.lines == [
-        "start", ScopeState.FREE, ScopeState.SCANNING, (TIP, True), ScopeState.FREE, (TIP, False), "end",
+        "start", ScopeState.FREE, ScopeState.SCANNING, (TIP_NAME, True), ScopeState.FREE, (TIP_NAME, False), "end",
     ]  # fmt: skip
 
 
@@ -94,16 +94,16 @@ def test_a_problem_flagged_before_the_start_is_told_at_the_start() -> None:
     lab.at(1.0, lab.kill)
     diary = Diary()
     run(diary, lab)
-    assert (TIP, True) in diary.lines
+    assert (TIP_NAME, True) in diary.lines
 
 
-def test_a_problem_of_the_experiment_file_comes_as_its_number() -> None:
+def test_a_problem_of_the_experiment_file_comes_by_its_name() -> None:
     lab = Lab()
     lab.at(1.0, lambda: lab.publish(model.ControlState(problems=(42,))))
     lab.at(2.0, lab.kill)
     diary = Diary()
     run(diary, lab, problems={"water-film": 42})
-    assert (42, True) in diary.lines
+    assert ("water-film", True) in diary.lines
 
 
 def test_what_arrives_while_a_handler_blocks_is_handled_afterwards_in_order() -> None:
@@ -111,7 +111,7 @@ def test_what_arrives_while_a_handler_blocks_is_handled_afterwards_in_order() ->
         def __init__(self) -> None:
             self.seen: list[Any] = []
 
-        def on_problem(self, problem: int, flagged: bool) -> None:
+        def on_problem(self, problem: str, flagged: bool) -> None:
             if flagged:
                 self.seen.append("repairing")
                 with self.scope.control(solving=problem):

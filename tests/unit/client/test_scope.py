@@ -742,3 +742,19 @@ def test_a_note_on_a_scan_of_which_the_time_is_not_known_is_refused(scope: Scope
     scan = Scan(REGION, "Height", "m", np.zeros((2, 2)))
     with pytest.raises(InvalidValue, match="when it was finished"):
         scope.note("here", scan=scan)
+
+
+def test_a_place_may_be_text_with_units(lab: Lab, scope: Scope) -> None:
+    scope.move_probe(("100 nm", 0.0))
+    assert lab.position.xy_m == (1e-7, 0.0)
+    with pytest.raises(UnitError):
+        scope.move_probe(("1e-7", "0"))
+
+
+def test_states_and_modes_are_shown_by_their_names(lab: Lab, scope: Scope) -> None:
+    assert (str(scope.state), f"{scope.mode}") == ("FREE", "AUTOMATED")
+
+
+def test_a_scope_shows_what_is_so_now(lab: Lab, scope: Scope) -> None:
+    lab.flag(TIP)
+    assert "tip-shape-changed is flagged" in repr(scope)

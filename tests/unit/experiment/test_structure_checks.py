@@ -291,6 +291,12 @@ def test_a_problem_that_a_person_solves_may_be_flagged(write: Write) -> None:
     assert not errors(write(CLASSIFIER + '[control]\nsolved_by_hand = ["EP_TIP_SHAPE_CHANGED"]\n'))
 
 
+def test_a_problem_that_ends_the_experiment_needs_no_solver(write: Write) -> None:
+    assert not errors(write(CLASSIFIER + '[control]\nend_on = ["tip-shape-changed"]\n'))
+    (error,) = errors(write(CLASSIFIER + '[control]\nend_on = ["tip-shape-changed", "tip-shape"]\n'))
+    assert "'tip-shape' is no problem" in str(error)
+
+
 def test_a_problem_named_in_the_file_is_one(write: Write) -> None:
     text = '[a]\ncomponent = true\ncommand = ["python3"]\nsolves = ["tip lost"]\n[problems]\ntip-lost = 10\n'
     experiment = write(text)

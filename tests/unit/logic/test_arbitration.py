@@ -69,7 +69,7 @@ def test_each_event_has_a_last_row_that_always_applies() -> None:
 def test_every_row_can_apply() -> None:
     roles = RoleTable(end={"boss"}, mode={"boss"}, clear={"boss"}, operate={"boss"})
     met = set()
-    for rules in (RULES, Rules(roles)):
+    for rules in (RULES, Rules(roles), Rules(end_on=frozenset({TIP}))):
         for control in _states():
             for event in ArbitrationEvent:
                 for who in ("a", "b", "boss"):
@@ -249,6 +249,13 @@ def test_roles_say_who_may_end_and_switch() -> None:
     assert after(ControlInput(ArbitrationEvent.END, "boss"), rules=rules)[0].ended
     assert after(mode(MANUAL, "other"), rules=rules)[1].response is ControlResponse.FAILURE
     assert after(mode(MANUAL, "boss"), rules=rules)[0].mode is ControlMode.MANUAL
+
+
+def test_a_problem_ends_the_experiment_where_the_file_says_so() -> None:
+    rules = Rules(end_on=frozenset({TIP}))
+    control, row = after(request("experiment"), flag("classifier", TIP), rules=rules)
+    assert (control.ended, row.response) == (True, ControlResponse.SUCCESS)
+    assert not after(flag("classifier", FEEDBACK), rules=rules)[0].ended
 
 
 def test_a_refusal_says_who_and_what() -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from afspm.errors import InvalidValue
+from afspm.errors import InvalidValue, UnitError
 from afspm.model import Region, RegionChange, ScanParameters
 
 lengths = st.floats(-1e-4, 1e-4)
@@ -77,3 +77,14 @@ def test_a_change_keeps_the_corner_of_the_unturned_rectangle() -> None:
 def test_a_part_of_a_region_needs_one_to_change() -> None:
     with pytest.raises(InvalidValue, match="whole"):
         ScanParameters(RegionChange(width_m=1.0)).onto(ScanParameters())
+
+
+def test_a_region_takes_text_with_units() -> None:
+    region = Region(("1 um", 0), ("500 nm", "0.5 um"), "30 deg")  # type: ignore[arg-type]
+    assert region == Region((1e-6, 0.0), (5e-7, 5e-7), math.radians(30.0))
+
+
+@pytest.mark.parametrize("width", ["1e-6", "1 V", "wide", "1,5 um"])
+def test_text_that_is_no_length_is_refused(width: str) -> None:
+    with pytest.raises(UnitError, match=r"unit|V|number|comma"):
+        Region((0.0, 0.0), (width, 1e-6))  # type: ignore[arg-type]
