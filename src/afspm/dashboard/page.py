@@ -23,6 +23,7 @@ from afspm.dashboard.steering_panel import ModeButtons, ProblemBar, SteeringPane
 from afspm.dashboard.steering_session import SteeringSession
 from afspm.dashboard.watch import Audience, Watch
 from afspm.drawing import timeline
+from afspm.drawing.levelling import Levelling
 from afspm.drawing.palette import PALETTES
 
 ASSETS = Path(__file__).with_name("assets")
@@ -31,6 +32,8 @@ ANSWER_S = 5.0  # a browser that has not drawn the last for so long gets nothing
 THEMES = {"": None, "light": False, "dark": True}
 _HEAD = f"""<style>{timeline.CSS}</style><link rel="stylesheet" href="/assets/dashboard.css">
 <script type="module" src="/assets/page.js"></script>"""
+LEVELLINGS = {Levelling.LINES: "line by line"}
+"""How levellings are called where their value is no word."""
 SIMULATED = "SIMULATED: this is no real microscope"
 
 
@@ -238,5 +241,16 @@ def section(title: str, name: str) -> Iterator[ui.element]:
 
 def _image_html() -> str:
     """Return what assets/image.js brings to life."""
-    palettes = "".join(f'<option value="{name}">{name}</option>' for name in PALETTES)
-    return (ASSETS / "image.html").read_text(encoding="utf-8").replace("{palettes}", palettes)
+    offered = {
+        "palettes": {name: name for name in PALETTES},
+        "levellings": {how.value: LEVELLINGS.get(how, how.value) for how in sorted(Levelling, key=_plane_first)},
+    }
+    html = (ASSETS / "image.html").read_text(encoding="utf-8")
+    for name, options in offered.items():
+        every = "".join(f'<option value="{value}">{text}</option>' for value, text in options.items())
+        html = html.replace(f"{{{name}}}", every)
+    return html
+
+
+def _plane_first(how: Levelling) -> bool:
+    return how is not Levelling.PLANE
