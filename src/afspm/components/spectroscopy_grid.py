@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import logging
+
 from afspm.client.component import Component
 from afspm.components.planned_scans import pair
 from afspm.components.scan_plan import grid_centers
 from afspm.errors import ConfigError
 from afspm.model import names
 from afspm.units import Angle, Length
+
+MOST_LINES = 20
+"""In the log, on the progress of a grid; what looks on is told of each spectrum."""
 
 
 class SpectroscopyGrid(Component):
@@ -76,6 +81,7 @@ class SpectroscopyGrid(Component):
                 self.scope.forget(key)
             per_spectrum_s = (self.clock.now_s() - start_s) / (index + 1)
             self.scope.progress(index + 1, total, left_s=per_spectrum_s * (total - index - 1))
-            self.log.info("spectrum %d of %d", index + 1, total)
+            is_told = total <= MOST_LINES or (index + 1) * MOST_LINES // total > index * MOST_LINES // total
+            self.log.log(logging.INFO if is_told else logging.DEBUG, "spectrum %d of %d", index + 1, total)
         if self.end_when_done:
             self.scope.end_experiment()

@@ -209,6 +209,14 @@ def test_a_spectrum_is_taken_at_each_point_of_a_grid() -> None:
     assert lab.control.ended
 
 
+def test_a_large_grid_of_spectra_does_not_flood_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO"):
+        run(SpectroscopyGrid(counts=(10, 5), spacing=(1e-8, 1e-8), end_when_done=True), Lab("grid"))
+    lines = [message for message in caplog.messages if message.startswith("spectrum ")]
+    assert len(lines) == 20
+    assert lines[-1] == "spectrum 50 of 50"
+
+
 def progress_of(lab: Lab) -> list[Progress]:
     told = [request.subject for request in lab.requests if request.kind == RELAY_REQUEST]
     return [wire.decode(one.message, one.payload) for one in told]
