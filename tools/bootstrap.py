@@ -23,8 +23,10 @@ EXTRAS = ("dashboard", "features", "messages", "study", "testing", "xarray")
 def main(wanted: str) -> None:
     if sys.version_info < (3, 11):  # noqa: UP036  (it is run by whatever python3 there is)
         sys.exit(f"afspm needs Python 3.11 or later, this is {sys.version.split()[0]}")
+    is_new = not VENV.exists()
     _sync("--group=pip")
-    _compile()
+    if is_new or wanted == "demo":
+        _compile()
     if wanted != "demo":
         groups = ["test", *(["browser"] if _has_browser() else []), *(["check"] if wanted == "all" else [])]
         _sync(*(f"--group={group}" for group in ["pip", *groups]), *(f"--extra={extra}" for extra in EXTRAS))

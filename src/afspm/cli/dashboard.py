@@ -176,9 +176,12 @@ def _join(folder: Path, settings: dict[str, Any]) -> int:
 
 
 def _serve_recorded(folder: Path, settings: dict[str, Any]) -> None:
+    from afspm.dashboard import Dashboard
     from afspm.dashboard.recorded import serve
     from afspm.experiment.process_starts import DASHBOARD
+    from afspm.requirements import require
 
+    require(Dashboard)
     serve(_recorded(folder, DASHBOARD, settings), typer.echo)
 
 
