@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from afspm import plugins
-from afspm.cli import dashboard, demo, drift, drivers, experiment_file, new, recorded, run, status, steer
+from afspm.cli import dashboard, demo, drift, drivers, experiment_file, new, notify, recorded, run, status, steer
 from afspm.errors import ConfigError
 
 app = typer.Typer(
@@ -47,6 +47,7 @@ app.add_typer(new.app, name="new", rich_help_panel=BEFORE)
 app.command("check", rich_help_panel=BEFORE)(experiment_file.check)
 app.command("graph", rich_help_panel=BEFORE)(experiment_file.graph)
 app.command("keys", rich_help_panel=BEFORE)(experiment_file.keys)
+app.command("notify", rich_help_panel=BEFORE)(notify.notify)
 app.command("dashboard", rich_help_panel=MEANWHILE)(dashboard.dashboard)
 app.command("status", rich_help_panel=MEANWHILE)(status.status)
 app.command("watch", rich_help_panel=MEANWHILE)(status.watch)

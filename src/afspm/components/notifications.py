@@ -17,6 +17,8 @@ END: Final = "end"
 UNSOLVED: Final = "unsolved-problem"
 GIVEN_UP: Final = "given-up"
 CRITICAL: Final = "critical"
+TEST: Final = "test"
+"""Of a message that only shows that calls arrive."""
 OCCASIONS: Final = (END, UNSOLVED, GIVEN_UP, CRITICAL)
 
 TIMEOUT_S = 10.0  # of one try
@@ -36,7 +38,7 @@ class Notification:
     """A notification for people.
 
     Attributes:
-        what: one of OCCASIONS.
+        what: one of OCCASIONS, or TEST.
         experiment: its name.
         run: the folder of the run.
         time_ns: experiment time.

@@ -118,7 +118,7 @@ def test_a_user_s_own_estimator_that_fails_or_hangs_costs_no_scan(rig: Rig) -> N
     options = 'estimator = "surveyor.Fails", longest_registration = "9 s", rescan = { rule = "never" }'
     run = rig.start(options, scans=5, speed=40.0)
     assert run.end() == 0, run.output
-    run.wait_for("scheduler .*was not registered within 9 s, it goes out as predicted")
+    run.wait_for("scheduler .*was not registered within 9 s, and is published at the predicted position")
     rows = table(run)
     assert [row["matched"] for row in rows] == ["yes", "no", "yes", "yes"], rows  # none of what hangs
     assert "ZeroDivisionError: nothing is known" in rows[1]["reason"]

@@ -150,7 +150,7 @@ def test_a_script_that_fails_twice_alike_does_not_measure_a_third_time(run: Run,
     )
     with connect(one.folder, "person") as scope:
         scope.restart("survey")
-    one.wait_for("survey is given up", count=2)
+    one.wait_for("gave up survey", count=2)
     assert sum(" survey " in line and "started, process" in line for line in one.lines) == 4, one.output
     one.process.send_signal(signal.SIGINT)
     one.end()

@@ -134,7 +134,7 @@ def test_with_the_tip_retracted_by_ctrl_c_a_run_is_resumed_when_that_was_seen_to
     assert RETRACTED in one.output
     assert not engaged(one)
     again = afspm_run("--resume", str(one.folder))
-    steps = ("scheduler flagged device-malfunction", "is cleared by doctor", "series is in control")
+    steps = ("scheduler flagged device-malfunction", "doctor cleared", "series is in control")
     for step in steps:
         again.wait_for(" scheduler ", step)
     found = [again.output.index(step) for step in steps]

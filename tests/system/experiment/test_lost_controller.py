@@ -65,7 +65,7 @@ def run(request: pytest.FixtureRequest, tmp_path: Path, stranger: Any) -> Iterat
 def test_a_controller_that_is_killed_while_it_scans_is_a_malfunction_until_it_is_back(run: AfspmRun) -> None:
     run.wait_for("details .*scan 1 of 3 at")
     run.wait_for_next(" witness ", "state SCANNING")
-    cleared_before = run.output.count("device-malfunction is cleared")
+    cleared_before = run.output.count("cleared device-malfunction")
     run.signal("controller", signal.SIGKILL)
     run.wait_for_next("ERROR lost contact with the controller: ")
     run.wait_for_next("translator flagged device-malfunction; details lost control")

@@ -12,8 +12,10 @@ from pathlib import Path
 
 import pytest
 from client_lab import FakeClock
+from typer.testing import CliRunner
 
 from afspm import model
+from afspm.cli.app import app
 from afspm.components import notifications, notifier
 from afspm.components.notifications import NotDelivered, Notification, Targets
 from afspm.components.notifier import Notifier
@@ -291,3 +293,26 @@ def test_nobody_to_tell_is_an_error() -> None:
         Notifier()
     with pytest.raises(ConfigError, match="'dawn' never happens"):
         Notifier(webhook="http://a.example", on=["dawn"])
+
+
+@pytest.mark.parametrize(("code", "exit_code"), [(200, 0), (500, 1)])
+def test_a_test_message_says_whether_it_arrived(tmp_path: Path, hook: Hook, code: int, exit_code: int) -> None:
+    hook.codes = [code]
+    file = tmp_path / "night.toml"
+    parts = "".join(f'[{n}]\ncomponent = true\nclass = "{c}"\n' for n, c in (("m", "Simulator"), ("s", "Scheduler")))
+    file.write_text(f'{parts}[notify]\nwebhook = "{hook.url}"\n', encoding="utf-8")
+    done = CliRunner().invoke(app, ["notify", str(file), "--test"])
+    assert done.exit_code == exit_code
+    assert [message["what"] for message in hook.got] == (["test"] if code == 200 else [])
+    assert (
+        "the webhook took the message" if code == 200 else "the webhook failed: 127.0.0.1 answers 500"
+    ) in done.output
+    assert SECRET not in done.output
+
+
+def test_without_notify_there_is_nothing_to_test(tmp_path: Path) -> None:
+    file = tmp_path / "night.toml"
+    file.write_text('[m]\ncomponent = true\nclass = "Simulator"\n[s]\ncomponent = true\nclass = "Scheduler"\n')
+    done = CliRunner().invoke(app, ["notify", str(file), "--test"])
+    assert done.exit_code == 1
+    assert "no [notify]" in done.output
