@@ -142,3 +142,8 @@ def typeset_area(size_m: Sequence[float]) -> str:
 def typeset_length(length_m: float) -> str:
     """Return a length for a page: "200 nm"."""
     return typeset(lengths_text([length_m]))
+
+
+def counted(count: int, one: str, many: str = "") -> str:
+    """Return (1, "scan") as "1 scan", (2, "scan") as "2 scans"; `many` where that is no s more."""
+    return f"{count} {one if count == 1 else many or f'{one}s'}"

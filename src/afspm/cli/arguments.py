@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-_FILES = "The experiment file; each further file is laid over it and needs to hold only what differs."
+_FILES = "The experiment file; each further file overrides those before it, and needs to hold only what differs."
 _WHERE = "The folder of a run, a folder of runs (its newest is meant), or the experiment file."
 RUNS = Path("runs")
 

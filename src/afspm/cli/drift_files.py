@@ -25,7 +25,7 @@ from afspm.drift.registration import DriftScan, Registration
 from afspm.drift.trackers import tracker
 from afspm.errors import AfspmError, FileError, InvalidValue
 from afspm.files import FORMATS, FileContent, read
-from afspm.formatting import day_and_time
+from afspm.formatting import counted, day_and_time
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.measured_files import SUFFIX as RECORDED
 from afspm.study.scan_series import Series, series
@@ -69,7 +69,7 @@ def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Pa
     for told in found.left_out:
         aside.print(f"left out: {told}", markup=False, soft_wrap=True)
     begun = day_and_time(round(found.scans[0].mid_s * NS_PER_S), UTC, seconds=False)
-    console.print(f"{len(found.scans)} scans of {found.channel} from {begun} on", markup=False)
+    console.print(f"{counted(len(found.scans), 'scan')} of {found.channel} from {begun} on", markup=False)
     analysis = analysed(found.scans, by, following, jobs, aside)
     console.print(as_table(analysis.record))
     truth_m = true_drift(paths[0], found.scans) if len(paths) == 1 else None  # of one simulated run

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from afspm.emulators.emulator import Emulator
     from afspm.testing.translators import CheckOptions
 
-_ASK = """The probe will be moved, scans and spectra be taken, gains and bias changed by a few percent, the feedback
-switched off and on, all within the frame that is set now; everything is put back. Nothing is approached, pulsed or
-crashed. Is the tip so far from the sample that it can't reach it, whatever the feedback does?"""
+_ASK = """This moves the probe, takes scans and spectra, changes gains and bias by a few percent, and switches the feedback
+off and on, all within the present frame, and then restores all settings. It never approaches, pulses or crashes. Is the
+tip so far from the sample that it can't reach it, whatever the feedback does?"""
 
 
 def check_translator(
@@ -117,7 +117,9 @@ def _check(options: CheckOptions, console: Console, copy: Path | None) -> None:
 
 
 def emulate(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="The controller; without it: those that there are.")] = "",
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="The controller. Without it, the command lists all.")
+    ] = "",
     settings: Annotated[
         list[str] | None,
         typer.Argument(

@@ -128,10 +128,10 @@ def _only_if_running(folder: Path) -> Iterator[None]:
         say_nothing_runs(str(error))
     except NoResponse:
         if told := cut_off_message(folder):
-            say_nothing_runs(f"nobody answers in {folder.resolve().name}; {told}")
+            say_nothing_runs(f"no scheduler answers in {folder.resolve().name}; {told}")
         if name := other_computer(folder):
             say_unreachable(folder, name)
-        said = f"nobody answers in {folder.resolve().name}, though it has not ended"
+        said = f"no scheduler answers in {folder.resolve().name}, though it has not ended"
         if (run_json_or_empty(folder).get("guest") or {}).get("keys"):
             said += f"; perhaps its scheduler lacks the public key of {TERMINAL}"
         say_nothing_runs(said)

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from afspm.cli.arguments import RUNS, RecordedRun, Where, names_in, opt
+from afspm.formatting import counted
 
 
 def report(where: Where = RUNS) -> None:
@@ -68,4 +69,4 @@ def replay(
 
     options = replaying.ReplayOptions(speed, names_in(only), publish, serve, stay=stay, runs=runs)
     count = replaying.replay(run, options, typer.echo)
-    typer.echo(f"{count} packets were published")
+    typer.echo(f"published {counted(count, 'packet')}")

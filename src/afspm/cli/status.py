@@ -52,7 +52,7 @@ def watch(where: Where = RUNS) -> None:
         else:
             _in_lines(follower)
         if not follower.ended:
-            say_nothing_runs(f"nobody answers any more in {follower.folder.resolve().name}; {follower.cut_off()}")
+            say_nothing_runs(f"no scheduler answers any more in {follower.folder.resolve().name}; {follower.cut_off()}")
         typer.echo("the experiment has ended")
 
 

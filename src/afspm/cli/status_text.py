@@ -78,7 +78,7 @@ class StatusText:
 
         lines = [self._head()]
         if silent_s > OLD_S:
-            told = f"no news for {duration_text(silent_s)}: the scheduler is being started again, or can't be reached"
+            told = f"no news for {duration_text(silent_s)}: the scheduler is restarting, or can't be reached"
             lines.append(Text(told, "bold yellow"))
         lines += [self._control(), *self._problems(), self._scanning(), *self._progress(), *self._processes()]
         lines += self._refusals()
@@ -127,7 +127,7 @@ class StatusText:
     def _microscope(self) -> Text:
         line, status = _label("microscope"), self._seen.status
         if status is None:
-            return line.append("has not been heard of yet")
+            return line.append("has not reported yet")
         now = self._seen.states.now
         line.append(status.state.name.lower().replace("_", " ")).append(", paused" if status.paused else "", "yellow")
         return line.append(self._since(now.start_ns if now else None))
@@ -176,8 +176,8 @@ class StatusText:
             line = _label("process").append(f"{state.name} ")
             if state.name in unheard:
                 gone = duration_text(unheard[state.name] / NS_PER_S)
-                line.append("not heard of", "bold red")
-                yield line.append(f" for {gone}: whoever started it is gone, or can't be reached")
+                line.append("no report", "bold red")
+                yield line.append(f" for {gone}: its supervisor is gone, or can't be reached")
             elif state.condition not in WELL:
                 condition = state.condition.name.lower().replace("_", " ")
                 line.append(condition, "bold red" if state.condition in BAD else "yellow").append(self._lately(state))

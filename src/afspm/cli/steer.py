@@ -22,7 +22,7 @@ def pause(where: Where = RUNS) -> None:
     """
     from afspm.model import ControlMode
 
-    _set_mode(where, ControlMode.MANUAL, "the experiment is paused (MANUAL); `afspm resume` lets it go on")
+    _set_mode(where, ControlMode.MANUAL, "the experiment is paused (MANUAL); `afspm resume` continues it")
 
 
 def resume(where: Where = RUNS) -> None:
@@ -44,7 +44,7 @@ def end(
         if not yes:
             typer.confirm("End the experiment?", abort=True)
         scope.end_experiment()
-    typer.echo("the experiment is ended")
+    typer.echo("the experiment has ended")
 
 
 def restart(
@@ -54,7 +54,7 @@ def restart(
     """End a process of a running experiment and start it anew, also one that was given up; what it keeps stays."""
     with acting(where) as scope:
         scope.restart(process)
-    typer.echo(f"{process} is started anew")
+    typer.echo(f"{process} is restarted")
 
 
 def problems(

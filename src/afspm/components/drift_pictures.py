@@ -14,6 +14,7 @@ import numpy as np
 
 from afspm.components.drift_table import DriftTable
 from afspm.errors import AfspmError, FileError
+from afspm.formatting import counted
 
 if TYPE_CHECKING:
     from afspm.drift.figures.album import RunPart
@@ -122,7 +123,7 @@ class DriftPictures(DriftTable):
     def on_end(self) -> None:
         told = self._told()
         if len(told) < 2:
-            self.log.info("drift of %d scans, no pictures", len(told))
+            self.log.info("drift of %s, no pictures", counted(len(told), "scan"))
         else:
             self._draw(told)
 

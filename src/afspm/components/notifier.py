@@ -35,7 +35,7 @@ class Notifier(Component):
     """Calls a command, a webhook or both when a problem stays unsolved, a component is given up or says CRITICAL.
 
     [notify] of the experiment file makes it part of an experiment. It only listens, and holds up nobody. What can't be
-    delivered is tried again, later and later, for half an hour; killed and started again, it goes on with that, and
+    delivered is retried at growing intervals for half an hour; after a restart it continues, and
     tells nothing twice that was delivered. Of the end of the experiment `afspm run` itself tells, which sees how it
     ended.
 

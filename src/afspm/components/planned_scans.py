@@ -86,7 +86,8 @@ class PlannedScans(Component):
                     break
                 self._take(step)
         left_out = (self.plan.total or 0) - (self._total or 0)
-        self.log.info("all %d scans are taken%s", self._total, f", {left_out} were left out" if left_out else "")
+        taken = "the scan is" if self._total == 1 else f"all {self._total} scans are"
+        self.log.info("%s taken%s", taken, f", {left_out} were left out" if left_out else "")
         if self.end_when_done:
             self.scope.end_experiment()
 

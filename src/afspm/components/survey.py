@@ -13,7 +13,7 @@ from afspm.components.planned_scans import FRAME, Pixels, pair
 from afspm.components.scan_plan import XY, ScanPlan
 from afspm.components.target_finder import TargetFinder
 from afspm.errors import ConfigError, Refused
-from afspm.formatting import lengths_text, position_text
+from afspm.formatting import counted, lengths_text, position_text
 from afspm.model import Region, Scan, ScanSet, names
 from afspm.storage.atomic import OutageLog
 from afspm.survey.record import Outcome, SurveyRecord, Visit
@@ -152,7 +152,7 @@ class Survey(Component):
             self.memory["targets"] = [[*target.position_m, target.height] for target in found]
             self.memory.save()
             if found:
-                self.log.info("%d targets found", len(found))
+                self.log.info("%s found", counted(len(found), "target"))
             else:
                 self.log.warning("no target found in the survey: nothing is zoomed")
         return [Target((x, y), height) for x, y, height in self.memory["targets"]]

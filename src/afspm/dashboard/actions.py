@@ -17,7 +17,7 @@ from afspm.clock import Clock
 from afspm.dashboard.access import Access, Visitor, check_name
 from afspm.dashboard.watch import Watch
 from afspm.errors import AfspmError, UnitError
-from afspm.formatting import quantity, typeset_position
+from afspm.formatting import counted, quantity, typeset_position
 from afspm.launch import Launch
 from afspm.model import (
     RELAY_REQUEST,
@@ -100,7 +100,7 @@ class Actions:
         for problem in problems:
             if not (result := self.clear(problem)).ok:
                 return result
-        return ActionResult(f"{len(problems)} problems are cleared")
+        return ActionResult(f"Cleared {counted(len(problems), 'problem')}")
 
     def restart(self, process: str) -> ActionResult:
         """Have a process ended and started anew."""

@@ -198,7 +198,7 @@ def process_words(state: ProcessState, unheard_ns: int | None = None) -> tuple[s
     condition = state.condition.name.lower().replace("_", " ")
     since = f"since {time_of_day(state.since_ns)}"
     if unheard_ns is not None:
-        gone = f"for {duration_text(unheard_ns / NS_PER_S)}: whoever started it is gone, or can't be reached"
+        gone = f"for {duration_text(unheard_ns / NS_PER_S)}: its supervisor is gone, or can't be reached"
         condition, since = NOT_HEARD_OF, gone
     elif state.step_age_s >= 1.0:
         since = f"on its step for {duration_text(state.step_age_s)}"

@@ -11,7 +11,7 @@ from urllib.parse import quote
 import numpy as np
 
 from afspm.drawing.curves import Array, round_ticks
-from afspm.formatting import quantity, scale, time_of_day, typeset_area, typeset_position
+from afspm.formatting import counted, quantity, scale, time_of_day, typeset_area, typeset_position
 from afspm.model import Region
 from afspm.model.geometry import XY
 from afspm.record.overview import FoundPlace, ScanSummary, SpectrumSummary
@@ -78,7 +78,7 @@ def map_html(content: MapContent, *, whole: bool = True) -> str:
     ]
     away = "" if probe is None or view.contains(probe) else _away(view, probe)
     more = f"<p>{left_out} older places are not drawn.</p>" if left_out else ""
-    words = f"{len(places)} places with scans and {len(spectra)} spectra"
+    words = f"{counted(len(places), 'place')} with scans and {counted(len(spectra), 'spectrum', 'spectra')}"
     aspect = view.width / view.height
     return (
         f'<figure class="map" role="img" aria-label="Map of the sample: {words}">'

@@ -61,7 +61,7 @@ def check_notify(resolved: ResolvedExperiment) -> None:
     """Check that [notify] names a way to tell people, and that it works."""
     section = resolved.sections.notify
     if "notify" in resolved.parts.sections and not (section.command or section.webhook):
-        resolved.document.error("[notify] nobody is told of anything", "notify", hint="give a `command` or a `webhook`")
+        resolved.document.error("[notify] has no recipient", "notify", hint="give a `command` or a `webhook`")
     if section.command and not is_program(section.command[0], resolved.document.folders[0]):
         what = f"[notify] there is no program {section.command[0]!r}"
         resolved.document.error(what, "notify", "command", hint="give its path, or install it")

@@ -113,7 +113,7 @@ def _require_addresses(
     if missing:
         needed = [f"{where} (for {', '.join(sorted(users))})" for where, users in sorted(missing.items())]
         raise ConfigError(
-            "where parts are started on their own, the file has to say " + "; ".join(needed),
+            "to start parts separately, the file must hold " + "; ".join(needed),
             where=str(resolved.document.files[0]),
             hint=f'e.g. {min(missing)} = "tcp://127.0.0.1:9000", see the reference on wiring',
         )

@@ -14,7 +14,7 @@ from afspm.experiment.findings import closest, nearest
 from afspm.experiment.handlers import check_handlers
 from afspm.experiment.implied_parts import check_notify, is_program
 from afspm.experiment.published import wire_of
-from afspm.experiment.resolution import ResolvedExperiment
+from afspm.experiment.resolution import ResolvedExperiment, ResolvedProcess
 from afspm.experiment.wiring_classes import WIRE_SETTINGS
 from afspm.model import Role, component_of, is_process_name
 from afspm.model.events import LONGEST_PROCESS_NAME, PERSON
@@ -162,7 +162,7 @@ def check_addresses(resolved: ResolvedExperiment) -> None:
             if target is None or target in resolved.net.slots or not is_address(target):
                 continue
             if not any(reaches(target, b) for b in bound):
-                what = f"[{name}] connects to {target}, which nobody binds"
+                what = f"[{name}] connects to {target}, which no process binds"
                 resolved.document.error(what, name, hint=nearest(target, bound, 0.8))
 
 
@@ -207,7 +207,7 @@ def check_problems(resolved: ResolvedExperiment) -> None:
                     hint = nearest(problem, resolved.problems) + ", or name it under [problems]"
                     resolved.document.error(f"[{name}] {verb} {problem!r}, which is no problem", name, hint=hint)
                 elif verb == "flags" and number not in solved:
-                    what = f"[{name}] flags {problem!r}, which nobody solves: the experiment would stand still"
+                    what = f"[{name}] flags {problem!r}, which no component solves: the experiment would stand still"
                     hint = "add a component that solves it, or name it in [control] end_on or solved_by_hand"
                     resolved.document.error(what, name, hint=hint)
     for key in ("solved_by_hand", "end_on"):
@@ -228,7 +228,7 @@ def check_envelopes(resolved: ResolvedExperiment) -> None:
     """Require that every envelope subscribed to is published."""
     processes, made = resolved.processes.values(), resolved.caching.envelopes
     published = {*PUBLISHED, *(e for process in processes for e in process.declared.publishes), *made}
-    if any(t.part.command or t.part.settings.get("live_lines_s") for t in resolved.with_role(Role.TRANSLATOR)):
+    if any(map(_may_publish_lines, resolved.with_role(Role.TRANSLATOR))):
         published.add(LIVE)
     for name, process in resolved.processes.items():
         for i, prefix in enumerate(process.envelopes or ()):
@@ -238,11 +238,16 @@ def check_envelopes(resolved: ResolvedExperiment) -> None:
             path = (name, key, i) if key == "envelopes" else (name, key)
             live = LIVE.startswith(prefix)
             hint = 'give the microscope live_lines_s = "1 s"' if live else nearest(prefix, published)
-            what = f"[{name}] subscribes to {prefix!r}, which nobody publishes"
+            what = f"[{name}] subscribes to {prefix!r}, which no component publishes"
             if resolved.caching.mapping is not None:
                 resolved.document.warning(f"{what}, unless the mapping of [cache] makes it", *path, hint=hint)
             else:
                 resolved.document.error(what, *path, hint=hint)
+
+
+def _may_publish_lines(translator: ResolvedProcess) -> bool:
+    given = translator.part.settings.get("live_lines_s", getattr(translator.component, "live_real_s", None))
+    return bool(translator.part.command or given)
 
 
 def _is_published(prefix: str, published: set[str], made: Collection[str]) -> bool:
@@ -290,12 +295,12 @@ def check_names_of_people(resolved: ResolvedExperiment) -> None:
                 what = f"[control.roles] {role}: there is no {member!r} among components and keys"
                 resolved.document.error(what, *path, hint=nearest(member, names))
             elif not _has_password(resolved, member):
-                what = f"[control.roles] {role}: {member!r} has no password, whoever types the name has the role"
+                what = f"[control.roles] {role}: {member!r} has no password: anyone who types the name has the role"
                 hint = f"`afspm dashboard --make-password` makes a line of people for [{component_of(member)}]"
                 resolved.document.warning(what, *path, hint=hint)
     if any_role and (security.plain or security.insecure):
         hint = "leave [security] plain away, or make keys with `afspm keys` and set [security] keys"
-        what = "[control.roles] without keys: whoever takes the name has the role"
+        what = "[control.roles] without keys: any program that takes the name has the role"
         resolved.document.warning(what, "control", "roles", hint=hint)
     if keys is not None and not keys.is_dir():
         what = f"[security] keys: there is no folder {str(keys)!r}"

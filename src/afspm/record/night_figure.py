@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM, colour_map
-from afspm.formatting import period_text, time_of_day
+from afspm.formatting import counted, period_text, time_of_day
 from afspm.model import names
 from afspm.record.night_record import BAD, NightMark, NightRecord, Shot
 from afspm.record.timeline import Span
@@ -98,7 +98,7 @@ def _figure(height_in: float) -> Figure:
 def _head(figure: Figure, record: NightRecord, title: str, height_in: float, *, simulated: bool) -> None:
     what = f"{title}   " if title else ""
     y = 1 - 0.17 / height_in
-    about = f"{what}{period_text(record.start_ns, record.end_ns, UTC)}, {record.scans} scans"
+    about = f"{what}{period_text(record.start_ns, record.end_ns, UTC)}, {counted(record.scans, 'scan')}"
     figure.text(0.03, y, about, size=7, va="center")
     is_judged = any(mark.of_ns is not None for mark in record.marks)
     legend = "bar: who was in control, as in b" + ("; framed: the tip was judged bad" if is_judged else "")

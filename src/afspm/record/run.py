@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from afspm import wire
 from afspm.errors import FileError, InvalidValue, NoSuchItem, WireError
+from afspm.formatting import counted
 from afspm.model import (
     ControlState,
     Frame,
@@ -319,7 +320,7 @@ class Run:
 
     def __repr__(self) -> str:
         scans, spectra = (self._query(f"SELECT count(*) FROM {kind}")[0][0] for kind in ("scans", "spectra"))
-        return f"<Run {self.folder.name}: {scans} scans, {spectra} spectra>"
+        return f"<Run {self.folder.name}: {counted(scans, 'scan')}, {counted(spectra, 'spectrum', 'spectra')}>"
 
     def _query(self, sql: str, values: Sequence[Any] = ()) -> list[Any]:
         with self._naming_damage():

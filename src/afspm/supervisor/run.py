@@ -16,6 +16,7 @@ from afspm.client.connect import GUEST, guest_facts
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, ProcessStart, Role
+from afspm.formatting import counted
 from afspm.launch import Launch, Sockets
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.record.run_json import COMPUTER, ENDED, STATE_DIR, run_json_or_empty
@@ -115,7 +116,7 @@ def go(
         run_folder.write_run(folder, facts)
         if {start.launch.name for start in starts} & set(experiment.recorders):
             expect_recorder(log_folder(folder / STATE_DIR))
-        log.write(LOGGED_AS, logging.INFO, f"{name}: {len(starts)} processes, into {folder}")
+        log.write(LOGGED_AS, logging.INFO, f"{name}: {counted(len(starts), 'process', 'processes')}, into {folder}")
         handed = key_handout.hand_over(experiment, starts)
         reporter = reporter_of(experiment, starts, clock, common.run, handed.supervisor)
         tasks = [from_start(start) for start in handed.starts]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from afspm.drawing.image_html import round_length_m
 from afspm.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM
-from afspm.formatting import scale, typeset_area, typeset_length
+from afspm.formatting import counted, scale, typeset_area, typeset_length
 from afspm.model import Scan, Spectrum
 from afspm.model.geometry import XY
 from afspm.model.plotting import draw_scale_bar, gold
@@ -86,7 +86,9 @@ class _Picture:
         record, y = self._record, 1 - 0.2 / self._height_in
         scan, measured = record.survey, sum(record.outcome(v) is Outcome.MEASURED for v in record.visits)
         when = f"{scan.time:%Y-%m-%d %H:%M} UTC" if scan.time else ""
-        counted = f"{measured} of {len(record.visits)} targets measured" if record.visits else "no target found"
+        counted = (
+            f"{measured} of {counted(len(record.visits), 'target')} measured" if record.visits else "no target found"
+        )
         said = ", ".join(filter(None, (title, scan.channel, typeset_area(scan.region.size_m), when, counted)))
         self._figure.text(_LEFT_IN / self._width_in, y, said, size=9, va="center")
         if simulated:

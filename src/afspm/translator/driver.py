@@ -131,7 +131,8 @@ class Driver(ABC):
             state more often when a measurement is about to end, as learned from those before.
         result_timeout_s: how long after a scan or spectrum its file may take to appear, in experiment seconds (see
             `patience_s`).
-        live_lines_s: how often the lines of a running scan are published, in experiment seconds; None: not at all.
+        live_lines_s: how often the lines of a running scan are published, in experiment seconds; 0: not at all; None:
+            as often as `live_real_s` says.
 
     Attributes:
         clock, log: of the experiment; given before `connect`.
@@ -156,6 +157,8 @@ class Driver(ABC):
     eager_poll_s: ClassVar[float] = EAGER_S
     """Real seconds between two looks when a scan may end at any moment."""
     max_pixels: ClassVar[int] = 4096 * 4096
+    live_real_s: ClassVar[float | None] = None
+    """Real seconds between the lines of a running scan where `live_lines_s` is not given; None: none are published."""
     simulated: ClassVar[bool] = False
     """No tip can break: the experiment's clock may go at another speed than the real one."""
     memory_is_all: ClassVar[bool] = False

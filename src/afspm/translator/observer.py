@@ -200,16 +200,24 @@ class Observer:
         return None, extent
 
 
+def _live_lines_s(microscope: Driver) -> float | None:
+    """Return how often, in experiment seconds, lines of a running scan are published; None: never."""
+    if microscope.live_lines_s is not None:
+        return microscope.live_lines_s or None
+    real_s = microscope.live_real_s
+    return None if real_s is None else real_s / microscope.clock.real_s(1.0)
+
+
 class LiveLines:
     """Knows which lines of the running scan have been published. Times are of the experiment.
 
     Args:
-        microscope: its `live_lines_s` says how often it is asked for lines; None: never.
+        microscope: its `live_lines_s` says how often it is asked for lines.
     """
 
     def __init__(self, microscope: Driver) -> None:
         self._microscope = microscope
-        self._every_s = microscope.live_lines_s
+        self._every_s = _live_lines_s(microscope)
         self._began_ns = 0
         self._lines = 0
         self.due_s: float | None = None

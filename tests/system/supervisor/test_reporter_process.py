@@ -147,7 +147,7 @@ def test_processes_lines_and_refusals_are_published_and_orders_are_carried_out(r
     assert second.pid != first.pid
     assert second.since_ns >= first.since_ns
     assert second.last_exit == "killed by SIGKILL"
-    listener.until(lambda: any(line.name == "one" and "started again" in line.text for line in listener.lines))
+    listener.until(lambda: any(line.name == "one" and "restarting" in line.text for line in listener.lines))
 
     listener.until(lambda: listener.ask(RESTART_REQUEST, "two").ok)
     listener.alive("two", 2)
@@ -218,5 +218,5 @@ def test_a_key_that_is_missing_is_told_and_nothing_else_is_the_matter(tmp_path: 
     entries = {"folder": str(tmp_path / "keys"), address: "scheduler"}
     launch = Launch("supervisor:lab", sockets=Sockets(control=address), keys=entries)
     running = run_tasks(peer("one"), reporter=Reporter(launch, CLOCK, "lab"))
-    running.terminal.wait_for("WARNING", "the scheduler is not told", "key can't be read")
+    running.terminal.wait_for("WARNING", "the scheduler refused the report", "key can't be read")
     running.terminal.wait_for(" one ", "life 1")

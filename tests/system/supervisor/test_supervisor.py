@@ -40,7 +40,7 @@ def test_a_translator_that_ends_without_a_word_has_crashed_whatever_its_exit_cod
 ) -> None:
     lives = str(tmp_path / "lives")
     running = run_tasks(peer("scope", Role.TRANSLATOR, first="quit", lives=lives), peer("other"))
-    running.terminal.wait_for(" scope ", "before the experiment has ended")
+    running.terminal.wait_for(" scope ", "before the end of the experiment")
     running.terminal.wait_for(" scope ", "life 2")
     outcome = running.stop()
     assert (outcome.why, outcome.reports[0].starts) == (EndReason.STOPPED, 2)

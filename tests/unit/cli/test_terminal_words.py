@@ -142,7 +142,7 @@ def test_manual_is_said_with_since_when(night: Overview) -> None:
 
 def test_nothing_known_is_said_as_such() -> None:
     assert "not known yet" in shown(Overview())
-    assert "has not been heard of yet" in shown(Overview())
+    assert "has not reported yet" in shown(Overview())
 
 
 def test_json_says_the_same(night: Overview) -> None:

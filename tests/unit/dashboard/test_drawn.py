@@ -304,7 +304,7 @@ def test_processes_of_a_computer_that_is_gone_are_not_told_of_as_alive() -> None
     assert silent == {"series": (ELSEWHERE - 1 - 29) * S}, "and what has ended there has ended"
     state = watch.overview.processes["series"]
     assert process_words(state, silent["series"])[:2] == (
-        "not heard of", "for 9 min 30 s: whoever started it is gone, or can't be reached",
+        "not heard of", "for 9 min 30 s: its supervisor is gone, or can't be reached",
     )  # fmt: skip
     html = time_line_html(watch.overview, ELSEWHERE * S, silent)
     assert html.count("process-not-heard-of") == 1

@@ -104,8 +104,8 @@ BROKEN = {
     ),
     "a problem's number is taken": ("[problems]\ntip-lost = 4\n", FRAME, "can't have the number 4"),
     "a problem's number is no number": ('[problems]\ntip-lost = "six"\n', FRAME, "not a whole number"),
-    "nobody publishes": (ANYTHING + 'envelopes = ["Scn2d"]\n', FRAME, "'Scn2d', which nobody publishes"),
-    "nobody publishes what a class listens to": (CHOOSER, FRAME, "'PeakList', which nobody publishes"),
+    "nobody publishes": (ANYTHING + 'envelopes = ["Scn2d"]\n', FRAME, "'Scn2d', which no component publishes"),
+    "nobody publishes what a class listens to": (CHOOSER, FRAME, "'PeakList', which no component publishes"),
     "two binds of one address": (
         PEAKS + 'publisher = "tcp://127.0.0.1:9000"\n' + PEAKS.replace("peaks", "more")
         + 'publisher = "tcp://127.0.0.1:9000"\n',
@@ -254,10 +254,11 @@ def test_of_a_port_that_is_too_high_it_is_said(write: Write) -> None:
 def test_lines_of_running_scans_are_there_for_those_who_asked_the_microscope_for_them(write: Write) -> None:
     simulated = FRAME[: FRAME.index("[microscope]")] + '[microscope]\ncomponent = true\nclass = "Simulator"\n'
     watcher = ANYTHING + 'envelopes = ["ScanLines"]\n'
-    error = only_error(write(watcher, frame=simulated))
-    assert "'ScanLines', which nobody publishes" in error.what
+    error = only_error(write(watcher, frame=simulated + "live_lines_s = 0\n"))
+    assert "'ScanLines', which no component publishes" in error.what
     assert "live_lines_s" in error.hint
-    assert errors(write(watcher, frame=simulated + 'live_lines_s = "1 s"\n')) == []
+    for frame in (simulated, simulated + 'live_lines_s = "1 s"\n'):
+        assert errors(write(watcher, frame=frame)) == []
 
 
 @pytest.mark.parametrize("case", BROKEN, ids=str)

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.microscopes.simulator import Simulator
 from afspm.model import ControlRequest, Region, ScanLines, ScopeState, names
+from afspm.translator.observer import LiveLines
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))
 
@@ -128,3 +130,12 @@ def test_the_simulators_lines_make_up_its_scan(direction: str, tmp_path: Path, f
     for scan in simulator.load(simulator.results()[-1]):
         taken = ~np.isnan(pictures[scan.channel])  # type: ignore[union-attr]
         assert np.array_equal(pictures[scan.channel][taken], scan.values[taken])  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(("given", "every_s"), [(None, 120.0), (0.0, None), (3.0, 3.0)])
+def test_a_simulated_microscope_publishes_lines_by_real_time(given: float | None, every_s: float | None) -> None:
+    driver = Simulator(live_lines_s=given)
+    driver.clock = ExperimentClock.starting_now(speed=240.0)
+    live = LiveLines(driver)
+    live.begin(0)
+    assert live.due_s == every_s

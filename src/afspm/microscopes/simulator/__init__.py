@@ -97,12 +97,13 @@ class Simulator(Driver):
         actions: generic actions added: `{name = {set = {<parameter> = <value>}}}`.
         poll_period_s: how often it is looked at, in real seconds, when nothing is about to happen.
         result_timeout_s: how long after a scan or spectrum its file may take to appear.
-        live_lines_s: how often the lines of a running scan are published; by default not at all.
+        live_lines_s: how often lines of a running scan are published, 0: not at all; by default twice a real second.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
     max_pixels: ClassVar[int] = 2048 * 2048
     simulated: ClassVar[bool] = True
+    live_real_s: ClassVar[float | None] = 0.5
     memory_is_all: ClassVar[bool] = True
 
     def __init__(

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from afspm.drawing.timeline import TimelineRow
+from afspm.formatting import counted
 from afspm.model import ControlEvent, ControlRequest, Frame, JournalEntry, ProcessCondition, ScopeState, names
 from afspm.record.overview import Overview, ProcessRestart
 from afspm.record.run import Run
@@ -151,22 +152,18 @@ def gathered(refusals: Sequence[JournalEntry]) -> list[Refusals]:
 
 def sentence(story: RunStory) -> str:
     """Return the run in one sentence."""
-    parts = [_counted(len(story.scans) - story.interrupted, "scan", "scans")]
+    parts = [counted(len(story.scans) - story.interrupted, "scan")]
     if story.interrupted:
         parts.append(f"{story.interrupted} interrupted")
     if story.spectra:
-        parts.append(_counted(story.spectra, "spectrum", "spectra"))
+        parts.append(counted(story.spectra, "spectrum", "spectra"))
     flagged = Counter(span.label for span in story.problems)
     parts += [f"{name} flagged {_times(count)}" for name, count in flagged.items()]
     parts += [f"{story.problem_name(entry)} seen after the end" for entry in story.seen_late]
     if story.restarts:
-        parts.append(_counted(len(story.restarts), "restart", "restarts"))
+        parts.append(counted(len(story.restarts), "restart"))
     parts += [f"{name} given up" for name in story.given_up]
     return ", ".join(parts)
-
-
-def _counted(count: int, one: str, many: str) -> str:
-    return f"{count} {one if count == 1 else many}"
 
 
 def _times(count: int) -> str:
