@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from afspm.emulators.emulator import Emulator
     from afspm.testing.translators import CheckOptions
 
-_ASK = """This moves the probe, takes scans and spectra, changes gains and bias by a few percent, and switches the feedback
-off and on, all within the present frame, and then restores all settings. It never approaches, pulses or crashes. Is the
-tip so far from the sample that it can't reach it, whatever the feedback does?"""
+_ASK = """This moves the probe, takes scans and spectra, changes gains and bias by a few percent, and switches the
+feedback off and on, all within the present frame, and then restores all settings. It never approaches, pulses or
+crashes. Is the tip so far from the sample that it can't reach it, whatever the feedback does?"""
 
 
 def check_translator(

@@ -86,10 +86,10 @@ class _Picture:
         record, y = self._record, 1 - 0.2 / self._height_in
         scan, measured = record.survey, sum(record.outcome(v) is Outcome.MEASURED for v in record.visits)
         when = f"{scan.time:%Y-%m-%d %H:%M} UTC" if scan.time else ""
-        counted = (
+        targets = (
             f"{measured} of {counted(len(record.visits), 'target')} measured" if record.visits else "no target found"
         )
-        said = ", ".join(filter(None, (title, scan.channel, typeset_area(scan.region.size_m), when, counted)))
+        said = ", ".join(filter(None, (title, scan.channel, typeset_area(scan.region.size_m), when, targets)))
         self._figure.text(_LEFT_IN / self._width_in, y, said, size=9, va="center")
         if simulated:
             right = 1 - _LEFT_IN / self._width_in

@@ -43,7 +43,7 @@ def test_a_run_that_was_cut_off_says_how_it_goes_on_and_one_that_runs_what_may_b
     with held, pytest.raises(typer.Exit), command(tmp_path / "night-1"):
         pass
     said = capsys.readouterr().err
-    assert "nobody answers in night-1" in said
+    assert "no scheduler answers in night-1" in said
     assert (f"it was cut off; `afspm run --resume {tmp_path / 'night-1'}` goes on with it" in said) is not runs
     assert ("though it has not ended" in said) is runs
     assert ("lacks the public key of terminal" in said) is (runs and keys != "null")

@@ -101,9 +101,9 @@ def test_who_is_not_told_of_while_others_are_is_not_well(night: Overview) -> Non
     for after_s in (121, 121 + 7 * 60):  # at 60 times real time
         now_ns = START + after_s * S
         night.take("ProcessStates", model.ProcessStates(now_ns, "other", (elsewhere,)), now_ns, "ProcessStates_other")
-        is_gone = "series not heard of for 7 min 00 s" in shown(night)
+        is_gone = "series no report for 7 min 00 s" in shown(night)
         assert is_gone is (after_s > 121)
-    assert "scheduler not heard of" not in shown(night)
+    assert "scheduler no report" not in shown(night)
     told = StatusText(night, ABOUT, START + 600 * S).as_json()["processes"]
     assert {one["name"]: one["heard_of"] for one in told} == {
         "series": False, "judge": False, "grid": False, "scheduler": True,
