@@ -74,7 +74,7 @@ def test_components_know_whose_places_they_see(write: Write) -> None:
 
 def test_a_rescanner_without_anybody_to_ask_it_is_told_of(write: Write) -> None:
     found = errors(write(experiment(name="Scheduler"), frame=""))
-    assert ["nobody publishes" in one.what for one in found] == [True, True]  # wishes, and what comes of them
+    assert ["no component publishes" in one.what for one in found] == [True, True]  # wishes, and what comes of them
 
 
 def test_drift_must_be_somebody_s_business(write: Write) -> None:

@@ -47,7 +47,7 @@ def test_python_is_the_one_that_runs_us(write: Write) -> None:
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ("[notify]\n", "nobody is told of anything"),
+        ("[notify]\n", "has no recipient"),
         ('[notify]\ncommand = ["no-such-program"]\n', "there is no program 'no-such-program'"),
         ('[notify]\nwebhook = "chat.example.org"\n', "it is not an address"),
         (HOOK + 'on = ["dawn"]\n', "'dawn'"),

@@ -96,7 +96,7 @@ BROKEN = {
     "nothing to run": ("[a]\ncomponent = true\n", FRAME, "neither `class` nor `command`"),
     "not a boolean": ('[a]\ncomponent = "yes"\nclass = "parts.Corrector"\n', FRAME, "not true or false"),
     "no such program": ('[a]\ncomponent = true\ncommand = ["no-such-program"]\n', FRAME, "there is no program"),
-    "nobody solves": (CLASSIFIER, FRAME, "which nobody solves"),
+    "nobody solves": (CLASSIFIER, FRAME, "which no component solves"),
     "no such problem": (
         '[a]\ncomponent = true\ncommand = ["python3"]\nsolves = ["tip-shape-chnged"]\n',
         FRAME,
@@ -161,7 +161,7 @@ BROKEN = {
         FRAME,
         "is not an address",
     ),
-    "nobody binds": (ANYTHING + 'subscriber = "tcp://127.0.0.1:9009"\n', FRAME, "which nobody binds"),
+    "nobody binds": (ANYTHING + 'subscriber = "tcp://127.0.0.1:9009"\n', FRAME, "which no process binds"),
     "not an address": (
         ANYTHING + 'subscriber = "s"\n[s]\nclass = "Subscriber"\nsub_url = "localhost:3"\n', FRAME, "is not an address"
     ),
