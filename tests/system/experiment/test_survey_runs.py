@@ -9,12 +9,14 @@ import signal
 import subprocess
 import sys
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from experiment_lab import AfspmRun, Run
 
 import afspm
+from afspm.errors import ExperimentEnded
 from afspm.survey import find_particles, nearest
 
 pytest.importorskip("skimage")
@@ -129,4 +131,16 @@ def test_zooms_outside_the_limits_are_told_as_refused_and_an_early_end_leaves_ta
         scope.end_experiment()
     assert one.end() == 0, one.output
     assert outcomes(one.folder) == ["measured", "refused", "refused", "not-reached"]
+    assert (one.folder / "targets.png").stat().st_size > 50_000
+
+
+def test_when_the_tip_gets_bad_the_survey_ends_with_what_it_has(afspm_run: Run, tmp_path: Path) -> None:
+    ends = '[control]\nend_on = ["tip-shape-changed"]\n'
+    one = afspm_run(str(SAMPLE), overlay(tmp_path, FEWER + SLOWER + ends), "--runs", str(tmp_path / "runs"))
+    one.wait_for("target 2 of 4 .*measured")
+    with suppress(ExperimentEnded), afspm.connect(one.folder, name="classifier") as scope:
+        scope.flag("tip-shape-changed")
+    assert one.end() == 0, one.output
+    assert outcomes(one.folder)[:2] == ["measured", "measured"]
+    assert outcomes(one.folder)[3] == "not-reached"
     assert (one.folder / "targets.png").stat().st_size > 50_000
