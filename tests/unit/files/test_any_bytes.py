@@ -19,6 +19,7 @@ from corpus import REAL, reading, whole
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from samples import DATA, WHOLE
+from systems import not_on_wine
 
 import afspm
 from afspm.errors import FileError
@@ -87,6 +88,7 @@ def test_pieces_of_files_are_refused_or_make_sense(pieces: list[bytes], suffix: 
     require_sense(b"".join(pieces), f"file{suffix}")
 
 
+@not_on_wine("the older HDF5 that runs there ends the process on some damaged files")
 @pytest.mark.parametrize("name", [*WHOLE, *REAL])
 @settings(max_examples=10, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())

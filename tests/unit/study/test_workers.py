@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from systems import not_on_wine
 
 from afspm.errors import InvalidValue
 from afspm.study.workers import TaskOutcome, on_cores, processes
@@ -46,12 +47,14 @@ def test_as_many_processes_as_asked_for_else_one_where_they_do_not_pay() -> None
     assert processes(None, 10**9) == (os.cpu_count() or 1)
 
 
+@not_on_wine("a pool of processes does not hear of the end of one that was killed")
 def test_a_worker_that_is_killed_loses_no_task(tmp_path: Path) -> None:
     done = by_index(list(on_cores(doubled_by_the_next, [(n, tmp_path) for n in range(6)], jobs=2)))
     assert [outcome.value for outcome in done] == [2 * n for n in range(6)]
     assert (tmp_path / "died").exists()
 
 
+@not_on_wine("a pool of processes does not hear of the end of one that was killed")
 def test_what_kills_every_worker_is_told_instead_of_tried_for_ever() -> None:
     done = list(on_cores(deadly, [(1,), (2,)], jobs=2))
     assert len(done) == 2

@@ -25,8 +25,9 @@ def test_two_runs_of_one_second_do_not_share_a_folder(tmp_path: Path) -> None:
     first = run_folder.create(tmp_path, "night", STARTED)
     second = run_folder.create(tmp_path, "night", STARTED)
     assert first != second
-    assert (tmp_path / "latest").resolve() == second
     assert latest_run(tmp_path) == second
+    if sys.platform != "win32":  # where most persons may make no links
+        assert (tmp_path / "latest").resolve() == second
 
 
 def test_where_no_link_can_be_made_a_file_names_the_newest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from afspm.testing.skeletons import write
 def test_a_package_has_the_name_that_was_asked_for_everywhere(name: str, tmp_path: Path) -> None:
     folder = write("driver", name, tmp_path)
     assert folder == tmp_path / "tip_top"
-    files = {str(file.relative_to(folder)): file.read_text() for file in folder.rglob("*") if file.is_file()}
+    files = {file.relative_to(folder).as_posix(): file.read_text() for file in folder.rglob("*") if file.is_file()}
     assert set(files) == {
         "README.md", "experiment.toml", "pyproject.toml", "tests/test_tip_top.py", "tip_top/__init__.py",
         "tip_top/parameters.toml",
