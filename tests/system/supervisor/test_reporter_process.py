@@ -156,7 +156,7 @@ def test_processes_lines_and_refusals_are_published_and_orders_are_carried_out(r
     assert listener.ask(ControlRequest.END_EXPERIMENT).code == ControlResponse.FAILURE
     refused = listener.until(lambda: [e for e in listener.entries if e.refused and e.kind == "request"])
     assert (refused[0].who, refused[0].what) == ("dashboard:Ada", "ends the experiment")
-    assert refused[0].reason == "dashboard:Ada has not the role 'end' ([control] roles)"
+    assert refused[0].reason == "dashboard:Ada does not have the role end_experiment ([control.roles])"
 
     _, one, two = rig.running.stop().reports
     assert (one.starts, one.ordered) == (2, 0)
