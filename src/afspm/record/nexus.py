@@ -52,7 +52,7 @@ class FileProvenance:
 
 
 def encode_scan(scans: Sequence[Scan], circumstances: FileProvenance) -> bytes:
-    """All channels of one scan, of the same region and shape, as a file. Needs h5py."""
+    """All channels of one scan, of the same region and shape, as a file."""
     first, fields = scans[0], field_names((scan.channel for scan in scans), ("x", "y"))
     region = first.region
     about = _about("scan", first.filename, circumstances) | {
@@ -83,7 +83,7 @@ def encode_scan(scans: Sequence[Scan], circumstances: FileProvenance) -> bytes:
 
 
 def encode_spectrum(spectrum: Spectrum, circumstances: FileProvenance) -> bytes:
-    """One spectrum as a file. Needs h5py."""
+    """One spectrum as a file."""
     fields = field_names(spectrum.names)
     about = _about("spectrum", spectrum.filename, circumstances) | {
         "position_m": spectrum.position_m,

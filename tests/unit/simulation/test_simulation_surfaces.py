@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -171,16 +170,6 @@ def test_a_real_file_that_holds_no_heights_is_refused(name: str, why: str) -> No
         pytest.skip(f"{DATA / name} is missing")
     with pytest.raises(FileError, match=why):
         read(DATA / name)
-
-
-def test_hdf5_without_its_library_is_refused_with_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    for name in ("a.h5", "a.nc"):
-        (tmp_path / name).write_bytes(b"\x89HDF\r\n\x1a\n")
-        with pytest.raises(FileError, match="pip install"):
-            read(tmp_path / name)
 
 
 def test_a_wrong_surface_is_refused_with_the_nearest_name() -> None:

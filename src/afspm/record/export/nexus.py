@@ -11,7 +11,7 @@ from afspm.record.tables import ScanRow, SpectrumRow
 
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
-    """Yield the file of a scan or spectrum, with the end of its name. Needs h5py."""
+    """Yield the file of a scan or spectrum, with the end of its name."""
     import h5py
 
     run.about(row)  # raises where the file is damaged
