@@ -221,3 +221,17 @@ def test_a_site_of_a_lattice_is_refused_if_it_is_like_the_others_though_it_was_e
     wrong = expecting(DRIFT_M + period_m * np.array([cos, sin]))
     assert not wrong.accepted
     assert "a site like the others" in wrong.reason
+
+
+def test_an_overlap_too_small_for_an_uncertainty_is_refused() -> None:
+    first, second = (scanned(REGION, (12, 12), start_s=start_s) for start_s in (0.0, 900.0))
+    found = registered(second, first)
+    assert not found.accepted
+    assert found.reason == "the overlap of 10 x 10 pixels is too small to tell how certain a displacement is"
+
+
+def test_a_small_overlap_is_registered_where_a_displacement_is_expected() -> None:
+    first, second = (scanned(REGION, (12, 12), start_s=start_s) for start_s in (0.0, 900.0))
+    found = registered(second, first, Prior(np.zeros(2), (20 * NM) ** 2 * np.eye(2)))
+    assert "too small" not in found.reason
+    assert np.isfinite(found.sd_m)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.drift.estimators.images import flatten_rows
+from afspm.drift.estimators.images import Unusable, flatten_rows
 from afspm.drift.estimators.noise import LEAST_NOISE, FineFilter, denoised, noise_metric, products, seen, without_lines
 from afspm.drift.estimators.warp import COUNT, LINEAR, SLOPES, WarpedPair, derivative
 
@@ -165,7 +165,10 @@ def covariance(fit: Fit, believed: Believed) -> Array:
     whole = fit.curvature.sum(axis=0) + believed.precision
     inverse = np.linalg.inv(whole)
     model = inverse @ (fit.spread.sum(axis=0) + believed.precision) @ inverse.T
-    change = np.linalg.solve(whole - fit.curvature[used], fit.slope[used][:, :, None])[:, :, 0]
+    try:
+        change = np.linalg.solve(whole - fit.curvature[used], fit.slope[used][:, :, None])[:, :, 0]
+    except np.linalg.LinAlgError:
+        raise Unusable("too small to tell how certain a displacement is") from None
     varied = change.T @ change * (n - 1) / n + inverse @ believed.precision @ inverse.T
     size = float(np.trace(np.linalg.solve(model[:2, :2], varied[:2, :2]))) / 2
     total: Array = max(size, 1.0) * (model + model.T) / 2

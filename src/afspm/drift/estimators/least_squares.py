@@ -75,7 +75,11 @@ class LeastSquares:
         box = None if start is None else scene.box(start[0][:2])
         if start is None or box is None:
             return Registration.refused("the scans overlap too little")
-        theta, total, seen = _fine(scene, box, start[0], expected, _shear_models(prior, reference, scan, grid))
+        try:
+            theta, total, seen = _fine(scene, box, start[0], expected, _shear_models(prior, reference, scan, grid))
+        except Unusable as reason:
+            rows, columns = box.shape
+            return Registration.refused(f"the overlap of {columns} x {rows} pixels is {reason}")
         if not (np.isfinite(total).all() and np.hypot(*(theta - start[0])[:2]) < FARTHEST_PX):
             return Registration.refused("no displacement fits: the scans hold nothing in common")
         found = _evidence(scene, box, theta, total, start[1:], expected)

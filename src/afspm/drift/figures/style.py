@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from afspm.drawing.levelling import Levelling, levelled
 from afspm.drift.registration import DriftScan
 
 Array = NDArray[np.float64]
@@ -68,17 +69,17 @@ def time_axis(ax: Axes, *, label: bool = True) -> None:
 
 
 def show_scan(ax: Axes, scan: DriftScan) -> None:
-    """A scan in grey, levelled line by line, in µm of its own frame (before it is turned)."""
+    """A scan in grey, levelled by the differences of its lines, in µm of its own frame (before it is turned)."""
     left, low = (1e6 * edge for edge in scan.region.top_left_m)
     width, height = (1e6 * size for size in scan.region.size_m)
-    levelled = scan.values - np.nanmedian(scan.values, axis=1, keepdims=True)
-    dark, bright = np.nanpercentile(levelled, (0.5, 99.5)) if np.isfinite(levelled).any() else (0.0, 1.0)
+    level = levelled(levelled(scan.values, Levelling.DIFFERENCES), Levelling.PLANE)
+    dark, bright = np.nanpercentile(level, (0.5, 99.5)) if np.isfinite(level).any() else (0.0, 1.0)
     # the first and last pixels lie on the border of the region: half of each reaches over it
     half_x, half_y = (
         size / (count - 1) / 2 for size, count in zip((width, height), scan.values.shape[::-1], strict=True)
     )
     extent = (left - half_x, left + width + half_x, low - half_y, low + height + half_y)
-    ax.imshow(levelled, cmap="gray", vmin=dark, vmax=bright, extent=extent, origin="lower", interpolation="nearest")
+    ax.imshow(level, cmap="gray", vmin=dark, vmax=bright, extent=extent, origin="lower", interpolation="nearest")
     ax.set_aspect("equal")
 
 
