@@ -7,11 +7,20 @@ from collections.abc import Callable
 from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
 from afspm.errors import NoResponse, Refused
-from afspm.model import RELAY_REQUEST, ControlRequest, ControlResponse, Response, ScopeState, request_name
+from afspm.model import (
+    RELAY_REQUEST,
+    ControlRequest,
+    ControlResponse,
+    Response,
+    ResponseDetail,
+    ScopeState,
+    request_name,
+)
 
 PATIENCE_S = 60.0  # real time that a translator may take to be there again
 RETRY_S = 1.0  # before an unreachable one is asked again, when nothing is published in between
 STATE_WITHIN_S = 5.0  # before a warning that the microscope has published no state
+CONNECTED_WITHIN_S = 5.0  # before a warning that the scheduler has no connection to the translator (yet)
 SETTLED_WITHIN_S = 2.0  # what was set is published, if it changed anything
 ASK_FREE_AGAIN_S = 5.0  # should the state FREE never reach us
 ASK_BUSY_AGAIN_S = 25.0  # the same where another state than FREE was published
@@ -125,8 +134,9 @@ class CommandRetry:
         link = self._link
         request_id = request_id or link.next_id()
         give_up_s = link.earlier(PATIENCE_S, until_s)
-        is_repeated = False
+        is_repeated = is_told = False
         self._wait_for_state(give_up_s)
+        late_s = link.earlier(CONNECTED_WITHIN_S, give_up_s)
         while True:
             response = link.request(kind, subject, request_id=request_id, until_s=until_s)
             if is_repeated and response.code in NOT_IN_CONTROL:  # now; whether it was done before is still unknown
@@ -142,8 +152,10 @@ class CommandRetry:
                     where=link.name,
                     hint="is its translator running? it may or may not have been carried out",
                 )
-            if not is_repeated:
-                link.log.warning("the microscope does not answer %s; asking again", kind.name)
+            if not is_told and (response.detail is not ResponseDetail.NOT_SENT or link.clock.monotonic_s() >= late_s):
+                why = response.reason or "no reason given"
+                link.log.warning("the microscope does not answer %s (%s); asking again", kind.name, why)
+                is_told = True
             is_repeated = True
             self._wait_for_news(link.earlier(RETRY_S, give_up_s))
 

@@ -298,6 +298,23 @@ def test_a_translator_that_is_silent_for_a_while_is_asked_with_the_same_id(lab: 
     assert len(sets) == 1
 
 
+@pytest.mark.parametrize(("late_s", "warnings"), [(3.0, 0), (9.0, 1)])
+def test_a_translator_that_is_not_yet_connected_is_worth_a_warning_only_if_it_stays_so(
+    lab: Lab, scope: Scope, caplog: pytest.LogCaptureFixture, late_s: float, warnings: int
+) -> None:
+    until_s, reason = lab.clock.passed_s + late_s, "not sent: the translator is not connected"
+
+    def unconnected(request: model.Request) -> Response | str:
+        if request.kind != ControlRequest.SET_SCAN_PARAMS or lab.clock.passed_s >= until_s:
+            return "go on"
+        return Response(ControlResponse.NO_RESPONSE, reason=reason, detail=model.ResponseDetail.NOT_SENT)
+
+    lab.intercept = unconnected
+    with caplog.at_level("WARNING"):
+        scope.scan(REGION)
+    assert [reason in record.getMessage() for record in caplog.records] == [True] * warnings
+
+
 def test_a_translator_that_stays_silent_is_told(lab: Lab, scope: Scope) -> None:
     lab.intercept = lambda request: (
         Response(ControlResponse.NO_RESPONSE) if request.kind == ControlRequest.PARAM else "go on"
