@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import importlib
 import json
+import threading
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from afspm.client.component import Component
 from afspm.components import tip_verdict
@@ -27,25 +28,18 @@ class NightPicture(Component):
         title: above the picture.
     """
 
-    period_s = 2.0
-    period_time: Literal["experiment", "real"] = "real"
-
     def __init__(self, channel: str = "Height", file: str = "night.png", title: str = "") -> None:
         self.channel, self.file, self.title = channel, file, title
         self._control: ControlState | None = None
         self._begin: tuple[int | None, str | None] = (None, None)
         self._is_scanning = False
-        self._drawing_is_loaded = False
 
     def on_start(self) -> None:
         self._file = LineFile(Path(self.run_dir) / "state" / f"{self.name}.night.jsonl")
         self.record = NightRecord.from_lines(self._file.lines())
-
-    def on_tick(self) -> None:
-        if not self._drawing_is_loaded:
-            # now, when there is time: at the end all must be quick
-            importlib.import_module("afspm.record.night_figure").prepare()
-        self._drawing_is_loaded = True
+        # now, when there is time, as at the end all must be quick; and beside the loop, which must not miss a scan
+        self._loading = threading.Thread(target=_load_drawing, name="loading", daemon=True)
+        self._loading.start()
 
     def on_control(self, control_state: ControlState) -> None:
         self._control = control_state
@@ -77,6 +71,7 @@ class NightPicture(Component):
         if not self.record.shots:
             self.log.info("no scan, no picture")
             return
+        self._loading.join()
         from afspm.record.night_figure import draw
 
         path = Path(self.run_dir) / self.file
@@ -91,3 +86,7 @@ class NightPicture(Component):
     def _add(self, entry: Plain) -> None:
         if self.record.add(entry):
             self._file.append([json.dumps(entry, separators=(",", ":"))])
+
+
+def _load_drawing() -> None:
+    importlib.import_module("afspm.record.night_figure").prepare()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from afspm.record.night_record import (
 )
 
 pytest.importorskip("matplotlib")
+from afspm.record import night_figure
 from afspm.record.night_figure import MOST_SHOTS, _chosen, _episodes, draw, flagged_by
 
 MINUTE_NS = 60_000_000_000
@@ -143,6 +145,22 @@ def test_the_component_draws_when_the_experiment_ends(tmp_path: Path) -> None:
         ("tip_classifier", "verdict"),
         ("tip_corrector", "x-pulse"),
     }
+    assert (tmp_path / "night.png").exists()
+
+
+def test_scans_are_taken_in_while_the_drawing_is_loaded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    is_seen, seen_while_loading = threading.Event(), list[bool]()
+
+    class Observed(NightPicture):
+        def on_scan(self, scan: Scan) -> None:
+            super().on_scan(scan)
+            is_seen.set()
+
+    monkeypatch.setattr(night_figure, "prepare", lambda: seen_while_loading.append(is_seen.wait(5.0)))
+    lab = _lab()
+    lab.at(500.0, lab.parent_goes)
+    run(Observed(), lab, tmp_path / "state", run_dir=str(tmp_path))
+    assert seen_while_loading == [True]
     assert (tmp_path / "night.png").exists()
 
 
