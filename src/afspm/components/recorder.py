@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import tomllib
 from pathlib import Path
@@ -57,7 +56,6 @@ class Recorder(Component):
         launch = context.launch
         run_dir = Path(launch.run_dir or ".")
         context.activity.longest_step_s = self.longest_step_s
-        logging.getLogger("h5py").setLevel(logging.WARNING)  # else it tells of every number that it converts
         # one that keeps a log need not send us everything, too
         heard = SIGNS_OF_LIFE if len(launch.sockets.subscribe) == 1 else None
         port = context.open_port(heard)

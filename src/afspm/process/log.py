@@ -19,11 +19,13 @@ class LineFormatter(logging.Formatter):
 
 
 def set_up(name: str, level: str) -> logging.Logger:
-    """Send all records of `level` and above to standard error; returns the logger of the component `name`."""
+    """Send records of `level` and above to standard error, of libraries only warnings; returns the logger of the
+    component `name`."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(LineFormatter())
     root = logging.getLogger()
     root.handlers[:] = [handler]
-    root.setLevel(level.upper())
+    root.setLevel(logging.WARNING)
+    logging.getLogger(ROOT).setLevel(level.upper())
     logging.captureWarnings(capture=True)
     return logging.getLogger(f"{ROOT}.{name}")
