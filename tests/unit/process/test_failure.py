@@ -120,7 +120,7 @@ def test_asking_for_the_scope_too_early_is_told_at_the_line_that_did() -> None:
 @pytest.mark.parametrize(
     "wrong",
     [
-        lambda: Region(("0 um", 0), ("1 um", "1 um")),
+        lambda: Region(([0], 0), ("1 um", "1 um")),
         lambda: Region(0, 1e-6),
         lambda: ScanParameters(shape=64),
         lambda: ScanParameters(shape=(1, 2, 3)),
