@@ -492,6 +492,8 @@ def test_at_the_start_the_first_scan_is_wanted_in_the_other_direction() -> None:
     lab.says(registered(lab.worker.jobs[0], forecast()))
     (told,) = lab.published("DriftRescan")
     assert (told.kind, told.upwards) == (2, False)
+    assert any("requesting a rescan" in text for text in logged(lab, "INFO"))
+    assert not logged(lab, "WARNING")  # nothing is wrong
     assert problems(lab) == (Problem.THERMAL_DRIFT,)
     again = Lab(DriftCompensationSettings(at_start="up-down"), state=lab.saved())
     again.scan()

@@ -128,8 +128,9 @@ class DriftResponse:
         if place is None:
             return [Log("ERROR", f"{reason}, and the region to scan again is unknown")]
         wanted = RescanWanted(kind, place.said, self._frame.shape, reason, now_ns, upwards)
+        level = "INFO" if kind is RescanKind.OPPOSITE else "WARNING"  # one belongs to the beginning of every night
         return [
-            Log("WARNING", f"requesting a rescan: {reason}"),
+            Log(level, f"requesting a rescan: {reason}"),
             *step(Announced(RESCAN, self._codec.encode_rescan(wanted))),
         ]
 
