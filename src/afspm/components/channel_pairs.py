@@ -20,14 +20,15 @@ class HeightPair:
     trace: Scan
     retrace: Scan | None
 
-    def judged_by(self, judge: TipJudge) -> Verdict:
-        """Return what the pair tells of the tip.
+    def judged_by(self, judge: TipJudge, *, learns: bool) -> Verdict:
+        """Return what the pair tells of the tip; `learns` as in `TipJudge.judge`.
 
         Raises:
             UnitError: the channels are no heights.
         """
         retrace = None if self.retrace is None else self.retrace.values * convert(1.0, self.retrace.unit, "m")
-        return judge.judge(self.trace.values * convert(1.0, self.trace.unit, "m"), retrace, self.trace.region)
+        trace = self.trace.values * convert(1.0, self.trace.unit, "m")
+        return judge.judge(trace, retrace, self.trace.region, learns=learns)
 
 
 class ChannelPairing:

@@ -17,14 +17,15 @@ _SCORES = {Opinion.GOOD: tip_verdict.GOOD, Opinion.BAD: tip_verdict.BAD, Opinion
 class TipClassifier(Component):
     """Flags `tip-shape-changed` when scans say that the tip is blunt, double or carries debris, and clears it again.
 
-    It learns what a good tip shows from the first scans, so the tip has to be good then; scans of another size are not
-    judged. It judges best a place that it has seen before; elsewhere it sees only large changes. What it thinks of each
-    scan it publishes as a `SpatialROIWithScoreList` (1 good, 0.5 unclear, 0 bad).
+    It learns what a good tip shows from the first scans of each size and number of pixels, so the tip has to be good
+    then; it learns nothing while a problem is flagged or the last scan judged was not good. It judges best a place that
+    it has seen before; elsewhere it sees only large changes. What it thinks of each scan it publishes as a
+    `SpatialROIWithScoreList` (1 good, 0.5 unclear, 0 bad).
 
     Args:
         channel: of the heights.
         retrace_channel: their retrace; empty where it is not recorded (then debris is not seen).
-        reference_scans: how many scans it learns from.
+        reference_scans: how many scans of each kind it learns from.
         flag_after: bad scans in a row until the problem is flagged.
         clear_after: good scans in a row until it is cleared.
         detail: share of the fine detail at a known place below which the tip is blunt.
@@ -71,6 +72,8 @@ class TipClassifier(Component):
             self.counter.good = 0  # somebody else saw something: only scans from now on can tell that it is over
         elif was and not self._is_flagged:
             self.counter.bad = 0  # somebody has seen to it: only scans from now on can tell that it is bad again
+            self.judge.trust()
+            self._save()
 
     def on_scan(self, scan: Scan) -> None:
         self.expected.see(scan)
@@ -85,13 +88,8 @@ class TipClassifier(Component):
         return self.scope.problems.number(self.problem) in (self._problems or ())
 
     def _judge(self, pair: HeightPair) -> None:
-        if not self.judge.has_learnt and self._problems != ():
-            known = "a problem is flagged" if self._problems else "whether a problem was flagged is not known yet"
-            self.log.info("not learnt from %s: %s", _name(pair.trace), known)
-            self._remember(pair.trace)
-            return
         try:
-            verdict = pair.judged_by(self.judge)
+            verdict = pair.judged_by(self.judge, learns=self._problems == ())  # None: flags are not known yet
         except UnitError as error:
             self.log.warning("%s is no height: %s", pair.trace.channel, error)
             return
@@ -116,6 +114,9 @@ class TipClassifier(Component):
     def _remember(self, scan: Scan) -> None:
         if scan.time_ns is not None:
             self.memory["newest_ns"] = scan.time_ns
+        self._save()
+
+    def _save(self) -> None:
         self.memory["counter"] = [self.counter.bad, self.counter.good]
         self.memory["judge"] = self.judge.state()
         self.memory.save()

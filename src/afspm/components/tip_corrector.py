@@ -186,15 +186,15 @@ class TipCorrector(Component):
         """Judge, and clear the flag of a good tip."""
         for scan in scans.values():
             pair = self.pairing.add(scan)
-            if pair is not None and self.judge is not None and self.judge.has_learnt:
-                verdict = pair.judged_by(self.judge)
+            if pair is not None and self.judge is not None:
+                verdict = pair.judged_by(self.judge, learns=False)
                 self.log.info("test scan: %s (%s)", verdict.opinion.value, verdict.why)
                 if verdict.opinion is Opinion.GOOD:
                     self._restore(self._of_experiment()[0])
                     self.scope.clear(self.problem)
                     self._wait_flag(self.problem, flagged=False)
                 return tip_verdict.BAD if verdict.opinion is Opinion.BAD else tip_verdict.UNCLEAR
-        self.log.warning("a test scan that can't be judged: no reference, or without the channels")
+        self.log.warning("a test scan that can't be judged: it is without the channels")
         return tip_verdict.UNCLEAR
 
     def _score_of_others(self, scans: ScanSet, answers: Events) -> float:
@@ -210,10 +210,10 @@ class TipCorrector(Component):
         return tip_verdict.BAD
 
     def _learn(self, scan: Scan, problems: tuple[int, ...]) -> None:
-        if self.judge is None or self.judge.has_learnt or problems:
+        if self.judge is None or self.judge.knows(scan.region, scan.shape) or problems:
             return
         pair = self.pairing.add(scan)
-        if pair is not None and pair.judged_by(self.judge).opinion is Opinion.LEARNING:
+        if pair is not None and pair.judged_by(self.judge, learns=True).opinion is Opinion.LEARNING:
             self.memory["judge"] = self.judge.state()
             self.memory.save()
 

@@ -4,6 +4,10 @@ At a place that it knows the judge compares like with like, and sees small chang
 scans there, since the sample drifts; the first scans stay as the measure of slow wear. Elsewhere it can tell only what
 no place explains: a large loss of detail, or debris. A ghost image it cannot tell there from the sample's own order.
 
+Scans of another size or other pixels have a reference of their own, since what a tip does to a scan depends on the
+pixel: a fault that a zoom shows may be finer than the pixels of an overview. A reference is begun only while all that
+is known speaks for the tip, and a fault found in one kind of scan is over only when as fine a kind says so.
+
 Measured on simulated nights (128 x 128 pixels, 8 seeds, slow drift, one scan judged by itself, known places):
 
     sample      good called bad    double / blunt / with debris called good
@@ -23,6 +27,7 @@ import numpy as np
 
 from afspm.components.tip_metrics import LEAST_CONTRAST, Array, TipMetrics, autocorrelation, metrics, slopes
 from afspm.errors import ConfigError, InvalidValue
+from afspm.formatting import area_text
 from afspm.model import Region
 from afspm.model.snapshot import Plain, from_plain, to_plain
 
@@ -32,7 +37,7 @@ SAME_SIZE = 0.02  # relative difference of sizes that are still called the same
 SAME_PLACE = 0.2  # of the size: how far a place may have moved and still be the same
 MOST_PLACES = 16
 DECIMALS = 4  # of an autocorrelation, which is kept on disk
-MOST_KINDS = 4  # of scans that are learnt from side by side, until one kind is known
+MOST_KINDS = 4  # of scans that are known or learnt from side by side
 FOLLOW = 0.25  # weight of a new good scan in what is known of its place
 FLOORS = TipMetrics(detail=0.02, ghost=0.01, unrest_m=0.15, contrast=0.0)  # spreads that few scans can't be better than
 
@@ -112,13 +117,15 @@ class KnownPlace:
 
 @dataclass
 class TipReference:
-    """The scans of a good tip, all of the same size, angle and shape.
+    """The scans of a good tip of one kind: all of the same size, angle and shape.
 
     Attributes:
         size_m, angle_rad, shape: of those scans.
         places: where they were taken, the last seen at the end.
         first: the metrics of the scans that were learnt from.
         deviations: how such scans differed at the same place: detail and unrest as ratios, ghost as it is.
+        suspect: whether a fault was found at a known place, and not yet found to be over.
+        confirmed: whether a comparison was good after the last scan that was learnt from.
     """
 
     size_m: tuple[float, float]
@@ -127,6 +134,12 @@ class TipReference:
     places: list[KnownPlace] = field(default_factory=list)
     first: list[TipMetrics] = field(default_factory=list)
     deviations: list[TipMetrics] = field(default_factory=list)
+    suspect: bool = False
+    confirmed: bool = False
+
+    @property
+    def pixel_m(self) -> float:
+        return max(size / pixels for size, pixels in zip(self.size_m, reversed(self.shape), strict=True))
 
     def fits(self, region: Region, shape: tuple[int, int]) -> bool:
         """Return whether a scan can be compared at all."""
@@ -167,19 +180,22 @@ class TipReference:
 
 @dataclass
 class JudgeState:
-    """State that survives a restart: the reference, those begun of scans of other sizes, and a suspicion."""
+    """State that survives a restart.
 
-    reference: TipReference | None = None
-    others: list[TipReference] = field(default_factory=list)
-    suspect: bool = False
+    Attributes:
+        kinds: the references, known and begun, the last used at the end.
+        doubtful: whether the last scan that was compared was not good.
+    """
+
+    kinds: list[TipReference] = field(default_factory=list)
+    doubtful: bool = False
 
 
 class TipJudge:
-    """Learns from the first scans, then judges.
+    """Learns from the first scans of each kind, then judges that kind.
 
     Args:
-        reference_scans: how many are learnt from. The tip has to be good by then: nobody can tell from inside. They are
-            those of the first size that there are so many of.
+        reference_scans: how many are learnt from. The tip has to be good by then: nobody can tell from inside.
         tolerance: see there.
     """
 
@@ -191,12 +207,13 @@ class TipJudge:
         self._state = JudgeState()
 
     @property
-    def reference(self) -> TipReference | None:
-        return self._state.reference
+    def kinds(self) -> tuple[TipReference, ...]:
+        """The references, known and begun, the last used at the end."""
+        return tuple(self._state.kinds)
 
-    @property
-    def has_learnt(self) -> bool:
-        return self.reference is not None and len(self.reference.first) >= self.reference_scans
+    def knows(self, region: Region, shape: tuple[int, int]) -> bool:
+        """Return whether such a scan is compared rather than learnt from."""
+        return any(self._is_known(kind) and kind.fits(region, shape) for kind in self._state.kinds)
 
     def state(self) -> Plain:
         """Return what must survive a restart, in JSON's types."""
@@ -207,41 +224,65 @@ class TipJudge:
         """Continue from what `state` returned."""
         self._state = from_plain(JudgeState, state)
 
-    def judge(self, trace: Array, retrace: Array | None, region: Region) -> Verdict:
+    def trust(self) -> None:
+        """End all suspicion: the tip was seen to, and later scans alone can tell that it is bad."""
+        self._state.doubtful = False
+        for kind in self._state.kinds:
+            kind.suspect = False
+
+    def judge(self, trace: Array, retrace: Array | None, region: Region, *, learns: bool = True) -> Verdict:
         """Return what a scan says about the tip.
 
         Args:
             trace, retrace: heights in m, [y, x]; retrace None where it is not recorded.
             region: where they were taken.
+            learns: whether a kind of scan that is not known yet may be learnt from.
         """
         shape = (trace.shape[0], trace.shape[1])
-        if self.reference is not None and self.has_learnt and not self.reference.fits(region, shape):
-            return Verdict(Opinion.UNCLEAR, "of another size than the reference")
+        if not self.knows(region, shape) and not (learns and self._is_trusted):
+            why = f"no reference of {_kind_text(region, shape)}, and none is begun while the tip may be bad"
+            return Verdict(Opinion.UNCLEAR, why)
         try:
             seen_slopes = slopes(trace, retrace)
         except InvalidValue as error:
             return Verdict(Opinion.UNCLEAR, error.what)
-        if self.reference is None or not self.reference.fits(region, shape):
-            self._state.reference = self._begun(region, shape)
-        assert self.reference is not None
-        place = self.reference.place(region)
+        kind = self._kind(region, shape)
+        place = kind.place(region)
         correlation = autocorrelation(seen_slopes, min(REACH_PX, min(shape) // 3))
         seen = metrics(seen_slopes, correlation, place.expected if place else None)
         if seen.contrast < LEAST_CONTRAST:
             return Verdict(Opinion.UNCLEAR, f"nothing to see but noise (contrast {seen.contrast:.2f})", seen)
-        if not self.has_learnt:
-            return self._learn(self.reference, place, seen, correlation, region)
-        verdict = self._compare(self.reference, place, seen)
+        if not self._is_known(kind):
+            return self._learn(kind, place, seen, correlation, region)
+        verdict = self._compare(kind, place, seen)
+        self._state.doubtful = verdict.opinion is not Opinion.GOOD
         if verdict.opinion is Opinion.GOOD:
-            self.reference.note(place, region, seen, correlation)
+            kind.note(place, region, seen, correlation)
+            for one in self._state.kinds:
+                one.confirmed = True
+        elif verdict.opinion is Opinion.BAD:
+            # what was learnt since the last good comparison may be of the bad tip
+            self._state.kinds = [one for one in self._state.kinds if one.confirmed or one is kind]
         return verdict
 
-    def _begun(self, region: Region, shape: tuple[int, int]) -> TipReference:
-        """Return what is known so far of scans like this one, which the last was not; that is put by."""
-        begun = [one for one in (*self._state.others, self.reference) if one is not None]
-        known = next((one for one in begun if one.fits(region, shape)), None)
-        self._state.others = [one for one in begun if one is not known][-MOST_KINDS + 1 :]
-        return known or TipReference(region.size_m, region.angle_rad, shape)
+    @property
+    def _is_trusted(self) -> bool:
+        return not self._state.doubtful and not any(kind.suspect for kind in self._state.kinds)
+
+    def _is_known(self, kind: TipReference) -> bool:
+        return len(kind.first) >= self.reference_scans
+
+    def _kind(self, region: Region, shape: tuple[int, int]) -> TipReference:
+        """Return the reference of such scans, begun if there is none; the least recently used makes room for it."""
+        kinds = self._state.kinds
+        kind = next((one for one in kinds if one.fits(region, shape)), None)
+        if kind is not None:
+            kinds.remove(kind)
+        elif len(kinds) >= MOST_KINDS:
+            kinds.remove(next((one for one in kinds if not self._is_known(one)), kinds[0]))
+        kind = kind or TipReference(region.size_m, region.angle_rad, shape)
+        kinds.append(kind)
+        return kind
 
     def _learn(
         self, reference: TipReference, place: KnownPlace | None, seen: TipMetrics, correlation: Array, region: Region
@@ -249,10 +290,10 @@ class TipJudge:
         if place is not None:
             reference.deviations.append(_relative(seen, place.usual))
         reference.first.append(seen)
+        reference.confirmed = False
         reference.note(place, region, seen, correlation)
-        if self.has_learnt:
-            self._state.others.clear()
-        return Verdict(Opinion.LEARNING, f"reference {len(reference.first)} of {self.reference_scans}", seen)
+        of = _kind_text(region, reference.shape)
+        return Verdict(Opinion.LEARNING, f"reference {len(reference.first)} of {self.reference_scans} of {of}", seen)
 
     def _compare(self, reference: TipReference, place: KnownPlace | None, seen: TipMetrics) -> Verdict:
         faults = self._faults_anywhere(reference, seen)
@@ -260,17 +301,23 @@ class TipJudge:
             faults += self._faults_here(reference, place, seen)
         worst = max(way for way, _ in faults)
         if worst >= 1.0:
-            self._state.suspect = self._state.suspect or place is not None
+            reference.suspect = reference.suspect or place is not None
             return Verdict(Opinion.BAD, "; ".join(why for way, why in faults if way >= 1.0), seen)
         if worst > self.tolerance.margin:
             return Verdict(
                 Opinion.UNCLEAR, "nearly " + "; ".join(why for way, why in faults if way > self.tolerance.margin), seen
             )
-        if place is None and self._state.suspect:
-            # what was found by comparing like with like can only be found to be over in the same way
-            return Verdict(Opinion.UNCLEAR, "nothing wrong, but there is no reference of this place", seen)
-        self._state.suspect = False
+        if place is not None:
+            self._clear_suspicion(reference)
+        if any(kind.suspect for kind in self._state.kinds):
+            missing = "there is no reference of this place" if place is None else "a finer kind of scan showed a fault"
+            return Verdict(Opinion.UNCLEAR, f"nothing wrong, but {missing}", seen)
         return Verdict(Opinion.GOOD, _summary(seen, place.usual if place else reference.usual_anywhere()), seen)
+
+    def _clear_suspicion(self, by: TipReference) -> None:
+        """A fault that comparing like with like has found is over if the same comparison, as fine, finds none."""
+        for kind in self._state.kinds:
+            kind.suspect = kind.suspect and by.pixel_m > (1.0 + SAME_SIZE) * kind.pixel_m
 
     def _faults_anywhere(self, reference: TipReference, seen: TipMetrics) -> list[tuple[float, str]]:
         usual, tolerance = reference.usual_anywhere(), self.tolerance
@@ -319,6 +366,10 @@ class VerdictCounter:
     @property
     def wants_clear(self) -> bool:
         return self.good >= self.clear_after
+
+
+def _kind_text(region: Region, shape: tuple[int, int]) -> str:
+    return f"scans of {area_text(region.size_m)}, {shape[1]} x {shape[0]} pixels"
 
 
 def _relative(seen: TipMetrics, usual: TipMetrics) -> TipMetrics:

@@ -11,7 +11,7 @@ from tip_scans_lab import channels
 
 from afspm import wire
 from afspm.components.tip_classifier import TipClassifier
-from afspm.components.tip_verdict import BAD, GOOD, MESSAGE, read_verdict
+from afspm.components.tip_verdict import BAD, GOOD, MESSAGE, UNCLEAR, read_verdict
 from afspm.exit_codes import ExitCode
 from afspm.logic.arbitration import ArbitrationEvent
 from afspm.model import ControlRequest, Problem, Region, Scan
@@ -90,8 +90,8 @@ def test_what_was_learnt_and_judged_survives_a_kill(tmp_path: Path) -> None:
     lab.at(200.0, lab.kill)
     again = classifier()
     run(again, lab, tmp_path)
-    assert again.judge.reference is not None
-    assert len(again.judge.reference.first) == 3
+    (kind,) = again.judge.kinds
+    assert len(kind.first) == 3
     assert lab.control.published().problems == (TIP,)
 
 
@@ -102,7 +102,7 @@ def test_nothing_is_learnt_while_a_problem_is_flagged() -> None:
     lab.at(200.0, lab.kill)
     component = classifier()
     run(component, lab)
-    assert component.judge.reference is None
+    assert component.judge.kinds == ()
 
 
 def test_a_tip_that_somebody_has_seen_to_is_flagged_by_what_is_bad_from_then_on() -> None:
@@ -121,6 +121,21 @@ def test_a_tip_that_somebody_has_seen_to_is_flagged_by_what_is_bad_from_then_on(
     assert asked(lab, ControlRequest.ADD_EXP_PRBLM) == 1
 
 
+def test_a_kind_of_scan_that_is_new_while_a_problem_is_flagged_is_unclear_and_not_learnt_from() -> None:
+    lab = Lab("tip_classifier")
+    pairs = channels(1, "double", 5)
+    for number, pair in enumerate((*pairs[:3], pairs[5])):
+        publish_at(lab, 100.0 * (number + 1), pair)
+    time_ns = (pairs[5][0].time_ns or 0) + 10**9
+    zoom = tuple(replace(s, region=Region((0.0, 0.0), (5e-7, 5e-7)), time_ns=time_ns) for s in pairs[6])
+    publish_at(lab, 500.0, zoom)  # type: ignore[arg-type]
+    lab.at(700.0, lab.kill)
+    component = classifier()
+    run(component, lab)
+    assert verdicts_of(lab)[-1] == (time_ns, UNCLEAR)
+    assert len(component.judge.kinds) == 1
+
+
 def test_what_was_rightly_not_learnt_from_is_not_after_a_restart_either(tmp_path: Path) -> None:
     lab = Lab("tip_classifier")
     lab.at(50.0, lambda: lab.flag(TIP))
@@ -134,7 +149,7 @@ def test_what_was_rightly_not_learnt_from_is_not_after_a_restart_either(tmp_path
     lab.at(50.0, lab.kill)
     again = classifier()
     run(again, lab, tmp_path)
-    assert again.judge.reference is None
+    assert again.judge.kinds == ()
 
 
 def test_channels_of_two_scans_are_not_taken_for_one() -> None:
@@ -144,7 +159,7 @@ def test_channels_of_two_scans_are_not_taken_for_one() -> None:
     lab.at(200.0, lab.kill)
     component = classifier()
     run(component, lab)
-    assert component.judge.reference is None
+    assert component.judge.kinds == ()
 
 
 def test_that_nothing_is_judged_for_want_of_a_channel_is_said_once(caplog: pytest.LogCaptureFixture) -> None:

@@ -87,7 +87,8 @@ def test_what_was_learnt_survives_a_restart() -> None:
 def test_a_sample_so_smooth_that_its_first_scans_had_no_fine_detail_is_judged_by_the_rest() -> None:
     judge, left, _ = learnt(1, "blunt")
     state = judge.state()
-    for seen in (*state["reference"]["first"], *(place["usual"] for place in state["reference"]["places"])):
+    (kind,) = state["kinds"]
+    for seen in (*kind["first"], *(place["usual"] for place in kind["places"])):
         seen["detail"] = 0.0
     judge.restore(state)
     assert judged(judge, left[0]).opinion is Opinion.GOOD
@@ -106,13 +107,73 @@ def test_nothing_but_noise_says_nothing_of_the_tip() -> None:
     assert TipJudge(LEARN).judge(noise[0], noise[1], HOME).opinion is Opinion.UNCLEAR
 
 
-def test_a_scan_of_another_size_or_with_too_many_holes_is_not_judged() -> None:
+def zoom_of(pair: tuple[Scan, Scan]) -> tuple[np.ndarray, np.ndarray, Region]:
+    """The middle of a scan, as a scan of its own: of another size and other pixels."""
+    trace, retrace = (scan.values[16:80, 16:80] for scan in pair)
+    return trace, retrace, Region((0.0, 0.0), (HOME.size_m[0] * 64 / PIXELS, HOME.size_m[1] * 64 / PIXELS))
+
+
+def both_kinds(seed: int, condition: str) -> tuple[TipJudge, list[tuple[Scan, Scan]], list[tuple[Scan, Scan]]]:
+    """A judge that has learnt whole scans and their middles, one after the other in turns."""
+    pairs = channels(seed, condition, 5)
+    judge = TipJudge(LEARN)
+    for pair in pairs[:LEARN]:
+        assert judged(judge, pair).opinion is Opinion.LEARNING
+        assert judge.judge(*zoom_of(pair)).opinion is Opinion.LEARNING
+    return judge, list(pairs[LEARN:4]), list(pairs[5:9])
+
+
+@pytest.mark.parametrize("condition", ["double", "contaminated"])
+@pytest.mark.parametrize("seed", range(2))
+def test_scans_of_two_sizes_are_each_compared_with_their_own_kind(seed: int, condition: str) -> None:
+    judge, good, bad = both_kinds(seed, condition)
+    judge.restore(json.loads(json.dumps(judge.state())))
+    for pair in good:
+        assert judged(judge, pair).opinion is Opinion.GOOD
+        assert judge.judge(*zoom_of(pair)).opinion is Opinion.GOOD
+    for pair in bad:
+        assert judge.judge(*zoom_of(pair)).opinion is Opinion.BAD
+        assert judged(judge, pair).opinion is Opinion.BAD
+
+
+def test_another_kind_is_not_learnt_from_while_the_tip_may_be_bad() -> None:
+    judge, good, bad = learnt(0, "double")
+    assert judged(judge, bad[0]).opinion is Opinion.BAD
+    assert judge.judge(*zoom_of(bad[1])).opinion is Opinion.UNCLEAR
+    assert judged(judge, good[0]).opinion is Opinion.GOOD
+    assert judge.judge(*zoom_of(good[0])).opinion is Opinion.LEARNING
+    assert judge.judge(*zoom_of(good[0]), learns=False).opinion is Opinion.UNCLEAR
+
+
+def test_what_was_learnt_between_the_last_good_scan_and_a_bad_one_is_forgotten() -> None:
+    judge, good, bad = learnt(0, "double")
+    assert judged(judge, good[0]).opinion is Opinion.GOOD
+    for pair in bad[:LEARN]:
+        assert judge.judge(*zoom_of(pair)).opinion is Opinion.LEARNING
+    assert len(judge.kinds) == 2
+    assert judged(judge, bad[0]).opinion is Opinion.BAD
+    assert len(judge.kinds) == 1
+
+
+def test_a_fault_is_not_called_over_by_coarser_scans() -> None:
+    judge, good, bad = learnt(0, "double")
+    coarse = [(t.values[::2, ::2], r.values[::2, ::2], t.region) for t, r in [*good[:1], *channels(0, "double", 5)[:3]]]
+    assert judged(judge, good[0]).opinion is Opinion.GOOD
+    for scan in coarse[:LEARN]:
+        judge.judge(*scan)
+    assert judge.judge(*coarse[LEARN]).opinion is Opinion.GOOD
+    assert judged(judge, bad[0]).opinion is Opinion.BAD
+    verdict = judge.judge(*coarse[LEARN])
+    assert (verdict.opinion, verdict.why) == (Opinion.UNCLEAR, "nothing wrong, but a finer kind of scan showed a fault")
+    judge.trust()
+    assert judge.judge(*coarse[LEARN]).opinion is Opinion.GOOD
+
+
+def test_a_scan_with_too_many_holes_is_not_judged() -> None:
     judge, good, _ = learnt(0, "double")
     trace, retrace = good[0]
-    other = judge.judge(trace.values[:64, :64], retrace.values[:64, :64], HOME)
     holes = trace.values.copy()
     holes[: PIXELS // 2] = np.nan
-    assert other.opinion is Opinion.UNCLEAR
     assert judge.judge(holes, retrace.values, HOME).opinion is Opinion.UNCLEAR
 
 
