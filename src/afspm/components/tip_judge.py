@@ -15,6 +15,10 @@ Measured on simulated nights (128 x 128 pixels, 8 seeds, slow drift, one scan ju
     stamper          0 of 80             0 / 0 / 0 of 16
     rough            0 of 80             2 / 16 / 0 of 16      a blunt tip hardly changes gentle slopes
     steps            3 of 80            10 / 10 / 0 of 16      0.4 nm high, 0.05 nm of noise: ask for two in a row
+
+Three kinds in turns (2 um and 500 nm at 128 x 128, 800 nm at 96 x 96, 2 seeds): of 32 good scans of each kind none was
+called bad of 2 um and 500 nm, and one (stamper) of 800 nm; of 6 scans of each fault and kind none was called good on
+particles and stamper. On rough ground and steps debris alone was seen, as above.
 """
 
 from __future__ import annotations
