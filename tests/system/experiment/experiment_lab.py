@@ -202,7 +202,8 @@ class AfspmRun:
 def require_each_row_once(run: AfspmRun, scans: int) -> None:
     """The table of measurements has one row for each channel of each scan."""
     with (run.folder / "metadata.csv").open(encoding="utf-8", newline="") as file:
-        rows = Counter((row["channel"], row["time"]) for row in csv.DictReader(file))
+        measured = [row for row in csv.DictReader(file) if row["measurement"] != "note"]
+    rows = Counter((row["channel"], row["time"]) for row in measured)
     assert set(rows.values()) == {1}, rows
     assert set(Counter(channel for channel, _ in rows).values()) == {scans}, rows
 

@@ -43,7 +43,7 @@ def test_the_second_experiment_ends_at_once_and_says_why_and_the_first_goes_on(r
     first.wait_for("series .*scan 1")
     second = run(over=where, scans=30, where=tmp_path)
     assert "another program listens at tcp://127.0.0.1:" in refused(second)
-    assert len(list((tmp_path / "runs").glob("*/run.json"))) == 1
+    assert len(list((tmp_path / "runs").glob("*-*/run.json"))) == 1
     assert first.end() == 0, first.output
     assert set(first.witnessed().values()) == {1}
 

@@ -49,10 +49,10 @@ def scans_on(microscope: str, folder: Path, more: str = "") -> Kept:
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    (facts,) = (folder / "runs").glob("*/run.json")
+    (facts,) = (folder / "runs").glob("*-*/run.json")
     assert json.loads(facts.read_text(encoding="utf-8"))["simulated"] is True
     kept = []
-    for file in sorted((folder / "runs").glob("*/kept-*.npz")):
+    for file in sorted((folder / "runs").glob("*-*/kept-*.npz")):
         with np.load(file) as found:
             channel, unit, *place = json.loads(str(found["facts"]))
             if channel == HEIGHTS[microscope]:

@@ -140,7 +140,7 @@ def test_a_notebook_joins_by_the_folder_of_the_run(experiment: Experiment, monke
         with pytest.raises(Refused):
             scope.set("no-such-parameter", 1.0)
         scope.set_mode(ControlMode.MANUAL)
-        with pytest.raises(ControlLost, match="manual"):
+        with pytest.raises(ControlLost, match="MANUAL"):
             scope.scan(timeout_s=0.5)
         scope.end_experiment()
         with pytest.raises(ExperimentEnded):

@@ -192,7 +192,7 @@ class Instrument:
         if rate_m_s != (float(before[names.DRIFT_RATE_X]), float(before[names.DRIFT_RATE_Y])):
             self._world.compensate(rate_m_s, now_s)
             self._settle()
-        if any(before[name] != after[name] for name in ADJUSTED):
+        if any(before.get(name) != after.get(name) for name in ADJUSTED):  # a driver may lack some
             self._adjust(values, now_s)
         speed_m_s = float(after[names.MOVE_SPEED])
         distance_m = max(
