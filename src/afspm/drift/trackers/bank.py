@@ -220,11 +220,13 @@ class BankTracker:
         widening = self._settings.widening * 4.0 ** min(self._state.unmatched, self._settings.lost_after)
         tried = {}
         for number in self._references.candidates(newest.scan, *_drifts(filters), anywhere=anywhere):
-            prior = None if anywhere else newest.prior(number, kept[number], widening)
+            # in an overview a zoom fits many places: it is never looked for everywhere there
+            everywhere = anywhere and self._references.is_alike(number, newest.scan)
+            prior = None if everywhere else newest.prior(number, kept[number], widening)
             tried[number] = self._estimator.register(kept[number].scan, newest.scan, prior)
         firm = [number for number in tried if self._proves(number)]
         if not anywhere and not any(tried[number].accepted for number in firm):
-            # not where it was expected, or not to be recognised: somewhere else? In an overview a zoom fits many places
+            # not where it was expected, or not to be recognised: somewhere else?
             elsewhere = [number for number in firm if self._references.is_alike(number, newest.scan)]
             for number in elsewhere[: self._settings.second_looks]:
                 tried[number] = self._estimator.register(kept[number].scan, newest.scan)
