@@ -399,6 +399,23 @@ def test_zooms_that_the_overview_does_not_show_clearly_are_not_looked_for_elsewh
     assert not any(update.lost for update in updates)
 
 
+def test_long_after_the_overview_a_zoom_is_still_not_looked_for_everywhere_in_it() -> None:
+    world = World(night(4))
+    following = BankTracker(world)
+    following.add(scan_at(FRAME_S, pixels=64, key="overview"))
+    asked: list[Prior | None] = []
+
+    def refuse(reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
+        asked.append(prior)
+        return Registration.refused("ambiguous")
+
+    world.register = refuse  # type: ignore[method-assign]
+    hours_later_s = FRAME_S + 40 * 3600.0
+    following.add(scan_at(hours_later_s, size_m=SIZE_M / 8, pixels=64, key="zoom"))
+    following.add(scan_at(hours_later_s + 300.0, pixels=64, key="overview again"))
+    assert [one is None for one in asked[:2]] == [False, True], "an overview is looked for everywhere"
+
+
 def test_without_correction_anchors_follow_each_other() -> None:
     """The region stays in tip coordinates, and the sample drifts out of it."""
     world = World(steady((0.3 * NM, 0.0)))
