@@ -24,8 +24,6 @@ from afspm.errors import ConfigError
 from afspm.file_lock import locked
 
 NS_PER_S = 1_000_000_000
-
-
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 

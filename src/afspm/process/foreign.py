@@ -44,7 +44,8 @@ def main(arguments: list[str]) -> int:
     threading.Thread(target=program.pass_on, name="stdin", daemon=True).start()
     code = child.wait()
     program.sweep()
-    if program.stopped:  # it did not end by itself: that it was stopped is what counts
+    # it did not end by itself: that it was stopped is what counts. On Windows no code tells the one from the other
+    if program.stopped and (code < 0 or sys.platform == "win32"):
         return ExitCode.ORPHAN
     return 128 - code if code < 0 else code
 

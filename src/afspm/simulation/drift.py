@@ -99,10 +99,8 @@ class Drift:
         Raises:
             InvalidValue: a time before the start.
         """
-        since_s = np.asarray(self._since_s(t_s))
-        angle_rad = self._settings.rotation_rad_per_s * since_s
-        # written out, since the C library of Wine has no exponential of complex numbers
-        return np.exp(self._settings.expansion_per_s * since_s) * (np.cos(angle_rad) + 1j * np.sin(angle_rad))
+        rate = complex(self._settings.expansion_per_s, self._settings.rotation_rad_per_s)
+        return np.asarray(np.exp(rate * self._since_s(t_s)))
 
     def turned(self, x_m: Array, y_m: Array, t_s: ArrayLike) -> tuple[Array, Array]:
         """Turn and expand places (x, y) of the sample up to times, which are broadcast with x and y."""

@@ -377,11 +377,8 @@ def test_a_zoom_that_can_not_be_compared_with_the_overview_begins_a_row_of_its_o
     assert None not in asked[-5:], "its place among the others is known"
 
 
-def test_zooms_that_the_overview_does_not_show_clearly_are_not_looked_for_elsewhere() -> None:
-    """In an overview a zoom of a particle fits every particle."""
-    world = World(night(4))
-    following = BankTracker(world)
-    following.add(scan_at(FRAME_S, pixels=64, key="overview"))
+def refusing(world: World) -> list[Prior | None]:
+    """Have every registration refused; returns where each is expected, as they are asked for."""
     asked: list[Prior | None] = []
 
     def refuse(reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
@@ -389,6 +386,15 @@ def test_zooms_that_the_overview_does_not_show_clearly_are_not_looked_for_elsewh
         return Registration.refused("ambiguous")
 
     world.register = refuse  # type: ignore[method-assign]
+    return asked
+
+
+def test_zooms_that_the_overview_does_not_show_clearly_are_not_looked_for_elsewhere() -> None:
+    """In an overview a zoom of a particle fits every particle."""
+    world = World(night(4))
+    following = BankTracker(world)
+    following.add(scan_at(FRAME_S, pixels=64, key="overview"))
+    asked = refusing(world)
     places = [(x * SIZE_M / 4, y * SIZE_M / 4) for x in (-1, 0, 1) for y in (-1, 1)]
     updates = [
         following.add(scan_at(FRAME_S + (k + 1) * 20.0, place, size_m=SIZE_M / 8, pixels=64, key=f"zoom {k}"))
@@ -403,13 +409,7 @@ def test_long_after_the_overview_a_zoom_is_still_not_looked_for_everywhere_in_it
     world = World(night(4))
     following = BankTracker(world)
     following.add(scan_at(FRAME_S, pixels=64, key="overview"))
-    asked: list[Prior | None] = []
-
-    def refuse(reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
-        asked.append(prior)
-        return Registration.refused("ambiguous")
-
-    world.register = refuse  # type: ignore[method-assign]
+    asked = refusing(world)
     hours_later_s = FRAME_S + 40 * 3600.0
     following.add(scan_at(hours_later_s, size_m=SIZE_M / 8, pixels=64, key="zoom"))
     following.add(scan_at(hours_later_s + 300.0, pixels=64, key="overview again"))
