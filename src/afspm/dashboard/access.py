@@ -140,6 +140,10 @@ class Access:
         """Return whether the session of a visitor goes on: it ends when the person signs out anywhere."""
         return not visitor.cookie or self._sessions.find(visitor.cookie) is not None
 
+    def person_of(self, visitor: Visitor) -> str:
+        """Return the name of a visitor who has signed in and not out again; empty for all others."""
+        return check_name(visitor.person) if self.is_signed_in(visitor) else ""
+
     def by_password(self, person: str, password: str, address: str) -> Visitor | None:
         """Return who shows a name and a password with a request; None if that is wrong, or was wrong too often."""
         is_proved = not self.wait_s(address) and self._proves(person, password, address)

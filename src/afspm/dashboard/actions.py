@@ -14,7 +14,7 @@ from afspm import wire
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.parameter_values import from_parameter, to_parameter
 from afspm.clock import Clock
-from afspm.dashboard.access import Access, Visitor, check_name
+from afspm.dashboard.access import Access, Visitor
 from afspm.dashboard.watch import Watch
 from afspm.errors import AfspmError, UnitError
 from afspm.formatting import counted, quantity, typeset_position
@@ -65,7 +65,14 @@ class ActionResult:
     each: Mapping[str, ActionResult] = field(default_factory=dict)
 
 
-NOT_SIGNED_IN = ActionResult("Sign in first: what is done is in the record with a name.", ok=False)
+_NOT_SIGNED_IN = ActionResult("Sign in first: what is done is in the record with a name.", ok=False)
+
+
+def not_signed_in() -> Future[ActionResult]:
+    """Return the answer to a person who has not signed in."""
+    done: Future[ActionResult] = Future()
+    done.set_result(_NOT_SIGNED_IN)
+    return done
 
 
 class Actions:
@@ -308,12 +315,8 @@ class Steering:
 
     def do(self, visitor: Visitor, action: Action) -> Future[ActionResult]:
         """Carry out an action in the name of a person, who must have one and not have signed out."""
-        person = check_name(visitor.person)
-        if not person or not self._access.is_signed_in(visitor):
-            done: Future[ActionResult] = Future()
-            done.set_result(NOT_SIGNED_IN)
-            return done
-        return self._submit(person, action)
+        person = self._access.person_of(visitor)
+        return self._submit(person, action) if person else not_signed_in()
 
     def read(self, action: Action) -> Future[ActionResult]:
         """Carry out an action that only reads, in the name of the page itself."""

@@ -6,8 +6,8 @@ import logging
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from afspm.clock import ExperimentClock
-from afspm.dashboard.access import Access, Visitor, check_name
-from afspm.dashboard.actions import NOT_SIGNED_IN, Action, ActionResult, Actions, Steering
+from afspm.dashboard.access import Access, Visitor
+from afspm.dashboard.actions import Action, ActionResult, Actions, Steering, not_signed_in
 from afspm.dashboard.night import Night
 from afspm.errors import AfspmError
 from afspm.model.events import PERSON
@@ -43,12 +43,8 @@ class NightSteering(Steering):
         self._log = logging.getLogger("afspm.dashboard")
 
     def do(self, visitor: Visitor, action: Action) -> Future[ActionResult]:
-        person = check_name(visitor.person)
-        if not person or not self._access.is_signed_in(visitor):
-            done: Future[ActionResult] = Future()
-            done.set_result(NOT_SIGNED_IN)
-            return done
-        return self._thread.submit(self._note, f"{self._name}{PERSON}{person}", action)
+        person = self._access.person_of(visitor)
+        return self._thread.submit(self._note, f"{self._name}{PERSON}{person}", action) if person else not_signed_in()
 
     def close(self) -> None:
         self._thread.shutdown()

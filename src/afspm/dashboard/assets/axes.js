@@ -59,6 +59,21 @@ export function drawAxis(context, box, low, high, found, side, label) {
   }
 }
 
+/** A bar of colours from low to high, with its numbers and unit; without a picture of the colours only its frame. */
+export function drawColourBar(context, { x, y, width, height }, colours, { low, high, unit }) {
+  if (colours) context.drawImage(colours, x, y, width, height);
+  context.strokeRect(x, y, width, height);
+  const found = scale(Math.max(Math.abs(low), Math.abs(high)), unit);
+  context.textAlign = "left";
+  context.textBaseline = "middle";
+  for (const value of ticks(low * found.factor, high * found.factor, Math.max(2, height / 48))) {
+    const at = (value / found.factor - low) / (high - low);
+    context.fillText(plain(value), x + width + 5, y + height * (1 - at));
+  }
+  context.textBaseline = "bottom";
+  context.fillText(found.unit ? `[${found.unit}]` : "", x, y - 5);
+}
+
 /** A bar of a round length, in the corner of the box. */
 export function drawScaleBar(context, box, width_m) {
   const power = 10 ** Math.floor(Math.log10(width_m * 0.4));

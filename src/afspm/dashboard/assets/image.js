@@ -1,6 +1,6 @@
 // The picture of a scan: axes, colour bar, scale bar, zoom, values under the pointer, profile, and places to measure at.
 
-import { drawAxis, drawScaleBar, fitted, plain, quantity, scale, ticks } from "./axes.js";
+import { drawAxis, drawColourBar, drawScaleBar, fitted, plain, quantity, scale } from "./axes.js";
 import { Pictures, Questions } from "./fetching.js";
 import { Geometry } from "./geometry.js";
 import { drawProfile } from "./profile.js";
@@ -227,19 +227,10 @@ export class ImageView {
   }
 
   #drawBar({ context }) {
-    const { box } = this.geometry, x = box.x + box.width + 14, wide = 14;
-    if (this.bar.complete && this.bar.naturalWidth) context.drawImage(this.bar, x, box.y, wide, box.height);
-    context.strokeRect(x, box.y, wide, box.height);
-    const { low, high, unit } = this.head;
-    const found = scale(Math.max(Math.abs(low), Math.abs(high)), unit);
-    context.textAlign = "left";
-    context.textBaseline = "middle";
-    for (const value of ticks(low * found.factor, high * found.factor, Math.max(2, box.height / 48))) {
-      const at = (value / found.factor - low) / (high - low);
-      context.fillText(plain(value), x + wide + 5, box.y + box.height * (1 - at));
-    }
-    context.textBaseline = "bottom";
-    context.fillText(found.unit ? `[${found.unit}]` : "", x, box.y - 5);
+    const { box } = this.geometry, { low, high, unit } = this.head;
+    const bar = { x: box.x + box.width + 14, y: box.y, width: 14, height: box.height };
+    const colours = this.bar.complete && this.bar.naturalWidth ? this.bar : null;
+    drawColourBar(context, bar, colours, { low, high, unit });
   }
 
   #drawMarks({ context }) {

@@ -1,6 +1,6 @@
 // Pictures of finished scans, and how they are drawn beside each other.
 
-import { drawScaleBar, fitted, plain, scale, ticks } from "./axes.js";
+import { drawColourBar, drawScaleBar, fitted } from "./axes.js";
 
 const KEPT = 120;
 
@@ -66,18 +66,8 @@ export function drawPicture(canvas, picture, title, again) {
 }
 
 function drawColours(context, box, { low, high, unit, palette }, again) {
-  const x = box.x + box.width + 10, wide = 12, bar = colourBar(palette, again);
-  if (bar) context.drawImage(bar, x, box.y, wide, box.height);
-  context.strokeRect(x, box.y, wide, box.height);
-  const found = scale(Math.max(Math.abs(low), Math.abs(high)), unit);
-  context.textAlign = "left";
-  context.textBaseline = "middle";
-  for (const value of ticks(low * found.factor, high * found.factor, Math.max(2, box.height / 48))) {
-    const at = (value / found.factor - low) / (high - low);
-    context.fillText(plain(value), x + wide + 5, box.y + box.height * (1 - at));
-  }
-  context.textBaseline = "bottom";
-  context.fillText(found.unit ? `[${found.unit}]` : "", x, box.y - 4);
+  const bar = { x: box.x + box.width + 10, y: box.y, width: 12, height: box.height };
+  drawColourBar(context, bar, colourBar(palette, again), { low, high, unit });
 }
 
 /** Fill a select; what was chosen stays if it can. */
