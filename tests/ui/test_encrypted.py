@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from ui_lab import Night
 
-from afspm.dashboard.access import hashed
 from afspm.model import ControlMode
+from afspm.web.passwords import hashed
 
 PASSWORD, COMMON = "a tip of gold", "lead for all"
 TLS = 'certificate = "lab.crt"\ncertificate_key = "lab.key"\n'

@@ -113,7 +113,7 @@ def _overlay() -> Path:
 
 
 def _print_password() -> None:
-    from afspm.dashboard.access import check_name, hashed
+    from afspm.web.passwords import check_name, hashed
 
     person = check_name(typer.prompt("Name (empty: a password for all who look)", default="", show_default=False))
     password = typer.prompt("Password", hide_input=True, confirmation_prompt=True)

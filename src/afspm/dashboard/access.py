@@ -1,59 +1,16 @@
-"""Access to the dashboard: names and passwords of those who may look or steer."""
+"""Access to the dashboard: who may look or steer, by a cookie or by a password shown with a request."""
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import hmac
-import ipaddress
 import os
-import re
-from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from afspm.dashboard.sessions import Sessions
 from afspm.errors import ConfigError
+from afspm.web.passwords import Passwords, check_name, hashed
 
 PASSWORD = "AFSPM_DASHBOARD_PASSWORD"
-LONGEST_NAME = 40
-_COST = {"n": 2**14, "r": 8, "p": 1}
-_NAME = re.compile(r"[\w][\w .'-]*", re.UNICODE)
-_TRIES, _TRIES_WITHIN_S = 5, 60.0
-_MOST_ADDRESSES = 1000
-
-
-def hashed(password: str) -> str:
-    """Return a password as it may be written down: "scrypt:<salt>:<hash>"."""
-    salt = os.urandom(16)
-    return f"scrypt:{_text(salt)}:{_text(_scrypt(password, salt))}"
-
-
-def matches(password: str, kept: str) -> bool:
-    """Return whether a password is the one of `kept`, a result of `hashed`."""
-    _, salt, digest = kept.split(":")
-    return hmac.compare_digest(_scrypt(password, base64.b64decode(salt)), base64.b64decode(digest))
-
-
-def is_hash(text: str) -> bool:
-    """Return whether a text is what `hashed` makes."""
-    return re.fullmatch(r"scrypt:[A-Za-z0-9+/=]{24}:[A-Za-z0-9+/=]{44,88}", text) is not None
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether an address to listen at is reached from this computer only."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
-def check_name(name: str) -> str:
-    """Return the name of a person as it may stand in the record; empty if it may not."""
-    name = " ".join(name.split())
-    return name if len(name) <= LONGEST_NAME and _NAME.fullmatch(name) else ""
 
 
 @dataclass(frozen=True)
@@ -76,14 +33,11 @@ class Visitor:
 
 
 class Access:
-    """Decides whom the dashboard lets look, and whom it lets steer.
-
-    On loopback without passwords everybody may look, and any name may steer. Where there is a common password, only
-    those who know it may look. Where there are persons, only they may steer, each with a password of the own.
+    """Decides whom the dashboard lets look, and whom it lets steer; see `Passwords`.
 
     Args:
         host: the address that is listened at.
-        password_hash: of the common password, see `hashed`; the password itself may be in the environment instead
+        password_hash: of the common password; the password itself may be in the environment instead
             (AFSPM_DASHBOARD_PASSWORD).
         people: the hash of each person's password.
         now_s: the time in real seconds, for sessions and for how often an address may try.
@@ -102,37 +56,30 @@ class Access:
         sessions: Sessions,
         environment: Mapping[str, str] = os.environ,
     ) -> None:
-        for person, kept in {"": password_hash, **people}.items():
-            _require_hash(person, kept)
         password = environment.get(PASSWORD, "")
-        # "" is the name of those who only look
-        self._hashes = {**people, "": hashed(password) if password else password_hash}
-        self._local = is_loopback(host)
-        if not self._local and not any(self._hashes.values()):
+        self._passwords = Passwords(host, hashed(password) if password else password_hash, people, now_s)
+        if self._passwords.is_unprotected:
             raise ConfigError(
                 f"at {host} other computers can reach the dashboard, and it has no password", where="dashboard",
                 hint="set people or password_hash (`afspm dashboard --make-password`), or "
                 f"{PASSWORD} in the environment; or listen on 127.0.0.1",
             )  # fmt: skip
         self._sessions = sessions
-        self._now_s = now_s
-        self._failures: OrderedDict[str, deque[float]] = OrderedDict()
-        self._proved: set[bytes] = set()
 
     @property
     def is_open(self) -> bool:
         """True if a name alone is enough to steer."""
-        return self._local and not any(self._hashes.values())
+        return self._passwords.is_open
 
     @property
     def lets_look(self) -> bool:
         """True if everybody may look."""
-        return self._local and not self._hashes[""]
+        return self._passwords.lets_look
 
     def visitor(self, cookie: str | None) -> Visitor | None:
         """Return who shows a cookie; None: nobody who may come in."""
         session = self._sessions.find(cookie or "")
-        if session is not None and session.proof == self._proof_of(session.person):
+        if session is not None and session.proof == self._passwords.proof_of(session.person):
             return Visitor(session.person, cookie or "")
         return Visitor() if self.lets_look else None
 
@@ -146,84 +93,23 @@ class Access:
 
     def by_password(self, person: str, password: str, address: str) -> Visitor | None:
         """Return who shows a name and a password with a request; None if that is wrong, or was wrong too often."""
-        is_proved = not self.wait_s(address) and self._proves(person, password, address)
-        return Visitor(person) if is_proved else None
+        return Visitor(person) if self._passwords.proves(person, password, address) else None
 
     def wait_s(self, address: str) -> float:
         """Return how long an address that was wrong too often has to wait; 0 if it needn't."""
-        failures = self._failures.get(address)
-        if failures is None or len(failures) < _TRIES:
-            return 0.0
-        return max(0.0, failures[0] + _TRIES_WITHIN_S - self._now_s())
+        return self._passwords.wait_s(address)
 
     def enter(self, person: str, password: str, address: str) -> str | None:
-        """Sign in; returns the cookie, None if the password is wrong (then `wait_s` may be above zero).
-
-        It takes some hundredths of a second. An address that has to wait is not even looked at.
-        """
-        if self.wait_s(address) or not self._proves(person, password, address):
+        """Sign in; returns the cookie, None if the password is wrong (then `wait_s` may be above zero)."""
+        if not self._passwords.proves(person, password, address):
             return None
-        self._failures.pop(address, None)
+        self._passwords.forgive(address)
         return self.cookie(person)
 
     def cookie(self, person: str) -> str:
         """Begin a session; returns what the browser shows next time."""
-        return self._sessions.begin(person, self._proof_of(person))
+        return self._sessions.begin(person, self._passwords.proof_of(person))
 
     def leave(self, cookie: str | None, *, everywhere: bool = False) -> None:
         """End a session, or all of its person."""
         self._sessions.end(cookie or "", everywhere=everywhere)
-
-    def _proof_of(self, person: str) -> str:
-        """Return what stands for a person's password: with another one the session ends."""
-        if self.is_open:
-            return ""
-        return hashlib.sha256(self._hashes.get(person, "nobody").encode()).hexdigest()
-
-    def _proves(self, person: str, password: str, address: str) -> bool:
-        if self.is_open or (not person and self.lets_look):
-            return True
-        shown = hashlib.sha256(f"{person}\0{password}".encode()).digest()
-        if shown in self._proved:
-            return True
-        # for a name that nobody has it takes as long as for the others
-        kept = self._hashes.get(person) or _NOBODYS
-        if matches(password, kept) and kept is not _NOBODYS:
-            self._proved.add(shown)
-            return True
-        self._remember_failure(address)
-        return False
-
-    def _remember_failure(self, address: str) -> None:
-        failures = self._failures.setdefault(address, deque(maxlen=_TRIES))
-        failures.append(self._now_s())
-        self._failures.move_to_end(address)
-        if len(self._failures) > _MOST_ADDRESSES:
-            self._failures.popitem(last=False)
-        while failures and failures[0] < self._now_s() - _TRIES_WITHIN_S:
-            failures.popleft()
-
-
-def _require_hash(person: str, kept: str) -> None:
-    setting = f"people, {person!r}" if person else "password_hash"
-    if person != check_name(person):
-        raise ConfigError(
-            f"{setting}: that can't be a name", where="dashboard",
-            hint=f"letters, digits, spaces, - . and ', at most {LONGEST_NAME}",
-        )  # fmt: skip
-    if (kept or person) and not is_hash(kept):
-        raise ConfigError(
-            f"{setting} is not the hash of a password", where="dashboard",
-            hint="`afspm dashboard --make-password` makes one; the password itself doesn't belong into the file",
-        )  # fmt: skip
-
-
-def _scrypt(password: str, salt: bytes) -> bytes:
-    return hashlib.scrypt(password.encode(), salt=salt, dklen=32, maxmem=64 << 20, **_COST)
-
-
-def _text(data: bytes) -> str:
-    return base64.b64encode(data).decode()
-
-
-_NOBODYS = f"scrypt:{_text(bytes(16))}:{_text(bytes(32))}"

@@ -4,50 +4,22 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 
 from afspm import wire
-from afspm.client.experiment_link import ExperimentLink
-from afspm.client.parameter_values import from_parameter, to_parameter
-from afspm.clock import Clock
+from afspm.client.parameter_values import from_parameter
 from afspm.dashboard.access import Access, Visitor
-from afspm.dashboard.watch import Watch
 from afspm.errors import AfspmError, UnitError
 from afspm.formatting import counted, quantity, typeset_position
-from afspm.launch import Launch
-from afspm.model import (
-    RELAY_REQUEST,
-    RESTART_REQUEST,
-    ControlMode,
-    ControlRequest,
-    ControlResponse,
-    Note,
-    Parameter,
-    ProbePosition,
-    Region,
-    RelayedMessage,
-    Response,
-    ScanParameters,
-    ScopeState,
-    names,
-)
-from afspm.model.events import PERSON
+from afspm.model import ControlMode, ControlResponse, Region, Response, names
 from afspm.model.geometry import XY
-from afspm.process.context import new_session
-from afspm.record.overview import Overview
-from afspm.transport.network import Network
-from afspm.transport.port import ParentGone
-from afspm.transport.zmq_port import ZmqPort
 from afspm.units import parse_quantity
+from afspm.web.person_commands import PersonCommands
+from afspm.web.persons import Persons
+from afspm.web.watch import Watch
 
-ANSWER_S = 20.0  # real time that an answer may take
-FREE_S = 60.0  # that the microscope may take to get to a place
-SETTLED_S = 2.0  # what was set is published by then, if it changed anything
-MOST_PERSONS = 32
 _PAGE = ".page"  # no name of a person begins so
 
 
@@ -78,29 +50,27 @@ def not_signed_in() -> Future[ActionResult]:
 class Actions:
     """Actions in the name of one person, for one thread. None raises for a refusal; it is in the result."""
 
-    def __init__(self, link: ExperimentLink, watch: Watch) -> None:
-        self._link = link
+    def __init__(self, commands: PersonCommands, watch: Watch) -> None:
+        self._commands = commands
         self._watch = watch
 
     # --- the experiment ---
 
     def set_mode(self, mode: ControlMode) -> ActionResult:
         """Set MANUAL or AUTOMATED."""
-        return _result(self._ask(ControlRequest.SET_CONTROL_MODE, int(mode)), f"The mode is {mode.name}")
+        return _result(self._commands.set_mode(mode), f"The mode is {mode.name}")
 
     def end(self) -> ActionResult:
         """End the experiment for everybody."""
-        return _result(self._ask(ControlRequest.END_EXPERIMENT), "The experiment ends")
+        return _result(self._commands.end(), "The experiment ends")
 
     def flag(self, problem: int) -> ActionResult:
         """Raise a problem."""
-        response = self._ask(ControlRequest.ADD_EXP_PRBLM, problem)
-        return _result(response, f"{self._watch.problems.name(problem)} is flagged")
+        return _result(self._commands.flag(problem), f"{self._watch.problems.name(problem)} is flagged")
 
     def clear(self, problem: int) -> ActionResult:
         """Remove the flag of a problem."""
-        response = self._ask(ControlRequest.RMV_EXP_PRBLM, problem)
-        return _result(response, f"{self._watch.problems.name(problem)} is cleared")
+        return _result(self._commands.clear(problem), f"{self._watch.problems.name(problem)} is cleared")
 
     def clear_all(self, problems: Sequence[int]) -> ActionResult:
         """Remove the flags of these problems; the first refusal ends it."""
@@ -111,14 +81,11 @@ class Actions:
 
     def restart(self, process: str) -> ActionResult:
         """Have a process ended and started anew."""
-        return _result(self._ask(RESTART_REQUEST, process), f"{process} will be started anew")
+        return _result(self._commands.restart(process), f"{process} will be started anew")
 
     def note(self, text: str, scan_ns: int | None = None, time_ns: int | None = None) -> ActionResult:
         """Write a note on a scan, on a moment, or on now."""
-        now_ns = self._link.clock.now_ns()
-        about_ns = next(one for one in (time_ns, scan_ns, now_ns) if one is not None)
-        note = Note(about_ns, self._link.name, text, scan_ns, now_ns)
-        return _result(self._ask(RELAY_REQUEST, RelayedMessage(*wire.encode(note))), "Noted")
+        return _result(self._commands.note(text, scan_ns, time_ns), "Noted")
 
     # --- the microscope, in MANUAL ---
 
@@ -132,10 +99,8 @@ class Actions:
             result = self.set_mode(ControlMode.MANUAL)
             if not result.ok:
                 return result
-        with self._watch.reading() as overview:
-            is_spectrum = overview.status is not None and overview.status.state is ScopeState.SPEC
-        response = self._ask(ControlRequest.ACTION, names.STOP_SPEC if is_spectrum else names.STOP_SCAN)
-        return _result(response, "The spectrum is stopped" if is_spectrum else "The scan is stopped")
+        what = "spectrum" if self._commands.measures_spectrum else "scan"
+        return _result(self._commands.stop(), f"The {what} is stopped")
 
     def read(self, parameters: Iterable[str]) -> ActionResult:
         """Return the values of parameters that are in force, with their units; one that is refused is not ok."""
@@ -159,58 +124,31 @@ class Actions:
 
     def scan(self, region: Region | None = None, shape: tuple[int, int] | None = None) -> ActionResult:
         """Begin a scan; `region` and `shape` None: as they are set. It is done when the scan has begun."""
-        if region is not None or shape is not None:
-            wanted = ScanParameters(region, shape)
-            response = self._ask(ControlRequest.SET_SCAN_PARAMS, wanted)
-            if not response.ok:
-                return _result(response, "")
-            self._settle(lambda o: o.scan_parameters is not None and _fits(o.scan_parameters, wanted))
+        if (refused := self._commands.prepare_scan(region, shape)) is not None:
+            return _result(refused, "")
         where = "" if region is None else f" at {typeset_position(region.center_m)}"
-        return _result(self._when_free(names.START_SCAN), f"The scan{where} begins")
+        return _result(self._commands.act_when_free(names.START_SCAN), f"The scan{where} begins")
 
     def spectrum(self, at_m: XY | None = None) -> ActionResult:
         """Begin a spectrum at (x, y); None: where the probe stands. It is done when it has begun."""
-        if at_m is not None:
-            response = self._ask(ControlRequest.SET_PROBE_POS, ProbePosition(at_m))
-            if not response.ok:
-                return _result(response, "")
-            self._settle(lambda o: o.probe_position is not None and _near(o.probe_position.xy_m, at_m))
+        if (refused := self._commands.prepare_spectrum(at_m)) is not None:
+            return _result(refused, "")
         where = "" if at_m is None else f" at {typeset_position(at_m)}"
-        return _result(self._when_free(names.START_SPEC), f"The spectrum{where} begins")
+        return _result(self._commands.act_when_free(names.START_SPEC), f"The spectrum{where} begins")
 
     # --- within ---
 
-    def _ask(self, kind: int, subject: object = None) -> Response:
-        self._link.pump(0.0)  # what has come of the connection since we asked last
-        return self._link.request(kind, subject, until_s=self._link.until(ANSWER_S))
-
     def _read(self, parameter: str) -> ActionResult:
-        response = self._ask(ControlRequest.PARAM, Parameter(parameter))
+        response = self._commands.get(parameter)
         return ActionResult(_in_force(parameter, response)) if response.ok else _result(response, "")
 
     def _set(self, parameter: str, text: str) -> ActionResult:
-        response = self._ask(ControlRequest.PARAM, to_parameter(parameter, _number_or(text), None))
+        response = self._commands.set(parameter, _number_or(text))
         if not response.ok:
             which = "" if parameter in response.reason else f"{parameter}: "
             return ActionResult(f"{which}{refusal(response)}.", ok=False)
         now = _in_force(parameter, response) if response.payload else text
         return ActionResult(f"{parameter} is now {now}.")
-
-    def _when_free(self, action: str) -> Response:
-        """Ask for an action, again and again while the microscope is not free."""
-        until_s = self._link.clock.monotonic_s() + FREE_S
-        while True:
-            self._watch.wait_free(until_s - self._link.clock.monotonic_s())
-            with self._watch.reading():
-                seen = self._watch.changes
-            response = self._ask(ControlRequest.ACTION, action)
-            if response.code != ControlResponse.NOT_FREE or self._link.clock.monotonic_s() >= until_s:
-                return response
-            self._watch.wait_for(lambda _, n=seen: self._watch.changes != n, 1.0)  # type: ignore[misc]
-
-    def _settle(self, done: Callable[[Overview], bool]) -> None:
-        """Wait until what was set is published; it is not where nothing changed."""
-        self._watch.wait_for(done, SETTLED_S)
 
 
 def _result(response: Response, done: str) -> ActionResult:
@@ -267,50 +205,20 @@ def _number_or(text: str) -> float | str:
         return text
 
 
-def _fits(now: ScanParameters, wanted: ScanParameters) -> bool:
-    if wanted.shape is not None and now.shape != wanted.shape:
-        return False
-    a, b = now.region, wanted.region
-    return b is None or (isinstance(a, Region) and isinstance(b, Region) and _near(a.center_m, b.center_m))
-
-
-def _near(a: XY, b: XY) -> bool:
-    return math.dist(a, b) < 1e-3 * max(math.hypot(*b), 1e-9)
-
-
 Action = Callable[[Actions], ActionResult]
-
-
-@dataclass
-class _Person:
-    """A person's connection to the scheduler, used by one thread."""
-
-    thread: ThreadPoolExecutor
-    actions: Actions | None = None
-    port: ZmqPort | None = None
-
-    def close(self) -> None:
-        if self.port is not None:
-            self.port.wake_up(ParentGone())
-            self.thread.submit(self.port.close)
-        self.thread.shutdown(wait=False)
 
 
 class Steering:
     """Carries out what persons ask for, each in the own name, one thing after the other for each.
 
     Args:
-        launch: the line that the dashboard was started with; persons reach the scheduler as it does, with its keys.
         access: knows who has signed in.
     """
 
-    def __init__(self, launch: Launch, clock: Clock, watch: Watch, access: Access) -> None:
-        self._launch = launch
+    def __init__(self, persons: Persons, watch: Watch, access: Access) -> None:
+        self._persons = persons
         self._access = access
-        self._clock = clock
         self._watch = watch
-        self._lock = threading.Lock()
-        self._persons: OrderedDict[str, _Person] = OrderedDict()
         self._log = logging.getLogger("afspm.dashboard")
 
     def do(self, visitor: Visitor, action: Action) -> Future[ActionResult]:
@@ -322,28 +230,16 @@ class Steering:
         """Carry out an action that only reads, in the name of the page itself."""
         return self._submit(_PAGE, action)
 
-    def _submit(self, person: str, action: Action) -> Future[ActionResult]:
-        with self._lock:
-            one = self._persons.get(person)
-            if one is None:
-                while len(self._persons) >= MOST_PERSONS:
-                    self._persons.popitem(last=False)[1].close()
-                one = self._persons[person] = _Person(ThreadPoolExecutor(1, thread_name_prefix="person"))
-            self._persons.move_to_end(person)
-            return one.thread.submit(self._carry_out, person, one, action)
-
     def close(self) -> None:
         """End all connections; what is under way ends without an answer."""
-        with self._lock:
-            persons, self._persons = list(self._persons.values()), OrderedDict()
-        for one in persons:
-            one.close()
+        self._persons.close()
 
-    def _carry_out(self, person: str, one: _Person, action: Action) -> ActionResult:
+    def _submit(self, person: str, action: Action) -> Future[ActionResult]:
+        return self._persons.submit(person, lambda commands: self._carry_out(person, commands, action))
+
+    def _carry_out(self, person: str, commands: PersonCommands, action: Action) -> ActionResult:
         try:
-            if one.actions is None:
-                one.port, one.actions = self._connect(person)
-            result = action(one.actions)
+            result = action(Actions(commands, self._watch))
         except AfspmError as error:
             result = ActionResult(str(error), ok=False)
         except Exception as error:
@@ -351,11 +247,3 @@ class Steering:
             result = ActionResult(f"that failed: {type(error).__name__}: {error}", ok=False)
         self._log.debug("%s: %s%s", person, result.text, "" if result.ok else " (not done)")
         return result
-
-    def _connect(self, person: str) -> tuple[ZmqPort, Actions]:
-        launch = self._launch
-        name = f"{launch.name}{PERSON}{person}"
-        network = Network.from_launch(launch.name, launch.keys)
-        port = ZmqPort(network, name, self._clock, control=launch.sockets.control)
-        link = ExperimentLink.of_launch(launch, port, new_session(launch.run), name=name, log=self._log)
-        return port, Actions(link, self._watch)

@@ -11,12 +11,14 @@ from fastapi.staticfiles import StaticFiles
 from nicegui import app as nicegui
 from nicegui import ui
 
-from afspm.dashboard.access import Visitor, is_loopback
-from afspm.dashboard.archive import Archive
+from afspm.dashboard.access import Visitor
 from afspm.dashboard.live import Live
 from afspm.dashboard.page import ASSETS, Page, Services
-from afspm.dashboard.sign_in import VISITOR, AsgiApp, Guard, add_sign_in
-from afspm.dashboard.watch import Bell
+from afspm.dashboard.sign_in import VISITOR, Guard, add_sign_in
+from afspm.web.archive import Archive
+from afspm.web.asgi import AsgiApp
+from afspm.web.passwords import is_loopback
+from afspm.web.watch import Bell
 
 
 def application(

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from afspm.dashboard.frames import ChannelFrame
 from afspm.drawing.levelling import Array, Levelling, levelled
 from afspm.drift.estimators import estimator
 from afspm.drift.registration import DriftScan
 from afspm.errors import InvalidValue
 from afspm.formatting import typeset_position
 from afspm.model import Region
+from afspm.web.frames import ChannelFrame
 
 _ALIKE = 1e-3
 

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 
 from afspm.dashboard.actions import Action, ActionResult
-from afspm.dashboard.watch import Watch
 from afspm.model import names
 from afspm.record.overview import RunningScan
+from afspm.web.watch import Watch
 
 LABELS = {names.TIP_BIAS_VOLTAGE: "Bias", names.SCAN_SPEED: "Speed", names.ZCTRL_SETPOINT: "Setpoint"}
 KEPT = 2_000

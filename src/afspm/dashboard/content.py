@@ -12,13 +12,13 @@ from afspm.clock import NS_PER_S
 from afspm.dashboard.charts import Chart, drift_chart
 from afspm.dashboard.flags import Flag, flags
 from afspm.dashboard.sample_map import MapContent, map_html, picture_url
-from afspm.dashboard.watch import Watch
 from afspm.drawing.timeline import TimelineRow, timeline_html, tint_class
 from afspm.formatting import duration_text, time_of_day, typeset_area
 from afspm.model import ControlMode, JournalEntry, LogLine, Note, ProcessState, Region
 from afspm.model.events import PERSON
 from afspm.record.overview import OVER, Overview, ScanSummary
 from afspm.record.timeline import Span, Timeline
+from afspm.web.watch import Watch
 
 ANEW_S = 0.4  # at most that often, however much is published
 SLOWLY_S = 2.0  # for what takes longer to make

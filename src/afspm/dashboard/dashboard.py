@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING, Annotated
 from afspm.addresses import Listens
 from afspm.client.component import Component
 from afspm.clock import ExperimentClock
-from afspm.dashboard.access import Access, is_loopback
-from afspm.dashboard.archive import Archive, adjustable_parameters, allowed_region
-from afspm.dashboard.server import USUAL_PORT, PageServer, listening, url_of
+from afspm.dashboard.access import Access
 from afspm.dashboard.sessions import Sessions
-from afspm.dashboard.watch import Audience, Watch
 from afspm.errors import ConfigError
 from afspm.process.priority import step_back
 from afspm.record.run_json import experiment_name
 from afspm.record.run_lock import cut_off_message
+from afspm.web.archive import Archive, adjustable_parameters, allowed_region
+from afspm.web.passwords import is_loopback
+from afspm.web.server import USUAL_PORT, WebServer, listening, url_of
+from afspm.web.watch import Audience, Watch
 
 if TYPE_CHECKING:
     from afspm.process.context import ProcessContext
@@ -62,7 +63,7 @@ class Dashboard(Component):
         self._people, self._password_hash = dict(people or {}), password_hash
         self._certificate = None if certificate is None else Path(certificate)
         self._certificate_key = None if certificate_key is None else Path(certificate_key)
-        self._server: PageServer | None = None
+        self._server: WebServer | None = None
 
     def run_process(self, context: ProcessContext) -> int:
         step_back()
@@ -75,6 +76,7 @@ class Dashboard(Component):
         from afspm.dashboard.conditions import Conditions
         from afspm.dashboard.content import Contents
         from afspm.dashboard.page import Services
+        from afspm.web.persons import Persons
 
         launch = self._context.launch
         state_dir = Path(launch.state_dir) if launch.state_dir else None
@@ -85,7 +87,7 @@ class Dashboard(Component):
         archive = Archive(self.run_dir if launch.run_dir else None)
         problems = self._context.problems
         self._watch = Watch(self.clock, problems, archive.past(problems), lambda: cut_off_message(self.run_dir))
-        self._steering = Steering(launch, self.clock, self._watch, access)
+        self._steering = Steering(Persons(launch, self.clock, self._watch), self._watch, access)
         services = Services(
             self._watch,
             Contents(
@@ -103,7 +105,7 @@ class Dashboard(Component):
         )
         encrypted = self._certificate is not None
         app, self._wait_told = application(services, archive, host=self._host, encrypted=encrypted)
-        self._server = PageServer(app, bound, self._certificate, self._certificate_key)
+        self._server = WebServer(app, bound, self._certificate, self._certificate_key)
         self._server.start()
         self._say_where(bound.getsockname()[1])
 

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from afspm.dashboard.content import Content, Contents
-from afspm.dashboard.frames import FrameStore
-from afspm.dashboard.watch import SpectrumStore, Watch
 from afspm.drawing.levelling import Array
 from afspm.errors import FileError
 from afspm.model import Note, Region, Scan
 from afspm.model.geometry import XY
 from afspm.record.overview import Overview
 from afspm.record.run import Run, open_run
+from afspm.web.frames import FrameStore
+from afspm.web.watch import SpectrumStore, Watch
 
 SPECTRA = 8
 """The spectra before a moment that are read."""

@@ -9,11 +9,11 @@ from typing import ClassVar
 from nicegui import events, ui
 
 from afspm.dashboard.access import Visitor
-from afspm.dashboard.archive import allowed_region
 from afspm.dashboard.content import Content
 from afspm.dashboard.night import Night, NightContents, NightWatch
 from afspm.dashboard.page import ASSETS, TABS, Page, Services, section
 from afspm.record.run_lock import describe_state
+from afspm.web.archive import allowed_region
 
 _HEAD = """<link rel="stylesheet" href="/assets/night.css"><script type="module" src="/assets/night.js"></script>"""
 

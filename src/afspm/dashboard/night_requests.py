@@ -11,7 +11,6 @@ from fastapi import FastAPI, Response
 from fastapi.responses import FileResponse, PlainTextResponse
 
 from afspm.clock import NS_PER_S
-from afspm.dashboard.archive import Archive
 from afspm.dashboard.comparison import difference
 from afspm.dashboard.night import Night
 from afspm.dashboard.pictures import Look, RenderedFrame
@@ -22,6 +21,7 @@ from afspm.errors import InvalidValue
 from afspm.formatting import time_of_day, typeset_area
 from afspm.record.report import REPORT_FILE
 from afspm.record.tables import ScanRow
+from afspm.web.archive import Archive
 
 
 class NightRequests:

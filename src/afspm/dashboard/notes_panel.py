@@ -8,7 +8,7 @@ from nicegui import context, ui
 
 from afspm.dashboard.access import Visitor
 from afspm.dashboard.actions import ActionResult, Steering
-from afspm.dashboard.watch import Watch
+from afspm.web.watch import Watch
 
 MOMENT, SCAN = "this moment", "the scan shown"
 _SHOWN = "return window.afspm?.image?.head?.time_ns ?? ''"

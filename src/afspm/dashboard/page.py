@@ -21,10 +21,10 @@ from afspm.dashboard.panels import ChartPanel, HealthPanel, LogPanel, SpectraPan
 from afspm.dashboard.sign_in import SIGN_IN
 from afspm.dashboard.steering_panel import ModeButtons, ProblemBar, SteeringPanel
 from afspm.dashboard.steering_session import SteeringSession
-from afspm.dashboard.watch import Audience, Watch
 from afspm.drawing import timeline
 from afspm.drawing.levelling import Levelling
 from afspm.drawing.palette import PALETTES
+from afspm.web.watch import Audience, Watch
 
 ASSETS = Path(__file__).with_name("assets")
 REFRESH_S = 0.5

@@ -12,10 +12,10 @@ from afspm.dashboard.charts import Chart, spectrum_chart
 from afspm.dashboard.content import NOT_HEARD_OF
 from afspm.dashboard.steering_panel import ask_restart
 from afspm.dashboard.steering_session import SteeringSession
-from afspm.dashboard.watch import Watch
 from afspm.drawing.timeline import tint_class
 from afspm.formatting import duration_text, time_of_day
 from afspm.model import LogLine, ProcessCondition, ProcessState
+from afspm.web.watch import Watch
 
 MOST_LINES = 300
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")

@@ -8,11 +8,11 @@ import threading
 from dataclasses import dataclass
 from functools import lru_cache
 
-from afspm.dashboard.frames import ChannelFrame
 from afspm.dashboard.scan_facts import Facts
 from afspm.drawing.levelling import Array, Levelling, levelled
 from afspm.drawing.palette import PALETTES
 from afspm.drawing.raster import Contrast, ValueRange, indices, png, value_range
+from afspm.web.frames import ChannelFrame
 
 KEPT = 8
 

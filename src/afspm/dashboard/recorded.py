@@ -18,12 +18,12 @@ from pathlib import Path
 
 from afspm.clock import ExperimentClock
 from afspm.dashboard.access import Access, Visitor
-from afspm.dashboard.archive import Archive, allowed_region
-from afspm.dashboard.server import USUAL_PORT, PageServer, listening, url_of
 from afspm.dashboard.sessions import Sessions
 from afspm.errors import AfspmError, FileError
 from afspm.process.memory import Memory
 from afspm.record.run_json import STATE_DIR
+from afspm.web.archive import Archive, allowed_region
+from afspm.web.server import USUAL_PORT, WebServer, listening, url_of
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def serve(settings: RecordedSettings, tell: Callable[[str], object], stopped: th
     from afspm.dashboard.night_requests import NightRequests
     from afspm.dashboard.night_steering import NightSteering
     from afspm.dashboard.page import Services
-    from afspm.dashboard.watch import Audience
+    from afspm.web.watch import Audience
 
     night = Night(Path(settings.folder))
     state = night.folder / STATE_DIR
@@ -84,7 +84,7 @@ def serve(settings: RecordedSettings, tell: Callable[[str], object], stopped: th
         page=partial(NightPage, night, pictures), more=NightRequests(night, archive).add_to,
     )  # fmt: skip
     certificate, key = (None if one is None else Path(one) for one in (settings.certificate, settings.certificate_key))
-    server = PageServer(app, bound, certificate, key)
+    server = WebServer(app, bound, certificate, key)
     stopped = stopped or threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.set())

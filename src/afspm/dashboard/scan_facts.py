@@ -6,10 +6,10 @@ import math
 from collections.abc import Mapping
 
 from afspm.clock import NS_PER_S
-from afspm.dashboard.frames import ChannelFrame
 from afspm.formatting import duration_text, scale, time_of_day, typeset, typeset_area
 from afspm.model.geometry import XY
 from afspm.record.overview import Overview, ScanSummary
+from afspm.web.frames import ChannelFrame
 
 Facts = list[tuple[str, str]]
 """Pairs of label and text."""

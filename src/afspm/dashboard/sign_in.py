@@ -4,23 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import html
-from collections.abc import Awaitable, Callable, MutableMapping
 from pathlib import Path
-from typing import Any
-from urllib.parse import urlsplit
 
 from fastapi import FastAPI, Form, Request, Response
 from fastapi.responses import HTMLResponse, PlainTextResponse, RedirectResponse
 from starlette.datastructures import MutableHeaders
 from starlette.requests import HTTPConnection
 
-from afspm.dashboard.access import Access, Visitor, check_name, is_loopback
+from afspm.dashboard.access import Access, Visitor
 from afspm.dashboard.sessions import COOKIE, REMEMBERED_S
-
-Message = MutableMapping[str, Any]
-Send = Callable[[Message], Awaitable[None]]
-Receive = Callable[[], Awaitable[Message]]
-AsgiApp = Callable[[Message, Receive, Send], Awaitable[None]]
+from afspm.web.asgi import AsgiApp, Message, Receive, Send, wrong_origin
+from afspm.web.passwords import check_name, is_loopback
 
 VISITOR = "afspm_visitor"
 SIGN_IN = "/login"
@@ -47,8 +41,7 @@ _PASSWORD = """<label for="password">Password</label>
 class Guard:
     """ASGI middleware: checks each request and each websocket, and sets scope["state"][VISITOR].
 
-    Besides the cookie it checks where a request comes from: a page of somebody else that is open in the same browser
-    must not be able to steer a microscope, nor one that gave its own name our address.
+    Besides the cookie it checks where a request comes from.
     """
 
     def __init__(self, app: AsgiApp, access: Access, host: str) -> None:
@@ -61,7 +54,7 @@ class Guard:
             await self._app(scope, receive, send)
             return
         asked = HTTPConnection(scope)
-        if (wrong := self._wrong_origin(asked)) is not None:
+        if (wrong := wrong_origin(asked.headers, only_here=self._only_loopback)) is not None:
             await _refuse(403, wrong, scope, receive, send)
             return
         visitor = self._access.visitor(asked.cookies.get(COOKIE))
@@ -83,15 +76,6 @@ class Guard:
             return
         scope.setdefault("state", {})[VISITOR] = visitor or Visitor()
         await self._app(scope, receive, _with_headers(send))
-
-    def _wrong_origin(self, asked: HTTPConnection) -> str | None:
-        host = asked.headers.get("host", "")
-        if self._only_loopback and not is_loopback(urlsplit(f"//{host}").hostname or ""):
-            return f"this dashboard is for this computer only, and not for {host!r}"
-        origin = asked.headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc != host:
-            return f"a page of {origin} may not ask this dashboard"
-        return None
 
 
 def add_sign_in(app: FastAPI, access: Access, title: str, *, encrypted: bool, only_here: bool) -> None:

@@ -11,8 +11,8 @@ from nicegui import background_tasks, context, ui
 from afspm.dashboard.access import Visitor
 from afspm.dashboard.actions import Action, ActionResult, Steering
 from afspm.dashboard.content import Content
-from afspm.dashboard.watch import Watch
 from afspm.formatting import time_of_day
+from afspm.web.watch import Watch
 
 _CLOSE = [{"label": "Close", "color": "white"}]
 

@@ -8,10 +8,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from afspm.dashboard.frames import ChannelFrame
 from afspm.drawing.levelling import Array, Levelling, levelled
 from afspm.drawing.palette import PALETTES
 from afspm.drawing.raster import indices, png, value_range
+from afspm.web.frames import ChannelFrame
 
 KEPT = 600
 SIDE_PX = 128

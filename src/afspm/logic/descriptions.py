@@ -9,6 +9,7 @@ from typing import Any
 from afspm.formatting import area_text, lengths_text, position_text
 from afspm.logic.arbitration import ArbitrationEvent, ArbitrationState, Cause, ControlInput, Rules, Transition
 from afspm.model import (
+    LEASE_REQUEST,
     RESTART_REQUEST,
     ControlMode,
     ControlRequest,
@@ -139,5 +140,6 @@ _WORDS: dict[int, Callable[[Any, ProblemNames], str]] = {
     int(ControlRequest.SET_CONTROL_MODE): _mode,
     int(ControlRequest.END_EXPERIMENT): lambda subject, problems: "ends the experiment",
     int(ControlRequest.ACTION_SUPPORT): lambda subject, problems: f"asks whether there is {subject}",
+    LEASE_REQUEST: lambda subject, problems: f"keeps control for {subject:g} s",
     RESTART_REQUEST: lambda subject, problems: f"restart {subject}",
 }

@@ -11,10 +11,15 @@ from afspm.logic.sessions import SessionTable
 
 @dataclass(frozen=True)
 class Lease:
-    """The idle time of the holder while the microscope is free, in experiment time: a simulated night decides alike.
+    """The idle time of the holder.
+
+    That of the experiment file counts while the microscope is free, in experiment time: a simulated night decides
+    alike. That which a holder asks for itself, as it speaks for somebody who may vanish without a connection to lose,
+    counts in real time and whatever the microscope does.
 
     Attributes:
-        lease_ns: longest idle time; None: no limit.
+        lease_ns: longest idle time by the experiment file; None: no limit.
+        asked_s: longest idle time that the holder asked for; None: it did not.
         token: of the life of the holder that was granted control.
         announced: the last holder that was logged.
     """
@@ -24,14 +29,28 @@ class Lease:
     token: str | None = None
     announced: str | None = None
     idle_since_ns: int = 0
+    asked_s: float | None = None
+    idle_since_s: float = 0.0
 
     def held_by(self, holder: str | None, now_ns: int) -> Lease:
         """Restart the idle time for another holder, or for nobody."""
-        return self if holder == self.holder else replace(self, holder=holder, idle_since_ns=now_ns)
+        return self if holder == self.holder else replace(self, holder=holder, idle_since_ns=now_ns, asked_s=None)
 
     def used(self, now_ns: int) -> Lease:
-        """Restart the idle time: a request was accepted, or the microscope began or ended something."""
+        """Restart the idle time while the microscope is free: it began or ended something."""
         return replace(self, idle_since_ns=now_ns)
+
+    def commanded(self, now_ns: int, now_s: float) -> Lease:
+        """Restart the idle time: a request of the holder was accepted."""
+        return replace(self, idle_since_ns=now_ns, idle_since_s=now_s)
+
+    def asked(self, lease_s: float | None, now_s: float) -> Lease:
+        """Begin the lease that the holder asks for, or begin it anew."""
+        return replace(self, asked_s=lease_s, idle_since_s=now_s)
+
+    def asked_until_s(self) -> float | None:
+        """Return when (real) the lease that the holder asked for runs out; None: it asked for none."""
+        return None if self.asked_s is None or self.holder is None else self.idle_since_s + self.asked_s
 
     def deadline_ns(self, *, is_free: bool) -> int | None:
         """Return when the lease runs out; None while the microscope is busy, or nobody is in control."""

@@ -25,6 +25,7 @@ from afspm.logic.state import StateDraft
 from afspm.model import (
     CLOCK_REQUEST,
     HAS_ENDED,
+    LEASE_REQUEST,
     OTHER_RUN_RESPONSE,
     RELAY_REQUEST,
     RESTART_REQUEST,
@@ -149,6 +150,8 @@ def authorise(draft: StateDraft, event: RequestIn) -> bool:
         publishing.order_restart(draft, event)
     elif kind == CLOCK_REQUEST:
         _tell_time(draft, event)
+    elif kind == LEASE_REQUEST:
+        _renew_lease(draft, event)
     elif kind <= 0:
         why = f"there is no request with the number {kind}"
         answers.answer(draft, event, ControlResponse.CMD_NOT_SUPPORTED, why)
@@ -165,6 +168,18 @@ def _microscope_event(request: Request, rules: Rules) -> ArbitrationEvent:
         return ArbitrationEvent.READ
     is_adjustable = request.kind == _PARAM and request.subject.name in rules.adjustable
     return ArbitrationEvent.ADJUST if is_adjustable else ArbitrationEvent.COMMAND
+
+
+def _renew_lease(draft: StateDraft, event: RequestIn) -> None:
+    """Begin the lease of the holder anew; that is not written down, as it is done again and again."""
+    name, holder = event.name, draft.control.holder
+    if name != holder:
+        why = f"{name} is not in control, {holder or 'nobody'} is"
+        answers.answer(draft, event, ControlResponse.NOT_IN_CONTROL, why)
+        return
+    draft.lease = draft.lease.asked(event.request.subject, draft.now_s)
+    response = Response(int(ControlResponse.SUCCESS), b"", "", event.request.id)
+    draft.effects.append(Reply(event.connection, name, response, LEASE_REQUEST))
 
 
 def _tell_time(draft: StateDraft, event: RequestIn) -> None:
@@ -208,7 +223,7 @@ def check_limits(draft: StateDraft, event: RequestIn, deadline_s: float = 0.0) -
 def _use_lease(draft: StateDraft, client: str) -> None:
     """Begin the lease anew; what a person adjusts beside the holder is no sign of life of the holder."""
     if client == draft.control.holder:
-        draft.lease = draft.lease.used(draft.now_ns)
+        draft.lease = draft.lease.commanded(draft.now_ns, draft.now_s)
 
 
 def _tip_comes_first(draft: StateDraft) -> str | None:

@@ -58,7 +58,7 @@ def step(
 
 def due_s(state: SchedulerState) -> float | None:
     """Return when, in real monotonic time, a Tick is due at the latest."""
-    dues = (state.due_s(), _malfunction(state)[0], _entries_due_s(state), _dead_at_s(state))
+    dues = (state.due_s(), _malfunction(state)[0], _entries_due_s(state), _dead_at_s(state), _unrenewed_at_s(state))
     return min((one_s for one_s in dues if one_s is not None), default=None)
 
 
@@ -92,6 +92,7 @@ class SchedulerCore:
         draft.watchdog = draft.watchdog.begun(now_s)
         draft.lease = draft.lease.held_by(draft.control.holder, now_ns)
         if self._restored is not None:
+            draft.lease = draft.lease.asked(self._restored.lease_s, now_s)
             self._env.cache.remember(self._restored.recent)
         if draft.control.ended:
             control_change.begin_end(draft)
@@ -296,7 +297,8 @@ def _see_to_deadlines(draft: StateDraft) -> None:
     if (holder := draft.control.holder) is not None and _has_come(_dead_at_s(draft), draft.now_s):
         control_change.decide(draft, ControlInput(ArbitrationEvent.DEAD, holder))
     lease_ns = draft.lease.deadline_ns(is_free=draft.microscope.is_free)
-    if (holder := draft.control.holder) is not None and lease_ns is not None and draft.now_ns >= lease_ns:
+    is_idle = (lease_ns is not None and draft.now_ns >= lease_ns) or _has_come(_unrenewed_at_s(draft), draft.now_s)
+    if (holder := draft.control.holder) is not None and is_idle:
         control_change.decide(draft, ControlInput(ArbitrationEvent.IDLE, holder))
     for name in draft.pending.still_unclear(draft.now_s):  # both connections go on: they are two
         draft.pending, waiting = draft.pending.clear_up(name)
@@ -357,6 +359,12 @@ def _dead_at_s(state: SchedulerState | StateDraft) -> float | None:
     over_since_s = state.supervisors.over_since_s(component_of(holder))
     dead_at_s = state.holder_timeout.dead_at_s(holder, state.sessions, over_since_s)
     return dead_at_s if dead_at_s is None or told_at_s is None else max(dead_at_s, told_at_s)
+
+
+def _unrenewed_at_s(state: SchedulerState | StateDraft) -> float | None:
+    """Return when control is taken from a holder that does not renew its lease, after what was before a restart."""
+    until_s, told_at_s = state.lease.asked_until_s(), state.barrier.until_s
+    return until_s if until_s is None or told_at_s is None else max(until_s, told_at_s)
 
 
 def _malfunction(state: SchedulerState | StateDraft) -> tuple[float | None, str]:

@@ -36,6 +36,7 @@ class SavedState:
 
     Attributes:
         granted_to: the token of the life of the holder that was granted control.
+        lease_s: that the holder asked for.
         sessions: the token of each session that was connected.
         last_ns: the time of the newest packet.
         recent: (translator's time, ours) of the packets published last.
@@ -44,6 +45,7 @@ class SavedState:
 
     control: ArbitrationState = field(default_factory=ArbitrationState)
     granted_to: str | None = None
+    lease_s: float | None = None
     sessions: Mapping[str, str] = field(default_factory=dict)
     sent_actions: tuple[SentAction, ...] = ()
     limits: LimitState = field(default_factory=LimitState)
@@ -56,7 +58,7 @@ class SavedState:
 
     def without_holder(self) -> SavedState:
         """Return the state with nobody in control: an older state does not know who was."""
-        return replace(self, control=replace(self.control, holder=None, solving=0), granted_to=None)
+        return replace(self, control=replace(self.control, holder=None, solving=0), granted_to=None, lease_s=None)
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ class SchedulerState:
 
     def saved_parts(self) -> tuple[object, ...]:
         """The parts of which every change is saved before it is told."""
-        saved = self.control, self.lease.token, self.watchdog.tip, self.microscope.risk
+        saved = self.control, self.lease.token, self.lease.asked_s, self.watchdog.tip, self.microscope.risk
         return *saved, self.limits.state.usage, self.idempotency.sent_actions
 
     def due_s(self) -> float | None:
@@ -207,6 +209,7 @@ def saved_state(state: SchedulerState, env: Environment) -> SavedState:
     return SavedState(
         control=state.control,
         granted_to=state.lease.token,
+        lease_s=state.lease.asked_s,
         sessions=state.sessions.tokens(),
         sent_actions=state.idempotency.sent_actions,
         limits=state.limits.state,

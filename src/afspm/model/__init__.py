@@ -25,6 +25,8 @@ from afspm.model.problems import Problem, ProblemNames
 from afspm.model.requests import (
     CLOCK_REQUEST,
     HAS_ENDED,
+    LEASE_REQUEST,
+    LONGEST_LEASE_S,
     OTHER_RUN_RESPONSE,
     RELAY_REQUEST,
     RESTART_REQUEST,
@@ -54,6 +56,8 @@ from afspm.model.state import (
 __all__ = [
     "CLOCK_REQUEST",
     "HAS_ENDED",
+    "LEASE_REQUEST",
+    "LONGEST_LEASE_S",
     "OTHER_RUN_RESPONSE",
     "RELAY_REQUEST",
     "RESTART_REQUEST",

@@ -34,11 +34,15 @@ RELAY_REQUEST = 102
 """A request of ours, not in version 1: a supervisor has something to publish; its answer are orders to it."""
 RESTART_REQUEST = 103
 """A request of ours, not in version 1: a process is to be started anew; its subject is the process's name."""
+LEASE_REQUEST = 104
+"""A request of ours, not in version 1: the holder loses control when it has let so many real seconds pass without
+another command or another of these, whatever the microscope does; its subject is that number."""
+LONGEST_LEASE_S = 86_400.0
 
 OTHER_RUN_RESPONSE = 100
 """A response of ours, not in version 1, and only to those who named their run: it is not that of the scheduler."""
 
-_OURS = {CLOCK_REQUEST: "CLOCK", RELAY_REQUEST: "TELL", RESTART_REQUEST: "RESTART"}
+_OURS = {CLOCK_REQUEST: "CLOCK", RELAY_REQUEST: "TELL", RESTART_REQUEST: "RESTART", LEASE_REQUEST: "LEASE"}
 
 
 def request_name(kind: int) -> str:

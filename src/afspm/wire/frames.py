@@ -6,12 +6,15 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
+from google.protobuf.duration_pb2 import Duration
 from google.protobuf.message import DecodeError
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from afspm.errors import AfspmError, InvalidValue, WireError
 from afspm.model import (
     CLOCK_REQUEST,
+    LEASE_REQUEST,
+    LONGEST_LEASE_S,
     RELAY_REQUEST,
     RESTART_REQUEST,
     ControlRequest,
@@ -82,11 +85,17 @@ def encode_request(request: Request) -> list[bytes]:
 
 
 def encode_subject(subject: Any) -> bytes:
-    """Return a request's subject in bytes: one byte for a number, an ActionMsg for text, else the model object's."""
+    """Return a request's subject in bytes.
+
+    One byte for a whole number, a Duration for seconds, an ActionMsg for text, else the model object's.
+    """
     if subject is None:
         return b""
     if isinstance(subject, int):
         return bytes([subject])
+    if isinstance(subject, float):
+        seconds, nanos = divmod(round(subject * 1e9), 10**9)
+        return Duration(seconds=seconds, nanos=nanos).SerializeToString()
     if isinstance(subject, str):
         return _action_message(subject) if len(subject) <= LONGEST_ID else _new_action_message(subject)
     return encode(subject)[1]
@@ -202,6 +211,17 @@ def _number(payload: bytes) -> int:
     return payload[0]
 
 
+def _seconds(payload: bytes) -> float:
+    try:
+        told = Duration.FromString(payload)
+    except DecodeError as error:
+        raise WireError(f"the bytes are no Duration: {error}") from None
+    seconds = told.seconds + told.nanos * 1e-9
+    if not 0.0 < seconds <= LONGEST_LEASE_S:
+        raise InvalidValue(f"a lease of {seconds:g} s", hint=f"above 0 and at most {LONGEST_LEASE_S:g} s")
+    return seconds
+
+
 _SUBJECTS: dict[int, Callable[[bytes], Any]] = {
     ControlRequest.ACTION: _action,
     ControlRequest.PARAM: PARAMETER.decode,
@@ -217,5 +237,6 @@ _SUBJECTS: dict[int, Callable[[bytes], Any]] = {
     CLOCK_REQUEST: lambda p: None,
     RELAY_REQUEST: RELAYED.decode,
     RESTART_REQUEST: _action,
+    LEASE_REQUEST: _seconds,
     ControlRequest.ACTION_SUPPORT: _action,
 }

@@ -6,18 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from afspm.dashboard.access import (
-    PASSWORD,
-    Access,
-    Visitor,
-    check_name,
-    hashed,
-    is_hash,
-    is_loopback,
-    matches,
-)
+from afspm.dashboard.access import PASSWORD, Access, Visitor
 from afspm.dashboard.sessions import MOST_ENDED, Sessions
 from afspm.errors import ConfigError
+from afspm.web.passwords import check_name, hashed, is_hash, is_loopback, matches
 
 KEPT = hashed("open sesame")
 ADAS = hashed("analytical")
@@ -220,11 +212,11 @@ def test_whoever_was_wrong_too_often_has_to_wait_even_with_the_right_password() 
 
 
 def test_many_that_are_wrong_take_no_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("afspm.dashboard.access.matches", lambda password, kept: False)  # which takes its time
+    monkeypatch.setattr("afspm.web.passwords.matches", lambda password, kept: False)  # which takes its time
     guard = access()
     for i in range(3000):
         guard.by_password("", "guess", f"10.0.{i // 256}.{i % 256}")
-    assert len(guard._failures) <= 1000
+    assert len(guard._passwords._failures) <= 1000
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from afspm.dashboard.comparison import difference
-from afspm.dashboard.frames import ChannelFrame
 from afspm.drawing.levelling import Levelling
 from afspm.errors import InvalidValue
 from afspm.model import Region
+from afspm.web.frames import ChannelFrame
 
 SIDE = 96
 SIZE_M = (1e-6, 0.5e-6)

@@ -18,7 +18,6 @@ from afspm.dashboard.charts import drift_chart, spectrum_chart
 from afspm.dashboard.content import refusals_html, rows_of, unheard
 from afspm.dashboard.panels import log_html, process_words
 from afspm.dashboard.sample_map import MapContent, map_html, places_of
-from afspm.dashboard.watch import Watch
 from afspm.drawing.timeline import timeline_html
 from afspm.formatting import typeset_position
 from afspm.model import (
@@ -36,6 +35,7 @@ from afspm.model import (
     Spectrum,
 )
 from afspm.record.overview import DriftPoint, Overview, ScanSummary, SpectrumSummary
+from afspm.web.watch import Watch
 
 S = 1_000_000_000
 HERE = Region((0.0, 0.0), (1e-6, 1e-6))

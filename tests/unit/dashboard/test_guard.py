@@ -9,9 +9,10 @@ import httpx
 import pytest
 from fastapi import FastAPI, Request, WebSocket
 
-from afspm.dashboard.access import Access, hashed
+from afspm.dashboard.access import Access
 from afspm.dashboard.sessions import Sessions
 from afspm.dashboard.sign_in import VISITOR, Guard, add_sign_in
+from afspm.web.passwords import hashed
 
 KEPT = hashed("open sesame")
 PEOPLE = {"Ada": hashed("analytical")}

@@ -10,8 +10,9 @@ from afspm.clock import ExperimentClock
 from afspm.dashboard.access import Access, Visitor
 from afspm.dashboard.actions import ActionResult, Steering
 from afspm.dashboard.sessions import Sessions
-from afspm.dashboard.watch import Watch
 from afspm.launch import Launch
+from afspm.web.persons import Persons
+from afspm.web.watch import Watch
 
 
 @pytest.fixture
@@ -22,17 +23,18 @@ def access() -> Access:
 @pytest.fixture
 def steering(access: Access, monkeypatch: pytest.MonkeyPatch) -> Steering:
     clock = ExperimentClock.real()
-    made = Steering(Launch("dashboard"), clock, Watch(clock), access)
-    monkeypatch.setattr(made, "_connect", lambda person: (None, person))
-    return made
+    watch = Watch(clock)
+    persons = Persons(Launch("dashboard"), clock, watch)
+    monkeypatch.setattr(persons, "_connect", lambda person: (None, person))
+    return Steering(persons, watch, access)
 
 
 def done(steering: Steering, visitor: Visitor) -> list[Any]:
     """In whose names an act was carried out."""
     asked: list[Any] = []
 
-    def act(person: Any) -> ActionResult:
-        asked.append(person)
+    def act(actions: Any) -> ActionResult:
+        asked.append(actions._commands)
         return ActionResult("done")
 
     steering.do(visitor, act).result(5.0)

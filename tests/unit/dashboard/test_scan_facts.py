@@ -11,12 +11,12 @@ import numpy as np
 from afspm.clock import ExperimentClock
 from afspm.dashboard.actions import ActionResult
 from afspm.dashboard.conditions import Conditions
-from afspm.dashboard.frames import ChannelFrame
 from afspm.dashboard.scan_facts import scan_facts
 from afspm.dashboard.thumbnails import SIDE_PX, Thumbnails
-from afspm.dashboard.watch import Watch
 from afspm.model import ControlMode, ControlState, Region, Scan, ScopeState, ScopeStatus
 from afspm.record.overview import Overview
+from afspm.web.frames import ChannelFrame
+from afspm.web.watch import Watch
 
 S = 1_000_000_000
 REGION = Region((1e-6, -5e-7), (1e-6, 5e-7), 0.1)

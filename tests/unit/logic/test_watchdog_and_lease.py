@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import pytest
 from core_parts import Dog
-from logic_lab import Lab
+from logic_lab import Lab, killed
 
 from afspm.logic.arbitration import Cause
+from afspm.logic.events import Tick
 from afspm.logic.holder_timeout import Lease
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.watchdog import SafetyResult, WatchdogSettings
-from afspm.model import ControlResponse, ScopeState
+from afspm.model import LEASE_REQUEST, ControlEvent, ControlRequest, ControlResponse, ScopeState
 
 OK, NOT_FREE, SILENCE = (
     int(c) for c in (ControlResponse.SUCCESS, ControlResponse.NOT_FREE, ControlResponse.NO_RESPONSE)
@@ -391,3 +392,63 @@ def test_asking_again_does_not_renew_a_lease() -> None:
 def test_without_a_lease_or_a_holder_there_is_no_deadline() -> None:
     assert Lease().held_by("greedy", 0).deadline_ns(is_free=True) is None
     assert Lease(NS).deadline_ns(is_free=True) is None
+
+
+def leased(lab: Lab, lease_s: float = 20.0) -> Lab:
+    """A lab with a scan under way whose holder asked for a lease."""
+    lab.translator()
+    lab.scope_is(FREE)
+    lab.take_control("gateway:Ada")
+    assert lab.says("gateway:Ada", LEASE_REQUEST, lease_s) is ControlResponse.SUCCESS
+    lab.scope_is(SCANNING)
+    return lab
+
+
+def test_a_lease_that_its_holder_asked_for_runs_out_in_the_middle_of_a_scan_which_is_stopped() -> None:
+    lab = leased(Lab(SchedulerSettings()))
+    until_s = lab.now_s + 20.0
+    lab.entries()
+    assert lab.core.deadline_s() == until_s
+    lab.later(real_s=19.8)
+    lab.step(Tick())
+    assert lab.holder == "gateway:Ada"
+    lab.later(real_s=0.1)
+    lab.step(Tick())
+    assert lab.holder is None
+    assert lab.forwarded[-1].request.subject == "stop-scan"
+    assert [entry.reason for entry in lab.entries() if entry.event is ControlEvent.CONTROL_LOST] == [Cause.IDLE.value]
+
+
+def test_renewals_and_commands_begin_such_a_lease_anew_and_control_ends_it() -> None:
+    lab = leased(Lab(SchedulerSettings()))
+    lab.later(real_s=15.0)
+    assert lab.says("gateway:Ada", LEASE_REQUEST, 20.0) is ControlResponse.SUCCESS
+    lab.later(real_s=15.0)
+    lab.ask("gateway:Ada", ControlRequest.ACTION, "stop-scan", "gateway:Ada/a/1")
+    lab.later(real_s=15.0)
+    lab.step(Tick())
+    assert lab.holder == "gateway:Ada"
+    lab.says("gateway:Ada", ControlRequest.RELEASE_CTRL)
+    lab.take_control("gateway:Ada")
+    lab.later(real_s=1000.0)
+    lab.step(Tick())
+    assert lab.holder == "gateway:Ada", "it asked for no lease this time"
+
+
+def test_only_the_holder_has_a_lease() -> None:
+    lab = leased(Lab(SchedulerSettings()))
+    assert lab.says("gateway:Max", LEASE_REQUEST, 1.0) is ControlResponse.NOT_IN_CONTROL
+    lab.later(real_s=19.0)
+    lab.step(Tick())
+    assert lab.holder == "gateway:Ada"
+
+
+def test_a_lease_outlives_the_scheduler_and_begins_anew() -> None:
+    lab = killed(leased(Lab(SchedulerSettings(restart_grace_s=1000.0))), SchedulerSettings(restart_grace_s=1000.0))
+    lab.later(real_s=19.0)
+    lab.step(Tick())
+    assert lab.holder == "gateway:Ada"
+    lab.later(real_s=21.0)
+    lab.step(Tick())
+    lab.step(Tick())
+    assert lab.holder is None

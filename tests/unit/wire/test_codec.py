@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from afspm import wire
 from afspm.errors import InvalidValue, WireError
 from afspm.model import (
+    LEASE_REQUEST,
     ControlRequest,
     ControlResponse,
     Feedback,
@@ -302,3 +303,14 @@ def test_a_spectrum_that_came_variable_after_variable_is_put_in_order(shape: tup
     right = Spectrum((1e-9, 2e-9), "IV", names, ("V",) * variables, values, 1_700_000_000_000_000_001, "a.dat")
     scrambled = wire.encode(replace(right, values=values.T.copy().reshape(shape)))[1]
     assert wire.by_point(scrambled) == wire.encode(right)[1]
+
+
+@pytest.mark.parametrize("lease_s", [1e-9, 0.5, 20.0, 86_400.0])
+def test_a_lease_is_told_in_seconds(lease_s: float) -> None:
+    assert wire.decode_request(wire.encode_request(Request(LEASE_REQUEST, lease_s, id="1"))).subject == lease_s
+
+
+@pytest.mark.parametrize("lease_s", [0.0, -1.0, 86_400.5])
+def test_a_lease_without_an_end_is_refused(lease_s: float) -> None:
+    with pytest.raises(WireError, match="a lease of"):
+        wire.decode_request(wire.encode_request(Request(LEASE_REQUEST, lease_s, id="1")))

@@ -14,8 +14,8 @@ from urllib.request import Request, urlopen
 
 import pytest
 
-from afspm.dashboard.server import PageServer, listening, url_of
 from afspm.errors import ConfigError
+from afspm.web.server import WebServer, listening, url_of
 
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "watch-and-steer.md"
 
@@ -44,7 +44,7 @@ async def hello(scope: Any, receive: Any, send: Any) -> None:
 
 def test_whoever_trusts_the_certificate_comes_in_encrypted(certificate: Path) -> None:
     bound = listening("127.0.0.1", 0)
-    server = PageServer(hello, bound, certificate, certificate.with_suffix(".key"))
+    server = WebServer(hello, bound, certificate, certificate.with_suffix(".key"))
     url = url_of("127.0.0.1", bound.getsockname()[1], encrypted=True)
     server.start()
     try:
@@ -66,7 +66,7 @@ def test_a_forged_header_is_not_the_address_of_whoever_asks() -> None:
         await hello({**scope, "scheme": scope.get("client", ("",))[0]}, receive, send)
 
     bound = listening("127.0.0.1", 0)
-    server = PageServer(origin, bound, None, None)
+    server = WebServer(origin, bound, None, None)
     server.start()
     try:
         forged = Request(
@@ -83,7 +83,7 @@ def test_what_is_no_certificate_is_refused(certificate: Path) -> None:
     with listening("127.0.0.1", 0) as bound:
         for wrong in (certificate.with_name("none.crt"), PAGE):
             with pytest.raises(ConfigError, match="certificate and certificate_key can't be used"):
-                PageServer(hello, bound, wrong, certificate.with_suffix(".key"))
+                WebServer(hello, bound, wrong, certificate.with_suffix(".key"))
 
 
 def test_a_port_that_is_taken_is_told_unless_any_will_do() -> None:

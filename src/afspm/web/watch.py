@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from afspm.clock import Clock
-from afspm.dashboard.frames import FrameStore
 from afspm.drawing.levelling import Array
 from afspm.model import ProblemNames, Scan, ScanLines, ScopeState, Spectrum
 from afspm.record.overview import Overview
+from afspm.web.frames import FrameStore
 
 MOST_SPECTRA, SPECTRA_BYTES = 200, 64 << 20
 

@@ -1,4 +1,4 @@
-"""Serves the page, in a thread of its own."""
+"""Serves an ASGI application, in a thread of its own."""
 
 from __future__ import annotations
 
@@ -14,17 +14,20 @@ from typing import TYPE_CHECKING
 from afspm.errors import ConfigError
 
 if TYPE_CHECKING:
-    from afspm.dashboard.sign_in import AsgiApp
+    from afspm.web.asgi import AsgiApp
 
 USUAL_PORT = 8080
-_STARTED_S, _STOPPED_S = 20.0, 3.0
+_STOPPED_S = 3.0
 
 
-def listening(host: str, port: int | None, wanted: Iterable[int] = (USUAL_PORT,)) -> socket.socket:
+def listening(
+    host: str, port: int | None, wanted: Iterable[int] = (USUAL_PORT,), *, what: str = "dashboard"
+) -> socket.socket:
     """Return a socket that listens at `host`.
 
     Args:
         port: None: the first of `wanted` that is free, or any.
+        what: listens, for the error.
 
     Raises:
         ConfigError: no such address, or the port is taken.
@@ -35,8 +38,8 @@ def listening(host: str, port: int | None, wanted: Iterable[int] = (USUAL_PORT,)
         except OSError as error:
             failed = error
     raise ConfigError(
-        f"the dashboard can't listen at {host}, port {port}: {failed.strerror or failed}",
-        where="dashboard",
+        f"the {what} can't listen at {host}, port {port}: {failed.strerror or failed}",
+        where=what,
         hint="is another one running there? choose another with port, or leave it away",
     ) from failed
 
@@ -65,17 +68,26 @@ def url_of(host: str, port: int, *, encrypted: bool) -> str:
     return f"{'https' if encrypted else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"
 
 
-class PageServer:
+class WebServer:
     """Serves an ASGI application until it is stopped.
 
     Args:
         certificate, key: PEM files, for https; None: http.
+        most_connections: at a time; those beyond hear 503. None: any number.
 
     Raises:
         ConfigError: the files are no certificate and its key.
     """
 
-    def __init__(self, app: AsgiApp, bound: socket.socket, certificate: Path | None, key: Path | None) -> None:
+    def __init__(
+        self,
+        app: AsgiApp,
+        bound: socket.socket,
+        certificate: Path | None,
+        key: Path | None,
+        *,
+        most_connections: int | None = None,
+    ) -> None:
         import uvicorn
 
         logging.getLogger("uvicorn").setLevel(logging.WARNING)
@@ -86,6 +98,7 @@ class PageServer:
             lifespan="on",
             proxy_headers=False,  # what a request says of its origin is anybody's word, and passwords are tried by it
             timeout_graceful_shutdown=1,
+            limit_concurrency=most_connections,
             ssl_certfile=certificate,
             ssl_keyfile=key,
         )
@@ -93,11 +106,11 @@ class PageServer:
             config.load()
         except (OSError, ValueError) as error:
             raise ConfigError(
-                f"certificate and certificate_key can't be used: {error}", where="dashboard", hint="two PEM files"
+                f"certificate and certificate_key can't be used: {error}", hint="two PEM files"
             ) from error
         self._socket = bound
         self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(target=self._run, name="page", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="web", daemon=True)
 
     def start(self) -> None:
         """Begin to serve; requests that came before are answered then."""
@@ -114,4 +127,4 @@ class PageServer:
         try:
             self._server.run(sockets=[self._socket])
         except SystemExit:  # that is how it tells that it couldn't start
-            logging.getLogger("afspm.dashboard").error("the page can't be served")
+            logging.getLogger("afspm.web").error("nothing can be served")

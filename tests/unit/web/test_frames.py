@@ -3,10 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from afspm.dashboard.frames import MEMORY_BYTES, MOST_CHANNELS, FrameStore
 from afspm.dashboard.pictures import Look, PictureCache
 from afspm.drawing.levelling import Levelling
 from afspm.model import Region, Scan, ScanLines
+from afspm.web.frames import MEMORY_BYTES, MOST_CHANNELS, FrameStore
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))
 SHAPE = (8, 6)

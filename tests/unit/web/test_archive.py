@@ -8,9 +8,7 @@ import pytest
 
 from afspm import wire
 from afspm.clock import ExperimentClock
-from afspm.dashboard.archive import Archive
 from afspm.dashboard.content import trouble
-from afspm.dashboard.watch import Watch
 from afspm.model import (
     ControlMode,
     ControlState,
@@ -32,6 +30,8 @@ from afspm.model import (
 from afspm.record.journal import SCHEDULER
 from afspm.record.run_json import REPLAY_OF
 from afspm.record.store import RecordSettings, RecordStore
+from afspm.web.archive import Archive
+from afspm.web.watch import Watch
 
 S = 1_000_000_000
 

@@ -9,7 +9,6 @@ from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
-from afspm.dashboard.frames import ChannelFrame, FrameKey
 from afspm.errors import AfspmError
 from afspm.model import ProblemNames, Region, Scan
 from afspm.record.journal import JOURNAL_FILE
@@ -17,6 +16,7 @@ from afspm.record.overview import Overview
 from afspm.record.run import open_run
 from afspm.record.run_json import EXPERIMENT_FILE
 from afspm.units import si
+from afspm.web.frames import ChannelFrame, FrameKey
 
 KEPT = 6
 PAST = (
