@@ -412,7 +412,7 @@ def test_a_lease_that_its_holder_asked_for_runs_out_in_the_middle_of_a_scan_whic
     lab.later(real_s=19.8)
     lab.step(Tick())
     assert lab.holder == "gateway:Ada"
-    lab.later(real_s=0.1)
+    lab.later(real_s=0.2)
     lab.step(Tick())
     assert lab.holder is None
     assert lab.forwarded[-1].request.subject == "stop-scan"
