@@ -7,7 +7,7 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 SETUP := .venv/.made
 
-.PHONY: demo demo-drift test mutants test-samples test-ui test-translators test-windows check bench bench-drift soak chaos simulate power-cut docs clean
+.PHONY: demo demo-drift test mutants test-samples test-ui test-translators test-windows test-nexus check bench bench-drift soak chaos simulate power-cut docs clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -73,6 +73,10 @@ TESTS ?= $(wildcard tests/unit/*/ tests/unit/*.py) $(addprefix tests/system/,pro
 test-windows: $(TEST)
 	@$(PYTHON) tools/windows/python.py
 	@printf '%s\n' $(TESTS) | grep -v __ | xargs -P 2 -n 1 $(PYTHON) tools/windows/python.py -m pytest -q -p no:cacheprovider
+
+## the files of runs, with the validator of NeXus
+test-nexus: $(TEST)
+	@$(PYTHON) tools/validate_nexus.py
 
 ## style, types, and who may import whom
 check: $(SETUP)

@@ -34,6 +34,9 @@ def run(
             metavar="RUN",
         ),
     ] = None,
+    ask: Annotated[
+        bool, opt("Ask for sample, person and project first, for the files of the run ([metadata]).", "--ask")
+    ] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check, say what would be started, and start nothing.")
     ] = False,
@@ -52,7 +55,9 @@ def run(
     """
     import logging
     import sys
+    from dataclasses import replace
 
+    from afspm.cli import metadata_questions
     from afspm.cli.dashboard import resumed_with_dashboard, with_dashboard
     from afspm.cli.experiment_file import require_no_errors
     from afspm.experiment import load
@@ -68,7 +73,7 @@ def run(
         log_level=logging.DEBUG if verbose else logging.INFO,
     )
     if resume is not None:
-        if files or only or without or speed or dry_run:
+        if files or only or without or speed or dry_run or ask:
             said = "a run is resumed as it was begun: give nothing else, but --dashboard"
             raise typer.BadParameter(said, param_hint="--resume")
         found = resuming.find(resume)
@@ -87,6 +92,8 @@ def run(
         for start in running.dry_run(experiment, options):
             typer.echo(_told(start))
         return
+    if ask:
+        options = replace(options, metadata=metadata_questions.ask(experiment))
     ended = running.run(experiment, options, terminal=sys.stdout)
     _stay(experiment, ended, stay)
     raise typer.Exit(ended.outcome.exit_code)

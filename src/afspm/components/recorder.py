@@ -12,7 +12,7 @@ from afspm.exit_codes import ExitCode
 from afspm.model import Frame
 from afspm.model.snapshot import Plain
 from afspm.process.priority import step_back
-from afspm.record.run_json import EXPERIMENT_FILE, experiment_name
+from afspm.record.run_json import EXPERIMENT_FILE, METADATA, experiment_name, run_json_or_empty
 from afspm.storage.packet_log import log_folder
 from afspm.storage.segment import segments
 from afspm.transport.port import Killed, PacketReceived, ParentGone
@@ -112,6 +112,7 @@ def _about(context: ProcessContext, run_dir: Path, *, scans: bool) -> RecordSett
         "simulated": launch.simulated,
         "seeds": _seeds(run_dir / EXPERIMENT_FILE),
         "frame": frame.value,
+        METADATA: run_json_or_empty(run_dir).get(METADATA, {}),
     }
     return RecordSettings(facts, context.problems, frame, measured=scans)
 

@@ -16,7 +16,9 @@ from afspm.experiment.toml_lines import Path, Settings, Table
 from afspm.experiment.toml_writer import value as toml
 from afspm.experiment.wiring_classes import WIRE_KEYS
 
-SECTIONS: Final = ("clock", "control", "limits", "problems", "cache", "security", "restart", "record", "notify")
+SECTIONS: Final = (
+    "clock", "control", "limits", "problems", "cache", "security", "restart", "record", "metadata", "notify",
+)  # fmt: skip
 
 # Keys of a component's table that are for us; everything else is a setting of its class or command.
 OWN_KEYS: Final = frozenset(

@@ -11,6 +11,7 @@ import pydantic
 from pydantic import Field
 
 from afspm.experiment.document import Document
+from afspm.experiment.run_metadata import Orcid
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.validation_messages import report
 from afspm.units import Duration
@@ -105,6 +106,21 @@ class RecordSection(Section):
     """Scans and spectra, too, each as a file."""
 
 
+class MetadataSection(Section):
+    """[metadata]: what is written into every file of the run; None: not known."""
+
+    technique: Literal["STM", "STS", "AFM"] | None = None
+    """STM, STS or AFM; of a microscope that is always the same, its class knows it."""
+    sample: str | None = None
+    person: str | None = None
+    orcid: Orcid | None = None
+    project: str | None = None
+    microscope: str | None = None
+    """The model, such as "Cypher S"."""
+    vendor: str | None = None
+    """Of the microscope; if it is not given, that of the controller."""
+
+
 class NotifySection(Section):
     """[notify]: who is told, outside of the experiment, of what."""
 
@@ -125,6 +141,7 @@ class ExperimentSections(Section):
     security: SecuritySection = SecuritySection()
     restart: RestartSection = RestartSection()
     record: RecordSection = RecordSection()
+    metadata: MetadataSection = MetadataSection()
     notify: NotifySection = NotifySection()
 
 

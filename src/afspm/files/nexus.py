@@ -15,6 +15,8 @@ from afspm.files.content import FileContent
 from afspm.model import Frame, Region, Scan, Spectrum
 
 DEFINITION = "NXspm"
+BIAS_SPECTRUM = "NXsts"
+"""The definition that a spectrum over the bias of a tunnelling microscope follows."""
 ABOUT = "afspm"
 """The group with what NeXus has no name for."""
 VENDOR = "vendor"
@@ -55,7 +57,7 @@ def vendor_header(file: Any) -> dict[str, Any]:
 
 def _is_ours(file: Any) -> bool:
     entry = file.get("entry")
-    return entry is not None and ABOUT in entry and hdf5.text(entry["definition"][()]) == DEFINITION
+    return entry is not None and ABOUT in entry and hdf5.text(entry["definition"][()]) in (DEFINITION, BIAS_SPECTRUM)
 
 
 def _scans(file: Any, about: dict[str, Any]) -> list[Scan]:

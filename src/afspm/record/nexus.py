@@ -1,21 +1,20 @@
-"""Scans and spectra as HDF5 files that follow NeXus' NXspm where that fits, and lose nothing.
+"""Scans and spectra as HDF5 files that follow NeXus' NXspm (spectra over the bias: NXsts), and lose nothing.
 
-    /entry                  NXentry, definition "NXspm"; start_time, end_time, title
+    /entry                  NXentry, definition "NXspm" or "NXsts"; technique, start_time, end_time, title
       data                  NXdata: a field for each channel over y and x (unrotated, in m), with units
-      experiment_instrument NXinstrument: scan_environment/scan_control/scan_region has centre, range and angle
-      sample                NXsample
+      experiment_instrument NXinstrument: hardware, software, where and in how many points was measured
+      sample, user          NXsample, NXuser
       afspm                 NXcollection: `about`, all that is known as JSON; who was in control, problems, drift …
       vendor                NXcollection: `header` of the controller's own file as JSON, where that could be read
 
-What NXspm requires and nobody here knows (technique, temperatures, amplifiers) is left out rather than made up.
+What afspm does not know (temperatures, amplifiers; the technique of some microscopes) is left out, not made up.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -26,12 +25,14 @@ from numpy.typing import NDArray
 
 from afspm.clock import iso_utc
 from afspm.files import hdf5
-from afspm.files.nexus import ABOUT, DEFINITION, VENDOR, about_of
+from afspm.files.nexus import ABOUT, BIAS_SPECTRUM, DEFINITION, VENDOR, about_of
 from afspm.model import Scan, Spectrum
+from afspm.record import nxspm
+from afspm.record.nxspm import group, values
 
 Array = NDArray[np.float64]
 
-_SHOWN = ("in_control", "mode", "interrupted", "number", "run")
+_SHOWN = ("in_control", "mode", "interrupted", "number", "run", "frame")
 """Facts that are attributes, too, for whoever looks into a file with a viewer."""
 
 
@@ -68,18 +69,18 @@ def encode_scan(scans: Sequence[Scan], circumstances: FileProvenance) -> bytes:
     (left, low), (width, height), (rows, columns) = region.top_left_m, region.size_m, first.shape
     x, y = np.linspace(left, left + width, columns), np.linspace(low, low + height, rows)
 
-    def fill(entry: Any) -> None:
-        data = _group(entry, "data", "NXdata")
+    def fill(entry: Any, instrument: Any) -> None:
+        data = group(entry, "data", "NXdata")
         data.attrs.update(signal=fields[0], axes=["y", "x"], x_indices=1, y_indices=0)
         if fields[1:]:
             data.attrs["auxiliary_signals"] = fields[1:]
         for name, axis in (("x", x), ("y", y)):
-            _values(data, name, axis, "m", f"{name} before the frame was turned")
+            values(data, name, axis, "m", f"{name} before the frame was turned")
         for scan, name in zip(scans, fields, strict=True):
-            _values(data, name, scan.values, scan.unit, scan.channel)
-        _scan_region(entry, first)
+            values(data, name, scan.values, scan.unit, scan.channel)
+        nxspm.write_frame(instrument, first)
 
-    return _encoded(about, circumstances, fill)
+    return _encoded(DEFINITION, about, circumstances, fill)
 
 
 def encode_spectrum(spectrum: Spectrum, circumstances: FileProvenance) -> bytes:
@@ -96,22 +97,23 @@ def encode_spectrum(spectrum: Spectrum, circumstances: FileProvenance) -> bytes:
         ],
     }
 
-    def fill(entry: Any) -> None:
-        data = _group(entry, "data", "NXdata")
+    definition = nxspm.definition_of(spectrum, circumstances.facts.get("metadata") or {})
+
+    def fill(entry: Any, instrument: Any) -> None:
+        data = group(entry, "data", "NXdata")
         if fields[1:]:
             data.attrs.update({"signal": fields[1], "axes": [fields[0]], f"{fields[0]}_indices": 0})
         if fields[2:]:
             data.attrs["auxiliary_signals"] = fields[2:]
         for number, name in enumerate(fields):
             column = np.ascontiguousarray(spectrum.values[:, number])
-            _values(data, name, column, spectrum.units[number], spectrum.names[number])
-        instrument = _group(entry, "experiment_instrument", "NXinstrument")
-        if spectrum.position_m is not None:
-            probe = _group(instrument, "piezo_sensor", "NXsensor")
-            for axis, value in zip("xy", spectrum.position_m, strict=True):
-                _values(probe, axis, value, "m")
+            values(data, name, column, spectrum.units[number], spectrum.names[number])
+        if definition == BIAS_SPECTRUM:
+            nxspm.write_bias_sweep(entry, instrument, spectrum)
+        else:
+            nxspm.write_point(instrument, spectrum)
 
-    return _encoded(about, circumstances, fill)
+    return _encoded(definition, about, circumstances, fill)
 
 
 def facts_of(path: Path) -> dict[str, Any]:
@@ -120,30 +122,25 @@ def facts_of(path: Path) -> dict[str, Any]:
         return about_of(file)
 
 
-def _encoded(about: dict[str, Any], circumstances: FileProvenance, fill: Any) -> bytes:
+def _encoded(
+    definition: str, about: dict[str, Any], circumstances: FileProvenance, fill: Callable[[Any, Any], None]
+) -> bytes:
     """Made in memory: whatever is wrong with the disk is then found in one place, where the bytes are written."""
     import h5py
 
     with h5py.File("aside", "w", driver="core", backing_store=False) as file:
         file.attrs.update(NX_class="NXroot", default="entry", creator="afspm", creator_version=afspm_version())
-        entry = _group(file, "entry", "NXentry")
+        entry = group(file, "entry", "NXentry")
         entry.attrs["default"] = "data"
-        entry["definition"] = DEFINITION
-        entry["title"] = str(about.get("experiment", ""))
         entry["end_time"] = iso_utc(circumstances.time_ns)
         if circumstances.began_ns is not None:
             entry["start_time"] = iso_utc(circumstances.began_ns)
-        if about.get("simulated"):
-            entry["experiment_description"] = "SIMULATED"
-        program = entry.create_dataset("program_name", data="afspm")
-        program.attrs["version"] = afspm_version()
-        _group(entry, "sample", "NXsample")["name"] = str(about.get("sample", ""))
-        fill(entry)
-        collection = _group(entry, ABOUT, "NXcollection")
+        fill(entry, nxspm.describe(entry, definition, about, afspm_version()))
+        collection = group(entry, ABOUT, "NXcollection")
         collection["about"] = json.dumps(about)
         collection.attrs.update({name: about[name] for name in _SHOWN if about.get(name) is not None})
         if circumstances.header:
-            vendor = _group(entry, VENDOR, "NXcollection")
+            vendor = group(entry, VENDOR, "NXcollection")
             vendor["header"] = json.dumps(dict(circumstances.header), default=_plain)
         file.flush()
         image: bytes = file.id.get_file_image()
@@ -158,30 +155,6 @@ def _about(content: str, filename: str, circumstances: FileProvenance) -> dict[s
         "time_ns": circumstances.time_ns,
         "began_ns": circumstances.began_ns,
     }
-
-
-def _scan_region(entry: Any, scan: Scan) -> None:
-    instrument = _group(entry, "experiment_instrument", "NXinstrument")
-    environment = _group(instrument, "scan_environment", "NXenvironment")
-    region = _group(_group(environment, "scan_control", "NXspm_scan_control"), "scan_region", "NXspm_scan_region")
-    region.attrs["frame"] = scan.region.frame.value
-    for axis, center, size in zip("xy", scan.region.center_m, scan.region.size_m, strict=True):
-        _values(region, f"scan_offset_value_{axis}", center, "m")
-        _values(region, f"scan_range_{axis}", size, "m")
-    _values(region, "scan_angle_x", math.degrees(scan.region.angle_rad), "deg")
-
-
-def _group(parent: Any, name: str, nexus_class: str) -> Any:
-    group = parent.create_group(name)
-    group.attrs["NX_class"] = nexus_class
-    return group
-
-
-def _values(group: Any, name: str, values: Array | float, unit: str, long_name: str = "") -> None:
-    dataset = group.create_dataset(name, data=values, dtype="<f8")
-    dataset.attrs["units"] = unit
-    if long_name:
-        dataset.attrs["long_name"] = long_name
 
 
 def field_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:

@@ -38,7 +38,7 @@ from afspm.record.measured_tables import (
     spectrum_row,
 )
 from afspm.record.packets import packets, without_reading_files
-from afspm.record.run_json import EXPERIMENT_FILE, REPLAY_OF, latest_run, run_json_or_empty
+from afspm.record.run_json import EXPERIMENT_FILE, METADATA, REPLAY_OF, latest_run, run_json_or_empty
 from afspm.record.tables import ControlRow, NoteRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
 
 if TYPE_CHECKING:
@@ -269,6 +269,11 @@ class Run:
     def facts(self) -> dict[str, Any]:
         """run.json: clock, addresses, how it ended. Empty if it can't be read."""
         return run_json_or_empty(self.folder)
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """Sample, person, project, technique … as far as they are known: [metadata] of the experiment file."""
+        return dict(self.facts.get(METADATA) or {})
 
     @property
     def name(self) -> str:

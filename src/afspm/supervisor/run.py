@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import platform
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TextIO
@@ -15,11 +15,11 @@ from afspm.addresses import connectable
 from afspm.client.connect import GUEST, guest_facts
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
-from afspm.experiment import Experiment, ProcessStart, Role
+from afspm.experiment import Experiment, ProcessStart, Role, run_metadata
 from afspm.formatting import counted
 from afspm.launch import Launch, Sockets
 from afspm.logic.supervisor_registry import LOGGED_AS
-from afspm.record.run_json import COMPUTER, ENDED, STATE_DIR, run_json_or_empty
+from afspm.record.run_json import COMPUTER, ENDED, METADATA, STATE_DIR, run_json_or_empty
 from afspm.record.run_lock import lock_run
 from afspm.storage.disk import run_bounded
 from afspm.storage.packet_log import discard_if_recorded, expect_recorder, log_folder
@@ -51,6 +51,7 @@ class RunOptions:
         only, without: names of processes to start, or not to start, on this computer.
         speed: experiment seconds in a real second, instead of the file's; for simulated microscopes only.
         report: whether the report is written when it has ended.
+        metadata: over what the file says in [metadata].
         log_level: of `logging`; what is shown in the terminal, and what the processes write at all.
     """
 
@@ -58,6 +59,7 @@ class RunOptions:
     only: Collection[str] = ()
     without: Collection[str] = ()
     speed: float | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict)
     report: bool = True
     log_level: int = logging.INFO
 
@@ -111,8 +113,10 @@ def go(
     log = RunLog(folder / run_folder.LOG_FILE, clock, terminal=terminal, level=options.log_level, names=names)
     try:
         starts = _starts(experiment, options, common, FreePorts(), folder)
-        files = run_json_or_empty(folder).get(FILES) or list(map(str, experiment.files))  # one that is resumed has it
+        before = run_json_or_empty(folder)  # empty unless the run is resumed
+        files = before.get(FILES) or list(map(str, experiment.files))
         facts = {**run_facts(name, starts, common), **facts_to_resume(experiment, starts, options), FILES: files}
+        facts[METADATA] = before.get(METADATA) or run_metadata.of_run(experiment.resolved) | dict(options.metadata)
         run_folder.write_run(folder, facts)
         if {start.launch.name for start in starts} & set(experiment.recorders):
             expect_recorder(log_folder(folder / STATE_DIR))

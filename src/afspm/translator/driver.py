@@ -159,6 +159,10 @@ class Driver(ABC):
     max_pixels: ClassVar[int] = 4096 * 4096
     live_real_s: ClassVar[float | None] = None
     """Real seconds between the lines of a running scan where `live_lines_s` is not given; None: none are published."""
+    maker: ClassVar[str] = ""
+    """The company or project that makes the controller, for the files of a run."""
+    software: ClassVar[str] = ""
+    """The controller's program, for the files of a run."""
     simulated: ClassVar[bool] = False
     """No tip can break: the experiment's clock may go at another speed than the real one."""
     memory_is_all: ClassVar[bool] = False
@@ -219,6 +223,11 @@ class Driver(ABC):
         """
         table = ParameterTable.from_toml(cls.parameters_file)
         return table.extended(changed, where="the experiment file", translated=cls.translated)
+
+    @classmethod
+    def technique(cls, settings: Mapping[str, Any]) -> str:
+        """Return STM or AFM, where the microscope is always the same with these settings; else an empty text."""
+        return ""
 
     @classmethod
     def excused(cls, controller: str) -> Mapping[str, str]:

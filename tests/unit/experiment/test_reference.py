@@ -19,6 +19,7 @@ MODELS = [
     sections.SecuritySection,
     sections.RestartSection,
     sections.RecordSection,
+    sections.MetadataSection,
     cache_section.CacheSection,
     cache_section.CacheRuleSection,
     limits_section.ParameterLimit,

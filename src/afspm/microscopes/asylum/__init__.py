@@ -50,6 +50,8 @@ class Asylum(Driver):
 
     parameters_file = Path(__file__).with_name("parameters.toml")
     translated = (*NAMES, *POSITION, *_AT_FIRST, FEEDBACK_ON, names.ENGAGED, names.CONTROLLER)
+    maker: ClassVar[str] = "Oxford Instruments Asylum Research"
+    software: ClassVar[str] = "Asylum Research in Igor Pro"
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
 
@@ -82,6 +84,10 @@ class Asylum(Driver):
         frame_settings = FrameSettings(self._igor, lambda: self.in_force(NAMES))
         feedback = FeedbackSwitch(self._igor, lambda holds: self.wait_for(holds, reply_timeout_s))
         self.groups = (self._kept, frame_settings, self._place, feedback)
+
+    @classmethod
+    def technique(cls, settings: Mapping[str, Any]) -> str:
+        return "AFM"
 
     def connect(self) -> None:
         self.close()

@@ -62,6 +62,8 @@ class Gxsm(Driver):
 
     parameters_file = Path(__file__).with_name("parameters.toml")
     translated = (*FRAME, *POSITION, FEEDBACK_ON, names.CONTROLLER, *_AT_FIRST)
+    maker: ClassVar[str] = "Gxsm project"
+    software: ClassVar[str] = "Gxsm"
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
 

@@ -50,6 +50,8 @@ class Nanonis(Driver):
 
     parameters_file = Path(__file__).with_name("parameters.toml")
     translated = (*own.TRANSLATED, *_AT_FIRST, names.CONTROLLER)
+    maker: ClassVar[str] = "SPECS Zurich"
+    software: ClassVar[str] = "Nanonis"
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
 

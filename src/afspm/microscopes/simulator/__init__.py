@@ -101,6 +101,8 @@ class Simulator(Driver):
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
+    maker: ClassVar[str] = "afspm"
+    software: ClassVar[str] = "afspm, simulated microscope"
     max_pixels: ClassVar[int] = 2048 * 2048
     simulated: ClassVar[bool] = True
     live_real_s: ClassVar[float | None] = 0.5
@@ -182,6 +184,11 @@ class Simulator(Driver):
                 self.table.written(event.set or {}, where=f"panel[{i}].set")
             if event.action and event.action not in self.own_actions():
                 errors.add(ConfigError(f"there is no action {event.action!r}", where=f"panel[{i}].action"))
+
+    @classmethod
+    def technique(cls, settings: Mapping[str, Any]) -> str:
+        loop = _loop_of(settings)
+        return "" if loop is None else "STM" if loop.mode == "current" else "AFM"
 
     @classmethod
     def rows(cls, settings: Mapping[str, Any]) -> Rows:

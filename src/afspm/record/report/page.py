@@ -31,7 +31,7 @@ def html(
     badge = '<span class="badge">SIMULATED</span>' if story.simulated else ""
     places = [position for group in spectra for position in group.positions]
     body = [
-        f"<header><h1>{escape(story.name)}{badge}</h1>{_when(story, clock)}</header>",
+        f"<header><h1>{escape(story.name)}{badge}</h1>{_what(story)}{_when(story, clock)}</header>",
         section("", _cards(story)),
         section("Time line", f'<div class="scroll">{_timeline(story)}</div>{_zones(clock)}'),
         section("Problems and repairs", _problems(story, clock)),
@@ -60,6 +60,12 @@ def _timeline(story: RunStory) -> str:
 def _zones(clock: PageTimes) -> str:
     local = f" Small, and in the second row: {escape(clock.zone)}, the zone of the computer that wrote this report."
     return f'<p class="note">Times in UTC, as the experiment had them.{local if clock.is_local else ""}</p>'
+
+
+def _what(story: RunStory) -> str:
+    """The sample, by whom it was measured, and for what, as far as that is known."""
+    told = [text for name in ("sample", "person", "project") if (text := story.metadata.get(name))]
+    return f"<p>{escape(' · '.join(told))}</p>" if told else ""
 
 
 def _when(story: RunStory, clock: PageTimes) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from afspm.drawing.timeline import TimelineRow
@@ -51,6 +51,7 @@ class RunStory:
 
     name: str
     folder: str
+    metadata: Mapping[str, str]
     simulated: bool
     start_ns: int
     end_ns: int
@@ -117,6 +118,7 @@ def read(run: Run) -> RunStory:
     return RunStory(
         name=run.name,
         folder=run.folder.name,
+        metadata=run.metadata,
         simulated=run.simulated,
         start_ns=start_ns,
         end_ns=max(overview.newest_ns, start_ns),

@@ -1,0 +1,128 @@
+"""What NXspm, and NXsts of a spectrum over the bias, have beside the values: technique, instrument, sample, person."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.files.nexus import BIAS_SPECTRUM, DEFINITION
+from afspm.model import Region, Scan, Spectrum
+
+_VERSION: Final = "v2024.02"
+"""Of the NeXus definitions."""
+_TECHNIQUE, _BIAS_TECHNIQUE = "STM", "STS"
+
+
+def definition_of(spectrum: Spectrum, metadata: Mapping[str, str]) -> str:
+    """Return the definition that a spectrum follows: NXsts for one over the bias of a tunnelling microscope."""
+    is_over_bias = spectrum.units[:1] == ("V",) and len(spectrum.values) > 0
+    is_tunnelling = metadata.get("technique") in (_TECHNIQUE, _BIAS_TECHNIQUE)
+    return BIAS_SPECTRUM if is_over_bias and is_tunnelling else DEFINITION
+
+
+def describe(entry: Any, definition: str, about: Mapping[str, Any], version: str) -> Any:
+    """Write what holds for the whole file, and return the instrument. What is not known is left out."""
+    entry["definition"] = definition
+    entry["definition"].attrs["version"] = _VERSION
+    metadata: Mapping[str, str] = about.get("metadata") or {}
+    technique = _BIAS_TECHNIQUE if definition == BIAS_SPECTRUM else metadata.get("technique")
+    texts = {
+        "experiment_technique": technique,
+        "title": about.get("experiment"),
+        "collection_identifier": metadata.get("project"),
+        "identifier_experiment": about.get("run"),
+        "experiment_description": "SIMULATED" if about.get("simulated") else None,
+    }
+    _write_texts(entry, texts)
+    sample = group(entry, "sample", "NXsample")
+    sample["name"] = metadata.get("sample", "")
+    if "person" in metadata or "orcid" in metadata:
+        user = group(entry, "user", "NXuser")
+        _write_texts(user, {"name": metadata.get("person"), "ORCID": metadata.get("orcid")})
+    instrument = group(entry, "experiment_instrument", "NXinstrument")
+    if vendor := metadata.get("vendor"):
+        hardware = group(instrument, "hardware", "NXfabrication")
+        _write_texts(hardware, {"vendor": vendor, "model": metadata.get("microscope")})
+        software = group(instrument, "software", "NXfabrication")
+        _write_texts(software, {"vendor": vendor, "name": metadata.get("software")})
+    program = entry.create_dataset("program_name", data="afspm")
+    program.attrs["version"] = version
+    return instrument
+
+
+def write_frame(instrument: Any, scan: Scan) -> None:
+    """Write region and pixels of a scan: start and end are those of the frame before it was turned."""
+    rows, columns = scan.shape
+    _write_pattern(instrument, scan.region.center_m, scan.region, (columns, rows))
+
+
+def write_point(instrument: Any, spectrum: Spectrum) -> None:
+    """Write where the probe was, as a scan of one point."""
+    if spectrum.position_m is not None:
+        _write_pattern(instrument, spectrum.position_m, None, (1, 1))
+
+
+def write_bias_sweep(entry: Any, instrument: Any, spectrum: Spectrum) -> None:
+    """Write the sweep of a spectrum over the bias."""
+    entry["scan_mode"] = "constant height"  # the feedback is held while the bias is swept
+    environment = group(instrument, "bias_spectroscopy_environment", "NXenvironment")
+    spectroscopy = group(environment, "bias_spectroscopy", "NXspm_bias_spectroscopy")
+    sweep = group(spectroscopy, "bias_sweep", "NXspm_scan_control")
+    sweep["scan_type"] = "linear"
+    bias = spectrum.values[:, 0]
+    first, last, count = float(bias[0]), float(bias[-1]), len(bias)
+    region = group(sweep, "scan_region", "NXspm_scan_region")
+    values(region, "scan_start_bias", first, "V")
+    values(region, "scan_end_bias", last, "V")
+    values(region, "scan_offset_bias", first, "V")
+    values(region, "scan_range_bias", abs(last - first), "V")
+    linear = group(sweep, "linear_sweep", "NXspm_scan_pattern")
+    linear["scan_points_bias"] = count
+    values(linear, "step_size_bias", (last - first) / max(1, count - 1), "V")
+    if spectrum.position_m is not None:
+        place = group(sweep, "spatial_location", "NXcoordinate_system")
+        for axis, value in zip("xy", spectrum.position_m, strict=True):
+            values(place, axis, value, "m")
+
+
+def _write_pattern(
+    instrument: Any, center_m: tuple[float, float], region: Region | None, points: tuple[int, int]
+) -> None:
+    environment = group(instrument, "scan_environment", "NXenvironment")
+    control = group(environment, "scan_control", "NXspm_scan_control")
+    area, mesh = group(control, "scan_region", "NXspm_scan_region"), group(control, "mesh_scan", "NXspm_scan_pattern")
+    size_m = (0.0, 0.0) if region is None else region.size_m
+    for axis, center, size, count in zip("xy", center_m, size_m, points, strict=True):
+        values(area, f"scan_offset_value_{axis}", center, "m")
+        values(area, f"scan_range_{axis}", size, "m")
+        values(area, f"scan_start_{axis}", center - size / 2, "m")
+        values(area, f"scan_end_{axis}", center + size / 2, "m")
+        mesh[f"scan_points_{axis}"] = count
+        if count > 1:
+            values(mesh, f"step_size_{axis}", size / (count - 1), "m")
+    values(area, "scan_angle_x", 0.0 if region is None else math.degrees(region.angle_rad), "deg")
+
+
+def group(parent: Any, name: str, nexus_class: str) -> Any:
+    """Create a group of a NeXus class."""
+    made = parent.create_group(name)
+    made.attrs["NX_class"] = nexus_class
+    return made
+
+
+def values(parent: Any, name: str, numbers: NDArray[np.float64] | float, unit: str, long_name: str = "") -> None:
+    """Create a field of float64 with its unit."""
+    dataset = parent.create_dataset(name, data=numbers, dtype="<f8")
+    dataset.attrs["units"] = unit
+    if long_name:
+        dataset.attrs["long_name"] = long_name
+
+
+def _write_texts(parent: Any, texts: Mapping[str, str | None]) -> None:
+    for name, text in texts.items():
+        if text:
+            parent[name] = str(text)

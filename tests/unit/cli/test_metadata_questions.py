@@ -1,0 +1,40 @@
+"""`afspm run --ask`: sample, person and project, asked until they are right."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+
+from afspm.cli.metadata_questions import ask
+from afspm.experiment import load
+
+FILE = """
+[metadata]
+sample = "Au(111)"
+
+[microscope]
+component = true
+class = "Simulator"
+
+[scheduler]
+component = true
+class = "Scheduler"
+"""
+
+
+def test_what_is_known_is_offered_and_what_is_wrong_asked_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "e.toml"
+    file.write_text(FILE, encoding="utf-8")
+    answers = ["", "A. Student", "0000-0002-1825-0098", "0000-0002-1825-0097", "", ""]
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n".join(answers) + "\n"))
+    assert ask(load(file)) == {
+        "sample": "Au(111)",
+        "person": "A. Student",
+        "orcid": "https://orcid.org/0000-0002-1825-0097",
+        "technique": "AFM",
+    }
+    assert "its last digit does not match the others" in capsys.readouterr().out

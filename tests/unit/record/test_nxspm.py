@@ -1,0 +1,85 @@
+"""What NXspm and NXsts require is in the files of a record; `make test-nexus` asks NeXus' own validator."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+import pytest
+
+from afspm.model import Region, Scan, Spectrum
+from afspm.record.nexus import FileProvenance, encode_scan, encode_spectrum
+
+h5py = pytest.importorskip("h5py")
+METADATA = {
+    "technique": "STM", "vendor": "SPECS Zurich", "software": "Nanonis", "microscope": "Tyto", "sample": "Au(111)",
+    "person": "A. Student", "orcid": "https://orcid.org/0000-0002-1825-0097", "project": "steps",
+}  # fmt: skip
+KNOWN = FileProvenance(1_773_518_400_000_000_000, None, {"run": "night-1", "metadata": METADATA})
+CONTROL = "experiment_instrument/scan_environment/scan_control"
+SCAN = Scan(Region((1e-6, -2e-6), (1e-6, 0.5e-6), 0.25), "Height", "m", np.zeros((6, 8)), 0, "")
+BIAS = np.linspace(-1.0, 2.0, 31)
+SPECTRUM = Spectrum((1e-6, 2e-6), "IV", ("Bias", "Current"), ("V", "A"), np.column_stack((BIAS, BIAS**3)), 0, "")
+
+
+def opened(image: bytes) -> Any:
+    return h5py.File(BytesIO(image), "r")["entry"]
+
+
+def said(entry: Any, *paths: str) -> list[Any]:
+    values = [entry[path][()] for path in paths]
+    return [value.decode() if isinstance(value, bytes) else value for value in values]
+
+
+def test_a_scan_has_what_nxspm_requires() -> None:
+    entry = opened(encode_scan([SCAN], KNOWN))
+    assert said(entry, "definition", "experiment_technique") == ["NXspm", "STM"]
+    assert entry["definition"].attrs["version"]
+    instrument = entry["experiment_instrument"]
+    assert said(instrument, "hardware/vendor", "hardware/model", "software/vendor", "software/name") == [
+        "SPECS Zurich", "Tyto", "SPECS Zurich", "Nanonis",
+    ]  # fmt: skip
+    region, mesh = entry[CONTROL]["scan_region"], entry[CONTROL]["mesh_scan"]
+    assert said(region, "scan_start_x", "scan_end_x") == pytest.approx([0.5e-6, 1.5e-6])
+    assert said(region, "scan_start_y", "scan_end_y") == pytest.approx([-2.25e-6, -1.75e-6])
+    assert said(mesh, "scan_points_x", "scan_points_y") == [8, 6]
+    assert said(mesh, "step_size_x", "step_size_y") == pytest.approx([1e-6 / 7, 0.5e-6 / 5])
+    assert set(region.attrs) == {"NX_class"}
+
+
+def test_a_file_says_of_what_it_is_and_who_measured_it() -> None:
+    entry = opened(encode_scan([SCAN], KNOWN))
+    assert said(entry, "sample/name", "user/name", "user/ORCID", "collection_identifier") == [
+        "Au(111)", "A. Student", "https://orcid.org/0000-0002-1825-0097", "steps",
+    ]  # fmt: skip
+
+
+def test_what_is_not_known_is_left_out() -> None:
+    entry = opened(encode_scan([SCAN], replace(KNOWN, facts={})))
+    assert {"experiment_technique", "user", "collection_identifier"} & set(entry) == set()
+    assert {"hardware", "software"} & set(entry["experiment_instrument"]) == set()
+
+
+def test_a_spectrum_over_the_bias_of_a_tunnelling_microscope_follows_nxsts() -> None:
+    entry = opened(encode_spectrum(SPECTRUM, KNOWN))
+    assert said(entry, "definition", "experiment_technique", "scan_mode") == ["NXsts", "STS", "constant height"]
+    sweep = entry["experiment_instrument/bias_spectroscopy_environment/bias_spectroscopy/bias_sweep"]
+    region = sweep["scan_region"]
+    assert said(region, "scan_start_bias", "scan_end_bias", "scan_offset_bias") == [-1.0, 2.0, -1.0]
+    assert said(region, "scan_range_bias") == [3.0]
+    assert said(sweep, "linear_sweep/scan_points_bias", "linear_sweep/step_size_bias") == [31, pytest.approx(0.1)]
+    assert said(sweep, "spatial_location/x", "spatial_location/y") == [1e-6, 2e-6]
+
+
+@pytest.mark.parametrize(
+    ("spectrum", "technique"),
+    [(SPECTRUM, "AFM"), (replace(SPECTRUM, names=("Z", "Force"), units=("m", "N"), kind="force"), "STM")],
+    ids=["conductive AFM", "over z"],
+)
+def test_any_other_spectrum_is_a_scan_of_one_point(spectrum: Spectrum, technique: str) -> None:
+    about = replace(KNOWN, facts={"metadata": {**METADATA, "technique": technique}})
+    entry = opened(encode_spectrum(spectrum, about))
+    assert said(entry, "definition", "experiment_technique") == ["NXspm", technique]
+    assert said(entry[CONTROL], "scan_region/scan_start_x", "mesh_scan/scan_points_x") == [1e-6, 1]
