@@ -1,0 +1,34 @@
+import { parentPort, workerData } from "node:worker_threads";
+import { XPublisher } from "zeromq";
+import type { HeartbeatData } from "./heartbeat.js";
+
+const ALIVE = 0;
+const CLOSING = 1;
+const IDLE_S = 0.5; // the event loop turns more often than that
+
+const { address, token, periodMs, longestStepS, turned } = workerData as HeartbeatData;
+const socket = new XPublisher({ linger: 200 });
+let sending: Promise<void> = Promise.resolve();
+
+function beat(kind: number): void {
+  const busyS = Number(process.hrtime.bigint() - Atomics.load(turned, 0)) / 1e9;
+  const frames = [Buffer.of(kind), (busyS > IDLE_S ? busyS : 0).toFixed(3), longestStepS.toFixed(3), token];
+  sending = sending.then(() => socket.send(frames));
+}
+
+/** The first beat goes out as soon as the supervisor listens: one sent before would be lost. */
+async function beatAtOnce(): Promise<void> {
+  for await (const [subscription] of socket) if (subscription?.[0] === 1) beat(ALIVE);
+}
+
+socket.connect(address);
+void beatAtOnce();
+const timer = setInterval(() => beat(ALIVE), periodMs);
+parentPort?.once("message", () => {
+  clearInterval(timer);
+  beat(CLOSING);
+  void sending.then(() => {
+    socket.close();
+    parentPort?.close();
+  });
+});

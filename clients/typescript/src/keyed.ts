@@ -1,0 +1,103 @@
+/** Keyed measurements happen once: the intent is on disk before the request, the result after it. */
+
+import { closeSync, fsyncSync, mkdirSync, openSync, readFileSync, renameSync, rmSync, writeSync } from "node:fs";
+import { dirname, join } from "node:path";
+import { createHash } from "node:crypto";
+import { InvalidValue } from "./errors.js";
+
+/** What was asked for and not finished yet. */
+export interface Intent {
+  readonly key: string;
+  readonly facts: string;
+  readonly attempt: number;
+  /** What was published until then is older. */
+  readonly sinceNs: string;
+  readonly interruptions: readonly string[];
+}
+
+/** What is kept of a measurement: its messages, and what interrupted it. */
+export interface Kept {
+  readonly messages: readonly Uint8Array[];
+  readonly interruptions: readonly string[];
+}
+
+interface Head {
+  readonly key: string;
+  readonly facts: string;
+  readonly interruptions: readonly string[];
+  readonly sizes: readonly number[];
+}
+
+export class KeyedResults {
+  private readonly folder: string | undefined;
+  private intent: Intent | undefined;
+
+  /** @param stateDir of the run; empty: nothing is kept over a restart. */
+  constructor(stateDir: string, name: string) {
+    this.folder = stateDir ? join(stateDir, `${name}.keyed`) : undefined;
+    const text = this.folder && readOrNothing(join(this.folder, "pending.json"));
+    this.intent = text ? (JSON.parse(text.toString()) as Intent) : undefined;
+  }
+
+  /** The intent that was written down and not fulfilled. */
+  get pending(): Intent | undefined {
+    return this.intent;
+  }
+
+  intend(intent: Intent): void {
+    this.intent = intent;
+    if (this.folder) write(join(this.folder, "pending.json"), [Buffer.from(JSON.stringify(intent))]);
+  }
+
+  /** Return what an earlier life, or an earlier call, measured. Throws InvalidValue: the key was used for another. */
+  find(key: string, facts: string): Kept | undefined {
+    const bytes = this.folder && readOrNothing(this.path(key));
+    if (!bytes) return undefined;
+    const end = bytes.indexOf("\n");
+    const head = JSON.parse(bytes.toString("utf8", 0, end)) as Head;
+    if (head.key !== key || head.facts !== facts) throw new InvalidValue(`the key ${key} was used for another measurement: ${head.facts}`);
+    let at = end + 1;
+    return { interruptions: head.interruptions, messages: head.sizes.map((size) => bytes.subarray(at, (at += size))) };
+  }
+
+  fulfil(key: string, facts: string, { messages, interruptions }: Kept): void {
+    if (!this.folder) return;
+    const head: Head = { key, facts, interruptions, sizes: messages.map((message) => message.length) };
+    write(this.path(key), [Buffer.from(`${JSON.stringify(head)}\n`), ...messages]);
+    this.intent = undefined;
+    rmSync(join(this.folder, "pending.json"), { force: true });
+  }
+
+  private path(key: string): string {
+    return join(this.folder!, `${createHash("sha256").update(key).digest("hex").slice(0, 24)}.result`);
+  }
+}
+
+/** Throws InvalidValue: the key can't be part of a request's id. */
+export function checkKey(key: string): void {
+  if (!/^[\x20-\x2e\x30-\x7e\u00a0-\uffff]+$/.test(key) || Buffer.byteLength(key) > 100) {
+    throw new InvalidValue(`${JSON.stringify(key)} can't be a key: 1 to 100 printable characters without '/'`);
+  }
+}
+
+function readOrNothing(path: string): Buffer | undefined {
+  try {
+    return readFileSync(path);
+  } catch (error) {
+    if ((error as NodeJS.ErrnoException).code === "ENOENT") return undefined;
+    throw error;
+  }
+}
+
+/** Write a file as a whole, or not at all, and see it on the disk. */
+function write(path: string, parts: readonly Uint8Array[]): void {
+  mkdirSync(dirname(path), { recursive: true });
+  const file = openSync(`${path}.new`, "w");
+  try {
+    for (const part of parts) for (let at = 0; at < part.length; ) at += writeSync(file, part, at);
+    fsyncSync(file);
+  } finally {
+    closeSync(file);
+  }
+  renameSync(`${path}.new`, path);
+}
