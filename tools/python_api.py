@@ -14,7 +14,7 @@ from itertools import pairwise, zip_longest
 from typing import Any
 
 GROUPS = {
-    "Join, open, read": ["afspm.connect", "afspm.open_run", "afspm.read"],
+    "Join, open, read": ["afspm.connect", "afspm.open_run", "afspm.find_runs", "afspm.read"],
     "Write a component": ["afspm.Component", "afspm.process.memory.Memory"],
     "Use the microscope": ["afspm.Scope", "afspm.client.events.Events", "afspm.client.events.PublishedEvent"],
     "What is asked for and measured": [

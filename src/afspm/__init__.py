@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from afspm.client.scope import Scope
     from afspm.files import read
     from afspm.model import ControlMode, Problem, Region, Scan, ScanSet, ScopeState, Spectrum
+    from afspm.record.catalogue import find_runs
     from afspm.record.run import open_run
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "ScopeState",
     "Spectrum",
     "connect",
+    "find_runs",
     "open_run",
     "read",
 ]
@@ -35,6 +37,7 @@ _HOMES = {
     "Component": "afspm.client.component",
     "Scope": "afspm.client.scope",
     "connect": "afspm.client.connect",
+    "find_runs": "afspm.record.catalogue",
     "open_run": "afspm.record.run",
     "read": "afspm.files",
 }

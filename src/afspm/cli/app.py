@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from afspm import plugins
-from afspm.cli import dashboard, demo, drift, drivers, experiment_file, new, notify, recorded, run, status, steer
+from afspm.cli import dashboard, demo, drift, drivers, experiment_file, new, notify, recorded, run, runs, status, steer
 from afspm.errors import ConfigError
 
 app = typer.Typer(
@@ -57,6 +57,7 @@ app.command("end", rich_help_panel=MEANWHILE)(steer.end)
 app.command("restart", rich_help_panel=MEANWHILE)(steer.restart)
 app.command("problems", rich_help_panel=MEANWHILE)(steer.problems)
 app.command("note", rich_help_panel=MEANWHILE)(steer.note)
+app.command("runs", rich_help_panel=AFTERWARDS)(runs.runs)
 app.command("report", rich_help_panel=AFTERWARDS)(recorded.report)
 app.command("export", rich_help_panel=AFTERWARDS)(recorded.export)
 app.command("replay", rich_help_panel=AFTERWARDS)(recorded.replay)

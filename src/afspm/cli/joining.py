@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, NoReturn
 import typer
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from afspm.cli.status_text import RunDescription
     from afspm.client.follower import Follower
     from afspm.client.scope import Scope
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 NOT_RUNNING = 3
 """The exit code where nothing runs."""
 TERMINAL = "terminal"
+_UNBROKEN = 10_000  # columns: what programs and files get has a line for a line
 
 
 def person() -> str:
@@ -135,3 +138,13 @@ def _only_if_running(folder: Path) -> Iterator[None]:
         if (run_json_or_empty(folder).get("guest") or {}).get("keys"):
             said += f"; perhaps its scheduler lacks the public key of {TERMINAL}"
         say_nothing_runs(said)
+
+
+def plain_console() -> Console:
+    """Return the terminal to print tables and colours to; what programs and files get has a line for a line."""
+    from rich.console import Console
+
+    console = Console(highlight=False, markup=False)
+    if not console.is_terminal:
+        console.width = _UNBROKEN
+    return console

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from afspm.cli.arguments import RUNS, Where
-from afspm.cli.joining import can_show_blocks, describe, looking, say_nothing_runs
+from afspm.cli.joining import can_show_blocks, describe, looking, plain_console, say_nothing_runs
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 REFRESH_S = 0.25
 LOOK_S = 2.0
 """Interval of checks whether the run still goes on, where nothing is published."""
-UNBROKEN = 10_000  # columns: what programs and files get has a line for a line
 
 
 def status(
@@ -37,7 +36,7 @@ def status(
         if as_json:
             typer.echo(json.dumps(text.as_json(), indent=2, ensure_ascii=False))
         else:
-            _console().print(text.screen(log_lines=log))
+            plain_console().print(text.screen(log_lines=log))
 
 
 def watch(where: Where = RUNS) -> None:
@@ -45,7 +44,7 @@ def watch(where: Where = RUNS) -> None:
 
     Where the output is no terminal, a line is written whenever something changes. Ends with 3 if the run is cut off.
     """
-    console = _console()
+    console = plain_console()
     with looking(where, lines=True) as follower, contextlib.suppress(KeyboardInterrupt):
         if console.is_terminal and not console.is_dumb_terminal:
             _live(follower, console)
@@ -103,12 +102,3 @@ def _in_lines(follower: Follower) -> None:
             typer.echo(log_line(line).plain)
             last = line
         follower.pump(LOOK_S)
-
-
-def _console() -> Console:
-    from rich.console import Console
-
-    console = Console(highlight=False, markup=False)
-    if not console.is_terminal:
-        console.width = UNBROKEN
-    return console

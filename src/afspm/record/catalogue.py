@@ -1,0 +1,229 @@
+"""All runs under a folder, with what one looks for them by: an index beside them that can be made anew at any time."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import asdict, dataclass, fields, replace
+from datetime import UTC, date, datetime, timedelta
+from pathlib import Path
+from typing import Any, Final
+
+from afspm.clock import NS_PER_S
+from afspm.errors import FileError, InvalidValue
+from afspm.formatting import counted
+from afspm.record.run import Run, open_run
+from afspm.record.run_json import RUN_FILE
+from afspm.record.run_lock import describe_state
+
+INDEX_FILE: Final = "runs.sqlite"
+_FORMAT: Final = 1
+_WATCHED: Final = (RUN_FILE, "journal.sqlite", "journal.sqlite-wal")
+"""Files of a run by which it is seen that something has changed."""
+_WORD: Final = re.compile(r"(?:(\w+):)?(.+)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """One run.
+
+    Attributes:
+        folder: relative to the folder of all runs, with "/".
+        name: of the experiment.
+        began_ns, ended_ns: the first and last that was published, in experiment time; None: nothing was.
+        state: how it ended, in words.
+        microscope: vendor and model, as far as they are known.
+        scans: the whole ones; spectra: their number.
+        problems: the names of those that were flagged.
+        notes: the texts of all notes.
+        damage: why its record can't be read; empty: it can.
+    """
+
+    folder: str
+    name: str
+    began_ns: int | None = None
+    ended_ns: int | None = None
+    state: str = ""
+    sample: str = ""
+    person: str = ""
+    project: str = ""
+    technique: str = ""
+    microscope: str = ""
+    simulated: bool = False
+    scans: int = 0
+    spectra: int = 0
+    problems: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    damage: str = ""
+
+    @property
+    def measured(self) -> str:
+        """How many scans and spectra there are, in words."""
+        scans, spectra = counted(self.scans, "scan"), counted(self.spectra, "spectrum", "spectra")
+        return f"{scans}, {spectra}" if self.spectra else scans
+
+    def texts(self) -> dict[str, str]:
+        """Return the fields that are looked through, by name."""
+        lists = {"problem": self.problems, "note": self.notes}
+        named = ("folder", "name", "state", "sample", "person", "project", "technique", "microscope")
+        return {name: getattr(self, name) for name in named} | {name: "\n".join(all_) for name, all_ in lists.items()}
+
+
+FIELDS: Final = tuple(RunSummary("", "").texts())
+"""What a word may be looked for in, as `field:word`."""
+
+
+def find_runs(
+    root: Path, words: Sequence[str] = (), since: date | None = None, until: date | None = None
+) -> list[RunSummary]:
+    """Return the runs under a folder that have all words in them, the newest first.
+
+    Args:
+        root: searched with all folders in it; the index `runs.sqlite` is kept there, where that can be written.
+        words: each in any field, or as "sample:gold" in that field; upper and lower case are the same.
+        since, until: the first and last day (UTC) of which something was published.
+
+    Raises:
+        FileError: there is no such folder.
+        InvalidValue: a word names a field that there is not.
+    """
+    wanted = [_read_word(word) for word in words]
+    if not root.is_dir():
+        raise FileError("there is no such folder", where=str(root), hint="runs are in runs/, or where --runs said")
+    found = [run for run in _up_to_date(root) if _was_within(run, since, until) and _has(run.texts(), wanted)]
+    return sorted(found, key=lambda run: (run.began_ns or 0, run.folder), reverse=True)
+
+
+def _read_word(word: str) -> tuple[str, str]:
+    """Return field ("" for any) and text of a word."""
+    match = _WORD.fullmatch(word.strip())
+    if match is None:
+        raise InvalidValue("a word to look for is empty")
+    if match[1] and match[1] not in FIELDS:
+        raise InvalidValue(f"runs have no {match[1]!r} to look in", hint=f"there are {', '.join(FIELDS)}")
+    return match[1] or "", match[2].casefold()
+
+
+def _has(texts: Mapping[str, str], words: Sequence[tuple[str, str]]) -> bool:
+    folded = {name: text.casefold() for name, text in texts.items()}
+    return all(
+        word in folded[field] if field else any(word in text for text in folded.values()) for field, word in words
+    )
+
+
+def _was_within(run: RunSummary, since: date | None, until: date | None) -> bool:
+    if run.began_ns is None or run.ended_ns is None:
+        return since is None and until is None
+    starts_ns = None if since is None else _midnight_ns(since)
+    ends_ns = None if until is None else _midnight_ns(until + timedelta(days=1))
+    return (starts_ns is None or run.ended_ns >= starts_ns) and (ends_ns is None or run.began_ns < ends_ns)
+
+
+def _midnight_ns(day: date) -> int:
+    return int(datetime(day.year, day.month, day.day, tzinfo=UTC).timestamp()) * NS_PER_S
+
+
+# --- the index: what was read of each run, until it changes ---------------------------------------------------------
+
+
+def _up_to_date(root: Path) -> list[RunSummary]:
+    with closing(_opened(root)) as index:
+        known = {folder: (stamp, about) for folder, stamp, about in index.execute("SELECT * FROM runs")}
+        summaries: list[RunSummary] = []
+        for path in _folders(root):
+            folder, stamp = path.relative_to(root).as_posix(), _stamp(path)
+            if known.get(folder, ("", ""))[0] == stamp:
+                summaries.append(_from_json(known[folder][1]))
+            else:
+                summaries.append(replace(_summary(path), folder=folder))
+        with suppress(sqlite3.OperationalError), index:  # a disk that is full or can't be written to costs time alone
+            index.execute("DELETE FROM runs")
+            stamps = [_stamp(root / run.folder) for run in summaries]
+            rows = [(run.folder, stamp, json.dumps(asdict(run))) for run, stamp in zip(summaries, stamps, strict=True)]
+            index.executemany("INSERT INTO runs VALUES (?, ?, ?)", rows)
+    return summaries
+
+
+def _opened(root: Path) -> sqlite3.Connection:
+    """Return the index; one that is damaged, or of another version, is made anew; one that can't be is in memory."""
+    file = root / INDEX_FILE
+    for _ in range(2):
+        try:
+            return _prepared(sqlite3.connect(file))
+        except sqlite3.OperationalError:
+            break
+        except (sqlite3.DatabaseError, ValueError):
+            file.unlink(missing_ok=True)
+    return _prepared(sqlite3.connect(":memory:"))
+
+
+def _prepared(index: sqlite3.Connection) -> sqlite3.Connection:
+    try:
+        (version,) = index.execute("PRAGMA user_version").fetchone()
+        if version not in (0, _FORMAT):
+            raise ValueError("of another version")
+        index.execute("CREATE TABLE IF NOT EXISTS runs (folder TEXT PRIMARY KEY, stamp TEXT NOT NULL, about TEXT)")
+        index.execute(f"PRAGMA user_version = {_FORMAT}")
+    except BaseException:
+        index.close()
+        raise
+    return index
+
+
+def _folders(root: Path) -> Iterator[Path]:
+    """Yield the folders of runs; links are not followed, such as that to the newest."""
+    for folder, inner, files in os.walk(root):
+        if RUN_FILE in files:
+            inner.clear()
+            yield Path(folder)
+
+
+def _stamp(folder: Path) -> str:
+    """Return what changes when anything is recorded."""
+    stamps = []
+    for name in _WATCHED:
+        with suppress(OSError):
+            stat = (folder / name).stat()
+            stamps.append(f"{stat.st_mtime_ns}/{stat.st_size}")
+    return " ".join(stamps)
+
+
+def _from_json(text: str) -> RunSummary:
+    about: dict[str, Any] = json.loads(text)
+    lists = {name: tuple(about[name]) for name in ("problems", "notes")}
+    return RunSummary(**{one.name: about[one.name] for one in fields(RunSummary)} | lists)
+
+
+def _summary(folder: Path) -> RunSummary:
+    try:
+        with open_run(folder) as run:
+            return _read(run)
+    except FileError as error:
+        return RunSummary("", folder.name, damage=error.what)
+
+
+def _read(run: Run) -> RunSummary:
+    metadata, overview = run.metadata, run.overview(("ControlState",))
+    began = next(iter(overview.controls.spans), None)
+    microscope = " ".join(filter(None, (metadata.get("vendor"), metadata.get("microscope"))))
+    return RunSummary(
+        folder="",
+        name=run.name,
+        began_ns=None if began is None else began.start_ns,
+        ended_ns=run.newest_ns or None,
+        state=describe_state(run.folder),
+        sample=metadata.get("sample", ""),
+        person=metadata.get("person", ""),
+        project=metadata.get("project", ""),
+        technique=metadata.get("technique", ""),
+        microscope=microscope,
+        simulated=run.simulated,
+        scans=sum(not scan.interrupted for scan in run.scans),
+        spectra=len(run.spectra),
+        problems=tuple(sorted(overview.problems.name(number) for number in overview.problem_timelines)),
+        notes=tuple(note.text for note in run.notes),
+    )

@@ -1,0 +1,141 @@
+"""All runs under a folder: listed, searched, and read anew only where something has changed."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from datetime import date
+from pathlib import Path
+
+import pytest
+from record_lab import ABOUT, Night
+from typer.testing import CliRunner
+
+from afspm.cli.app import app
+from afspm.errors import FileError, InvalidValue
+from afspm.record import catalogue
+from afspm.record.catalogue import INDEX_FILE, find_runs
+from afspm.record.run_json import RUN_FILE
+from afspm.record.store import RecordStore
+
+METADATA = {"sample": "Au(111) on mica", "person": "A. Student", "vendor": "SPECS Zurich", "microscope": "Tyto"}
+
+
+def record(folder: Path, problems: tuple[int, ...] = (), **metadata: str) -> Path:
+    """Make a run with one scan on 2026-03-14."""
+    folder.mkdir(parents=True)
+    (folder / RUN_FILE).write_text(json.dumps({"name": folder.name, "metadata": metadata}), encoding="utf-8")
+    add_scan(folder, problems)
+    return folder
+
+
+def add_scan(folder: Path, problems: tuple[int, ...] = (), number: int = 1) -> None:
+    night, store = Night(), RecordStore(folder, ABOUT)
+    night.now_ns += number * 1_000_000_000
+    store.take([night.control("series", problems), *night.whole_scan(number)])
+    store.close()
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    record(tmp_path / "gold-1", **METADATA)
+    record(tmp_path / "spring" / "mica-1", problems=(1,), sample="mica", person="B. Student")
+    return tmp_path
+
+
+def names(root: Path, *words: str) -> list[str]:
+    return sorted(run.folder for run in find_runs(root, words))
+
+
+def test_every_run_is_there_with_what_it_was(root: Path) -> None:
+    gold, mica = sorted(find_runs(root), key=lambda run: run.folder)
+    assert (gold.folder, gold.scans, gold.sample, gold.microscope) == (
+        "gold-1",
+        1,
+        METADATA["sample"],
+        "SPECS Zurich Tyto",
+    )
+    assert (mica.folder, mica.problems) == ("spring/mica-1", ("tip-shape-changed",))
+    assert gold.began_ns is not None
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["mica"], ["gold-1", "spring/mica-1"]),
+        (["sample:AU"], ["gold-1"]),
+        (["mica", "person:b."], ["spring/mica-1"]),
+        (["problem:tip"], ["spring/mica-1"]),
+        (["silicon"], []),
+    ],
+)
+def test_words_narrow_it_down(root: Path, words: list[str], found: list[str]) -> None:
+    assert names(root, *words) == found
+
+
+def test_days_narrow_it_down(root: Path) -> None:
+    day, next_day = date(2026, 3, 14), date(2026, 3, 15)
+    assert len(find_runs(root, since=day, until=day)) == 2
+    assert find_runs(root, since=next_day) == find_runs(root, until=date(2026, 3, 13)) == []
+
+
+def test_only_what_has_changed_is_read_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    find_runs(root)
+    read: list[str] = []
+    summary = catalogue._summary
+    monkeypatch.setattr(catalogue, "_summary", lambda folder: read.append(folder.name) or summary(folder))
+    assert names(root) == ["gold-1", "spring/mica-1"]
+    assert read == []
+    add_scan(root / "gold-1", number=2)
+    assert {run.folder: run.scans for run in find_runs(root)} == {"gold-1": 2, "spring/mica-1": 1}
+    assert read == ["gold-1"]
+
+
+def test_an_index_that_is_damaged_or_of_another_version_is_made_anew(root: Path) -> None:
+    (root / INDEX_FILE).write_bytes(b"no database" * 1000)
+    assert len(find_runs(root)) == 2
+    with sqlite3.connect(root / INDEX_FILE) as index:
+        index.execute("PRAGMA user_version = 99")
+    index.close()
+    assert len(find_runs(root)) == 2
+
+
+def test_a_run_that_is_gone_is_forgotten_and_one_that_is_damaged_named(root: Path) -> None:
+    find_runs(root)
+    (root / "gold-1").rename(root.parent / "elsewhere")
+    (root / "spring" / "mica-1" / "journal.sqlite").write_bytes(b"x" * 5000)
+    (run,) = find_runs(root)
+    assert (run.folder, run.name) == ("spring/mica-1", "mica-1")
+    assert "damaged" in run.damage
+
+
+def test_where_no_index_can_be_written_all_is_found_the_same(root: Path) -> None:
+    (root / INDEX_FILE).mkdir()
+    assert len(find_runs(root)) == 2
+
+
+def test_what_makes_no_sense_is_refused(root: Path) -> None:
+    with pytest.raises(InvalidValue, match="no 'colour' to look in"):
+        find_runs(root, ["colour:red"])
+    with pytest.raises(FileError, match="no such folder"):
+        find_runs(root / "nowhere")
+
+
+def test_the_page_has_a_card_with_pictures_for_each_run(root: Path) -> None:
+    (root / "gold-1" / "report.html").write_text("", encoding="utf-8")
+    done = CliRunner().invoke(app, ["runs", "--in", str(root), "--page"])
+    assert done.exit_code == 0
+    text = (root / "index.html").read_text(encoding="utf-8")
+    assert text.count("<article>") == 2
+    assert text.count('<img src="data:image') == 2
+    assert 'href="gold-1/report.html"' in text
+    assert 'href="spring/mica-1/"' in text
+    assert "Au(111) on mica" in text
+
+
+def test_the_terminal_lists_them_without_columns_of_which_nothing_is_known(root: Path) -> None:
+    shown = CliRunner().invoke(app, ["runs", "--in", str(root), "person:a."]).stdout
+    assert "gold-1" in shown
+    assert "problems" not in shown
+    told = json.loads(CliRunner().invoke(app, ["runs", "--in", str(root), "--json"]).stdout)
+    assert {run["folder"] for run in told} == {"gold-1", "spring/mica-1"}
