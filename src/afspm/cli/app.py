@@ -8,7 +8,21 @@ from typing import Annotated
 import typer
 
 from afspm import plugins
-from afspm.cli import dashboard, demo, drift, drivers, experiment_file, new, notify, recorded, run, runs, status, steer
+from afspm.cli import (
+    clients,
+    dashboard,
+    demo,
+    drift,
+    drivers,
+    experiment_file,
+    new,
+    notify,
+    recorded,
+    run,
+    runs,
+    status,
+    steer,
+)
 from afspm.errors import ConfigError
 
 app = typer.Typer(
@@ -62,6 +76,7 @@ app.command("report", rich_help_panel=AFTERWARDS)(recorded.report)
 app.command("export", rich_help_panel=AFTERWARDS)(recorded.export)
 app.command("replay", rich_help_panel=AFTERWARDS)(recorded.replay)
 app.add_typer(drift.app, name="drift", rich_help_panel=AFTERWARDS)
+app.command("test-client", rich_help_panel=MICROSCOPES)(clients.check_client)
 app.command("test-translator", rich_help_panel=MICROSCOPES)(drivers.check_translator)
 app.command("emulate", rich_help_panel=MICROSCOPES)(drivers.emulate)
 

@@ -93,7 +93,8 @@ def _check(options: CheckOptions, console: Console, copy: Path | None) -> None:
     import signal
 
     from afspm.testing.translators import CheckReport, run
-    from afspm.testing.translators.report import show_beginning, show_end, show_result
+    from afspm.testing.translators.report import show_beginning, show_end
+    from afspm.testing.verdicts import show_result
 
     begun: list[CheckReport] = []
 

@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 
 from afspm.testing.translators import CheckOptions, CheckReport, client, run
-from afspm.testing.translators.report import CheckOutcome, show_result
 from afspm.testing.translators.session import SPEED
+from afspm.testing.verdicts import CheckOutcome, show_result
 
 HERE = Path(__file__).parent
 STUCK = ("NeverFreeAgain", "SuccessWithoutChange")

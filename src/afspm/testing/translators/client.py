@@ -24,7 +24,7 @@ from afspm.model import (
     names,
 )
 from afspm.process.parent import StopRequested
-from afspm.testing.translators.registry import Failed, Lost, expect
+from afspm.testing.verdicts import Failed, Lost, expect
 
 T = TypeVar("T")
 

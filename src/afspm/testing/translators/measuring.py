@@ -22,8 +22,8 @@ from afspm.model import (
     names,
 )
 from afspm.testing.translators.client import CheckClient, Observation, answer_in_words, scans, spectra, told
-from afspm.testing.translators.registry import Failed, Skipped, expect
 from afspm.testing.translators.support import Support
+from afspm.testing.verdicts import Failed, Skipped, expect
 from afspm.units import convert
 
 NEAR = 1e-3

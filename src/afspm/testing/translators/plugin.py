@@ -18,8 +18,9 @@ import pytest
 
 from afspm.testing.translators import runner, session
 from afspm.testing.translators.measuring import CheckMeasurements
-from afspm.testing.translators.registry import Check, Lost, all_checks
-from afspm.testing.translators.report import CheckOutcome, CheckReport, CheckResult
+from afspm.testing.translators.registry import Check, all_checks
+from afspm.testing.translators.report import CheckReport
+from afspm.testing.verdicts import CheckOutcome, CheckResult, Lost
 
 _REPORTS = pytest.StashKey[list[CheckReport]]()
 

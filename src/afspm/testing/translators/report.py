@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field
-from enum import Enum
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -14,32 +13,7 @@ from rich.text import Text
 
 from afspm.model import names
 from afspm.testing.translators.support import Support
-
-
-class CheckOutcome(Enum):
-    """The outcome of one check."""
-
-    PASSED = "passed"
-    FAILED = "failed"
-    SKIPPED = "skipped"
-
-
-@dataclass(frozen=True)
-class CheckResult:
-    """One check.
-
-    Attributes:
-        line: what was expected and what came, or why it was skipped.
-        complaints: of a check that failed, the warnings and errors that were logged meanwhile.
-        real_s: how long it took.
-    """
-
-    name: str
-    title: str
-    outcome: CheckOutcome
-    line: str = ""
-    real_s: float = 0.0
-    complaints: tuple[str, ...] = ()
+from afspm.testing.verdicts import CheckOutcome, CheckResult
 
 
 @dataclass
@@ -104,28 +78,11 @@ class CheckReport:
         }
 
 
-_MARKS = {
-    CheckOutcome.PASSED: ("✓", "green"),
-    CheckOutcome.FAILED: ("✗", "bold red"),
-    CheckOutcome.SKIPPED: ("–", "yellow"),
-}
-_NAME_WIDTH = 29
-
-
 def show_beginning(report: CheckReport, console: Console) -> None:
     """Print what will be checked."""
     told = report.support.controller or "its controller does not tell its version"
     simulated = " SIMULATED" if report.simulated else ""
     console.print(Text.assemble((report.translator, "bold"), f": {told}", (simulated, "bold yellow")), soft_wrap=True)
-
-
-def show_result(result: CheckResult, console: Console) -> None:
-    """One check; what was expected and what came below it."""
-    mark, style = _MARKS[result.outcome]
-    line = Text.assemble((mark, style), f" {result.name:{_NAME_WIDTH}} ", (result.title, "dim"))
-    for told in filter(None, (result.line, *result.complaints)):
-        line.append(f"\n    {told}", style)
-    console.print(line, soft_wrap=True)
 
 
 def show_end(report: CheckReport, console: Console) -> None:

@@ -13,10 +13,11 @@ from afspm.errors import ConfigError
 from afspm.model import ControlRequest, Feedback, Parameter, ProbePosition, Region, ScanParameters, names
 from afspm.testing.translators.client import CheckClient, answer_in_words
 from afspm.testing.translators.measuring import CheckMeasurements, FrameSetting, number
-from afspm.testing.translators.registry import Check, Failed, Lost, Skipped, all_checks, near
-from afspm.testing.translators.report import CheckOutcome, CheckReport, CheckResult
+from afspm.testing.translators.registry import Check, all_checks
+from afspm.testing.translators.report import CheckReport
 from afspm.testing.translators.session import CheckOptions, CheckSession, opened
 from afspm.testing.translators.support import Support
+from afspm.testing.verdicts import CheckOutcome, CheckResult, Failed, Lost, Skipped, near
 
 _LAST = (names.SCAN_SPEED, names.MOVE_SPEED)
 """A frame may change them."""

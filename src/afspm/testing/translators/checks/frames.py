@@ -17,7 +17,8 @@ from afspm.model import (
 )
 from afspm.testing.translators.client import Observation, states, told
 from afspm.testing.translators.measuring import CheckMeasurements, FrameSetting, difference, number
-from afspm.testing.translators.registry import Failed, Skipped, check, expect, near
+from afspm.testing.translators.registry import check
+from afspm.testing.verdicts import Failed, Skipped, expect, near
 
 
 @check("published/in-force", "what is in force is published at the start, the state last")

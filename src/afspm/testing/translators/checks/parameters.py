@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from afspm.model import ControlRequest, ControlResponse, Parameter, Response, names
 from afspm.testing.translators.client import answer_in_words, value_in
 from afspm.testing.translators.measuring import CheckMeasurements, number
-from afspm.testing.translators.registry import Skipped, check, expect, near
+from afspm.testing.translators.registry import check
+from afspm.testing.verdicts import Skipped, expect, near
 from afspm.units import convert
 
 _SMALLER = {"m": "nm", "m/s": "nm/s", "V": "mV", "deg": "rad", "A": "pA"}

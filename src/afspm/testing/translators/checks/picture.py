@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from afspm.model import Region, names
 from afspm.testing.translators.measuring import CheckMeasurements, FrameSetting, Taken
-from afspm.testing.translators.registry import Failed, Skipped, check
+from afspm.testing.translators.registry import check
+from afspm.testing.verdicts import Failed, Skipped
 
 Array = NDArray[np.float64]
 LIKE = 0.6

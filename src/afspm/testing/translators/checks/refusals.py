@@ -17,7 +17,8 @@ from afspm.model import (
 from afspm.testing.translators.checks.parameters import require_param_error
 from afspm.testing.translators.client import answer_in_words, told
 from afspm.testing.translators.measuring import CheckMeasurements
-from afspm.testing.translators.registry import check, expect
+from afspm.testing.translators.registry import check
+from afspm.testing.verdicts import expect
 from afspm.wire import messages
 
 _UNKNOWN = "no-such-thing"

@@ -7,7 +7,8 @@ import numpy as np
 from afspm.model import Scan, ScanParameters, ScopeState, ScopeStatus, names
 from afspm.testing.translators.client import Observation, scans, states, told
 from afspm.testing.translators.measuring import SCAN_S, CheckMeasurements, Taken, difference
-from afspm.testing.translators.registry import Failed, Skipped, check, expect
+from afspm.testing.translators.registry import check
+from afspm.testing.verdicts import Failed, Skipped, expect
 
 
 def broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> list[Observation]:

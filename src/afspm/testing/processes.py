@@ -1,4 +1,4 @@
-"""Translator, scheduler and emulated controller as real processes: started once, never again, and ended for certain."""
+"""Translator, scheduler and emulated controller as real processes: started, killed for a check, and ended."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ class Processes:
         self._writing = threading.Lock()
         self._ended: dict[str, str] = {}
         self._running: dict[str, ChildProcess] = {}
+        self._starts: dict[str, ProcessStart] = {}
 
     def start(self, starts: Sequence[ProcessStart]) -> None:
         """Start these.
@@ -42,9 +43,20 @@ class Processes:
             AfspmError: one can't be started.
         """
         self._readers |= {start.launch.name: LineReader() for start in starts}
+        self._starts |= {start.launch.name: start for start in starts}
         for start in starts:
             task = from_start(start)
             self._running[task.name] = ChildProcess(task, self._tell)
+
+    def kill(self, name: str) -> None:
+        """Kill one, and wait until it has ended."""
+        self._running[name].kill()
+        self._await(KILLED_S, lambda: name in self._ended)
+
+    def start_again(self, name: str) -> None:
+        """Start one that has ended. Raises AfspmError: it can't be started."""
+        del self._ended[name]
+        self.start([self._starts[name]])
 
     @property
     def ended(self) -> str:
@@ -61,16 +73,19 @@ class Processes:
         """End all that still run: they are asked first, and killed if that does not help."""
         for process in self._running.values():
             process.close_stdin()
-        self._await(ASKED_S)
+        self._await(ASKED_S, self._all_ended)
         for name, process in self._running.items():
             if name not in self._ended:
                 self._write(name, logging.WARNING, "does not end: killed")
                 process.kill()
-        self._await(KILLED_S)
+        self._await(KILLED_S, self._all_ended)
 
-    def _await(self, within_s: float) -> None:
+    def _all_ended(self) -> bool:
+        return len(self._ended) == len(self._running)
+
+    def _await(self, within_s: float, done: Callable[[], bool]) -> None:
         until_s = self._clock.monotonic_s() + within_s
-        while len(self._ended) < len(self._running) and (left_s := until_s - self._clock.monotonic_s()) > 0.0:
+        while not done() and (left_s := until_s - self._clock.monotonic_s()) > 0.0:
             with contextlib.suppress(Empty):
                 self._exits.get(timeout=left_s)
 

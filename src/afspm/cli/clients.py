@@ -1,0 +1,52 @@
+"""`afspm test-client`: for those who write a client in another language."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from afspm.cli.arguments import RUNS, Runs, opt
+
+
+def check_client(
+    command: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="-- COMMAND ARGUMENTS…", help="The client's conformance program.", show_default=False),
+    ] = None,
+    only: Annotated[
+        list[str] | None, opt("Only checks with this in their name.", "--only", "-k", metavar="PART")
+    ] = None,
+    report: Annotated[Path | None, opt("Write the report here, too.", "--report", metavar="FILE")] = None,
+    runs: Runs = RUNS,
+    listed: Annotated[bool, typer.Option("--list", help="List the checks, and do none.")] = False,
+) -> None:
+    """Judge a client in another language by what it does in experiments on the simulated microscope.
+
+    Starts the client's conformance program again and again, with real and with scripted schedulers, and gives it
+    steps. Ends with 0 if nothing was wrong.
+    """
+    import sys
+
+    from rich.console import Console
+
+    from afspm.testing.clients import judge
+    from afspm.testing.clients.registry import all_client_checks
+    from afspm.testing.clients.report import show_client_end
+    from afspm.testing.verdicts import show_result
+
+    if listed:
+        for check in all_client_checks():
+            typer.echo(f"{check.name:25}{check.title}")
+        return
+    if not command:
+        raise typer.BadParameter("the client's conformance program is wanted", param_hint="-- COMMAND")
+    console = Console(file=sys.stdout, highlight=False)
+    result = judge(command, runs, only or (), lambda one: show_result(one, console))
+    show_client_end(result, console)
+    if report is not None:
+        report.parent.mkdir(parents=True, exist_ok=True)
+        report.write_text(result.to_json(), encoding="utf-8")
+    if not result.passed:
+        raise typer.Exit(1)

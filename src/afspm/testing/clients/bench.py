@@ -1,0 +1,141 @@
+"""The bench on which a client is judged: a scripted scheduler, or a real experiment, and the client beside it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from afspm.clock import Clock, ExperimentClock
+from afspm.launch import Launch, Sockets
+from afspm.supervisor import run_identity
+from afspm.supervisor.ports import FreePorts
+from afspm.testing.clients.experiment import CLIENT, JUDGE, KEYS, SCHEDULER, JudgedExperiment, Security
+from afspm.testing.clients.heartbeats import BeatRecorder
+from afspm.testing.clients.program import ClientProgram, Pump
+from afspm.testing.clients.scripted import ScriptedScheduler
+from afspm.transport import keys
+
+BEAT_S = 0.5
+TOKEN = "only-this-client-knows-it"
+LOG_FILE = "client.txt"
+
+
+@dataclass
+class JudgedClient:
+    """A started client, and its heartbeats."""
+
+    program: ClientProgram
+    beats: BeatRecorder
+
+
+@dataclass
+class ScriptedRun:
+    """A client with a scripted scheduler."""
+
+    scheduler: ScriptedScheduler
+    client: ClientProgram
+    beats: BeatRecorder
+
+
+class ClientBench:
+    """All that checks need.
+
+    Args:
+        command: the conformance program.
+        folder: where logs and the runs' files go.
+    """
+
+    def __init__(self, command: Sequence[str], folder: Path) -> None:
+        self.command, self.folder = tuple(command), folder
+        self.clock: Clock = ExperimentClock.real()
+        self._keys = folder / KEYS
+        keys.generate(self._keys, (CLIENT, SCHEDULER, JUDGE))
+        self._ports = FreePorts()
+        self._runs = itertools.count(1)
+        self._experiment: JudgedExperiment | None = None
+
+    @property
+    def experiment(self) -> JudgedExperiment:
+        """A real experiment, encrypted, that several checks share; another if the last one has ended."""
+        if self._experiment is not None and self._experiment.ended:
+            self.begin_anew()
+        if self._experiment is None:
+            self._experiment = self.new_experiment()
+        return self._experiment
+
+    def new_experiment(self, security: Security = Security.EVERYWHERE) -> JudgedExperiment:
+        """Start a real experiment, which is the caller's to close."""
+        return JudgedExperiment(self.folder / f"run-{next(self._runs)}", security)
+
+    def begin_anew(self) -> None:
+        """End the shared experiment: what it has gone through is not the next check's fault."""
+        if self._experiment is not None:
+            self._experiment.close()
+        self._experiment = None
+
+    def close(self) -> None:
+        """End everything."""
+        self.begin_anew()
+
+    @contextmanager
+    def client(self, experiment: JudgedExperiment, *, ready: bool = True, **changes: Any) -> Iterator[JudgedClient]:
+        """Start a client in an experiment.
+
+        Args:
+            ready: wait until it is.
+            changes: to its launch line.
+        """
+        with self._started(replace(experiment.launch, **changes), experiment.pump, experiment.wake) as client:
+            if ready:
+                client.program.succeed("ready")
+            yield client
+
+    @contextmanager
+    def scripted(self, *, ready: bool = True, owner: str | None = SCHEDULER, **changes: Any) -> Iterator[ScriptedRun]:
+        """Start a client with a scripted scheduler.
+
+        Args:
+            ready: wait until it is.
+            owner: whose keys the scheduler has; None: none at all.
+            changes: to the client's launch line.
+        """
+        control, publish = self._ports.address(), self._ports.address()
+        launch = replace(self._scripted_launch(control, publish), **changes)
+        own = None if owner is None else keys.load(self._keys, owner)
+        scheduler = ScriptedScheduler(self.clock, control, publish, own)
+        with ExitStack() as stack:
+            stack.callback(scheduler.close)
+            client = stack.enter_context(self._started(launch, scheduler.pump, scheduler.wake))
+            if ready:
+                client.program.succeed("ready")
+            yield ScriptedRun(scheduler, client.program, client.beats)
+
+    def _scripted_launch(self, control: str, publish: str) -> Launch:
+        own = keys.load(self._keys, CLIENT, {control: SCHEDULER, publish: SCHEDULER})
+        return Launch(
+            CLIENT,
+            sockets=Sockets(subscribe=(publish,), control=control),
+            clock=ExperimentClock.starting_now().as_dict(),
+            run_dir=str(self.folder),
+            request_timeout_s=1.0,
+            request_retries=3,
+            keys=own.as_launch(),
+            run=run_identity.new_identity(),
+            simulated=True,
+        )
+
+    @contextmanager
+    def _started(self, launch: Launch, pump: Pump, wake: Any) -> Iterator[JudgedClient]:
+        with ExitStack() as stack:
+            beats = BeatRecorder(self.clock)
+            stack.callback(beats.close)
+            sockets = replace(launch.sockets, heartbeat=beats.address)
+            complete = replace(launch, sockets=sockets, beat_period_s=BEAT_S, beat_token=TOKEN)
+            program = ClientProgram(self.command, complete, pump, wake, self.folder / LOG_FILE)
+            stack.callback(program.kill)
+            yield JudgedClient(program, beats)
+            program.require_clean_output()

@@ -1,0 +1,145 @@
+"""Measurements and settings through a real scheduler and the simulated microscope."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from afspm.testing.clients.bench import ClientBench
+from afspm.testing.clients.checks.launch import require_beats
+from afspm.testing.clients.experiment import JudgedExperiment
+from afspm.testing.clients.facts import compare
+from afspm.testing.clients.program import Answer
+from afspm.testing.clients.registry import client_check
+from afspm.testing.verdicts import Failed, expect, near
+from afspm.units import si
+
+SCAN_S = 120.0
+CHANNELS = 2
+"""The least that the simulated microscope records."""
+
+
+def scan_step(shape: Sequence[int] = (16, 32), angle_deg: float = 0.0, timeout_s: float = SCAN_S) -> dict[str, Any]:
+    """Return the arguments of a small scan."""
+    return {
+        "center_m": [0.2e-6, -0.1e-6],
+        "size_m": [1e-6, 0.5e-6],
+        "angle_deg": angle_deg,
+        "shape": list(shape),
+        "timeout_s": timeout_s,
+    }
+
+
+def require_scans(experiment: JudgedExperiment, answer: Answer, asked: dict[str, Any]) -> None:
+    """Raise Failed unless an answer has what was published of the scan that was asked for."""
+    expect(answer.ok, "the scan to be taken", str(answer))
+    scans = answer.get("scans")
+    if not isinstance(scans, list):
+        raise Failed("scans, a list", str(answer))
+    channels = {str(scan.get("channel")) for scan in scans}
+    expect(len(channels) == len(scans) >= CHANNELS, "each channel once", f"{[scan.get('channel') for scan in scans]}")
+    for scan in scans:
+        _require_published(experiment, "Scan2d", scan)
+        expect(scan["shape"] == asked["shape"], f"a scan of the shape {asked['shape']}", f"{scan['shape']}")
+        for name in ("center_m", "size_m"):
+            right = all(near(a, b, 1e-3, 1e-10) for a, b in zip(scan[name], asked[name], strict=True))
+            expect(right, f"a scan with {name} = {asked[name]}", f"{scan[name]}")
+        expect(near(scan["angle_deg"], asked["angle_deg"], 1e-3, 1e-3), f"{asked['angle_deg']}°", scan["angle_deg"])
+
+
+def _require_published(experiment: JudgedExperiment, message: str, told: dict[str, Any]) -> None:
+    """Raise Failed unless exactly this was published."""
+    key = (told.get("envelope"), told.get("timestamp_ns"))
+    experiment.pump(lambda: any((one.envelope, one.time_ns) == key for one in experiment.packets(message)), 5.0)
+    for packet in experiment.packets(message):
+        if (packet.envelope, packet.time_ns) == key:
+            compare(told, packet)
+            return
+    raise Failed(f"a {message} that was published", f"envelope and timestamp {key}")
+
+
+@client_check(
+    "measure/parameters",
+    "Parameters are read, and set with units.",
+    "Send value and unit as text; answer what the response's `ParameterMsg` says.",
+)
+def parameters(bench: ClientBench) -> None:
+    experiment = bench.experiment
+    with bench.client(experiment) as client:
+        program = client.program
+        _require_value(program.succeed("get_parameter", name="scan-speed"), "scan-speed", "4 um/s")
+        program.succeed("request_control", problem=0, timeout_s=10.0)
+        for value, unit in (("300", "mV"), ("0.25", "V"), ("-0.5", None)):
+            answer = program.succeed("set_parameter", name="tip-bias-voltage", value=value, unit=unit)
+            _require_value(answer, "tip-bias-voltage", f"{value} {unit or 'V'}")
+            there = float(experiment.scope.get("tip-bias-voltage"))
+            right = si(f"{value} {unit or 'V'}", "V")
+            expect(near(there, right), f"{right} V at the microscope", f"{there} V")
+        program.succeed("release_control")
+
+
+def _require_value(answer: Answer, name: str, right: str) -> None:
+    text = f"{answer.get('value')} {answer.get('unit') or ''}".strip()
+    dimension = right.split()[1].removeprefix("m") if "/" not in right else "m/s"
+    try:
+        came = si(text, dimension)
+    except Exception as error:
+        raise Failed(f"{name} = {right}", f"{answer} ({error})") from error
+    expect(near(came, si(right, dimension)), f"{name} = {right}", str(answer))
+
+
+@client_check(
+    "measure/scan",
+    "A scan gives all channels of the frame that was asked for, with the values that were published.",
+    "Set the frame, wait for `SS_FREE`, start, collect `Scan2d` until `SS_FREE`.",
+)
+def scan(bench: ClientBench) -> None:
+    experiment = bench.experiment
+    with bench.client(experiment) as client:
+        for asked in (scan_step(), scan_step((8, 8), 30.0), scan_step((8, 8), 30.0)):
+            answer = client.program.do("scan", **asked)
+            require_scans(experiment, answer, asked)
+            expect(answer.get("interruptions") == 0, "no interruption", str(answer.get("interruptions")))
+        free = experiment.pump(lambda: experiment.scope.control_state.holder is None, 5.0)
+        expect(free, "control given back after the scan", "a client that keeps it")
+        client.program.succeed("request_control", problem=0, timeout_s=10.0)
+        require_scans(experiment, client.program.do("scan", **scan_step()), scan_step())
+        held = client.program.succeed("state").get("in_control")
+        expect(held is True, "control kept after a scan, if it was there before", "a client that has given it back")
+        client.program.succeed("release_control")
+
+
+@client_check(
+    "measure/spectrum",
+    "A spectrum is taken where it was asked for.",
+    "Set `x-spec-kind` and the position, wait for `SS_FREE`, `start-spec`, collect `Spec1d`.",
+)
+def spectrum(bench: ClientBench) -> None:
+    experiment = bench.experiment
+    with bench.client(experiment) as client:
+        for position in ([0.1e-6, 0.2e-6], [-0.3e-6, 0.0]):
+            answer = client.program.do("spectrum", position_m=position, kind="IV", timeout_s=SCAN_S)
+            expect(answer.ok and answer.get("spectra"), "a spectrum", str(answer))
+            for told in answer["spectra"]:
+                _require_published(experiment, "Spec1d", told)
+                came = told["position_m"]
+                right = all(near(a, b, 1e-3, 1e-10) for a, b in zip(came, position, strict=True))
+                expect(right and told["kind"] == "IV", f"an IV curve at {position}", f"{told['kind']} at {came}")
+
+
+@client_check(
+    "measure/large-scan",
+    "A scan of 2048 × 2048 arrives, and heartbeats go on meanwhile.",
+    "Do not copy value by value; do not beat in the thread that decodes.",
+)
+def large_scan(bench: ClientBench) -> None:
+    experiment = bench.experiment
+    asked = scan_step((2048, 2048))
+    experiment.scope.set("scan-speed", "1 mm/s")
+    try:
+        with bench.client(experiment, envelopes=("ScopeStateMsg",)) as client:
+            since_s = bench.clock.monotonic_s()
+            require_scans(experiment, client.program.do("scan", **asked), asked)
+            require_beats(client.beats, since_s)
+    finally:
+        experiment.scope.set("scan-speed", "4 um/s")

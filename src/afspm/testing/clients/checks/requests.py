@@ -1,0 +1,165 @@
+"""Requests: ids, repetition, answers that get lost, and refusals."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+from afspm.model import RELAY_REQUEST, ControlRequest, ControlResponse, Note, RelayedMessage
+from afspm.testing.clients.bench import ClientBench
+from afspm.testing.clients.checks.wire import ask, in_base64
+from afspm.testing.clients.experiment import SCHEDULER, JudgedExperiment
+from afspm.testing.clients.program import ClientProgram
+from afspm.testing.clients.proxy import CuttingProxy
+from afspm.testing.clients.registry import client_check
+from afspm.testing.clients.scripted import ScriptedRequest, success
+from afspm.testing.verdicts import expect
+from afspm.wire import decode, encode, encode_subject
+
+REQUESTS = 1000
+_AT_A_TIME = 16
+_LOST = 0.3
+_TRY_S, _RETRIES = 0.3, 3
+_ALL_S = 300.0
+_SEEN_S = 10.0
+
+
+@client_check(
+    "requests/repeat",
+    "A request without an answer is repeated with its id, as often as the launch line says.",
+    "Keep the id with the request, not with the sending of it.",
+)
+def repeat(bench: ClientBench) -> None:
+    with bench.scripted(request_timeout_s=_TRY_S, request_retries=_RETRIES) as run:
+        run.scheduler.reply = lambda request: []
+        answer = ask(run, ControlRequest.RELEASE_CTRL)
+        told = (answer.get("response"), answer.get("detail"))
+        expect(told == ("REP_NO_RESPONSE", 2), "REP_NO_RESPONSE with the detail 2", str(answer))
+        ids = [request.id for request in run.scheduler.requests]
+        expect(len(set(ids)) == 1, "repetitions with the id of the first", f"the ids {sorted(set(ids))}")
+        right = f"the request and {_RETRIES} repetitions, and perhaps some after a new connection"
+        expect(1 + _RETRIES <= len(ids) <= 2 * (1 + _RETRIES), right, f"{len(ids)} requests")
+        run.scheduler.reply = success
+        expect(ask(run, ControlRequest.RELEASE_CTRL).ok, "the next request to be answered", "no success")
+
+
+@client_check(
+    "requests/other-answers",
+    "The answer to another request is never taken for this one's.",
+    "Compare the fourth frame with the id.",
+)
+def other_answers(bench: ClientBench) -> None:
+    with bench.scripted() as run:
+        earlier: list[ScriptedRequest] = []
+
+        def late(request: ScriptedRequest) -> list[list[bytes]]:
+            others = [replace(request, frames=(b"\7", b"", id_)) for id_ in (b"client/0/1", b"client/0/2")]
+            refusals = [one.answered(ControlResponse.NOT_IN_CONTROL, b"", "late") for one in [*others, *earlier]]
+            earlier.append(request)
+            return [*refusals, request.answered()]
+
+        run.scheduler.reply = late
+        for _ in range(5):
+            answer = ask(run, ControlRequest.RELEASE_CTRL)
+            expect(answer.ok, "the success that has the request's id", str(answer))
+
+
+def _note(experiment: JudgedExperiment, text: str) -> str:
+    """Return the object of the request that publishes a note, which shows that it was executed."""
+    now_ns = experiment.clock.now_ns()
+    note = Note(now_ns, "client", text, None, now_ns)
+    return in_base64(encode_subject(RelayedMessage(*encode(note))))
+
+
+def begin_note(experiment: JudgedExperiment, client: ClientProgram, text: str) -> int:
+    """Have the client publish a note; return the step's id."""
+    return client.begin("request", number=RELAY_REQUEST, object=_note(experiment, text))
+
+
+def published(experiment: JudgedExperiment) -> Counter[str]:
+    """Return how often each note has been published."""
+    notes = [decode("Note", packet.payload) for packet in experiment.packets("Note")]
+    return Counter(note.text for note in notes)
+
+
+@client_check(
+    "requests/lost-replies",
+    "Of 1,000 requests whose connection is cut again and again before the reply, each is executed once.",
+    "Repeat with the same id after a reconnect, too.",
+)
+def lost_replies(bench: ClientBench) -> None:
+    experiment = bench.experiment
+    launch = experiment.launch
+    assert launch.sockets.control is not None
+    proxy = CuttingProxy(launch.sockets.control, _LOST)
+    sockets = replace(launch.sockets, control=proxy.address)
+    keys = {**(launch.keys or {})}
+    keys["servers"] = {**keys["servers"], proxy.address: SCHEDULER}
+    names = [f"lost reply {number}" for number in range(REQUESTS)]
+    waiting: list[tuple[str, int]] = []
+    try:
+        with bench.client(experiment, sockets=sockets, keys=keys, request_timeout_s=_TRY_S, request_retries=20) as one:
+            for name in names:
+                waiting.append((name, begin_note(experiment, one.program, name)))
+                if len(waiting) >= _AT_A_TIME:
+                    _answered(one.program, *waiting.pop(0))
+            for name, step in waiting:
+                _answered(one.program, name, step)
+    finally:
+        proxy.close()
+    expect(proxy.cuts > REQUESTS * _LOST / _AT_A_TIME / 2, "connections that are cut", f"{proxy.cuts}")
+    experiment.pump(lambda: published(experiment)[names[-1]] > 0, _SEEN_S)
+    counts = published(experiment)
+    twice = [name for name in names if counts[name] > 1]
+    never = [name for name in names if not counts[name]]
+    came = f"{len(twice)} executed more than once and {len(never)} never, of {proxy.cuts} replies that were lost"
+    expect(not twice and not never, f"{REQUESTS} requests, each executed once", came)
+
+
+def _answered(program: ClientProgram, name: str, step: int) -> None:
+    answer = program.answer(step, _ALL_S)
+    expect(answer.ok, f"a success for {name}, in the end", str(answer))
+
+
+@client_check(
+    "requests/restart",
+    "A client that was killed and started again is not taken for its earlier life.",
+    "Put something random into the life of `<name>/<run>-<life>/<number>`.",
+)
+def restart(bench: ClientBench) -> None:
+    experiment = bench.experiment
+    names = [f"life {life}" for life in range(3)]
+    for name in names:
+        with bench.client(experiment) as client:
+            answer = client.program.answer(begin_note(experiment, client.program, name))
+            expect(answer.ok, "a success", str(answer))
+            executed = experiment.pump(lambda name=name: published(experiment)[name] > 0, _SEEN_S)  # type: ignore[misc]
+            expect(executed, f"the first request of {name} to be executed", "the answer to one of an earlier life")
+
+
+@client_check(
+    "requests/refusals",
+    "Refusals come with their response, reason and detail.",
+    "Hand on all three frames.",
+)
+def refusals(bench: ClientBench) -> None:
+    experiment = bench.experiment
+    with bench.client(experiment) as client:
+        program = client.program
+        refused = [
+            (program.do("action", name="start-scan"), "REP_NOT_IN_CONTROL"),
+            (program.do("set_parameter", name="tip-bias-voltage", value="1", unit="V"), "REP_NOT_IN_CONTROL"),
+            (program.do("get_parameter", name="x-no-such-thing"), "REP_PARAM_NOT_SUPPORTED"),
+        ]
+        program.succeed("request_control", problem=0, timeout_s=10.0)
+        refused += [
+            (program.do("action", name="x-no-such-thing"), "REP_ACTION_NOT_SUPPORTED"),
+            (program.do("set_parameter", name="tip-bias-voltage", value="5", unit="V"), "REP_PARAM_ERROR"),
+            (program.do("set_parameter", name="tip-bias-voltage", value="5", unit="kg"), "REP_PARAM_ERROR"),
+            (program.do("request_control", problem=4, timeout_s=1.0), "REP_WRONG_EXP_PROBLEM"),
+        ]
+        for answer, response in refused:
+            told = answer.get("response")
+            expect(not answer.ok and told == response, f"the refusal {response}", str(answer))
+            expect(answer.get("reason"), f"the reason of {response}", str(answer))
+        program.succeed("release_control")

@@ -1,0 +1,61 @@
+"""Hears the heartbeats of a client, each with the time at which it came."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from itertools import pairwise
+
+import zmq
+
+from afspm.clock import Clock
+from afspm.transport.frames import receive_frames
+from afspm.transport.network import Network
+from afspm.transport.polling import WakeUp
+from afspm.wire import CLOSING
+
+
+@dataclass(frozen=True)
+class HeardBeat:
+    """One beat, in real seconds, as it came."""
+
+    at_s: float
+    frames: list[bytes]
+
+    @property
+    def closing(self) -> bool:
+        return self.frames[:1] == [CLOSING]
+
+
+class BeatRecorder:
+    """Listens at an address of its own, in a thread of its own, until it is closed."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._network = Network()
+        self._socket = self._network.socket(zmq.SUB)
+        self._socket.setsockopt(zmq.SUBSCRIBE, b"")
+        self.address = self._network.bind(self._socket, "tcp://127.0.0.1:0")
+        self.beats: list[HeardBeat] = []
+        self._stop: WakeUp[None] = WakeUp()
+        self._thread = threading.Thread(target=self._run, name="beats", daemon=True)
+        self._thread.start()
+
+    def longest_pause_s(self, since_s: float) -> float:
+        """Return the longest time without a beat from `since_s` until now."""
+        times = [since_s, *(beat.at_s for beat in self.beats if beat.at_s > since_s), self._clock.monotonic_s()]
+        return max(after - before for before, after in pairwise(times))
+
+    def _run(self) -> None:
+        poller = zmq.Poller()
+        poller.register(self._socket, zmq.POLLIN)
+        poller.register(self._stop.fileno(), zmq.POLLIN)
+        while self._stop.fileno() not in dict(poller.poll()):
+            while frames := receive_frames(self._socket):
+                self.beats.append(HeardBeat(self._clock.monotonic_s(), [frame.bytes for frame in frames]))
+
+    def close(self) -> None:
+        self._stop.post()
+        self._thread.join()
+        self._network.close()
+        self._stop.close()

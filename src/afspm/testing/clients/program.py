@@ -1,0 +1,213 @@
+"""The conformance program of a client, as a process: steps go in by standard input, answers come by standard output."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import IO, Any, Protocol
+
+from afspm.errors import ConfigError
+from afspm.launch import Launch
+from afspm.testing.verdicts import Failed, expect
+
+ANSWER_S = 30.0
+"""Longest time for an answer, beside what the step itself may wait."""
+GONE = "it has ended"
+_LAST_WORDS = 3
+
+
+class Pump(Protocol):
+    """Serves the judge's own sockets while it waits for the client."""
+
+    def __call__(self, done: Callable[[], bool], within_s: float) -> bool:
+        """Wait until `done()`; False if that takes longer."""
+        ...
+
+
+class Answer(dict[str, Any]):
+    """The answer to one step."""
+
+    @property
+    def ok(self) -> bool:
+        return self.get("ok") is True
+
+    def __str__(self) -> str:
+        facts = {key: value for key, value in self.items() if key != "id"}
+        text = json.dumps(facts, ensure_ascii=False)
+        return text if len(text) < 400 else f"{text[:400]} …"
+
+
+class ClientProgram:
+    """A running conformance program.
+
+    Args:
+        command: the program and its arguments.
+        launch: its launch line.
+        pump: waits for its answers.
+        wake: called from other threads when the program has said something, or ended.
+        log: where its standard error goes.
+
+    Raises:
+        ConfigError: it can't be started.
+    """
+
+    def __init__(self, command: Sequence[str], launch: Launch, pump: Pump, wake: Callable[[], None], log: Path) -> None:
+        self.launch = launch
+        self._pump, self._wake = pump, wake
+        self._answers: dict[int, Answer] = {}
+        self._garbage: deque[str] = deque(maxlen=_LAST_WORDS)
+        self._said: deque[str] = deque(maxlen=_LAST_WORDS)
+        self._next = 0
+        self._log = log
+        try:
+            self._popen = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                start_new_session=sys.platform != "win32",
+            )
+        except (OSError, ValueError) as error:
+            raise ConfigError(
+                f"{command[0]} can't be started: {error}", hint="afspm test-client -- COMMAND ARGUMENTS…"
+            ) from error
+        self.pid = self._popen.pid
+        self._threads = [
+            threading.Thread(target=self._read, args=(self._popen.stdout, self._take), daemon=True),
+            threading.Thread(target=self._read, args=(self._popen.stderr, self._note), daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+        self._write(launch.to_json())
+
+    # --- steps ---
+
+    def begin(self, do: str, **arguments: Any) -> int:
+        """Give it a step, and return the step's id."""
+        self._next += 1
+        self._write(json.dumps({"id": self._next, "do": do, **arguments}))
+        return self._next
+
+    def answer(self, step: int, within_s: float = ANSWER_S) -> Answer:
+        """Return the answer to a step.
+
+        Raises:
+            Failed: none comes, or it is none.
+        """
+        self._pump(lambda: step in self._answers or not self.is_running, within_s)
+        self._finish_reading()
+        if step in self._answers:
+            return self._answers.pop(step)
+        came = f"nothing in {within_s:.0f} s" if self.is_running else f"the end of the program ({self.ending})"
+        raise Failed("an answer to the step", f"{came}{self.last_words}")
+
+    def is_answered(self, step: int) -> bool:
+        return step in self._answers
+
+    def do(self, do: str, **arguments: Any) -> Answer:
+        """Give it a step, and return the answer.
+
+        Raises:
+            Failed: none comes, or it could not do it at all.
+        """
+        answer = self.do_quietly(do, **arguments)
+        expect("error" not in answer, f"the step {do} to be done", str(answer))
+        return answer
+
+    def do_quietly(self, do: str, **arguments: Any) -> Answer:
+        """Give it a step, and return the answer, be it an error. Raises Failed: none comes."""
+        return self.answer(self.begin(do, **arguments), ANSWER_S + float(arguments.get("timeout_s", 0.0)))
+
+    def succeed(self, do: str, **arguments: Any) -> Answer:
+        """Give it a step, which must succeed. Raises Failed."""
+        answer = self.do(do, **arguments)
+        expect(answer.ok, f"the step {do} to succeed", str(answer))
+        return answer
+
+    # --- its end ---
+
+    @property
+    def is_running(self) -> bool:
+        return self._popen.poll() is None
+
+    @property
+    def ending(self) -> str:
+        """How it has ended, for a person."""
+        code = self._popen.poll()
+        return "still running" if code is None else f"exit code {code}" if code >= 0 else f"signal {-code}"
+
+    @property
+    def exit_code(self) -> int | None:
+        return self._popen.poll()
+
+    @property
+    def last_words(self) -> str:
+        """What it said last on standard error, and on standard output beside answers; empty if nothing."""
+        said = [*self._garbage, *self._said]
+        return f"; it said: {' / '.join(said)}" if said else ""
+
+    def close_stdin(self) -> None:
+        """End its standard input, by which it is asked to end."""
+        assert self._popen.stdin is not None
+        with contextlib.suppress(OSError):
+            self._popen.stdin.close()
+
+    def wait_ended(self, within_s: float) -> bool:
+        """Wait until it has ended; False if it takes longer."""
+        return self._pump(lambda: not self.is_running, within_s)
+
+    def kill(self) -> None:
+        """End it and what it has started, now."""
+        if sys.platform == "win32":
+            self._popen.kill()
+        else:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self.pid, signal.SIGKILL)
+        self._popen.wait()
+        self.close_stdin()
+        self._finish_reading()
+
+    def require_clean_output(self) -> None:
+        """Raise Failed if anything but answers came on standard output."""
+        expect(not self._garbage, "only answers on standard output", " / ".join(self._garbage))
+
+    # --- lines ---
+
+    def _write(self, line: str) -> None:
+        assert self._popen.stdin is not None
+        with contextlib.suppress(OSError):  # it has ended: waiting for the answer tells
+            self._popen.stdin.write(line.encode() + b"\n")
+            self._popen.stdin.flush()
+
+    def _read(self, pipe: IO[bytes], take: Callable[[str], None]) -> None:
+        with contextlib.suppress(OSError, ValueError), pipe:
+            for line in pipe:
+                take(line.decode(errors="replace").rstrip())
+                self._wake()
+        self._popen.wait()
+        self._wake()
+
+    def _take(self, line: str) -> None:
+        try:
+            answer = Answer(json.loads(line))
+            self._answers[int(answer["id"])] = answer
+        except (ValueError, TypeError, KeyError):
+            self._garbage.append(line[:200])
+
+    def _note(self, line: str) -> None:
+        self._said.append(line[:300])
+        with self._log.open("a", encoding="utf-8") as file:
+            file.write(f"{self.pid} {line}\n")
+
+    def _finish_reading(self) -> None:
+        if not self.is_running:
+            for thread in self._threads:
+                thread.join(1.0)

@@ -1,0 +1,108 @@
+"""A TCP proxy that cuts connections after a request has gone through, before its reply is delivered.
+
+It knows of ZMTP only where frames begin, which encryption (CURVE) does not hide: after the greeting and the handshake's
+commands, each frame that the scheduler sends belongs to a reply.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import socket
+import threading
+from dataclasses import dataclass, field
+
+_CHUNK = 1 << 16
+_GREETING = 64
+_LONG, _COMMAND = 0x02, 0x04
+
+
+@dataclass
+class FrameCounter:
+    """Counts the frames in a stream of ZMTP that are no commands."""
+
+    messages: int = 0
+    _skip: int = _GREETING
+    _head: bytearray = field(default_factory=bytearray)
+
+    def feed(self, chunk: bytes) -> None:
+        """Take in what was received."""
+        at = 0
+        while at < len(chunk):
+            if self._skip:
+                step = min(self._skip, len(chunk) - at)
+                self._skip, at = self._skip - step, at + step
+                continue
+            self._head.append(chunk[at])
+            at += 1
+            flags, size = self._head[0], self._head[1:]
+            if len(size) == (8 if flags & _LONG else 1):
+                self._skip = int.from_bytes(size, "big")
+                self.messages += not flags & _COMMAND
+                self._head.clear()
+
+
+class CuttingProxy:
+    """Passes on what client and scheduler send each other.
+
+    Args:
+        target: the scheduler's address, "tcp://host:port".
+        share: of the replies that are lost, and their connection with them.
+
+    Attributes:
+        cuts: how many connections were cut.
+    """
+
+    def __init__(self, target: str, share: float) -> None:
+        host, _, port = target.removeprefix("tcp://").rpartition(":")
+        self._target = (host, int(port))
+        self._share, self._random = share, random.Random(1)
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.address = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
+        self._open: set[socket.socket] = set()
+        self._lock = threading.Lock()
+        self.cuts = 0
+        threading.Thread(target=self._accept, name="proxy", daemon=True).start()
+
+    def close(self) -> None:
+        """Cut everything, and listen no more."""
+        with contextlib.suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        with self._lock:
+            self._end(*self._open)
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                client, _ = self._listener.accept()
+                try:
+                    server = socket.create_connection(self._target, 5.0)
+                except OSError:
+                    client.close()
+                    continue
+                server.settimeout(None)
+                with self._lock:
+                    self._open |= {client, server}
+                for pair in ((client, server, False), (server, client, True)):
+                    threading.Thread(target=self._pass_on, args=pair, daemon=True).start()
+
+    def _pass_on(self, source: socket.socket, sink: socket.socket, replies: bool) -> None:
+        counter = FrameCounter()
+        with contextlib.suppress(OSError):
+            for chunk in iter(lambda: source.recv(_CHUNK), b""):
+                before = counter.messages
+                counter.feed(chunk)
+                if replies and counter.messages > before and self._random.random() < self._share:
+                    self.cuts += 1
+                    break
+                sink.sendall(chunk)
+        with self._lock:
+            self._end(source, sink)
+
+    def _end(self, *sockets: socket.socket) -> None:
+        for one in sockets:
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+            one.close()
+        self._open -= set(sockets)

@@ -1,0 +1,173 @@
+"""A scripted scheduler: every byte that the client sends is seen, and every byte that it gets is chosen."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import zmq
+
+from afspm.clock import Clock
+from afspm.model import CLOCK_REQUEST, ControlResponse
+from afspm.transport.frames import receive_frames
+from afspm.transport.keys import Keys
+from afspm.transport.late_joiners import LONGEST, Marker
+from afspm.transport.network import Network
+from afspm.transport.polling import Poller, WakeUp, milliseconds
+from afspm.wire.protocol import ANSWER, QUESTION
+
+
+@dataclass(frozen=True)
+class ScriptedRequest:
+    """A request of the client, as it came; greetings are answered by themselves, and are not among them."""
+
+    peer: bytes
+    frames: tuple[bytes, ...]
+
+    @property
+    def id(self) -> bytes:
+        return self.frames[2] if len(self.frames) > 2 else b""
+
+    def answered(
+        self, code: int = ControlResponse.SUCCESS, payload: bytes = b"", reason: str = "", detail: int = 0
+    ) -> list[bytes]:
+        """Return the frames of a response to it."""
+        frames = [bytes([code]), payload, reason.encode(), self.id]
+        return [*frames, bytes([detail])] if detail else frames
+
+
+Reply = Callable[[ScriptedRequest], Sequence[Sequence[bytes]]]
+
+
+def success(request: ScriptedRequest) -> Sequence[Sequence[bytes]]:
+    """Answer that all is well."""
+    return [request.answered()]
+
+
+class ScriptedScheduler:
+    """The sockets of a scheduler.
+
+    Args:
+        control, publish: where to bind.
+        keys: its own; None: without encryption.
+
+    Attributes:
+        requests: as they came.
+        greetings: the requests 101 that came.
+        prefixes, markers: what was subscribed to.
+        cached: packets, as frames, for who asks by a marker.
+        reply: what to answer a request.
+        greeting: what to answer the request 101.
+    """
+
+    def __init__(self, clock: Clock, control: str, publish: str, keys: Keys | None) -> None:
+        self._clock, self._control, self._publish, self._keys = clock, control, publish, keys
+        self._woken: WakeUp[None] = WakeUp()
+        self.requests: list[ScriptedRequest] = []
+        self.greetings: list[ScriptedRequest] = []
+        self.prefixes: list[bytes] = []
+        self.markers: list[Marker] = []
+        self.cached: list[list[bytes]] = []
+        self.reply: Reply = success
+        self.greeting: Reply = self._what_time_it_is
+        self.open()
+
+    def open(self) -> None:
+        """Bind the sockets, the first time or again."""
+        self._network = Network(self._keys)
+        self._router = self._network.socket(zmq.ROUTER)
+        self._router.setsockopt(zmq.ROUTER_HANDOVER, 1)
+        self._network.bind(self._router, self._control, requests=True)
+        self._publisher = self._network.socket(zmq.XPUB, max_bytes=LONGEST + 1)
+        self._publisher.setsockopt(zmq.XPUB_MANUAL, 1)
+        self._publisher.setsockopt(zmq.XPUB_VERBOSER, 1)
+        self._network.bind(self._publisher, self._publish)
+        self._poller: Poller[Callable[[], None]] = Poller(self._woken)
+        self._poller.register(self._router, self._take_request)
+        self._poller.register(self._publisher, self._take_subscription)
+
+    def shut(self) -> None:
+        """Close the sockets; connections are lost."""
+        self._network.close()
+
+    def close(self) -> None:
+        """Close for good."""
+        self.shut()
+        self._woken.close()
+
+    def wake(self) -> None:
+        """Have `pump` look again. May be called from any thread."""
+        self._woken.post()
+
+    def pump(self, done: Callable[[], bool], within_s: float) -> bool:
+        """Serve until `done()`; False if that takes longer."""
+        until_s = self._clock.monotonic_s() + within_s
+        while not done():
+            left_s = until_s - self._clock.monotonic_s()
+            if left_s <= 0.0:
+                return False
+            sources, woken = self._poller.wait(milliseconds(left_s))
+            if woken:
+                self._woken.take()
+            for take in sources:
+                take()
+        return True
+
+    def serve(self, for_s: float) -> None:
+        """Serve for some time."""
+        self.pump(lambda: False, for_s)
+
+    def publish(self, *frames: bytes) -> None:
+        """Publish a packet, or what is none."""
+        self._publisher.send_multipart(list(frames))
+
+    def send(self, peer: bytes, frames: Sequence[bytes]) -> None:
+        """Send a response to a client."""
+        self._router.send_multipart([peer, b"", *frames])
+
+    @property
+    def peers(self) -> set[bytes]:
+        """The identities of all that asked for anything."""
+        return {request.peer for request in (*self.requests, *self.greetings)}
+
+    def _take_request(self) -> None:
+        peer, *frames = [frame.bytes for frame in receive_frames(self._router)]
+        if frames[:1] == [b""]:
+            del frames[0]
+        request = ScriptedRequest(peer, tuple(frames))
+        if not frames or frames == [b""]:
+            return
+        if tuple(frames) == QUESTION:
+            self.send(peer, ANSWER)
+        elif frames[0] == bytes([CLOCK_REQUEST]):
+            self.greetings.append(request)
+            self._answer(request, self.greeting)
+        else:
+            self.requests.append(request)
+            self._answer(request, self.reply)
+
+    def _answer(self, request: ScriptedRequest, reply: Reply) -> None:
+        for frames in reply(request):
+            self.send(request.peer, frames)
+
+    def _what_time_it_is(self, request: ScriptedRequest) -> Sequence[Sequence[bytes]]:
+        now_s = self._clock.now_s()
+        told = {"now_ns": round(now_s * 1e9), "origin_s": now_s, "start_s": now_s, "speed": 1.0, "simulated": True}
+        return [request.answered(payload=json.dumps(told).encode())]
+
+    def _take_subscription(self) -> None:
+        (frame,) = receive_frames(self._publisher)[:1]
+        kind, subscription = frame.bytes[:1], frame.bytes[1:]
+        marker = Marker.decode(subscription)
+        if kind == b"\0":
+            self._publisher.setsockopt(zmq.UNSUBSCRIBE, subscription if marker is None else marker.topic)
+        elif marker is None:
+            self._publisher.setsockopt(zmq.SUBSCRIBE, subscription)
+            self.prefixes.append(subscription)
+        else:
+            self._publisher.setsockopt(zmq.SUBSCRIBE, marker.topic)
+            self.markers.append(marker)
+            for packet in self.cached:
+                self._publisher.send_multipart([marker.topic, *packet])
+            self._publisher.send(marker.topic)
