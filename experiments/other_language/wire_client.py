@@ -16,6 +16,7 @@ import tempfile
 import threading
 import time
 from collections import deque
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,12 @@ SUCCESS, NO_RESPONSE, ALREADY, WRONG_MODE, NOT_IN_CONTROL, NOT_FREE, WRONG_PROBL
 CONFIG, ENDED = 78, 80
 METRES = {"": 1.0, "m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9, "pm": 1e-12, "angstrom": 1e-10}
 DEGREES = {"": 1.0, "deg": 1.0, "degree": 1.0, "°": 1.0, "rad": 180.0 / np.pi}
+
+
+def say(line):
+    """Write a line for people: a level first, and then what there is to say."""
+    sys.stderr.write(f"{line}\n")
+    sys.stderr.flush()
 
 
 def compiled(folder: Path) -> dict:
@@ -265,7 +272,7 @@ class Client:
     def leave(self, code, why=""):
         """End the program: the last beat says that it closes on purpose."""
         if why:
-            print(f"ERROR {why}", file=sys.stderr, flush=True)
+            say(f"ERROR {why}")
         with self.changed:
             self.stopped = True
             self.changed.notify_all()
@@ -295,9 +302,10 @@ class Client:
                 if not self.wait(lambda: self.connected, try_s * tries):
                     return Response(NO_RESPONSE, b"", "there is no connection to the scheduler", 2 if ever else 1)
                 connection, begun = self.connections, time.monotonic()
+                is_over = partial(self._is_answered_or_lost, asked, connection)
                 self._post([b"", bytes([number]), payload, asked])
                 ever = True
-                self.wait(lambda: asked in self.answers or self.connections != connection or not self.connected, try_s)
+                self.wait(is_over, try_s)
                 if asked in self.answers:
                     return self.answers.pop(asked)
                 if self.connected and self.connections == connection:
@@ -307,6 +315,9 @@ class Client:
             return Response(NO_RESPONSE, b"", "the scheduler does not answer", 2)
         finally:
             self._waiting.discard(asked)
+
+    def _is_answered_or_lost(self, asked, connection):
+        return asked in self.answers or self.connections != connection or not self.connected
 
     def demand(self, number, payload=b""):
         """Send a request that must succeed, and return the object of the response. Raises Refused."""
@@ -452,7 +463,7 @@ class Subscription:
         try:
             packet = Packet(frames)
         except Exception as error:
-            print(f"WARNING dropped a packet: {error}", file=sys.stderr, flush=True)
+            say(f"WARNING dropped a packet: {error}")
             return
         if packet.time_ns is not None:
             if packet.time_ns <= self._newest_of.get(packet.envelope, -1):

@@ -304,14 +304,10 @@ class Fragile(wire_client.Client):
     """Ends over a packet that can't be read."""
 
     def __init__(self, launch):
-        class Raising(wire_client.Subscription):
-            def take(self):
-                said = wire_client.print if hasattr(wire_client, "print") else print
-                wire_client.print = lambda *a, **k: self._client.leave(1)
-                super().take()
-                wire_client.print = said
+        def end_over(line):
+            self.leave(1)
 
-        wire_client.Subscription = Raising
+        wire_client.say = end_over
         super().__init__(launch)
 
 
