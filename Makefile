@@ -68,11 +68,12 @@ test-translators: $(TEST)
 	done; test -z "$$failed" || { echo "not as they should be:$$failed"; exit 1; }
 
 ## tests with a Windows Python under Wine, on Debian, two folders at a time: make test-windows TESTS="tests/unit/wire"
-# (a test that takes too long or crashes ends its process there, and with it the tests of its folder)
-TESTS ?= $(wildcard tests/unit/*/ tests/unit/*.py) $(addprefix tests/system/,process supervisor record experiment)
+# (those of whole experiments take longest: they come first; tip_repair is in components, the Nanonis sample in microscopes)
+TESTS ?= $(addprefix tests/system/,experiment supervisor microscopes components process record emulators) \
+	$(filter-out %__/,$(wildcard tests/unit/*/)) $(wildcard tests/unit/test_*.py)
 test-windows: $(TEST)
 	@$(PYTHON) tools/windows/python.py
-	@printf '%s\n' $(TESTS) | grep -v __ | xargs -P 2 -n 1 $(PYTHON) tools/windows/python.py -m pytest -q -p no:cacheprovider
+	@$(PYTHON) tools/windows/run_tests.py $(TESTS)
 
 ## the files of runs, with the validator of NeXus
 test-nexus: $(TEST)

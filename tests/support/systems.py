@@ -3,14 +3,55 @@
 from __future__ import annotations
 
 import ctypes
+import signal
+import subprocess
 import sys
+from typing import Any, Final
 
+import psutil
 import pytest
 
-WINE = sys.platform == "win32" and hasattr(ctypes.WinDLL("ntdll"), "wine_get_version")
+WINDOWS: Final = sys.platform == "win32"
+WINE: Final = WINDOWS and hasattr(ctypes.WinDLL("ntdll"), "wine_get_version")
 """A Windows Python runs the tests, but Windows' own functions are those of Wine."""
+KILLED: Final = 1 if WINDOWS else -9
+"""The exit code of a process that Popen.kill has ended."""
+KILLED_FROM_OUTSIDE: Final = 15 if WINDOWS else -9
+"""The exit code of a process that `kill` has ended."""
+HAS_CONSOLE: Final = not WINDOWS or bool(ctypes.WinDLL("kernel32").GetConsoleWindow())
+
+can_interrupt = pytest.mark.skipif(not HAS_CONSOLE, reason="without a console nobody can press Ctrl-C in it")
 
 
 def not_on_wine(reason: str) -> pytest.MarkDecorator:
     """Skip a test under Wine, for a reason that does not hold on a real Windows."""
     return pytest.mark.skipif(WINE, reason=f"Wine: {reason}")
+
+
+def kill(pid: int) -> None:
+    """End a process from outside, so that it can do nothing about it."""
+    psutil.Process(pid).kill()
+
+
+def freeze(pid: int) -> None:
+    """Stop a process where it is, with its connections open."""
+    psutil.Process(pid).suspend()
+
+
+def interrupt(process: subprocess.Popen[Any]) -> None:
+    """Press Ctrl-C for a process that shares our console.
+
+    On Windows all that share it hear of it: we ourselves must not, from now on.
+    """
+    if sys.platform == "win32":
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        assert ctypes.WinDLL("kernel32").GenerateConsoleCtrlEvent(signal.CTRL_C_EVENT, 0)
+    else:
+        process.send_signal(signal.SIGINT)
+
+
+def wait_until_gone(pids: dict[str, int], seconds: float) -> None:
+    """Wait for the end of processes that others have started; fails with the names of those that live on."""
+    processes = {psutil.Process(pid): name for name, pid in pids.items() if psutil.pid_exists(pid)}
+    _, alive = psutil.wait_procs(processes, seconds)
+    assert not alive, f"{[processes[process] for process in alive]} live on"

@@ -54,9 +54,10 @@ def main() -> None:
         _make_prefix()
         _install_afspm()
         return
-    # Wine's server is started apart, else it would say things of its own on our output
+    # Wine's server and services are started apart, else they would hold our output open
     environment = {**os.environ, **ENVIRONMENT}
-    subprocess.run([str(WINE.with_name("wineserver")), "-p60"], env=environment, stderr=subprocess.DEVNULL, check=False)
+    for apart in ([str(WINE.with_name("wineserver")), "-p60"], [str(WINE), "wineboot"]):
+        subprocess.run(apart, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)
     # a pipe as standard output, and no terminal as standard input: Wine's console is not that of Windows
     run = subprocess.Popen(
         [str(WINE), str(PYTHON / "python.exe"), *sys.argv[1:]],

@@ -6,7 +6,6 @@ import html
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from systems import can_interrupt, interrupt, kill
 from typer.testing import CliRunner
 
 from afspm.cli.app import app
@@ -22,7 +22,7 @@ from afspm.client.connect import find_run
 from afspm.client.follower import Follower
 from afspm.record.run import open_run
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+pytestmark = can_interrupt
 AFSPM = (sys.executable, "-m", "afspm")
 DEADLINE_S = 100.0  # a command or a picture takes long on a computer with much else to do
 EXPERIMENT = """
@@ -103,7 +103,7 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         running.wait_for(r"scan 1 of")
         yield running
     finally:
-        running.process.send_signal(signal.SIGINT)
+        interrupt(running.process)
         running.process.communicate(timeout=DEADLINE_S)
 
 
@@ -223,7 +223,7 @@ def test_a_note_on_a_scan_outlives_the_scheduler(night: Running) -> None:
 def kill_scheduler(night: Running) -> None:
     processes = night.until(lambda t: t["processes"])["processes"]
     before = next(one for one in processes if one["name"] == "scheduler")
-    os.kill(before["pid"], signal.SIGKILL)
+    kill(before["pid"])
     night.until(
         lambda t: any(one["name"] == "scheduler" and one["starts"] == before["starts"] + 1 for one in t["processes"])
     )

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import re
-import signal
 import subprocess
 import sys
 import threading
@@ -15,6 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from systems import freeze, kill
 
 import afspm
 
@@ -57,11 +57,11 @@ history = {{ Scan2d = 20 }}
 WITNESS = '''
 """Writes down every scan that it gets, and ends the experiment when it has had all of them."""
 
-import os
-import signal
 import threading
 from collections import Counter
 from pathlib import Path
+
+import psutil
 
 from afspm.model import ScopeState
 from afspm.client.component import Component
@@ -111,7 +111,7 @@ class Late(Component):
         self.seen[scan.channel] += 1
         if min(self.seen.values()) >= self.scans:
             if self.first:
-                os.kill(os.getpid(), signal.SIGSTOP)
+                psutil.Process().suspend()
             (self.run_dir / f"{self.name} has them all.txt").touch()
 '''
 
@@ -172,9 +172,13 @@ class AfspmRun:
         """Wait until the component has come up so many times."""
         self.wait_for(rf" {name} .*is up$", count=times)
 
-    def signal(self, name: str, number: signal.Signals) -> None:
-        """Send a signal to the component's process."""
-        os.kill(self.pid(name), number)
+    def kill(self, name: str) -> None:
+        """Kill the component's process."""
+        kill(self.pid(name))
+
+    def freeze(self, name: str) -> None:
+        """Stop the component's process where it is."""
+        freeze(self.pid(name))
 
     def end(self) -> int:
         """The exit code, once it has ended by itself."""

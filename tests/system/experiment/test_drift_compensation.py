@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from drift_rig import Rig, Surveyed, surveyed, table, worker_of
+from systems import KILLED_FROM_OUTSIDE, kill
 
 from afspm.model import Region
 
@@ -56,11 +55,11 @@ def test_a_sample_that_drifts_stands_still_for_components(rig: Rig) -> None:
 def test_killed_in_the_middle_the_scheduler_and_its_worker_know_where_the_sample_is(rig: Rig) -> None:
     run = rig.start('rescan = { rule = "never" }', scans=5)
     run.wait_for("surveyor .*round 1 is done")
-    os.kill(worker_of(run), signal.SIGKILL)
+    kill(worker_of(run))
     run.wait_for("surveyor .*round 2 is done")
-    run.signal("scheduler", signal.SIGKILL)
+    run.kill("scheduler")
     assert run.end() == 0, run.output
-    assert "is restarted: exit code -9" in run.output
+    assert f"is restarted: exit code {KILLED_FROM_OUTSIDE}" in run.output
     require_it_stood_still(surveyed(run), 5)
     rows = table(run)
     assert [row["matched"] for row in rows] == ["yes"] * len(rows), rows

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from pathlib import Path
 
 import pytest
 from experiment_lab import AfspmRun, Run, require_each_once, require_each_row_once
+from systems import can_interrupt, interrupt
 
 from afspm.client.connect import connect
 from afspm.model import ScopeState
-
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 
 QUICK = """
 [restart]
@@ -46,7 +44,7 @@ def test_each_process_is_killed_in_turn_and_every_scan_is_there_once(run: Run) -
     for times, state in ((2, "SCANNING"), (3, "FREE")):
         for name in EACH:
             one.wait_for_next(" witness ", f"state {state}")
-            one.signal(name, signal.SIGKILL)
+            one.kill(name)
             one.wait_up(name, times)
     assert one.end() == 0, one.output
     require_each_once(one, 40)
@@ -60,7 +58,7 @@ def test_a_frozen_process_is_replaced_and_every_scan_is_there_once(run: Run) -> 
     one.wait_for("scan 2 of 10")
     for name in ("microscope", "scheduler", "series"):
         one.wait_for_next(" witness ", "state SCANNING")
-        one.signal(name, signal.SIGSTOP)
+        one.freeze(name)
         one.wait_for(f" {name} ", "no heartbeat")
         one.wait_up(name, times=2)
     assert one.end() == 0, one.output
@@ -72,21 +70,21 @@ def test_all_but_the_witness_killed_at_once_and_every_scan_is_there_once(run: Ru
     one.wait_for("scan 2 of 5")
     one.wait_for_next(" witness ", "state SCANNING")
     for name in EACH:
-        one.signal(name, signal.SIGKILL)
+        one.kill(name)
     assert one.end() == 0, one.output
     require_each_once(one, 5)
     require_each_row_once(one, 5)
 
 
 def test_what_dies_or_freezes_at_the_end_is_started_again_to_finish(run: Run) -> None:
-    faults = {"dies": signal.SIGKILL, "freezes": signal.SIGSTOP}
+    faults = {"dies": AfspmRun.kill, "freezes": AfspmRun.freeze}
     finishers = (f'[{name}]\ncomponent = true\nclass = "witness.Finisher"\n' for name in faults)
     one = run(more=QUICK + "".join(finishers))
     for name in faults:
         one.wait_for(f" {name} ", "finishing")
     one.wait_for(" afspm ", "the experiment has ended$")
     for name, fault in faults.items():
-        one.signal(name, fault)
+        fault(one, name)
     for name in faults:
         one.wait_for(f" {name} ", "restarting it, to finish")
     assert one.end() == 0, one.output
@@ -140,6 +138,7 @@ class Survey(Component):
 """
 
 
+@can_interrupt
 def test_a_script_that_fails_twice_alike_does_not_measure_a_third_time(run: Run, tmp_path: Path) -> None:
     (tmp_path / "survey.py").write_text(SURVEY, encoding="utf-8")
     one = run(more='[survey]\ncomponent = true\nclass = "survey.Survey"\n', scans=1000)
@@ -152,14 +151,14 @@ def test_a_script_that_fails_twice_alike_does_not_measure_a_third_time(run: Run,
         scope.restart("survey")
     one.wait_for("gave up survey", count=2)
     assert sum(" survey " in line and "started, process" in line for line in one.lines) == 4, one.output
-    one.process.send_signal(signal.SIGINT)
+    interrupt(one.process)
     one.end()
 
 
 def test_without_a_microscope_the_run_ends_and_says_so(run: Run) -> None:
     one: AfspmRun = run(more="[restart]\nbudget = 0\n", scans=1000)
     one.wait_for("scan 1 of 1000")
-    one.signal("microscope", signal.SIGKILL)
+    one.kill("microscope")
     assert one.end() == 1, one.output
     one.wait_for("CRITICAL gave up microscope; the experiment can't go on without it")
 
@@ -180,7 +179,7 @@ def test_an_experiment_whose_disk_hangs_is_steered_and_ended(
         assert scope.wait_until(lambda: scope.state is not ScopeState.SCANNING, timeout_s=30.0)
         one.wait_for("CRITICAL", "the disk has not answered")
         began_s = time.monotonic()
-        one.process.send_signal(signal.SIGINT)
+        interrupt(one.process)
         one.end()
     assert time.monotonic() - began_s < 30.0
     switch.unlink()

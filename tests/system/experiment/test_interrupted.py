@@ -43,7 +43,7 @@ with afspm.connect(sys.argv[1], "notebook") as scope:
 """
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="sends a POSIX signal")
+@pytest.mark.skipif(sys.platform == "win32", reason="a console's Ctrl-C reaches all who share it")
 @pytest.mark.parametrize("times", [1, 3])
 def test_the_scan_is_stopped_and_the_next_call_works(
     afspm_run: Callable[..., AfspmRun], tmp_path: Path, times: int

@@ -3,14 +3,12 @@ to it."""
 
 from __future__ import annotations
 
-import os
-import select
-import signal
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from experiment_lab import AfspmRun, require_each_once
+from systems import can_interrupt, interrupt, wait_until_gone
 
 from afspm.process.memory import Memory
 
@@ -102,26 +100,26 @@ def test_a_tip_that_was_left_in_danger_is_retracted_and_nobody_measures_before_i
     require_each_once(one, 6)
 
 
-@pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="waiting for the end of another's child")
-@pytest.mark.parametrize(("by", "retract"), [("SIGTERM", False), ("SIGKILL", True)])
+@pytest.mark.parametrize(("killed", "retract"), [pytest.param(False, False, marks=can_interrupt), (True, True)])
 def test_when_a_run_ends_with_the_feedback_off_the_tip_is_retracted_unless_the_file_says_otherwise(
-    run: Callable[..., AfspmRun], tmp_path: Path, by: str, retract: bool
+    run: Callable[..., AfspmRun], tmp_path: Path, killed: bool, retract: bool
 ) -> None:
     (tmp_path / "danger.py").write_text(MODULE, encoding="utf-8")
     one = run(more=BLIND.format(retract=str(retract).lower()), scans=1000)
     one.wait_for(" blind ", "the feedback is off")
-    translator = os.pidfd_open(one.pid("microscope"))
-    one.process.send_signal(getattr(signal, by))
-    try:
-        assert select.select([translator], [], [], 10.0)[0]
-    finally:
-        os.close(translator)
+    translator = {"the translator": one.pid("microscope")}
+    if killed:
+        one.process.kill()
+    else:
+        interrupt(one.process)
+    wait_until_gone(translator, 10.0)
     assert engaged(one) is not retract
-    if by != "SIGKILL":  # there is nobody any more to tell it to
+    if not killed:  # there is nobody any more to tell it to
         assert one.end() == 130, one.output
         assert RETRACTED not in one.output
 
 
+@can_interrupt
 def test_with_the_tip_retracted_by_ctrl_c_a_run_is_resumed_when_that_was_seen_to(
     run: Callable[..., AfspmRun], afspm_run: Callable[..., AfspmRun], tmp_path: Path
 ) -> None:
@@ -129,7 +127,7 @@ def test_with_the_tip_retracted_by_ctrl_c_a_run_is_resumed_when_that_was_seen_to
     more = BLIND.format(retract="true") + DOCTOR
     one = run(more=more, scans=1000)
     one.wait_for(" blind ", "the feedback is off")
-    one.process.send_signal(signal.SIGINT)
+    interrupt(one.process)
     assert one.end() == 130, one.output
     assert RETRACTED in one.output
     assert not engaged(one)

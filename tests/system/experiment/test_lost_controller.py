@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from experiment_lab import AFSPM, WITNESS, AfspmRun
-
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 
 FILES = Path(__file__).parents[3] / "experiments" / "every_microscope"
 ADDRESSES = {"nanonis": "127.0.0.1:{port}", "asylum": "tcp://127.0.0.1:{port}", "gxsm": "127.0.0.1:{port}"}
@@ -66,7 +62,7 @@ def test_a_controller_that_is_killed_while_it_scans_is_a_malfunction_until_it_is
     run.wait_for("details .*scan 1 of 3 at")
     run.wait_for_next(" witness ", "state SCANNING")
     cleared_before = run.output.count("cleared device-malfunction")
-    run.signal("controller", signal.SIGKILL)
+    run.kill("controller")
     run.wait_for_next("ERROR lost contact with the controller: ")
     run.wait_for_next("translator flagged device-malfunction; details lost control")
     run.wait_up("controller", times=2)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import select
-import signal
 import sys
 import tempfile
 from contextlib import suppress
@@ -12,12 +9,11 @@ from pathlib import Path
 
 import pytest
 from experiment_lab import Run, require_each_once, require_recorded_once
+from systems import can_interrupt, interrupt, wait_until_gone
 
 import afspm
 from afspm.errors import ExperimentEnded
 from afspm.supervisor.ports import FreePorts
-
-posix_only = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 
 
 def test_an_experiment_ends_by_itself_and_leaves_its_folder(run: Run, tmp_path: Path) -> None:
@@ -126,18 +122,17 @@ def test_the_second_file_wins_and_modules_beside_the_file_are_meant_not_those_wh
     require_each_once(one, 1)
 
 
-@posix_only
+@can_interrupt
 def test_ctrl_c_ends_all_cleanly(run: Run) -> None:
     """How long that takes, the benchmarks say."""
     one = run(scans=1000)
     one.wait_for("scan 1 of 1000")
-    one.process.send_signal(signal.SIGINT)
+    interrupt(one.process)
     assert one.end() == 130, one.output
     for name in ("microscope", "scheduler", "series", "witness"):
         one.wait_for(f" {name} ", "ended as it was asked to")  # by itself: nothing had to be killed
 
 
-@pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="waiting for the end of another's child")
 def test_a_killed_supervisor_leaves_no_process_behind(run: Run) -> None:
     code = "import os, threading; print('pid', os.getpid(), flush=True); threading.Event().wait()"
     more = f"[foreign]\ncomponent = true\nheartbeats = false\ncommand = ['python', '-c', {code!r}]\n"
@@ -146,12 +141,5 @@ def test_a_killed_supervisor_leaves_no_process_behind(run: Run) -> None:
     names = ("microscope", "scheduler", "series", "witness", "foreign")
     pids = {name: one.pid(name) for name in names}
     pids["command of foreign"] = int(one.wait_for(" foreign ", "pid ").rsplit(" ", 1)[1])
-    watched = {name: os.pidfd_open(pid) for name, pid in pids.items()}
     one.process.kill()
-    try:
-        for name, descriptor in watched.items():
-            readable, _, _ = select.select([descriptor], [], [], 10.0)
-            assert readable, f"{name} lives on"
-    finally:
-        for descriptor in watched.values():
-            os.close(descriptor)
+    wait_until_gone(pids, 10.0)

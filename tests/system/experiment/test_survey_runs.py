@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import re
-import signal
 import subprocess
 import sys
 from collections import Counter
@@ -64,16 +63,16 @@ def require_each_once(one: AfspmRun, targets: int, said: str = "") -> None:
 def test_killed_and_kept_waiting_by_a_changed_tip_it_measures_each_target_once(afspm_run: Run, tmp_path: Path) -> None:
     one = afspm_run(str(SAMPLE), overlay(tmp_path, FEWER + SLOWER + BY_HAND), "--runs", str(tmp_path / "runs"))
     one.wait_for("survey .*4 targets found")
-    one.signal("survey", signal.SIGKILL)
+    one.kill("survey")
     one.wait_for("target 1 of 4 .*measured")
     with afspm.connect(one.folder, name="person") as scope:
         scope.flag("tip-shape-changed")
         one.wait_for("survey .*waiting for control")
-        one.signal("survey", signal.SIGKILL)
+        one.kill("survey")
         one.wait_up("survey", 3)
         scope.clear("tip-shape-changed")
         one.wait_for("target 2 of 4 .*measured")
-        one.signal("survey", signal.SIGKILL)
+        one.kill("survey")
     assert one.end() == 0, one.output
     require_each_once(one, 4)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,11 +9,13 @@ from typing import Any
 
 import pytest
 from supervisor_lab import BEAT_S, DEADLINE_S, Running, RunTasks, peer
+from systems import KILLED_FROM_OUTSIDE, kill
 
 from afspm import wire
 from afspm.clock import ExperimentClock
 from afspm.experiment import Role
 from afspm.launch import Launch, Sockets
+from afspm.logic.supervision.supervisor_events import describe_exit
 from afspm.model import (
     RESTART_REQUEST,
     ControlRequest,
@@ -142,11 +142,11 @@ def test_processes_lines_and_refusals_are_published_and_orders_are_carried_out(r
     assert (first.role, first.pid) == ("component", rig.running.pid("one"))
     assert listener.alive("scheduler", 1).role == "scheduler"
 
-    os.kill(first.pid, signal.SIGKILL)
+    kill(first.pid)
     second = listener.alive("one", 2)
     assert second.pid != first.pid
     assert second.since_ns >= first.since_ns
-    assert second.last_exit == "killed by SIGKILL"
+    assert second.last_exit == describe_exit(KILLED_FROM_OUTSIDE)
     listener.until(lambda: any(line.name == "one" and "restarting" in line.text for line in listener.lines))
 
     listener.until(lambda: listener.ask(RESTART_REQUEST, "two").ok)
@@ -170,7 +170,7 @@ def test_a_scheduler_that_was_killed_is_told_again_and_has_what_it_had(tmp_path:
         listener.alive("one", 1)
         listener.until(lambda: listener.ask(ControlRequest.REQUEST_CTRL, 0).ok)
         listener.until(lambda: any(entry.what == "in control" for entry in listener.entries))
-        os.kill(rig.running.pid("scheduler"), signal.SIGKILL)
+        kill(rig.running.pid("scheduler"))
         listener.alive("scheduler", 2)
         listener.until(lambda: any(entry.what.startswith("started again; dashboard") for entry in listener.entries))
         late = Listener(Network(), rig.publish, rig.serve)
@@ -198,7 +198,7 @@ def test_components_begin_once_their_own_scheduler_has_answered(run_tasks: RunTa
     tasks = (peer("scheduler", Role.SCHEDULER), peer("one"), peer("microscope", Role.TRANSLATOR))
     running = run_tasks(*tasks, reporter=Reporter(asking, CLOCK, "lab"))
     running.terminal.wait_for(" microscope ", "life 1")
-    os.kill(running.pid("microscope"), signal.SIGKILL)
+    kill(running.pid("microscope"))
     running.terminal.wait_for(" microscope ", "life 1", count=2)  # whoever was started with it has long had time
     assert not any(" one " in line and "life 1" in line for line in running.terminal.lines)
     port = ZmqServerPort(Network(), CLOCK, serve=address, publish=None)

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from supervisor_lab import DEADLINE_S, QUICK, RunTasks, peer
+from systems import KILLED_FROM_OUTSIDE, freeze, kill
 
 from afspm.clock import ExperimentClock
 from afspm.exit_codes import ExitCode
 from afspm.experiment import Role
 from afspm.logic.supervision.run_end import EndReason
+from afspm.logic.supervision.supervisor_events import describe_exit
 from afspm.supervisor.process import Task
 
-posix_only = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 look_only = pytest.mark.skipif(sys.platform not in ("linux", "win32"), reason="a process can't be looked at there")
 
 
@@ -46,20 +45,18 @@ def test_a_translator_that_ends_without_a_word_has_crashed_whatever_its_exit_cod
     assert (outcome.why, outcome.reports[0].starts) == (EndReason.STOPPED, 2)
 
 
-@posix_only
 def test_a_killed_process_is_started_again(run_tasks: RunTasks, tmp_path: Path) -> None:
     running = run_tasks(peer("a", lives=str(tmp_path / "lives")))
     running.terminal.wait_for(" a ", "life 1")
-    os.kill(running.pid("a"), signal.SIGKILL)
-    running.terminal.wait_for(" a ", "killed by SIGKILL")
+    kill(running.pid("a"))
+    running.terminal.wait_for(" a ", describe_exit(KILLED_FROM_OUTSIDE))
     running.terminal.wait_for(" a ", "life 2")
 
 
-@posix_only
 def test_a_frozen_process_is_killed_and_started_again(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("a"))
     running.terminal.wait_for(" a ", "is up")
-    os.kill(running.pid("a"), signal.SIGSTOP)
+    freeze(running.pid("a"))
     running.terminal.wait_for(" a ", "no heartbeat")
     running.terminal.wait_for(" a ", "is up", count=2)
 
@@ -86,16 +83,14 @@ def test_one_that_holds_pythons_lock_longer_than_it_declared_is_killed(run_tasks
     running.terminal.wait_for(" a ", "life 2")
 
 
-@posix_only
-@pytest.mark.parametrize("fault", [signal.SIGSTOP, None] if sys.platform != "win32" else [])
+@pytest.mark.parametrize("first", ["grip", "stuck"])
 def test_one_that_holds_pythons_lock_and_stands_still_is_killed(
-    run_tasks: RunTasks, tmp_path: Path, fault: signal.Signals | None
+    run_tasks: RunTasks, tmp_path: Path, first: str
 ) -> None:
-    first = "stuck" if fault is None else "grip"
     running = run_tasks(peer("a", first=first, busy_s=600.0, longest_step_s=600.0, lives=str(tmp_path / "lives")))
-    if fault is not None:
+    if first == "grip":
         running.terminal.wait_for(" a ", "holds on")
-        os.kill(running.pid("a"), fault)
+        freeze(running.pid("a"))
     running.terminal.wait_for(" a ", "no heartbeat")
     running.terminal.wait_for(" a ", "life 2")
 
@@ -250,7 +245,6 @@ def test_a_program_that_sends_no_heartbeats_is_not_waited_for(run_tasks: RunTask
     assert reports["program"] == 1
 
 
-@posix_only
 def test_a_scheduler_that_somebody_asks_to_end_is_started_again(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("scheduler", Role.SCHEDULER, first="exit", code=int(ExitCode.ORPHAN)))
     running.terminal.wait_for(" scheduler ", "restarting")

@@ -6,7 +6,7 @@ import contextlib
 
 import numpy as np
 import pytest
-from corpus import reading, whole
+from corpus import reading, to_damage, whole
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import DATA, WHOLE
@@ -58,22 +58,22 @@ def test_values_that_are_cut_off_are_refused(name: str) -> None:
             reading(content[:length], name)
 
 
-@pytest.mark.parametrize("name", [*WHOLE, *SOME])
+@pytest.mark.parametrize("name", to_damage([*WHOLE, *SOME]))
 @settings(max_examples=30)
 @given(data=st.data())
 def test_damaged_bytes_are_refused_or_read_and_nothing_else(name: str, data: st.DataObject) -> None:
     need(name)
-    damaged = bytearray(whole(name))
+    content = bytearray(whole(name))
     # headers are at the beginning, of some formats at the end
     places = st.one_of(
-        st.integers(0, min(len(damaged), 3000) - 1),
-        st.integers(max(len(damaged) - 1000, 0), len(damaged) - 1),
-        st.integers(0, len(damaged) - 1),
+        st.integers(0, min(len(content), 3000) - 1),
+        st.integers(max(len(content) - 1000, 0), len(content) - 1),
+        st.integers(0, len(content) - 1),
     )
     for place in data.draw(st.lists(places, min_size=1, max_size=8)):
-        damaged[place] = data.draw(st.integers(0, 255))
+        content[place] = data.draw(st.integers(0, 255))
     with contextlib.suppress(FileError):
-        for one in reading(bytes(damaged), name):
+        for one in reading(bytes(content), name):
             assert one.values.ndim == 2
             assert one.values.dtype == np.float64
 
