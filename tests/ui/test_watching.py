@@ -90,7 +90,7 @@ def test_each_pixel_has_the_colour_of_its_value(night: Night, opened: Opened, sc
 def test_it_is_said_to_be_simulated_and_what_is_scanned(night: Night, opened: Opened, scan: Scan, keep: Any) -> None:
     page = opened(night.url)
     shown(page, scan)
-    assert page.locator(".simulated").inner_text() == "SIMULATED: this is no real microscope"
+    assert page.locator(".simulated").inner_text() == "SIMULATED: this is not a real microscope"
     facts = dict(zip(*(page.locator(f".facts {tag}").all_inner_texts() for tag in ("dt", "dd")), strict=True))
     assert (facts["Angle"], facts["Pixels"], facts["Size"]) == ("22.92°", "72 × 48", "800 × 500 nm")
     assert facts["Bias"] == "100 mV"

@@ -132,7 +132,9 @@ def _people_in(file: Path) -> dict[str, str]:
         raise ConfigError(f"can't be read: {error}", where=str(file), hint='lines like Ada = "scrypt:…"') from error
     table = found.get("people", found)
     if not isinstance(table, dict) or not all(isinstance(kept, str) for kept in table.values()):
-        raise ConfigError("that is no table of names and hashes", where=str(file), hint='lines like Ada = "scrypt:…"')
+        raise ConfigError(
+            "that is not a table of names and hashes", where=str(file), hint='lines like Ada = "scrypt:…"'
+        )
     return table
 
 

@@ -208,7 +208,7 @@ def _settings(given: list[str]) -> dict[str, Any]:
             quoted = value.replace("\\", "\\\\").replace('"', '\\"')
             value = f'"{quoted}"'
         if not found:
-            raise ConfigError(f"{one!r} is no setting", hint="SETTING=VALUE")
+            raise ConfigError(f"{one!r} is not a setting", hint="SETTING=VALUE")
         lines.append(f"{key} = {value}")
     try:
         return tomllib.loads("\n".join(lines))

@@ -58,7 +58,7 @@ class FeedbackSignal:
         try:
             height_m = height.values * convert(1.0, height.unit, "m")
         except UnitError as wrong:
-            raise InvalidValue(f"{height.channel} is no height: {wrong.what}") from wrong
+            raise InvalidValue(f"{height.channel} is not a height: {wrong.what}") from wrong
         if height_m.shape != error.shape:
             raise InvalidValue(f"{height.channel} has not the pixels of {signal.channel}")
         return feedback_error(error, threshold, height_m, self._gap_m(signal, setpoint))

@@ -91,7 +91,7 @@ class TipClassifier(Component):
         try:
             verdict = pair.judged_by(self.judge, learns=self._problems == ())  # None: flags are not known yet
         except UnitError as error:
-            self.log.warning("%s is no height: %s", pair.trace.channel, error)
+            self.log.warning("%s is not a height: %s", pair.trace.channel, error)
             return
         self.counter.count(verdict.opinion)
         self._tell(pair.trace, verdict)

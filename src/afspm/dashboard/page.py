@@ -34,7 +34,7 @@ _HEAD = f"""<style>{timeline.CSS}</style><link rel="stylesheet" href="/assets/da
 <script type="module" src="/assets/page.js"></script>"""
 LEVELLINGS = {Levelling.LINES: "line by line"}
 """How levellings are called where their value is no word."""
-SIMULATED = "SIMULATED: this is no real microscope"
+SIMULATED = "SIMULATED: this is not a real microscope"
 
 
 @dataclass(frozen=True)

@@ -107,7 +107,7 @@ def _length_m(text: str) -> float:
         raise UnitError(f"{text!r} has no unit", hint='write a length, for example "400 nm"')
     length_m = convert(number, unit, "m")
     if not 0.0 < length_m < math.inf:
-        raise InvalidValue(f"{text!r} is no size of a scan", hint="it has to be above zero")
+        raise InvalidValue(f"{text!r} is not a size of a scan", hint="it has to be above zero")
     return length_m
 
 

@@ -192,9 +192,9 @@ class Emulator(ABC):
         except Exception as error:
             if getattr(error, "errno", None) not in _TAKEN:
                 raise
-            hint = "end that, or choose another port; without --port and --usual a free one is taken"
+            hint = "end that program or choose another port; without --port and --usual a free port is chosen"
             raise TransportError(
-                f"another program listens at the port {self.port or 'of the vendor'}", hint=hint
+                f"another program listens at port {self.port or 'of the vendor'}", hint=hint
             ) from error
 
     def stop(self) -> None:
@@ -293,7 +293,7 @@ class Emulator(ABC):
         except Crashed:
             raise
         except Exception:
-            self.log.exception("the emulated %s gave up what it was doing, after an error of its own", self.vendor)
+            self.log.exception("the emulated %s failed and dropped its current activity", self.vendor)
             self.abandon()
             return self.clock.now_s() + _AGAIN_S
 

@@ -30,7 +30,7 @@ class Fault:
 
     def __post_init__(self) -> None:
         if not (self.at_s >= 0 and self.count >= 1 and self.duration_s >= 0):
-            raise ConfigError(f"{self} never strikes", where="faults", hint="at_s >= 0, count >= 1, duration_s >= 0")
+            raise ConfigError(f"{self} can never happen", where="faults", hint="at_s >= 0, count >= 1, duration_s >= 0")
 
     @classmethod
     def parse(cls, text: str) -> Fault:
@@ -67,7 +67,7 @@ class Fault:
         try:
             return cls(**given)
         except TypeError as error:
-            raise ConfigError(f"{dict(given)} can't be: {error}", where="faults") from error
+            raise ConfigError(f"{dict(given)} is not a fault: {error}", where="faults") from error
 
 
 class Faults:

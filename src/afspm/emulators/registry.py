@@ -32,7 +32,7 @@ def emulator(name: str) -> type[Emulator]:
         module_name, class_name = f"{emulators.__name__}.{name}", CONSTANT
     found = getattr(_imported(module_name, name), class_name, None)
     if not (isinstance(found, type) and issubclass(found, Emulator)):
-        raise ConfigError(f"{name} is no emulator", hint="a class derived from afspm.emulators.emulator.Emulator")
+        raise ConfigError(f"{name} is not an emulator", hint="a class derived from afspm.emulators.emulator.Emulator")
     return found
 
 
@@ -40,4 +40,6 @@ def _imported(module: str, name: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        raise ConfigError(f"the emulator {name} can't be imported: {error}", hint="is it on the path?") from error
+        raise ConfigError(
+            f"the emulator {name} can't be imported: {error}", hint="is it installed, or on the path?"
+        ) from error

@@ -214,7 +214,7 @@ class Rig:
         Raises:
             RigBusy: with something else than a move. InvalidValue: no place.
         """
-        _finite("a place for the probe", *xy_m)
+        _finite("the position of the probe", *xy_m)
         now_s = self.clock.now_s()
         if self.doing(now_s) != "move":
             self._free_now_s()
@@ -250,7 +250,7 @@ class Rig:
     def crash(self, depth_m: float, speed_m_s: float) -> str:
         """Drive the tip into the sample where the probe is, and out again: as `pulse`."""
         if not min(depth_m, speed_m_s) > 0.0:
-            raise InvalidValue(f"a crash {depth_m} m deep with {speed_m_s} m/s", hint="deeper and faster than nothing")
+            raise InvalidValue(f"a crash {depth_m} m deep with {speed_m_s} m/s", hint="depth and speed must be above 0")
         now_s = self._free_now_s()
         outcome = self.world.crash(self._probe_m, depth_m, speed_m_s, now_s) if self.engaged else "unchanged"
         self.occupy("crash", 2.0 * depth_m / speed_m_s)
@@ -283,7 +283,7 @@ class Rig:
 
     def occupy(self, what: str, lasts_s: float) -> None:
         """Be busy with anything else for so long. Raises RigBusy, InvalidValue."""
-        _finite("a time to be busy", lasts_s)
+        _finite("the duration", lasts_s)
         now_s = self._free_now_s()
         self._doing = Occupied(what, now_s, now_s + lasts_s)
 
@@ -302,4 +302,4 @@ class Rig:
 def _finite(what: str, *values: float) -> None:
     """Raises InvalidValue unless all are."""
     if not all(map(math.isfinite, values)):
-        raise InvalidValue(f"{what}: {', '.join(map(str, values))}", hint="finite")
+        raise InvalidValue(f"{what}: {', '.join(map(str, values))}", hint="must be finite")

@@ -75,7 +75,7 @@ class ScanDrawing:
             try:
                 drawn = draw()
             except Exception:
-                self.log.exception("scan %d can't be simulated: it was broken off", scan.number)
+                self.log.exception("scan %d can't be simulated and was stopped", scan.number)
                 drawn, scan.stopped_s = NoValues(self._units, scan.shape), scan.start_s
             scan._drawn.set_result(drawn)
             self.wake()
@@ -91,7 +91,7 @@ def _check_scannable(scan: ScanActivity) -> None:
     if not (reach and max(pixels) <= _LONGEST_PIXEL * min(pixels)):
         raise InvalidValue(
             f"a frame of {scan.region.size_m} m with {scan.shape[1]} x {scan.shape[0]} pixels can't be simulated",
-            hint=f"{_SMALLEST_M} to {_LARGEST_M} m, pixels less than {_LONGEST_PIXEL:g} times as long as wide",
+            hint=f"{_SMALLEST_M} to {_LARGEST_M} m, pixels at most {_LONGEST_PIXEL:g} times as long as wide",
         )
     if scan.start_s + scan.shape[0] * scan.line_s <= scan.start_s:
-        raise InvalidValue(f"a line of {scan.line_s} s can't be simulated", hint="a time that is not nothing")
+        raise InvalidValue(f"a line of {scan.line_s} s can't be simulated", hint="its time must be above 0")

@@ -109,7 +109,7 @@ def _check_mapping(name: str, document: Document) -> None:
         document.error(f"[cache] mapping: {error.what}", "cache", "mapping", hint=error.hint)
         return
     if not callable(function):
-        document.error(f"[cache] mapping: {name} is no function", "cache", "mapping")
+        document.error(f"[cache] mapping: {name} is not a function", "cache", "mapping")
         return
     for header in _EXAMPLES:  # else its packets would be missing, in the middle of the night
         try:

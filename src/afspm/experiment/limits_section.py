@@ -107,7 +107,7 @@ class LimitsReader:
         parameters = {key: value for key, value in table.items() if key not in _OWN}
         actions = table.get("actions", {})
         if not isinstance(actions, Mapping):
-            self.document.error("[limits] actions is no table", "limits", "actions")
+            self.document.error("[limits] actions is not a table", "limits", "actions")
             actions = {}
         limits = ExperimentLimits(
             parameters={name: limit for name, one in parameters.items() if (limit := self._parameter(name, one))},

@@ -195,7 +195,9 @@ def _client(address: Callable[[Table], str]) -> Becomes:
 
     def becomes(value: Any, table: Table) -> Settings:
         if not isinstance(value, Mapping):
-            raise InvalidValue(f"{value!r} is no table of a client", hint='address = "…" says where the controller is')
+            raise InvalidValue(
+                f"{value!r} is not a table of a client", hint='address = "…" says where the controller is'
+            )
         found = {"address": address(value)}
         if "timeout_s" in value:
             found["reply_timeout_s"] = f"{value['timeout_s']} s"

@@ -127,7 +127,7 @@ def check_intermediaries(resolved: ResolvedExperiment) -> None:
                 resolved.document.error(what, name, key, hint=nearest(key, WIRE_SETTINGS[kind]))
             elif key in ("request_timeout_ms", "request_retries") and not isinstance(value, int | float):
                 hint = "is it in a second file, to be laid over this one?"
-                resolved.document.error(f"[{name}] {key} = {value!r} is no number", name, key, hint=hint)
+                resolved.document.error(f"[{name}] {key} = {value!r} is not a number", name, key, hint=hint)
             elif key.endswith("url"):
                 for url in value if isinstance(value, list) else [value]:
                     if not isinstance(url, str) or not is_address(url):
@@ -205,7 +205,7 @@ def check_problems(resolved: ResolvedExperiment) -> None:
                 number = _number(resolved, problem)
                 if number is None:
                     hint = nearest(problem, resolved.problems) + ", or name it under [problems]"
-                    resolved.document.error(f"[{name}] {verb} {problem!r}, which is no problem", name, hint=hint)
+                    resolved.document.error(f"[{name}] {verb} {problem!r}, which is not a problem", name, hint=hint)
                 elif verb == "flags" and number not in solved:
                     what = f"[{name}] flags {problem!r}, which no component solves: the experiment would stand still"
                     hint = "add a component that solves it, or name it in [control] end_on or solved_by_hand"
@@ -214,7 +214,7 @@ def check_problems(resolved: ResolvedExperiment) -> None:
         for i, problem in enumerate(getattr(control, key)):
             if _number(resolved, problem) is None:
                 hint = nearest(problem, resolved.problems)
-                resolved.document.error(f"{problem!r} is no problem", "control", key, i, hint=hint)
+                resolved.document.error(f"{problem!r} is not a problem", "control", key, i, hint=hint)
 
 
 def _number(resolved: ResolvedExperiment, problem: str) -> int | None:

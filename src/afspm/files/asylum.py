@@ -42,7 +42,9 @@ def read_igor(path: Path, zone: tzinfo | None) -> FileContent:
         return _image(wave, note, path, zone)
     if wave.values.ndim == 2 and first == "s":
         return _curve(wave, note, path, zone)
-    raise FileError(f"an Igor wave that is no image over lengths and no curve over time (shape {wave.values.shape})")
+    raise FileError(
+        f"an Igor wave that is neither an image over lengths nor a curve over time (shape {wave.values.shape})"
+    )
 
 
 def parsed_note(text: str) -> dict[str, str]:
@@ -59,7 +61,7 @@ def center_and_angle(note: Note) -> tuple[tuple[float, float], float]:
     """Of the scan: (x, y) in m, and radians counter-clockwise. Raises FileError if the note does not say where."""
     center = (number(note, "XOffset"), number(note, "YOffset"))
     if center[0] is None or center[1] is None:
-        raise FileError("the note does not say where it was scanned (XOffset, YOffset)")
+        raise FileError("its note lacks the position of the scan (XOffset, YOffset)")
     return (center[0], center[1]), counter_clockwise(number(note, "ScanAngle") or 0.0)
 
 

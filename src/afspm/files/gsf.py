@@ -24,17 +24,17 @@ def read_field(path: Path, zone: tzinfo | None) -> FileContent:
     data = path.read_bytes()
     end = data.find(b"\0")
     if not data.startswith(_MAGIC) or end < 0:
-        raise FileError("is no Gwyddion Simple Field")
+        raise FileError("is not a Gwyddion Simple Field")
     lines = data[len(_MAGIC) : end].decode("utf-8").splitlines()
     header = {key.strip(): value.strip() for key, _, value in (line.partition("=") for line in lines)}
     nx, ny = int(header["XRes"]), int(header["YRes"])
     start = end + 4 - end % 4
     if nx < 2 or ny < 2 or len(data) != start + 4 * nx * ny:
-        raise FileError(f"has {len(data) - start} bytes of values and not those of {nx} x {ny} pixels")
+        raise FileError(f"has {len(data) - start} bytes of values, which do not fit {nx} x {ny} pixels")
     if header.get("XYUnits", "") not in ("m", ""):
-        raise FileError(f"has its sides in {header['XYUnits']} and not in m")
+        raise FileError(f"has its sizes in {header['XYUnits']} instead of m")
     if "XReal" not in header or "YReal" not in header:
-        raise FileError("does not say how large it is")
+        raise FileError("lacks the size of the scan")
     width, height = float(header["XReal"]), float(header["YReal"])
     left, top = float(header.get("XOffset", "0")), -float(header.get("YOffset", "0"))
     # XReal is that of whole pixels; a region ends at the middles of the outermost.

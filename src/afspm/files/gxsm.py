@@ -61,7 +61,7 @@ def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
 def _netcdf3(file: netcdf.File) -> _Raw:
     name = "FloatField" if "FloatField" in file.variables else "H"
     if name not in file.variables:
-        raise FileError("a NetCDF file that is neither of GXSM nor of the simulated microscope")
+        raise FileError("a NetCDF file written neither by GXSM nor by the simulated microscope")
     field = file.variables[name]
     numbers = {key: float(v.values.flat[0]) for key, v in file.variables.items() if v.values.size == 1}
     return _Raw(field.values, _as_texts(field.attributes), numbers, dict(file.texts), _as_texts(file.attributes))
@@ -74,7 +74,7 @@ def _as_texts(attributes: netcdf.Attributes) -> dict[str, str]:
 def _netcdf4(path: Path) -> _Raw:
     with hdf5.opened(path) as file:
         if "FloatField" not in file:
-            raise FileError("a NetCDF file that is not of GXSM")
+            raise FileError("a NetCDF file that GXSM did not write")
         field = file["FloatField"]
         numbers: dict[str, float] = {}
         texts: dict[str, str] = {}
@@ -88,7 +88,7 @@ def _netcdf4(path: Path) -> _Raw:
 
 def _content(raw: _Raw, path: Path) -> FileContent:
     if raw.values.ndim != 4 or min(raw.values.shape[2:]) < 2:
-        raise FileError(f"holds no scan: an array of shape {raw.values.shape}")
+        raise FileError(f"holds no scan, but an array of shape {raw.values.shape}")
     region = _region(raw.numbers)
     start, end = (_ns(raw.numbers, key) for key in ("t_start", "t_end"))
     upwards = {"TopDown": False, "BottomUp": True}.get(raw.texts.get("spm_scancontrol", "").strip())

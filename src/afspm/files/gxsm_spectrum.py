@@ -32,13 +32,13 @@ def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
     starts = [k for k, line in enumerate(lines) if line.startswith(_BEGIN)]
     ends = [k for k, line in enumerate(lines) if line.startswith(_END)]
     if len(starts) != 1 or not ends or ends[0] < starts[0] + 3:
-        raise FileError("is no probe data of GXSM, or not whole: it has no table with an end")
+        raise FileError("is not probe data of GXSM, or incomplete: its table has no end")
     header = _header(lines[: starts[0]])
     columns = lines[starts[0] + 1].removeprefix("#C ").split("\t")
     rows = [line.split("\t") for line in lines[starts[0] + 2 : ends[0]] if line.strip("#C \t")]
     told = re.search(r"N=(\d+)", header.get("Probe Data Number", ""))
     if told is None or len(rows) != int(told[1]):
-        raise FileError(f"has {len(rows)} rows of its table, not as many as it says ({told and told[1]})")
+        raise FileError(f"has {len(rows)} rows in its table and announces {told and told[1]}")
     for number, row in enumerate(rows):
         if len(row) != len(columns) or row[0] != str(number):
             raise FileError(f"row {number} of its table is damaged")

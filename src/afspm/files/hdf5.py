@@ -27,7 +27,7 @@ def opened(path: Path) -> Any:
     import h5py
 
     if not is_hdf5(path):
-        raise FileError("is no HDF5 file", where=str(path))
+        raise FileError("is not an HDF5 file", where=str(path))
     _check_heaps(path.read_bytes(), path)
     return h5py.File(path, "r")
 
@@ -42,7 +42,7 @@ def _check_heaps(data: bytes, path: Path) -> None:
     while at >= 0:
         (size,) = struct.unpack_from("<Q", data.ljust(at + 16, b"\0"), at + 8)
         if at + size > len(data) or not _adds_up(data, at + 16, at + size):
-            raise FileError("is damaged: the sizes in a heap of texts do not add up", where=str(path))
+            raise FileError("is damaged: the sizes in a heap of strings do not add up", where=str(path))
         at = data.find(_HEAP, at + 16)
 
 
@@ -59,7 +59,7 @@ def array(dataset: Any) -> NDArray[np.float64]:
     """All values of a dataset of numbers. Raises FileError: it promises more than the file can hold."""
     most = _VALUES_PER_BYTE * dataset.file.id.get_filesize()
     if dataset.size is None or dataset.size > most:
-        raise FileError(f"promises {dataset.size} values in {dataset.name}")
+        raise FileError(f"announces {dataset.size} values in {dataset.name} and holds fewer")
     return np.asarray(dataset[()], dtype=np.float64)
 
 

@@ -46,11 +46,11 @@ def read_wave(data: bytes) -> Wave:
         FileError: of another version, not whole, or its checksum is wrong.
     """
     if len(data) < _DATA:
-        raise FileError(f"is not whole: {len(data)} bytes are no Igor wave")
+        raise FileError(f"is incomplete: {len(data)} bytes are too few for an Igor wave")
     order = "<" if data[0] else ">"
     (version,) = struct.unpack_from(f"{order}h", data)
     if version != 5:
-        raise FileError(f"is no Igor wave of version 5, but of {version}", hint="Igor saves it anew as version 5")
+        raise FileError(f"is an Igor wave of version {version}, not 5", hint="save it again in Igor, as version 5")
     if int(np.frombuffer(data, f"{order}i2", _DATA // 2).sum(dtype=np.int64)) & 0xFFFF:
         raise FileError("its header is damaged: the checksum is wrong")
     formula, note = struct.unpack_from(f"{order}2i", data, 8)
@@ -60,7 +60,7 @@ def read_wave(data: bytes) -> Wave:
     parts = []
     for size in sizes:
         if size < 0 or after + size > len(data):
-            raise FileError("is not whole: its texts are cut off")
+            raise FileError("is incomplete: its strings are cut off")
         parts.append(data[after : after + size])
         after += size
     labels = tuple(_labels(part, max(n, 1)) for part, n in zip(parts[7:], (*values.shape, 1, 1, 1, 1)[:4], strict=True))
@@ -88,7 +88,7 @@ def _values(data: bytes, order: str) -> tuple[NDArray[Any], int]:
     (count,) = struct.unpack_from(f"{order}i", data, 76)
     (kind,) = struct.unpack_from(f"{order}h", data, 80)
     if kind not in _KINDS:
-        raise FileError(f"an Igor wave of type {kind}: not real numbers")
+        raise FileError(f"an Igor wave of type {kind}, which is not real numbers")
     lengths = struct.unpack_from(f"{order}4i", data, 132)
     used = [n for n in lengths if n]
     # lengths after the first 0 are not used
@@ -97,7 +97,7 @@ def _values(data: bytes, order: str) -> tuple[NDArray[Any], int]:
     kind_of = np.dtype(f"{order}{_KINDS[kind]}")
     end = _DATA + count * kind_of.itemsize
     if end > len(data):
-        raise FileError(f"is not whole: values of {end - _DATA} bytes, of which {len(data) - _DATA} are there")
+        raise FileError(f"is incomplete: values of {end - _DATA} bytes, of which {len(data) - _DATA} are there")
     return np.frombuffer(data, kind_of, count, _DATA).reshape(used, order="F"), end
 
 

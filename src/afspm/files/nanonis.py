@@ -29,15 +29,15 @@ def read_scan(path: Path, zone: tzinfo | None) -> FileContent:
     head, found, rest = path.read_bytes().partition(_END)
     start = rest.find(_DATA)
     if not found or start < 0:
-        raise FileError("is no Nanonis scan, or not whole: its header does not end")
+        raise FileError("is not a Nanonis scan, or incomplete: its header does not end")
     header = _header(head.decode("latin-1"))
     if _field(header, "SCANIT_TYPE").split() != ["FLOAT", "MSBFIRST"]:
-        raise FileError(f"holds values as {_field(header, 'SCANIT_TYPE')!r} and not as FLOAT MSBFIRST")
+        raise FileError(f"holds values as {_field(header, 'SCANIT_TYPE')!r} instead of FLOAT MSBFIRST")
     nx, ny = (int(value) for value in _field(header, "SCAN_PIXELS").split())
     images = _images(_field(header, "DATA_INFO"))
     values, size = rest[start + len(_DATA) :], 4 * len(images) * nx * ny
     if min(nx, ny) < 2 or len(values) != size:
-        raise FileError(f"is not whole: {len(values)} bytes of values, not the {size} of {len(images)} images")
+        raise FileError(f"is incomplete: {len(values)} bytes of values, not the {size} of {len(images)} images")
     direction = _field(header, "SCAN_DIR")
     if direction not in ("up", "down"):
         raise FileError(f"was scanned {direction!r}, neither up nor down")

@@ -30,15 +30,15 @@ def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
     head, found, table = text.partition(f"\n{_TABLE}\n")
     header = {key: rest.strip() for key, _, rest in (line.partition("\t") for line in head.split("\n")) if key}
     if not found or "Experiment" not in header:
-        raise FileError("is no spectrum of Nanonis, or not whole: it has no [DATA]")
+        raise FileError("is not a spectrum of Nanonis, or incomplete: it has no [DATA]")
     if not table.endswith("\n"):
-        raise FileError("is not whole: its last line is cut off")
+        raise FileError("is incomplete: its last line is cut off")
     columns, *lines = [line.split("\t") for line in table.splitlines() if line.strip()]
     for number, line in enumerate(lines, 1):
         if len(line) != len(columns):
-            raise FileError(f"row {number} of its table has {len(line)} columns and not {len(columns)}")
+            raise FileError(f"row {number} of its table has {len(line)} columns instead of {len(columns)}")
     if not lines:
-        raise FileError("is not whole: its table is empty")
+        raise FileError("is incomplete: its table is empty")
     names, units = zip(*map(_name_and_unit, columns), strict=True)
     values = np.array([[float(cell) for cell in line] for line in lines])
     end = _time(header, ("Saved Date", "Date"), zone)

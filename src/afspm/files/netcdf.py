@@ -64,7 +64,7 @@ def read(path: Path) -> File:
     except OSError as error:
         raise FileError(f"can't be read: {error}", where=str(path)) from error
     if content[:4] not in (b"CDF\x01", b"CDF\x02"):
-        raise FileError("is no NetCDF file of the classic format", where=str(path))
+        raise FileError("is not a NetCDF file of the classic format", where=str(path))
     try:
         file = _netcdf_file(
             io.BytesIO(content), "r"
@@ -73,7 +73,7 @@ def read(path: Path) -> File:
     except FileError:
         raise
     except Exception as error:  # scipy stumbles in any way over a broken file
-        raise FileError(f"is not whole: {type(error).__name__}: {error}", where=str(path)) from error
+        raise FileError(f"is incomplete: {type(error).__name__}: {error}", where=str(path)) from error
 
 
 def _file(file: Any) -> File:

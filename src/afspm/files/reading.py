@@ -43,7 +43,7 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     reader = _reader(path.suffix.lower())
     if reader is None:
         raise FileError(
-            f"no reader for {path.suffix or 'a file without a suffix'}",
+            f"afspm has no reader for {path.suffix or 'a file without a suffix'}",
             where=str(path),
             hint=f"read: {' '.join((*FORMATS, *(f'.{name}' for name in plugins.names(plugins.READERS))))}",
         )

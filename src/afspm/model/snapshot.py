@@ -86,7 +86,7 @@ def from_plain(type_: Any, plain: Any) -> Any:
         return _from_union(arguments, plain)
     if (np := _numpy()) is not None and origin is np.ndarray:
         if not isinstance(plain, np.ndarray | list):
-            raise TypeError(f"{plain!r} is no array")
+            raise TypeError(f"{plain!r} is not an array")
         return np.asarray(plain, dtype=get_args(arguments[1])[0])
     if is_dataclass(type_):
         return _from_fields(type_, plain)

@@ -121,7 +121,7 @@ def check_format(connection: sqlite3.Connection, path: Path) -> None:
     found = connection.execute("SELECT value FROM about WHERE name = 'format'").fetchone()
     if found is None or found[0] != FORMAT:
         said = found[0] if found else "something else"
-        raise FileError(f"is no journal of this version: {said}", where=str(path), hint="a newer afspm may read it")
+        raise FileError(f"is not a journal of this version: {said}", where=str(path), hint="a newer afspm may read it")
 
 
 class _OfCopy(sqlite3.Connection):
@@ -171,7 +171,7 @@ def _checked(uri: str, path: Path, kind: type[sqlite3.Connection] = sqlite3.Conn
         if not tables:
             raise FileError("this record has not begun yet", where=str(path))
         if "about" not in tables:
-            raise FileError("is no journal of an experiment", where=str(path))
+            raise FileError("is not a journal of an experiment", where=str(path))
         check_format(connection, path)
     except BaseException:
         connection.close()

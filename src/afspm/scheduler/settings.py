@@ -96,5 +96,5 @@ def _mapping(name: str) -> EnvelopeMapping:
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"the mapping {name!r} can't be loaded: {error}", where="[cache] mapping") from error
     if not callable(mapping):
-        raise ConfigError(f"{name!r} is no function", where="[cache] mapping")
+        raise ConfigError(f"{name!r} is not a function", where="[cache] mapping")
     return mapping  # type: ignore[no-any-return]

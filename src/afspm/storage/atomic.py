@@ -159,7 +159,7 @@ class OutageLog:
             self._is_failing = True
         else:
             if self._is_failing:
-                self._log.info("it can be written again, no longer so: %s", self._loss)
+                self._log.info("writing works again; no longer true: %s", self._loss)
             self._is_failing = False
 
 
@@ -273,7 +273,7 @@ def load_checkpoint(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, s
     except FileNotFoundError as error:
         if not any(folder.is_dir() for folder in (path.parent, path.parent.parent)):
             # a drive of another computer: what is on it must not be begun anew
-            raise FileError(f"the folder of the run is not there: {error}", where=str(path)) from error
+            raise FileError(f"the folder of the run does not exist: {error}", where=str(path)) from error
         return None, ""
     except OSError as error:
         generations, damage = [], f"{error!r}"
@@ -288,7 +288,7 @@ def load_checkpoint(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, s
         with contextlib.suppress(*_DAMAGED):
             return read(before), damage
     raise FileError(
-        f"can't be read, and there is no generation before it: {damage}",
+        f"can't be read, and no earlier version of it exists: {damage}",
         where=str(path),
-        hint="remove it to start anew",
+        hint="delete it to start anew",
     )

@@ -31,7 +31,7 @@ class DiskTimeout(OSError):
     """The disk has not answered in time."""
 
     def __init__(self, within_s: float = DEADLINE_S) -> None:
-        super().__init__(f"the disk has not answered within {within_s:g} s")
+        super().__init__(f"the disk did not answer within {within_s:g} s")
 
 
 class DiskBacklogFull(DiskTimeout):

@@ -39,7 +39,9 @@ class SettingsGrid:
             elif text.endswith(".toml"):
                 values.update(_flat(_read(Path(text))))
             else:
-                raise ConfigError(f"{text!r} is no setting", hint="e.g. tracker=bank,paper, or a file ending in .toml")
+                raise ConfigError(
+                    f"{text!r} is not a setting", hint="e.g. tracker=bank,paper, or a file ending in .toml"
+                )
         return cls(values)
 
     @property

@@ -153,7 +153,7 @@ class Commands:
             where = f"actions.{name}"
             is_table = isinstance(what, Mapping) and set(what) <= {"set", "command", "for"} and len(what) > 0
             if not is_table or set(what) == {"for"} or not isinstance(what.get("set", {}), Mapping):
-                hint = '{ set = { "<parameter>" = <value> }, command = "<text>", for = "<time>" }: at least one of both'
+                hint = '{ set = { "<parameter>" = <value> }, command = "<text>", for = "<time>" }, or parts of it'
                 raise ConfigError(f"{what!r} is not an action", where=where, hint=hint)
             values = self._driver.table.written(what.get("set", {}), where=where)
             command = str(what["command"]) if "command" in what else None
@@ -178,7 +178,7 @@ def _duration_s(given: Any, where: str) -> float:
         number, unit = units.parse_quantity(given) if isinstance(given, str) else (float(given), "")
         found = units.convert(number, unit or "s", "s")
     except (AfspmError, ValueError, TypeError) as error:
-        raise ConfigError(f"{given!r} is no duration: {error}", where=where) from error
+        raise ConfigError(f"{given!r} is not a duration: {error}", where=where) from error
     if not 0.0 < found < math.inf:
-        raise ConfigError(f"{given!r} is no duration", where=where, hint="more than 0 s")
+        raise ConfigError(f"{given!r} is not a duration", where=where, hint="more than 0 s")
     return found

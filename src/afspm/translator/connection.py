@@ -57,7 +57,7 @@ class Connection:
         self.stands = self._ever_stood = True
         if self._logged:
             self._logged = ""
-            self._log.info("the controller answers")
+            self._log.info("the controller answers again")
         return True
 
     def reach(self) -> None:
@@ -72,7 +72,7 @@ class Connection:
     def require(self) -> None:
         """Raise ControllerLost unless connected."""
         if not self.stands:
-            raise ControllerLost(f"it is being looked for: {self.why_lost}")
+            raise ControllerLost(f"the controller is lost, and connecting is retried: {self.why_lost}")
 
     def wait_s(self) -> float:
         """Return the real seconds until the next attempt to connect."""
@@ -94,7 +94,7 @@ class Connection:
         except (*LOST, AfspmError) as error:
             self.lose(error)
         except Exception as error:  # whatever a controller says, its translator lives on
-            self._log.debug("while looking at the controller", exc_info=True)
+            self._log.debug("reading the controller's state failed", exc_info=True)
             self.lose(error)
         return False
 

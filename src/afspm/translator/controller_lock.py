@@ -61,8 +61,10 @@ def _locked(path: Path, address: str) -> BinaryIO:
         except FileNotFoundError:
             continue  # whoever had it has just taken it away
         except OSError as error:
-            told = f"the lock of this controller can't be had: {error.strerror or error}"
-            raise ControllerTaken(told, where=str(path), hint="delete it, and look who put it there") from error
+            told = f"the lock file of this controller can't be opened: {error.strerror or error}"
+            raise ControllerTaken(
+                told, where=str(path), hint="find out which program made it, then delete it"
+            ) from error
         try:
             lock(file)
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
@@ -71,8 +73,10 @@ def _locked(path: Path, address: str) -> BinaryIO:
             pass
         except OSError as error:
             file.close()
-            told = f"this controller is commanded by {_holder(path)}"
-            raise ControllerTaken(told, where=address, hint="one run at a time: end that one first") from error
+            told = f"another run already commands this controller: {_holder(path)}"
+            raise ControllerTaken(
+                told, where=address, hint="a controller takes commands from one run at a time: end that run first"
+            ) from error
         file.close()
 
 
@@ -85,7 +89,7 @@ def _opened(path: Path) -> BinaryIO:
         descriptor, mode = os.open(path, os.O_RDONLY | flags), "rb"
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
-        raise OSError(errno.EINVAL, "it is no file")
+        raise OSError(errno.EINVAL, "it is not a regular file")
     return cast("BinaryIO", os.fdopen(descriptor, mode))
 
 
@@ -108,10 +112,10 @@ def _folder() -> Path:
             folder.mkdir()
             folder.chmod(0o1777)
         if not stat.S_ISDIR(folder.lstat().st_mode):
-            raise NotADirectoryError(errno.ENOTDIR, "it is no folder")
+            raise NotADirectoryError(errno.ENOTDIR, "it is not a folder")
     except OSError as error:
-        told = f"the folder of controllers' locks can't be had: {error.strerror or error}"
-        raise ControllerTaken(told, where=str(folder), hint="delete it, and look who put it there") from error
+        told = f"the folder of the controllers' lock files can't be made: {error.strerror or error}"
+        raise ControllerTaken(told, where=str(folder), hint="find out which program made it, then delete it") from error
     return folder
 
 

@@ -192,7 +192,7 @@ class Driver(ABC):
         live_lines_s: Duration | None = None,
     ) -> None:
         if live_lines_s is not None and type(self).lines is Driver.lines:
-            raise ConfigError(f"{type(self).__name__} can't give lines while it scans", where="live_lines_s")
+            raise ConfigError(f"{type(self).__name__} does not publish lines of a running scan", where="live_lines_s")
         self.table = self.parameter_table(parameters or {})
         self.added_actions = dict(actions or {})
         self.poll_period_s = poll_period_s
@@ -284,7 +284,7 @@ class Driver(ABC):
 
     def command(self, text: str) -> None:
         """Send a command that the experiment file added to the controller as it is."""
-        raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, f"{type(self).__name__} can't be sent commands as a text")
+        raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, f"{type(self).__name__} does not take commands as text")
 
     def next_change_s(self) -> float | None:
         """The experiment time at which something is known to change by itself; None if nothing is known."""

@@ -100,7 +100,7 @@ class EmulatedController:
             ControllerLost: it does not.
         """
         if self._reached is None or self._find() != self._reached:
-            what = "the emulated controller is not the one that was connected to"
+            what = "the emulated controller was restarted, or moved to another address"
             raise ControllerLost(what, where=f"[{self._name}]")
 
     def _find(self) -> Listening:
@@ -108,17 +108,19 @@ class EmulatedController:
         try:
             with self._file.open("rb") as file:
                 if _is_unlocked(file):
-                    raise ControllerLost("the emulated controller does not run", where=where)
+                    raise ControllerLost("the emulated controller is not running", where=where)
                 file.seek(_LOCKED_BYTES)
                 found = Listening(**json.loads(file.read()))
         except FileNotFoundError:
-            raise ControllerLost("the emulated controller was not started yet", where=where) from None
+            raise ControllerLost("the emulated controller has not started yet", where=where) from None
         except (OSError, ValueError, TypeError) as error:
-            raise ControllerLost(f"the emulated controller can't be found: {error}", where=where) from error
+            raise ControllerLost(
+                f"the address of the emulated controller can't be read: {error}", where=where
+            ) from error
         if not found.address:
-            raise ControllerLost("the emulated controller does not listen now", where=where)
+            raise ControllerLost("the emulated controller is not listening at the moment", where=where)
         if found.run != self._run:
-            raise ControllerLost("the emulated controller is of another run", where=where)
+            raise ControllerLost("the emulated controller belongs to another run", where=where)
         return found
 
 
@@ -136,14 +138,14 @@ def wired_to(launch: Launch, microscope: Driver) -> EmulatedController | None:
     """
     if not launch.controller and not (launch.simulated and microscope.controller_at):
         return None
-    hint = "leave `simulated` out of its class for a real controller"
+    hint = "for a real controller, leave out `simulated`"
     if not launch.controller:
         what = f"the experiment is simulated, and nothing proves that {microscope.controller_at} is an emulator"
         raise ConfigError(what, where=launch.name, hint=hint)
     if not (launch.state_dir and launch.run):
-        raise ConfigError(f"nobody tells where [{launch.controller}] listens", where=launch.name)
+        raise ConfigError(f"the launch line does not say where [{launch.controller}] listens", where=launch.name)
     if not microscope.controller_at:
-        what = f"{type(microscope).__name__} has no controller_at, so it can't be wired to [{launch.controller}]"
+        what = f"{type(microscope).__name__} has no controller_at, so it can't be connected to [{launch.controller}]"
         raise ConfigError(what, where=launch.name, hint='see the how-to page "Write a driver"')
     return EmulatedController(launch.controller, notice_file(launch.state_dir, launch.controller), launch.run)
 

@@ -64,7 +64,7 @@ class Outbox:
         for sent in self._kept["sent"]:
             messages = self._load(sent["result"])
             if messages is None:
-                self._log.warning("%s can't be read again", sent["result"])
+                self._log.warning("%s can't be read again; it is not published again", sent["result"])
             else:
                 again += _packets(messages, sent["times"])
         return again
@@ -105,7 +105,7 @@ class Outbox:
         except Exception as error:  # whatever is wrong with a file, the microscope is to be commanded
             if result not in self._complained:
                 why = error if isinstance(error, AfspmError | OSError) else f"{type(error).__name__}: {error}"
-                self._log.warning("%s can't be read (yet): %s", result, why)
+                self._log.warning("%s can't be read yet: %s; retrying", result, why)
                 self._complained.add(result)
             return None
 

@@ -82,10 +82,10 @@ class ParameterSpec:
             Refused: PARAM_ERROR, with the value, the bound that it breaks and where that was set.
         """
         if len(text) > _LONGEST_TEXT:
-            raise refuse_value(self.name, f"a value of {len(text)} characters is not one")
+            raise refuse_value(self.name, f"a value of {len(text)} characters is too long")
         if self.type in ("bool", "text"):
             if unit:
-                raise refuse_value(self.name, f"it has no unit, {unit!r} was given")
+                raise refuse_value(self.name, f"it has no unit; got {unit!r}")
             return self._checked_word(text)
         try:
             number = float(text.replace("_", "?"))  # Python would read 1_000
@@ -160,7 +160,7 @@ class ParameterSpec:
 
     def _finite(self, number: float) -> float:
         if not math.isfinite(number):
-            raise refuse_value(self.name, f"the controller says {number}, which is no value")
+            raise refuse_value(self.name, f"the controller says {number}, which is not a finite number")
         return number
 
     def told(self, value: Value, unit: str | None = None) -> tuple[str, str]:
@@ -196,7 +196,7 @@ class ParameterSpec:
                 return word.lower() in names.ON_WORDS
             raise refuse_value(self.name, f"{text!r} is neither true nor false")
         if self.choices and word not in self.choices:
-            raise refuse_value(self.name, f"{text!r} is none of {', '.join(self.choices)}")
+            raise refuse_value(self.name, f"{text!r} is not one of {', '.join(self.choices)}")
         return word
 
 
@@ -217,7 +217,7 @@ class ParameterTable(Mapping[str, ParameterSpec]):
             with path.open("rb") as file:
                 content = tomllib.load(file)
         except (OSError, tomllib.TOMLDecodeError) as error:
-            raise ConfigError(f"the parameters can't be read: {error}", where=str(path)) from error
+            raise ConfigError(f"the file of parameters can't be read: {error}", where=str(path)) from error
         return cls({}).extended(content.get("parameters", {}), where=path.name)
 
     def extended(
@@ -304,7 +304,7 @@ _OF_THE_CONTROLLER = frozenset({"vendor", "sign"})
 def _row(known: ParameterSpec, given: Mapping[str, Any], where: str, *, translated: bool) -> ParameterSpec:
     at = f"{where}, parameters.{known.name}"
     if not isinstance(given, Mapping):
-        raise ConfigError(f"a table is wanted, not {given!r}", where=at)
+        raise ConfigError(f"expected a table, got {given!r}", where=at)
     errors = ErrorCollector()
     for key in given:
         if key not in _ATTRIBUTES:
@@ -312,17 +312,17 @@ def _row(known: ParameterSpec, given: Mapping[str, Any], where: str, *, translat
             hint = f"did you mean {near[0]!r}?" if near else ""
             errors.add(ConfigError(f"unknown attribute {key!r}", where=at, hint=hint))
         if translated and key in _OF_THE_CONTROLLER:
-            hint = "a Driver class of your own, made from this one, can translate it otherwise"
-            told = f"{key}: code translates this parameter for this microscope, and would not look at that"
+            hint = "to translate it differently, derive a driver class from this one"
+            told = f"{key} has no effect: the driver's code translates this parameter"
             errors.add(ConfigError(told, where=at, hint=hint))
     errors.raise_all()
     values = dict(given)
     for key in ("vendor", "unit", "type"):
         if not isinstance(values.get(key, ""), str):
-            raise ConfigError(f"{key} is a text, not {values[key]!r}", where=at)
+            raise ConfigError(f"{key} must be a text, not {values[key]!r}", where=at)
     for key in ("read_only", "while_busy"):
         if not isinstance(values.get(key, False), bool):
-            raise ConfigError(f"{key} is true or false, not {values[key]!r}", where=at)
+            raise ConfigError(f"{key} must be true or false, not {values[key]!r}", where=at)
     if "choices" in values:
         values["choices"] = tuple(str(choice) for choice in values["choices"])
     row = replace(known, **{k: v for k, v in values.items() if k not in ("range", "resolution")})
@@ -340,9 +340,9 @@ def _with_numbers(row: ParameterSpec, values: Mapping[str, Any], where: str) -> 
         return units.convert(given, unit or row.unit, row.si_unit)
 
     if row.type not in _TYPES:
-        raise ValueError(f"type is one of {', '.join(_TYPES)}, not {row.type!r}")
+        raise ValueError(f"type must be one of {', '.join(_TYPES)}, not {row.type!r}")
     if not isinstance(row.sign, int | float) or abs(row.sign) != 1:
-        raise ValueError(f"sign is 1 or -1, not {row.sign!r}")
+        raise ValueError(f"sign must be 1 or -1, not {row.sign!r}")
     if row.type in ("float", "int"):
         units.convert(1.0, row.unit, row.si_unit)  # the vendor's unit is of the right kind
     if "range" in values:

@@ -179,10 +179,10 @@ class RequestOutcomes:
             return None
         asked, _, outcome = entry.partition(" ")
         if asked != _fingerprint(request):
-            reason = "its id was used for another request before"
+            reason = "the id of this request was already used for another one"
             return Response(ControlResponse.FAILURE, reason=reason, id=request.id)
         if not outcome:
-            reason = "the translator was restarted while it carried this out: whether it was done is not known"
+            reason = "the translator was restarted during this request: it may or may not have been carried out"
             return Response(ControlResponse.NO_RESPONSE, reason=reason, id=request.id)
         code, payload, reason = outcome.split(" ", 2)
         return Response(int(code), base64.b64decode(payload), reason, request.id)

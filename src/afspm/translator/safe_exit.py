@@ -114,12 +114,12 @@ class SafeExit:
         until_s = self._clock.monotonic_s() + _TIP_S
         while self.is_owed():
             off = "off" if self._feedback.is_off else "perhaps off"
-            why_not = self._retracted() if off == "off" else f"it is not known: {self._connection.why_lost}"
+            why_not = self._retracted() if off == "off" else f"the controller is lost: {self._connection.why_lost}"
             if not why_not:
-                self._log.warning("the run is stopped with the feedback off: the tip is retracted")
+                self._log.warning("the run is stopping with the feedback off: the tip was retracted")
                 return
             if self._clock.monotonic_s() >= until_s:
-                told = "the run is stopped with the feedback %s, and the tip can't be retracted: %s"
+                told = "the run is stopping with the feedback %s, and the tip can't be retracted: %s"
                 self._log.critical(told, off, why_not)
                 return
             wait(RETRY_S)

@@ -108,7 +108,7 @@ class StatusSequence:
             return [DiscardResults(), *self._say(seen)]  # of the other kind: somebody began it
         if not self._timed_out(now_s):
             return []
-        return [LogError("the controller goes on in spite of being stopped"), *self._say(seen)]
+        return [LogError("the controller keeps measuring after it was told to stop"), *self._say(seen)]
 
     def _timed_out(self, now_s: float) -> bool:
         if self._waiting_since_s is None:

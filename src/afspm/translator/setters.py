@@ -83,7 +83,7 @@ def apply(driver: Driver, values: Mapping[str, Value], about_to_act: Callable[[]
         if not driver.same(name, after[name], value, after):
             driver.put_in_force(former)
             made, asked = (table[name].quantity(one) for one in (after[name], value))
-            raise refuse_value(name, f"the controller made {made} of {asked}; nothing was changed")
+            raise refuse_value(name, f"the controller set {made} instead of {asked}; the former values were restored")
 
 
 def _asked(subject: object) -> dict[str, Parameter | Value]:
@@ -105,7 +105,7 @@ def _asked(subject: object) -> dict[str, Parameter | Value]:
 
 def _settable(spec: ParameterSpec, value: Value) -> Value:
     if spec.read_only:
-        raise Refused(ControlResponse.PARAM_ERROR, f"{spec.name} can be asked for, not set")
+        raise Refused(ControlResponse.PARAM_ERROR, f"{spec.name} is read-only")
     if spec.name in FRAME and isinstance(value, float):  # the corner of a frame is reckoned from its centre
         value = next((end for end in spec.range if math.isclose(value, end, rel_tol=1e-12)), value)
     return spec.checked(value)

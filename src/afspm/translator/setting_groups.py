@@ -156,7 +156,7 @@ def check_together(values: Mapping[str, Value], table: ParameterTable, max_pixel
         raise Refused(ControlResponse.PARAM_ERROR, str(error)) from error
     if rows * columns > max_pixels:
         raise refuse_value(
-            "scan-resolution", f"{columns} x {rows} pixels are more than the {max_pixels} that this microscope takes"
+            "scan-resolution", f"{columns} x {rows} pixels exceed the {max_pixels} that this microscope takes"
         )
     for axis, name in enumerate(POSITION):
         if name in table:

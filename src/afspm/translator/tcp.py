@@ -97,7 +97,7 @@ class TcpConnection:
             raise ControllerLost(told, where=self.where, hint=self._silent_hint) from error
         except OSError as error:
             self.close()
-            told = f"the connection was lost at {what}: {error}"
+            told = f"the connection was lost during {what}: {error}"
             raise ControllerLost(told, where=self.where, hint=self._silent_hint) from error
         except ControllerLost as error:
             self.close()

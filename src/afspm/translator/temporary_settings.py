@@ -76,7 +76,7 @@ class TemporarySettings:
         except LOST:
             raise
         except Exception as error:
-            self._log.critical("can't put back %s: %s", found["former"], error)
+            self._log.critical("can't restore %s: %s; set it by hand", found["former"], error)
         self._forget()
 
     def _forget(self) -> None:

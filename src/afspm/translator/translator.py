@@ -182,7 +182,7 @@ def _run_alone(driver: Driver, context: ProcessContext, make: Callable[..., Tran
     # saved several times with each request: all of it is for a kill, after a power cut no request is waiting any more
     memory = Memory(Path(launch.state_dir) / f"{launch.name}.json" if launch.state_dir else None, synced=False)
     if memory.damage:
-        context.log.error("what it knew is damaged, the generation before is taken up: %s", memory.damage)
+        context.log.error("the newest saved state is damaged, the one before it is used: %s", memory.damage)
     port = open_server_port(launch, context.clock)
     context.when_stopping(lambda: port.wake_up(ParentGone()))
     run_dir = Path(launch.run_dir or ".")

@@ -72,7 +72,7 @@ def test_a_port_that_is_taken_is_told_in_one_sentence(vendor: str, tmp_path: Pat
             told = process.communicate(timeout=60.0)
     assert process.returncode == 1
     said = "".join(filter(None, told)).strip()
-    assert f"another program listens at the port {port}" in said
+    assert f"another program listens at port {port}" in said
     assert "Traceback" not in said
 
 

@@ -73,7 +73,7 @@ retract = {retract}
 component = true
 class = "danger.Blind"
 """
-RETRACTED = "the feedback off: the tip is retracted"
+RETRACTED = "the feedback off: the tip was retracted"
 
 
 def engaged(run: AfspmRun) -> bool:

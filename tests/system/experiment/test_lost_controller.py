@@ -68,7 +68,7 @@ def test_a_controller_that_is_killed_while_it_scans_is_a_malfunction_until_it_is
     run.wait_up("controller", times=2)
     run.wait_for("translator cleared device-malfunction", count=cleared_before + 1)
     assert run.end() == 0, run.output
-    run.wait_for(" microscope ", "the controller answers")
+    run.wait_for(" microscope ", "the controller answers again")
     run.wait_for("controller was restarted once")
     run.wait_for(f"measured: {SCANS} scans")
     seen = run.witnessed()

@@ -117,8 +117,8 @@ def test_a_users_own_is_named_by_its_class_and_gets_its_settings() -> None:
         ({"class": "no_such_module.Thing"}, "is it installed"),
         ({"class": f"{__name__}.Told", "gian": 1.0}, "did you mean 'gain'"),
         ({"class": f"{__name__}.Told", "gain": -1.0}, "the gain is negative"),
-        ({"class": "pathlib.PurePath"}, "is no estimator"),
-        (object(), "is no estimator"),
+        ({"class": "pathlib.PurePath"}, "is not an estimator"),
+        (object(), "is not an estimator"),
     ],
 )
 def test_what_is_not_there_is_refused_with_what_is(spec: Any, says: str) -> None:

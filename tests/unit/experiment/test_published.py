@@ -351,7 +351,7 @@ def test_user_code_that_needs_published_modules_is_never_to_be_had_from_pip(writ
 def test_a_variable_that_only_a_second_file_has_is_told(write: Write) -> None:
     text = WIRING.replace("request_timeout_ms = 5000\n", "")
     (error,) = errors(write(text + MEDIATOR + PICTURE + SERIES, frame=""))
-    assert "request_timeout_ms = 'request_timeout_ms' is no number" in error.what
+    assert "request_timeout_ms = 'request_timeout_ms' is not a number" in error.what
     assert "second file" in error.hint
     assert errors(write(text + MEDIATOR + PICTURE + SERIES, "request_timeout_ms = 1000\n", frame="")) == []
 

@@ -100,7 +100,7 @@ BROKEN = {
     "no such problem": (
         '[a]\ncomponent = true\ncommand = ["python3"]\nsolves = ["tip-shape-chnged"]\n',
         FRAME,
-        "is no problem",
+        "is not a problem",
     ),
     "a problem's number is taken": ("[problems]\ntip-lost = 4\n", FRAME, "can't have the number 4"),
     "a problem's number is no number": ('[problems]\ntip-lost = "six"\n', FRAME, "not a whole number"),
@@ -295,7 +295,7 @@ def test_a_problem_that_a_person_solves_may_be_flagged(write: Write) -> None:
 def test_a_problem_that_ends_the_experiment_needs_no_solver(write: Write) -> None:
     assert not errors(write(CLASSIFIER + '[control]\nend_on = ["tip-shape-changed"]\n'))
     (error,) = errors(write(CLASSIFIER + '[control]\nend_on = ["tip-shape-changed", "tip-shape"]\n'))
-    assert "'tip-shape' is no problem" in str(error)
+    assert "'tip-shape' is not a problem" in str(error)
 
 
 def test_a_problem_named_in_the_file_is_one(write: Write) -> None:

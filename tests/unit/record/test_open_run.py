@@ -66,7 +66,7 @@ def test_the_copy_of_a_journal_on_a_disk_that_is_only_read_goes_when_it_is_close
     assert not list(copies.iterdir())
     damaged = tmp_path / "damaged"
     damaged.mkdir()
-    (damaged / JOURNAL_FILE).write_bytes(b"no journal at all" * 100)
+    (damaged / JOURNAL_FILE).write_bytes(b"not a journal at all" * 100)
     with pytest.raises(FileError, match="damaged"):
         afspm.open_run(damaged)
     assert not list(copies.iterdir())
@@ -204,7 +204,7 @@ def test_a_database_of_others_is_refused(tmp_path: Path) -> None:
     with sqlite3.connect(tmp_path / JOURNAL_FILE) as connection:
         connection.execute("CREATE TABLE cats (name TEXT)")
     connection.close()
-    with pytest.raises(FileError, match="no journal"):
+    with pytest.raises(FileError, match="not a journal"):
         afspm.open_run(tmp_path)
 
 

@@ -131,7 +131,7 @@ def test_a_file_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="no such file"):
         surface_from({"kind": "file", "path": str(tmp_path / "b.png")})
     (tmp_path / "c.sxm").write_bytes(b"not a scan")
-    with pytest.raises(FileError, match="no Nanonis scan"):
+    with pytest.raises(FileError, match="not a Nanonis scan"):
         read(tmp_path / "c.sxm")
 
 

@@ -45,7 +45,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_second_run_is_refused_and_told_which_has_the_controller(other: str) -> None:
     with commanding("lab-1:6501", "runs/first"):
         with (
-            pytest.raises(ControllerTaken, match=f"commanded by runs/first, process {os.getpid()}"),
+            pytest.raises(ControllerTaken, match=f"commands this controller: runs/first, process {os.getpid()}"),
             commanding(other, "b"),
         ):
             pass
@@ -70,7 +70,11 @@ def test_nothing_is_left_behind_and_nobody_holds_what_has_been_removed(
         locked(file)
 
     monkeypatch.setattr(controller_lock, "lock", lock_too_late)
-    with commanding("lab:1", "a"), pytest.raises(ControllerTaken, match="commanded by a"), commanding("lab:1", "b"):
+    with (
+        commanding("lab:1", "a"),
+        pytest.raises(ControllerTaken, match="commands this controller: a"),
+        commanding("lab:1", "b"),
+    ):
         pass
     assert opened
     assert not list(folder.iterdir())
@@ -101,17 +105,17 @@ def test_a_link_that_somebody_laid_is_not_followed(tmp_path: Path, folder: Path)
     with commanding("lab:1", "a"):
         (file,) = folder.iterdir()
     file.symlink_to(precious)
-    with pytest.raises(ControllerTaken, match="can't be had"), commanding("lab:1", "a"):
+    with pytest.raises(ControllerTaken, match="lock file"), commanding("lab:1", "a"):
         pass
     file.unlink()
     os.mkfifo(file)
-    with pytest.raises(ControllerTaken, match="can't be had"), commanding("lab:1", "a"):
+    with pytest.raises(ControllerTaken, match="lock file"), commanding("lab:1", "a"):
         pass
     file.unlink()
     folder.rmdir()
     (tmp_path / "elsewhere").mkdir()
     folder.symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(ControllerTaken, match="it is no folder"), commanding("lab:1", "a"):
+    with pytest.raises(ControllerTaken, match="it is not a folder"), commanding("lab:1", "a"):
         pass
     assert precious.read_text(encoding="utf-8") == "years of work"
 
@@ -159,4 +163,4 @@ def test_the_translator_of_a_second_run_says_which_has_it_and_ends_to_be_tried_a
     with commanding("lab:6501", "runs/first"):
         code = run_translator(Nanonis(address="lab:6501"), context, make=pytest.fail)
     assert code == ExitCode.CRASHED
-    assert "commanded by runs/first" in caplog.text
+    assert "commands this controller: runs/first" in caplog.text

@@ -101,7 +101,7 @@ def test_without_being_asked_for_a_controller_is_not_asked(make_bench: Any, monk
 
 
 def test_a_microscope_that_has_none_says_so(make_bench: Any) -> None:
-    with pytest.raises(ConfigError, match="can't give lines"):
+    with pytest.raises(ConfigError, match="does not publish lines"):
         make_bench({"live_lines_s": 1.0})
 
 

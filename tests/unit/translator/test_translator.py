@@ -136,7 +136,7 @@ def test_without_the_feedback_that_a_request_has_switched_off_the_tip_is_retract
         bench.start()
     assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
     assert bench.microscope.done == ["scan", "stop", "retract"]
-    assert "the feedback off: the tip is retracted" in caplog.text
+    assert "the feedback off: the tip was retracted" in caplog.text
 
 
 class Killed(BaseException):
@@ -193,7 +193,7 @@ def test_a_controller_that_is_lost_or_refuses_when_the_run_is_stopped_is_asked_a
 
     assert bench.run_to_the_end(ParentGone(), after_s=(3.0, is_back)) == ExitCode.ORPHAN
     assert bench.microscope.done == ["retract"]
-    assert "the feedback off: the tip is retracted" in caplog.text
+    assert "the feedback off: the tip was retracted" in caplog.text
     assert "CRITICAL" not in caplog.text
 
 
@@ -414,7 +414,7 @@ def test_what_the_controller_makes_something_else_of_is_refused_and_put_back(ben
     bench.microscope.stuck = {"Speed": 3.0}
     response = bench.ask(PARAM, Parameter("scan-speed", "5", "um/s"))
     assert response.code == PARAM_ERROR
-    assert "made 3 um/s of 5 um/s" in response.reason
+    assert "set 3 um/s instead of 5 um/s" in response.reason
     bench.microscope.stuck = {"Speed": 5.00005}  # its precision
     assert bench.ask(PARAM, Parameter("scan-speed", "5", "um/s")).code == OK
 
@@ -430,7 +430,9 @@ def test_what_follows_in_the_rest_of_the_frame_is_refused_and_put_back(bench: An
     monkeypatch.setattr(bench.microscope, "set", square)
     response = bench.ask(PARAM, Parameter("scan-size-x", "2", "um"))
     assert response.code == PARAM_ERROR
-    assert response.reason == "scan-size-y: the controller made 2000 nm of 500 nm; nothing was changed"
+    assert (
+        response.reason == "scan-size-y: the controller set 2000 nm instead of 500 nm; the former values were restored"
+    )
     assert (values["W"], values["H"]) == (1000.0, 500.0)
 
 
@@ -551,7 +553,7 @@ def test_a_controller_that_starts_with_its_translator_is_waited_for_and_nothing_
     bench.look(0.9)
     assert len(caplog.records) == 1
     bench.look(0.2)
-    assert caplog.records[-1].message == "the controller answers"
+    assert caplog.records[-1].message == "the controller answers again"
 
 
 def test_a_controller_that_starts_late_is_found_soon(bench: Any, caplog: Any) -> None:

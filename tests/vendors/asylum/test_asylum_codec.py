@@ -61,7 +61,7 @@ def test_what_can_not_be_sent_is_refused_before(parameter: float | str) -> None:
 def test_the_longest_request_has_1024_bytes() -> None:
     spare = 1024 - len(xop.request("F", [""], "7"))
     assert len(xop.request("F", ["x" * spare], "7")) == 1024
-    with pytest.raises(InvalidValue, match="1025 bytes to call F"):
+    with pytest.raises(InvalidValue, match="the call of F has 1025 bytes"):
         xop.request("F", ["x" * (spare + 1)], "7")
 
 

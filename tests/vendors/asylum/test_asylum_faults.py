@@ -33,12 +33,12 @@ def scans_again(peer: Peer) -> list[Scan]:
         ("no-reply", "no reply to"),
         ("wrong-id", "no reply to"),
         ("late-reply", "no reply to"),
-        ("garbage", "replied with what can't be read"),
-        ("frames", "replied with 3 frames"),
+        ("garbage", "sent an unreadable reply"),
+        ("frames", "sent a reply of 3 frames"),
         ("not-utf8", "no reply to"),
         ("nan", "Asylum has no value"),
         ("aborted", "the function was aborted (107"),
-        ("unknown", "an error that it has no name for (1"),
+        ("unknown", "an error without a name (1"),
     ],
 )
 def test_a_bad_reply_has_a_name_and_igor_is_found_again(bench: Make, kind: str, told: str) -> None:
@@ -55,10 +55,10 @@ def test_a_bad_reply_has_a_name_and_igor_is_found_again(bench: Make, kind: str, 
 @pytest.mark.parametrize(
     ("kind", "told"),
     [
-        ("dialog", "Igor is silent while a dialog waits on its screen"),
+        ("dialog", "Igor does not answer while a dialog is open on its screen"),
         ("busy", "no reply to"),
         ("not-compiled", "Igor's procedures are not compiled (100"),
-        ("restart", "nobody listens"),
+        ("restart", "nothing listens at this address"),
     ],
 )
 def test_what_lasts_is_told_to_who_asks_until_it_is_over(bench: Make, kind: str, told: str) -> None:
@@ -124,7 +124,7 @@ def test_a_scan_that_does_not_begin_is_refused(bench: Make) -> None:
     made.strike("scan-refused")
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.ACTION_ERROR
-    assert "was told to begin a scan, and does not" in response.reason
+    assert "did not begin the measurement that it was asked for (scan)" in response.reason
     scans_again(peer)
 
 
@@ -134,7 +134,7 @@ def test_a_force_curve_that_is_refused(bench: Make) -> None:
     made.strike("force-refused")
     response = peer.act(names.START_SPEC)
     assert response.code == ControlResponse.ACTION_ERROR
-    assert "was told to begin a force, and does not" in response.reason
+    assert "did not begin the measurement that it was asked for (force)" in response.reason
     assert peer.act(names.START_SPEC).ok
     assert any(isinstance(one, Spectrum) for one in peer.until(FREE))
 
@@ -144,7 +144,7 @@ def test_a_force_curve_whose_end_could_not_be_seen_is_refused(bench: Make) -> No
     peer = small(made)
     response = peer.act(names.START_SPEC)
     assert response.code == ControlResponse.ACTION_ERROR
-    assert "without ARGetStatus" in response.reason
+    assert "Igor lacks ARGetStatus" in response.reason
     scans_again(peer)
 
 
@@ -161,7 +161,7 @@ def test_saving_is_switched_on_where_it_is_off(bench: Make) -> None:
     peer = small(made)
     made.at_panel(lambda emulator: emulator.controller.values.put("SaveImage", 0))
     scans_again(peer)
-    made.until_said("Asylum was not to save (SaveImage)")
+    made.until_said("Asylum did not save its measurements (SaveImage)")
 
 
 @pytest.mark.parametrize("kind", ["late-file", "half-file"])

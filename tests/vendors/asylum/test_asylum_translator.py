@@ -185,7 +185,7 @@ def test_a_frame_that_asylum_makes_of_it_is_told(bench: Make) -> None:
     made.at_panel(lambda emulator: emulator.controller.values.put("FastRatio", 1.0))
     scan = scanned(peer)["HeightTrace"]
     assert scan.region.size_m[1] > 2 * TURNED.size_m[1]
-    made.until_said("it is delivered as the file says")
+    made.until_said("the scan is published as the file has it")
 
 
 # --- parameters ---
@@ -282,7 +282,7 @@ def test_a_tip_without_feedback_is_retracted_when_the_run_is_stopped(bench: Make
     made = bench(speed=5.0)
     left_in_danger(made, scanning=scanning, retracts=True)
     assert not made.emulator.rig.engaged
-    why = "Asylum has withdrawn the tip" if scanning else "the run is stopped with the feedback off"
+    why = "Asylum withdrew the tip" if scanning else "the run is stopping with the feedback off"
     assert why in made.said()
 
 
@@ -383,7 +383,7 @@ def test_files_are_found_where_the_drive_is_mounted(bench: Make) -> None:
     ready(peer)
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.ACTION_ERROR
-    assert "240820 can't be seen from here" in response.reason
+    assert "240820 does not exist on this computer" in response.reason
     (made.folder / "240820").symlink_to(made.data, target_is_directory=True)
     assert Path(scanned(peer)["HeightTrace"].filename).parent.name == "240820"
 
@@ -395,7 +395,7 @@ def test_commands_of_the_experiment_file(bench: Make) -> None:
     peer.until(FREE)
     assert peer.act("x-drive").ok
     assert made.emulator.controller.values.get("DriveAmplitude") == 0.25
-    assert "gave 1" in peer.act("x-odd").reason
+    assert "it returned 1" in peer.act("x-odd").reason
     assert "as in JSON" in peer.act("x-typo").reason
 
 

@@ -51,15 +51,15 @@ def scanned(peer: Peer) -> list[str]:
 @pytest.mark.parametrize(
     ("kind", "settings", "told"),
     [
-        ("garbage", BRIDGE, "of what it is doing"),
+        ("garbage", BRIDGE, "reports its state as"),
         ("nan", BRIDGE, "GXSM says nan for"),
         ("wrong-type", BRIDGE, "GXSM replied '\\x04' to"),
         ("error", BRIDGE, "SystemError: an emulated error"),
-        ("error", SHM, "can't be passed on"),
+        ("error", SHM, "GXSM can't pass on the result"),
         ("wrong-type", SHM, "GXSM replied '\\x04' to"),
-        ("bad-pickle", SHM, "GXSM's reply is no pickle of a value"),
-        ("evil-pickle", SHM, "GXSM's reply asks for 'posix mkdir', which is not run"),
-        ("code", SHM, "can't be passed on"),
+        ("bad-pickle", SHM, "GXSM's reply is not a pickle of a value"),
+        ("evil-pickle", SHM, "GXSM's reply refers to 'posix mkdir', which afspm does not run"),
+        ("code", SHM, "GXSM can't pass on the result"),
         ("huge", SHM, "GXSM replied 2147483648 bytes"),
     ],
 )
@@ -171,7 +171,7 @@ def test_a_decimal_comma_is_refused_before_anything_is_set(bench: Make) -> None:
     peer = made.start()
     peer.until(UNDEFINED)
     assert peer.set(names.TIP_BIAS_VOLTAGE, 0.25).code == ControlResponse.NO_RESPONSE
-    made.until_said("start it with LC_NUMERIC=C")
+    made.until_said("start GXSM with LC_NUMERIC=C")
     assert made.emulator.program.entries["dsp-fbs-bias"] == made.emulator.rig.setup.bias_v == 0.1
 
 
@@ -181,7 +181,7 @@ def test_what_gxsm_does_not_take_is_refused_though_it_says_0(bench: Make) -> Non
     made.strike("refused")
     response = peer.set(names.TIP_BIAS_VOLTAGE, 0.3)
     assert response.code == ControlResponse.PARAM_ERROR
-    assert "the controller made 0.1 V of 0.3 V; nothing was changed" in response.reason
+    assert "the controller set 0.1 V instead of 0.3 V; the former values were restored" in response.reason
     assert peer.set(names.TIP_BIAS_VOLTAGE, 0.3).ok
 
 
@@ -198,7 +198,7 @@ def test_a_scan_that_did_not_begin_is_told_and_an_old_one_not_taken_for_it(bench
     heard = peer.until(FREE)
     assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
     assert not scans(heard)
-    made.until_said("it was stopped, or never began")
+    made.until_said("it was stopped or never began")
 
 
 def test_a_scan_without_channels_is_told(bench: Make) -> None:
@@ -207,7 +207,7 @@ def test_a_scan_without_channels_is_told(bench: Make) -> None:
     made.at_panel(lambda emulator: emulator.program.channels.clear())
     assert peer.act(names.START_SCAN).ok
     assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
-    made.until_said("is a channel set")
+    made.until_said("a channel is set")
 
 
 def stopped_at_panel(made: Bench, peer: Peer) -> None:
@@ -243,7 +243,7 @@ def test_a_scan_stopped_at_the_panel_is_told_as_broken_off(bench: Make, kind: di
         assert peer.set("x-pixel-rate", 1000).ok
     scanned(peer)
     stopped_at_panel(made, peer)
-    made.until_said("still has the scan before")
+    made.until_said("still holds the previous scan")
     assert scanned(peer), "the next one is whole, and published"
 
 
@@ -410,7 +410,7 @@ def test_a_folder_that_can_not_be_seen_from_here_is_named(bench: Make, tmp_path:
     peer = small(made, scan_dir=str(tmp_path / "not there"), result_timeout_s=20.0)
     assert peer.act(names.START_SCAN).ok
     assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
-    made.until_said("can't be seen from here")
+    made.until_said("does not exist on this computer")
 
 
 def test_a_scan_that_ended_while_gxsm_hung_is_not_lost(bench: Make) -> None:
@@ -433,7 +433,7 @@ def test_a_spectrum_that_is_not_saved_is_told(bench: Make) -> None:
     assert peer.act(names.START_SPEC).ok
     heard = peer.until(FREE)
     assert states(heard) == ["SPEC", "INTERRUPTED", "FREE"]
-    made.until_said("is probe Auto Save on")
+    made.until_said("switch on Auto Save of probes")
 
 
 @pytest.mark.parametrize("kind", ["file-late", "half-file"])

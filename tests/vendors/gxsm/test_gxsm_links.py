@@ -191,11 +191,11 @@ def test_who_is_not_the_bridge_of_this_version_is_not_called(tmp_path: Path) -> 
     secret.write_text("x" * 64)
     secret.chmod(0o600)
     with (
-        pytest.raises(ControllerLost, match="is not the bridge of this version"),
+        pytest.raises(ControllerLost, match="the bridge is of another version"),
         answering(b'{"error": "JSONDecodeError: x"}\n') as address,
     ):
         BridgeLink(address, 10.0, time.monotonic, secret).call("get", "RangeX")
-    with pytest.raises(ControllerLost, match="the bridge did not welcome us"), answering(b"") as address:
+    with pytest.raises(ControllerLost, match="the bridge refused the connection"), answering(b"") as address:
         BridgeLink(address, 10.0, time.monotonic, secret).call("get", "RangeX")
 
 
@@ -204,7 +204,7 @@ def test_a_secret_that_others_can_read_is_none(tmp_path: Path) -> None:
     secret = tmp_path / "secret"
     secret.write_text("x" * 64)
     secret.chmod(0o644)
-    with pytest.raises(ControllerLost, match="others can read"), answering(b"") as address:
+    with pytest.raises(ControllerLost, match="other users can read"), answering(b"") as address:
         BridgeLink(address, 10.0, time.monotonic, secret).call("get", "RangeX")
 
 

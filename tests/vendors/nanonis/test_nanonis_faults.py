@@ -27,7 +27,7 @@ SEEN = 5.0
         ("cut", "was closed after 0 of 40 bytes"),
         ("truncated", "the connection was closed after"),
         ("error", "an emulated error"),
-        ("wrong-name", "Nanonis replied to 'Util.RTFreqGet' when it was asked for"),
+        ("wrong-name", "Nanonis replied to 'Util.RTFreqGet' instead of"),
         ("garbage", "Nanonis replied to"),
         ("huge", "Nanonis announced 2147483647 bytes"),
         ("nan", "says nan"),
@@ -137,7 +137,7 @@ def test_a_scan_whose_file_does_not_come_is_fetched(bench: Make, kind: str) -> N
     found = scans(peer.until(FREE))
     assert found[0].filename.endswith("nanonis-0001.nc")
     # by the name that Nanonis had said, or by the folder if it had not said any in time
-    made.until_said("unnamed001.sxm): it was fetched from Nanonis", "session): it was fetched from Nanonis")
+    made.until_said("unnamed001.sxm); it was fetched over TCP", "session); it was fetched over TCP")
 
 
 def test_a_scan_that_does_not_begin_is_broken_off_and_the_one_before_not_taken_for_it(bench: Make) -> None:
@@ -150,7 +150,7 @@ def test_a_scan_that_does_not_begin_is_broken_off_and_the_one_before_not_taken_f
     heard = peer.until(FREE)
     assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
     assert not scans(heard)
-    made.until_said("it was never seen running")
+    made.until_said("the controller never reported it as running")
 
 
 @pytest.mark.parametrize("kinds", [("late-start",), ("ends-at-once",), ("ends-at-once", "late-start")])
@@ -186,7 +186,7 @@ def test_a_start_that_was_lost_on_its_way_gives_no_scan_of_before(bench: Make, m
     monkeypatch.setattr(made.emulator, "_answer", lose)
     assert peer.act(names.START_SCAN).code == ControlResponse.NO_RESPONSE
     heard = peer.until(FREE)
-    made.until_said("was never seen running", "was fetched from Nanonis")
+    made.until_said("never reported it as running", "was fetched over TCP")
     monkeypatch.undo()
     assert peer.act_once_free(names.START_SCAN).ok
     heard += peer.until(lambda one: isinstance(one, Scan) and one.filename.endswith(".sxm"))
@@ -242,7 +242,7 @@ def test_a_spectrum_that_somebody_takes_unsaved_is_not_that_of_before(bench: Mak
     heard = peer.until(FREE)
     assert not [one for one in heard if isinstance(one, Spectrum)], "nobody has its data"
     assert states(heard) == ["INTERRUPTED", "FREE"]
-    made.until_said("Nanonis was not asked for its data")
+    made.until_said("its data was not requested from Nanonis")
 
 
 def test_a_scan_that_is_not_saved_is_fetched_at_once(bench: Make) -> None:
@@ -278,7 +278,7 @@ def test_after_the_safe_tip_nothing_is_measured_until_the_tip_is_brought_back(be
         assert response.code in (ControlResponse.ACTION_ERROR, ControlResponse.NOT_FREE), action
     response = peer.act_once_free(names.START_SCAN)
     assert "safe tip" in response.reason
-    made.until_said("Nanonis' safe tip has withdrawn the tip")
+    made.until_said("Nanonis' safe tip withdrew the tip")
     assert peer.act(names.ENGAGE).ok
     assert peer.act_once_free(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
@@ -294,7 +294,7 @@ def test_a_scan_that_goes_on_in_the_air_is_none(bench: Make) -> None:
     heard = peer.until(FREE)
     assert states(heard) == ["INTERRUPTED", "FREE"]
     assert not scans(heard)
-    made.until_said("Nanonis' safe tip has withdrawn the tip")
+    made.until_said("Nanonis' safe tip withdrew the tip")
     assert "safe tip" in peer.act_once_free(names.START_SCAN).reason
 
 

@@ -50,7 +50,7 @@ def test_the_answer_to_another_question_is_never_taken_for_one() -> None:
     """After it nothing on this connection is believed any more."""
     late = wire.reply("Current.Get", wire.body("Current.Get", [0.5], 0))
     with talking(late, GOOD) as link:
-        with pytest.raises(ControllerLost, match=r"replied to 'Current.Get' when it was asked for Bias.Get"):
+        with pytest.raises(ControllerLost, match=r"replied to 'Current.Get' instead of Bias.Get"):
             link.ask("Bias.Get")
         with pytest.raises(ControllerLost, match="the connection was lost"):
             link.ask("Bias.Get")

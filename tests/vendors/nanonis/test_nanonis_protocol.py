@@ -91,7 +91,7 @@ def test_errors_are_read_with_results_and_without(text: str, bare: bool) -> None
 )
 def test_a_reply_of_another_release_is_named(name: str, written: int, read: int) -> None:
     sent = [EXAMPLES[code] for code, _ in protocol.functions()[name].results]
-    with pytest.raises(BadReply, match=f"it was read as of release {read}"):
+    with pytest.raises(BadReply, match=f"it was read as release {read}"):
         protocol.results(name, wire.body(name, sent, written), read)
 
 

@@ -132,7 +132,7 @@ def test_a_frame_beyond_the_scanner_is_refused_and_the_old_one_stays(bench: Make
     far = Region((0.45e-6, 0.0), (300e-9, 100e-9))
     response = peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(far, SHAPE, ""))
     assert response.code == ControlResponse.PARAM_ERROR
-    assert "nothing was changed" in response.reason
+    assert "the former values were restored" in response.reason
     assert float(peer.get(names.SCAN_TOP_LEFT_X)) == pytest.approx(TURNED.top_left_m[0], rel=1e-13)
 
 
@@ -143,7 +143,7 @@ def test_a_size_beyond_the_scanner_is_refused_and_the_frame_stays_where_it_is(be
     before = made.emulator.software.scans.frame
     response = peer.set(names.SCAN_SIZE_X, 3e-6)
     assert response.code == ControlResponse.PARAM_ERROR
-    assert "nothing was changed" in response.reason
+    assert "the former values were restored" in response.reason
     assert made.emulator.software.scans.frame == pytest.approx(before, rel=1e-6)
 
 
@@ -196,7 +196,7 @@ def test_feedback_is_set_switched_off_and_on(bench: Make) -> None:
     assert made.emulator.rig.setup.feedback.on is True
     response = peer.set(names.ZCTRL_PGAIN, 0)
     assert response.code == ControlResponse.PARAM_ERROR
-    assert "I = P / T" in response.reason
+    assert "T = P / I" in response.reason
 
 
 def test_feedback_is_switched_on_only_once_the_rest_of_it_is_set(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -311,7 +311,7 @@ def test_a_tip_without_feedback_is_retracted_when_the_run_is_stopped(bench: Make
     made = bench(speed=5.0)
     left_in_danger(made, scanning=scanning, retracts=True)
     assert not made.emulator.rig.engaged
-    assert "the run is stopped with the feedback off: the tip is retracted" in made.said()
+    assert "the run is stopping with the feedback off: the tip was retracted" in made.said()
 
 
 @pytest.mark.parametrize("kind", ["slow", "dialog", "refused", "cut"])
@@ -325,7 +325,7 @@ def test_it_is_retracted_also_by_a_nanonis_that_is_slow_or_refuses_or_is_not_the
     made.strike(kind, count=2, duration_s=10.0)  # two seconds, real time
     assert made.let_go() == ExitCode.ORPHAN
     assert not made.emulator.rig.engaged
-    assert "the run is stopped with the feedback off: the tip is retracted" in made.said()
+    assert "the run is stopping with the feedback off: the tip was retracted" in made.said()
 
 
 def test_a_tip_without_feedback_stays_where_the_file_says_so(bench: Make) -> None:

@@ -48,6 +48,7 @@ def estimator(spec: str | Mapping[str, Any] | Estimator = DEFAULT) -> Estimator:
 def _guarded(made: object, name: str) -> Estimator:
     if not callable(getattr(made, "register", None)):
         raise ConfigError(
-            f"{name} is no estimator", hint="it needs register(reference, scan, prior), see afspm.drift.registration"
+            f"{name} is not an estimator",
+            hint="it needs register(reference, scan, prior), see afspm.drift.registration",
         )
     return Guarded(made, name)  # type: ignore[arg-type]

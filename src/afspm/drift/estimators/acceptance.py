@@ -94,7 +94,7 @@ class AcceptanceLimits:
             if name not in known:
                 raise ConfigError(f"there is no limit {name!r}", where="limits", hint=f"known: {', '.join(known)}")
             if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-                raise ConfigError(f"{name} = {value!r} is no number", where="limits")
+                raise ConfigError(f"{name} = {value!r} is not a number", where="limits")
         return cls(**table)
 
     def refusal(self, found: MatchEvidence, *, expected: bool) -> str:

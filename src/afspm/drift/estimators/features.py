@@ -72,7 +72,7 @@ class Features:
                 raise ConfigError(f"{getattr(self, name)!r} is not above 0 and at most 1", where=name)
         for name in ("iterations", "max_keypoints"):
             if not (isinstance(getattr(self, name), int) and getattr(self, name) >= 1):
-                raise ConfigError(f"{getattr(self, name)!r} is no number from 1", where=name)
+                raise ConfigError(f"{getattr(self, name)!r} is not a number from 1", where=name)
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         """See `Estimator`."""

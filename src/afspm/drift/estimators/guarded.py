@@ -52,7 +52,7 @@ def _wrong(found: object) -> str:
     }
     for name, (value, shape) in arrays.items():
         if not (isinstance(value, np.ndarray) and value.dtype.kind == "f" and value.shape == shape):
-            return f"{name} is no array of floats of shape {shape}: {value!r}"
+            return f"{name} is not an array of floats of shape {shape}: {value!r}"
         if found.accepted and not np.isfinite(value).all():
             return f"accepted with {name} = {value.tolist()}"
     if not found.accepted:

@@ -49,14 +49,14 @@ class AsylumEmulator(Emulator):
     vendor = "Asylum"
     usual: ClassVar[dict[str, Any]] = {"port": 5555}
     fault_kinds: ClassVar[dict[str, str]] = {
-        "no-reply": "a request is carried out and not answered",
-        "late-reply": "a reply comes later, by the duration, when others may have come",
+        "no-reply": "a request is carried out but not answered",
+        "late-reply": "a reply is delayed by the duration and may arrive after later ones",
         "wrong-id": "a reply with the messageID of another request",
         "garbage": "a reply that is not JSON",
         "frames": "a reply of one frame too many",
         "not-utf8": "a text that is not UTF-8: there is no reply",
-        "busy": "Igor is busy for the duration, and does then what was asked meanwhile",
-        "dialog": "a function waits for the duration until somebody presses OK",
+        "busy": "Igor is busy for the duration, and then does what was requested meanwhile",
+        "dialog": "a dialog blocks a function for the duration, until OK is pressed",
         "not-compiled": "for the duration, a procedure window is being edited (error 100)",
         "aborted": "a function is aborted (error 107)",
         "unknown": "an unknown error (1)",
@@ -167,7 +167,7 @@ class AsylumEmulator(Emulator):
         except wire.CallFailed as failed:
             payload = wire.failure(failed, queued.call.message_id)
         except UnicodeEncodeError:
-            self.log.warning("the reply to %s is not UTF-8: there is none", queued.call.name)
+            self.log.warning("the reply to %s is not UTF-8 and was not sent", queued.call.name)
             return
         dialog = self.faults.strikes("dialog", now_s)
         if dialog is not None:

@@ -19,15 +19,15 @@ from afspm.model import Region
 FAULT_KINDS: Final = {
     "scan-refused": "DoScan does nothing",
     "force-refused": "a force curve is refused: DoForceFunc gives 0",
-    "keeps-scanning": "beginning to scan puts LastScan back to 0",
-    "stopped": "somebody stops a scan at the panel",
-    "status-stuck": "for the duration, ARGetStatus says that it scans",
+    "keeps-scanning": "the start of a scan resets LastScan to 0",
+    "stopped": "a scan is stopped at the panel",
+    "status-stuck": "for the duration, ARGetStatus reports a scan",
     "no-file": "a scan or curve is not saved",
-    "late-file": "a file comes later, by the duration",
-    "half-file": "the second half of a file comes later, by the duration",
-    "same-name": "a file is given the name of the one before",
-    "other-name": "somebody changes the base name while it measures",
-    "drive-gone": "for the duration, the drive with the data is not there",
+    "late-file": "a file appears only after the duration",
+    "half-file": "the second half of a file appears only after the duration",
+    "same-name": "a file gets the name of the previous one",
+    "other-name": "the base name is changed at the panel during a measurement",
+    "drive-gone": "for the duration, the drive with the data is not mounted",
 }
 _SCANNING, _ENGAGED, _FORCE = 0x1, 0x2, 0x10
 _MOST_POINTS: Final = 8192
@@ -174,7 +174,7 @@ class AsylumController:
         """Begin the image; with values that no scan can be taken with, it ends as if somebody had stopped it."""
         try:
             if not self._can_be_scanned():
-                raise InvalidValue("the scan parameters can't be scanned with")
+                raise InvalidValue("no scan is possible with these parameters")
             self._start()
         except (AfspmError, ArithmeticError, ValueError) as error:
             self._log.warning("the scan was interrupted: %s", error)

@@ -106,7 +106,7 @@ class XopServer:
 
     def _take(self, frames: list[bytes], *, locked: bool) -> None:
         if len(frames) != 3 or frames[1]:
-            self._log.warning("%d frames are no request: there is no reply to that", len(frames))
+            self._log.warning("received %d frames, which are not a request; it gets no reply", len(frames))
             return
         client, _, payload = frames
         try:

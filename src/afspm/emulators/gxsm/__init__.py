@@ -49,7 +49,7 @@ class GxsmEmulator(Emulator):
     usual: ClassVar[Mapping[str, Any]] = {"port": 65431, "block": "gxsm4_py_shm_data_block", "process": "gxsm4"}
     fault_kinds: ClassVar[Mapping[str, str]] = {
         "wedge": "nothing is answered for the duration",
-        "crash": "GXSM vanishes; its shared memory stays",
+        "crash": "GXSM crashes; its shared memory stays",
         "script-stopped": "script-control is set to 0: the script in the console ends",
         **calls.FAULT_KINDS,
         **program.FAULT_KINDS,

@@ -21,7 +21,7 @@ from afspm.microscopes.gxsm import pickles
 from afspm.microscopes.gxsm.errors import BadReply
 
 FAULT_KINDS: Final[Mapping[str, str]] = {
-    "bad-pickle": "shared memory: the result is no pickle",
+    "bad-pickle": "shared memory: the result is not a pickle",
     "evil-pickle": "shared memory: the result would run a program if it were unpickled",
     "code": "shared memory: the status says that the result can't be passed on",
     "huge": "shared memory: a result that is longer than the memory",

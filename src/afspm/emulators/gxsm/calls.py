@@ -15,7 +15,7 @@ from afspm.emulators.rig import RigBusy
 
 FAULT_KINDS: Final[Mapping[str, str]] = {
     "error": "a call raises an error",
-    "garbage": "what GXSM is doing is told from memory that nobody has written",
+    "garbage": "GXSM reports its state from uninitialised memory",
     "wrong-type": "a call is answered with a text",
     "nan": "a value is not a number",
 }

@@ -23,9 +23,9 @@ from afspm.model import Region
 
 CARDS: Final = {"SRanger": "SRangerMK2:SPM", "RPSPMC": "RPSPMC:SPM", "simulator": "SPM-SIM:SPM"}
 FAULT_KINDS: Final[Mapping[str, str]] = {
-    "refused": "a value is not taken, as one out of range: a dialog opens on the screen",
-    "no-start": "a scan does not begin, and nobody is told",
-    "panel-stop": "somebody stops the scan at the panel",
+    "refused": "a value is refused as out of range: a dialog opens on the screen",
+    "no-start": "a scan does not begin, without an error",
+    "panel-stop": "the scan is stopped at the panel",
 }
 ANGSTROM_M: Final = 1e-10
 SHOWS_S: Final = 0.15

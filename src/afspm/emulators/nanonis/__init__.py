@@ -200,7 +200,7 @@ class NanonisEmulator(Emulator):
             try:
                 request = wire.split(connection.received)
             except wire.MalformedRequest as error:
-                self.log.warning("a client is cut: %s", error)
+                self.log.warning("disconnected a client: %s", error)
                 self._server.cut(connection)
                 return
             if request is None:

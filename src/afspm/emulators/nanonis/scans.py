@@ -182,7 +182,7 @@ class ScanModule:
         elif action == 6:
             rig.move_probe(self.frame[:2])
         elif action not in (2, 3, 4, 5):
-            raise FunctionRefused(f"{action} is no action")
+            raise FunctionRefused(f"{action} is not an action")
         return ()
 
     def _start_on_request(self, upwards: bool, now_s: float) -> None:

@@ -237,7 +237,7 @@ class TipModules:
     @answers("Piezo.TiltSet")
     def _set_tilt(self, x_deg: float, y_deg: float) -> Answer:
         if not max(abs(x_deg), abs(y_deg)) < _STEEPEST_DEG:
-            raise FunctionRefused("that is no tilt")
+            raise FunctionRefused("that is not a tilt")
         self._core.registers.put("Piezo.Tilt", x_deg, y_deg)
         self._core.rig.setup.slope = (math.tan(math.radians(x_deg)), math.tan(math.radians(y_deg)))
         return ()
@@ -249,7 +249,7 @@ class TipModules:
     @answers("Piezo.RangeSet")
     def _set_range(self, *range_m: float) -> Answer:
         if not min(range_m) > 0.0:
-            raise FunctionRefused("that is no range")
+            raise FunctionRefused("that is not a range")
         self._core.range_m = (range_m[0], range_m[1], range_m[2])
         return ()
 
@@ -286,7 +286,7 @@ class TipModules:
     def _start_motor(self, direction: int, steps: int, group: int, wait: int) -> Answer:
         """(!) Whether the real one refuses that during a scan or a withdrawal is not known; here it does."""
         if direction > 5:
-            raise FunctionRefused(f"{direction} is no direction")
+            raise FunctionRefused(f"{direction} is not a direction")
         now_s = self._core.now_s
         at_m = self._motor_at_m(now_s)
         self._core.rig.occupy("motor", abs(steps) * _STEP_S)

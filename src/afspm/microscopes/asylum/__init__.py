@@ -100,7 +100,9 @@ class Asylum(Driver):
         )
         session.doing()
         if not session.at_once:
-            self.log.warning("Igor has not afspm.ipf: every value is asked for by itself, feedback can't be switched")
+            self.log.warning(
+                "Igor does not include afspm.ipf: values are read one by one, and the feedback can't be switched"
+            )
         for what in (SCAN, FORCE):
             self._activity.folder(what)
         if self._spots != "none":
@@ -171,7 +173,7 @@ class Asylum(Driver):
             try:
                 self._place.put(probe_m)
             except (XopError, Refused) as error:
-                self.log.error("it scans, but the spot can't be put where it was: %s", error)
+                self.log.error("the scan runs, but the spot could not be put back: %s", error)
 
     def _begin(self, what: str, function: str, button: str) -> None:
         try:
@@ -187,13 +189,13 @@ class Asylum(Driver):
         """Break the scan off. Asylum withdraws the tip."""
         self._igor().do("DoScanFunc", "StopScan")
         self._activity.stopped()
-        self.log.warning("Asylum has withdrawn the tip, as it does with every scan that is stopped")
+        self.log.warning("Asylum withdrew the tip, as it does whenever a scan is stopped")
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
         """Take a force curve where the tip was sent, or else where it is."""
         if self._igor().doing().bits is None:
-            reason = "without ARGetStatus it can't be seen when a force curve has ended"
+            reason = "Igor lacks ARGetStatus, without which the end of a force curve can't be detected"
             raise Refused(ControlResponse.ACTION_ERROR, reason)
         self._activity.saves(FORCE)
         if self._activity.was_led_away:
@@ -222,7 +224,7 @@ class Asylum(Driver):
     def engage(self) -> None:
         """Bring the tip to the sample, as the button Engage does."""
         if not self._igor().do("SimpleEngageMe", "SimpleEngageButton"):
-            raise Refused(ControlResponse.ACTION_ERROR, "Asylum refuses to engage")
+            raise Refused(ControlResponse.ACTION_ERROR, "Asylum refused to engage")
 
     @action(names.PULSE, state=ScopeState.BUSY_PARAM)
     def pulse(self) -> None:
@@ -237,13 +239,13 @@ class Asylum(Driver):
             reason = f'{text!r}: arguments as in JSON, PV "SaveImage", 2: {error}'
             raise Refused(ControlResponse.ACTION_ERROR, reason) from error
         if not self._igor().do(name, *parameters):
-            raise Refused(ControlResponse.ACTION_ERROR, f"{name} gave 1, which is how Asylum's functions refuse")
+            raise Refused(ControlResponse.ACTION_ERROR, f"Asylum refused {name} (it returned 1)")
 
 
 def _checked_name(name: str) -> str:
     """Return a base name that Asylum takes. Raises ConfigError."""
     fits = not name or (re.fullmatch(_NAME, name) and "mask" not in name.lower())
     if not fits:
-        hint = 'up to 17 letters, digits and "_", a letter first, no "Mask"'
+        hint = 'up to 17 letters, digits and "_", beginning with a letter, without "Mask"'
         raise ConfigError(f"Asylum does not take {name!r}", where="base_name", hint=hint)
     return name

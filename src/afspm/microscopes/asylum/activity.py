@@ -82,12 +82,12 @@ class Activity:
             return ScopeStatus(ScopeState.SPEC)
         self._on_arrival = None
         if state is not ScopeState.FREE:
-            self._log.error("no force curve is taken: somebody began something while the tip was on its way to it")
+            self._log.error("the force curve was not taken: another measurement began while the tip moved")
             return ScopeStatus(ScopeState.INTERRUPTED)
         try:
             take()
         except Refused as refused:
-            self._log.error("no force curve is taken: %s", refused.reason)
+            self._log.error("the force curve was not taken: %s", refused.reason)
             return ScopeStatus(ScopeState.INTERRUPTED)
         return ScopeStatus(ScopeState.SPEC)
 
@@ -135,11 +135,11 @@ class Activity:
         """
         name = _SAVED_TO[what]
         if self._session.values([name])[name] != _SAVE:
-            self._log.warning("Asylum was not to save (%s): now it is", name)
+            self._log.warning("Asylum did not save its measurements (%s); saving is on from now on", name)
             self._session.put(name, _SAVE)
         folder = self.folder(what)
         if not folder.is_dir():
-            reason = f"Asylum's folder {folder} can't be seen from here: is the drive there? see the setting folders"
+            reason = f"Asylum's folder {folder} does not exist on this computer: set folders"
             raise Refused(ControlResponse.ACTION_ERROR, reason)
 
     def folder(self, what: str) -> Path:
@@ -173,13 +173,15 @@ class Activity:
                 self._image_begins()
                 return
         self.forget()
-        raise Refused(ControlResponse.ACTION_ERROR, f"Asylum was told to begin a {what}, and does not")
+        raise Refused(
+            ControlResponse.ACTION_ERROR, f"Asylum did not begin the measurement that it was asked for ({what})"
+        )
 
     def refuse(self, what: str) -> Refused:
         """The refusal of what Asylum said that it does not do; nothing comes of it."""
         self.forget()
         return Refused(
-            ControlResponse.ACTION_ERROR, f"Asylum refuses to begin a {what}: its history window may say why"
+            ControlResponse.ACTION_ERROR, f"Asylum refused to begin the measurement ({what}): see its history window"
         )
 
     def stopped(self) -> None:

@@ -16,7 +16,7 @@ from afspm.translator.driver import ControllerLost
 
 _NEVER = -1
 _OUTCOMES = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_CLOSED | zmq.EVENT_DISCONNECTED
-_SILENT = "Igor is silent while a dialog waits on its screen, and dumb about texts that are not UTF-8"
+_SILENT = "Igor does not answer while a dialog is open on its screen, nor with text that is not UTF-8"
 
 
 class Link:
@@ -52,7 +52,7 @@ class Link:
         except zmq.ZMQError as error:
             self.close()
             hint = '"tcp://host:port", as given to zeromq_server_bind'
-            raise ConfigError(f"{address!r} is no address: {error}", where="address", hint=hint) from error
+            raise ConfigError(f"{address!r} is not an address: {error}", where="address", hint=hint) from error
         self._await_connection()
 
     def _await_connection(self) -> None:
@@ -64,13 +64,13 @@ class Link:
         if not stands:
             self.close()
             hint = "is Igor running, with zeromq_server_bind on this address?"
-            raise ControllerLost("nobody listens", where=self._address, hint=hint)
+            raise ControllerLost("nothing listens at this address", where=self._address, hint=hint)
 
     def ask(self, name: str, *parameters: xop.Parameter) -> xop.Result:
         """Call a function of Igor's that has one result. Raises: as `call`."""
         results = self.call(name, *parameters).results
         if len(results) != 1:
-            raise xop.BadReply(f"{name} gave {len(results)} results", where=self._address)
+            raise xop.BadReply(f"{name} returned {len(results)} results instead of one", where=self._address)
         return results[0]
 
     def call(self, name: str, *parameters: xop.Parameter) -> xop.Reply:
@@ -117,7 +117,7 @@ class Link:
 
 def _payload(frames: list[bytes]) -> bytes:
     if len(frames) != 2 or frames[0]:
-        raise xop.BadReply(f"ZeroMQ-XOP replied with {len(frames)} frames")
+        raise xop.BadReply(f"ZeroMQ-XOP sent a reply of {len(frames)} frames")
     return frames[1]
 
 
@@ -125,11 +125,11 @@ def text(result: Any) -> str:
     """A result that has to be a text. Raises BadReply."""
     if isinstance(result, str):
         return result
-    raise xop.BadReply(f"Igor gave {result!r} where a text was expected")
+    raise xop.BadReply(f"Igor returned {result!r} instead of a text")
 
 
 def number(result: Any) -> float:
     """A result that has to be a number, NaN too. Raises BadReply."""
     if isinstance(result, float):
         return result
-    raise xop.BadReply(f"Igor gave {result!r} where a number was expected")
+    raise xop.BadReply(f"Igor returned {result!r} instead of a number")

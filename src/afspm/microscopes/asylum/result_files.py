@@ -92,7 +92,7 @@ class AsylumFiles(ResultFiles):
     def read(self, entry: Entry) -> Content:
         path = Path(entry["file"])
         if modified_ns(path) != entry["modified_ns"]:
-            raise FileError("was overwritten or has gone", where=str(path))
+            raise FileError("was overwritten or deleted", where=str(path))
         return _content(path, entry)
 
     def _take(self, measured: Entry) -> bool:
@@ -120,8 +120,8 @@ class AsylumFiles(ResultFiles):
     def _warn_of_frame(self, path: Path, one: Scan | Spectrum, measured: Entry) -> None:
         """Warn if Asylum scanned another frame than was set: the file is right then."""
         if isinstance(one, Scan) and one.region != (wanted := as_region(measured["frame"])):
-            told = f"{path.name} says a frame of {one.region}, and not of {wanted} as was in force"
-            self._log.warning("%s: it is delivered as the file says", told)
+            told = f"{path.name} holds a frame of {one.region} instead of {wanted}, which was set"
+            self._log.warning("%s; the scan is published as the file has it", told)
 
 
 def free_suffix(folder: Path, base: str) -> int:

@@ -111,7 +111,7 @@ class Session:
         found = dict(zip(names, self._look(names)[1], strict=True))
         for name, value in found.items():
             if math.isnan(value):
-                reason = f"Asylum has no value {name!r}, or none in this mode (GV gives nan)"
+                reason = f"Asylum has no value {name!r} in its present mode (GV returns nan)"
                 raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, reason)
         return found
 
@@ -142,9 +142,9 @@ class Session:
         try:
             found = [float(word) for word in told.removesuffix(";").split(";")]
         except ValueError as error:
-            raise xop.BadReply(f"AfspmLook gave {told!r}") from error
+            raise xop.BadReply(f"AfspmLook returned {told!r}") from error
         if len(found) != 1 + len(names):
-            raise xop.BadReply(f"AfspmLook gave {len(found) - 1} values where {len(names)} were asked for")
+            raise xop.BadReply(f"AfspmLook returned {len(found) - 1} values instead of {len(names)}")
         return found
 
     def _bits(self) -> float:

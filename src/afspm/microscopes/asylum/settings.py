@@ -142,13 +142,13 @@ class TipPlace(SettingsGroup):
         """Put the spot somewhere. Raises Refused."""
         x, y = xy_m if self._image is None else on_image(xy_m, self._image())
         if not (self._igor().do("SetProbePosX", x) and self._igor().do("SetProbePosY", y)):
-            raise Refused(ControlResponse.PARAM_ERROR, "Asylum refuses the spot")
+            raise Refused(ControlResponse.PARAM_ERROR, "Asylum refused the spot")
 
     def go(self) -> None:
         """Send the tip to the spot. Raises Refused."""
         self._igor().put("ForceSpotNumber", _OUR_SPOT)  # whatever is chosen at the panel
         if not self._igor().do("DoForceFunc", "Go"):
-            raise Refused(ControlResponse.PARAM_ERROR, "Asylum refuses to move the tip")
+            raise Refused(ControlResponse.PARAM_ERROR, "Asylum refused to move the tip")
         self._on_move()
 
 

@@ -21,10 +21,10 @@ MISSING: Final = 101
 """The error of a function that Igor does not have."""
 
 _MEANINGS: Final = {
-    1: "an error that it has no name for",
-    3: "the request is no JSON to it",
+    1: "an error without a name",
+    3: "the request is not valid JSON",
     4: "another version of the interface",
-    5: "no function in the request",
+    5: "the request names no function",
     6: "the request is malformed",
     7: "the request's messageID is malformed",
     8: "Igor is out of memory",
@@ -32,13 +32,13 @@ _MEANINGS: Final = {
     101: "there is no such function",
     102: "too few arguments",
     103: "too many arguments",
-    104: "a kind of argument that can't be passed",
-    105: "a kind of result that can't be passed",
-    106: "an argument has a value that can't be",
+    104: "an argument is of a type that can't be passed",
+    105: "the result is of a type that can't be passed",
+    106: "an argument has an invalid value",
     107: "the function was aborted",
 }
 _HINTS: Final = {
-    100: "a procedure window was edited: Compile",
+    100: "a procedure window was edited: compile the procedures",
     101: "is afspm.ipf included in Igor's procedures (see the README of microscopes/asylum)?",
 }
 
@@ -101,7 +101,7 @@ def request(name: str, parameters: Sequence[Parameter], message_id: str) -> byte
     except UnicodeEncodeError as error:
         raise InvalidValue(f"{name} can't be called with a text that is not Unicode") from error
     if len(message) > LONGEST_REQUEST:
-        raise InvalidValue(f"{len(message)} bytes to call {name}: ZeroMQ-XOP takes {LONGEST_REQUEST}")
+        raise InvalidValue(f"the call of {name} has {len(message)} bytes; ZeroMQ-XOP takes at most {LONGEST_REQUEST}")
     return message
 
 
@@ -116,17 +116,17 @@ def reply(message: bytes) -> Reply:
     except BadReply:
         raise
     except RecursionError as error:
-        raise BadReply("ZeroMQ-XOP replied with JSON that is nested too deep") from error
+        raise BadReply("ZeroMQ-XOP sent JSON that is nested too deeply") from error
     except (ValueError, TypeError, KeyError, OverflowError, AttributeError) as error:
         shown = message[:80].decode("utf-8", "replace")
-        raise BadReply(f"ZeroMQ-XOP replied with what can't be read, {shown!r}: {error}") from error
+        raise BadReply(f"ZeroMQ-XOP sent an unreadable reply, {shown!r}: {error}") from error
 
 
 def _reply(content: Mapping[str, Any]) -> Reply:
     message_id = content.get("messageID")
     number = content["errorCode"]["value"]
     if type(number) is not int or not isinstance(message_id, str | None):
-        raise ValueError("of other types")
+        raise ValueError("errorCode or messageID has the wrong type")
     if number:
         history = str(content.get("history") or "").strip()
         told = str(content["errorCode"].get("msg", ""))
@@ -142,7 +142,7 @@ def _value(one: Mapping[str, Any]) -> Result:
         return _number(value)
     if kind in ("string", "dfref"):
         if not isinstance(value, str):
-            raise ValueError(f"{value!r} is no text")
+            raise ValueError(f"{value!r} is not a text")
         return value
     if kind == "wave":
         return None
@@ -153,4 +153,4 @@ def _number(value: Any) -> float:
     """NaN and infinities come as texts."""
     if value in ("nan", "inf", "-inf") or (isinstance(value, int | float) and not isinstance(value, bool)):
         return float(value)
-    raise ValueError(f"{value!r} is no number")
+    raise ValueError(f"{value!r} is not a number")

@@ -85,7 +85,7 @@ class Gxsm(Driver):
         if hardware is not None and hardware not in kinds:
             raise ConfigError(f"there is no {hardware!r}", where="hardware", hint=f"there are {', '.join(kinds)}")
         if saving not in _SAVERS:
-            raise ConfigError(f"{saving!r} saves nothing", where="saving", hint=f"{' or '.join(_SAVERS)}")
+            raise ConfigError(f"{saving!r} is not a way of saving", where="saving", hint=f"{' or '.join(_SAVERS)}")
         self.controller_at = address
         Address.parse(address)
         folders = (None if path is None else Path(path) for path in (scan_dir, probe_dir))
@@ -103,7 +103,9 @@ class Gxsm(Driver):
         """Return what GXSM's own simulator does otherwise than GXSM itself says."""
         if not controller.endswith(f"({Hardware.SIMULATOR.value})"):
             return {}
-        return {"scan/picture": "GXSM's simulator turns its picture the other way than GXSM turns the frame"}
+        return {
+            "scan/picture": "GXSM's simulator turns its picture against the direction in which GXSM turns the frame"
+        }
 
     def connect(self) -> None:
         """The link; what this GXSM has, in which unit it has it, and how it saves."""
@@ -123,7 +125,7 @@ class Gxsm(Driver):
         scan_frame = ScanFrame(ask, user_unit_m(ask))
         if self._saving.by_us and AUTOSAVE_OFF in self._offered.actions:
             ask.call("action", AUTOSAVE_OFF)
-            self.log.info("GXSM's Auto Save of scans is off from now on, and stays off: see the setting saving")
+            self.log.info("GXSM's Auto Save of scans was switched off and stays off (see the setting saving)")
         self._kept.kept_in(self.memory)
         waits_s = (self.patience_s(self.result_timeout_s / 2), self.patience_s(SOON_S))
         self._files = GxsmFiles(self.memory, *waits_s, self.log, rewritten=not self._saving.by_us)

@@ -226,7 +226,7 @@ class Activity:
 
     def _forestalled(self) -> ScopeStatus:
         """The tip was on its way to a spectrum: that must not be taken into what somebody measures."""
-        self._log.error("no spectrum is taken: somebody began to measure while the tip was on its way to it")
+        self._log.error("the spectrum was not taken: another measurement began while the tip moved")
         self._execute, self._kept["arrives_s"] = "", 0.0
         self._files.forget()
         return ScopeStatus(ScopeState.INTERRUPTED)

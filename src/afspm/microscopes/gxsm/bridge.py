@@ -46,10 +46,10 @@ def secret() -> bytes:
         with os.fdopen(os.open(SECRET, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
             file.write(secrets.token_hex(32).encode())
     if os.name == "posix" and SECRET.stat().st_mode & 0o077:
-        raise PermissionError(f"{SECRET} can be read by others: chmod 600 {SECRET}")
+        raise PermissionError(f"other users can read {SECRET}: chmod 600 {SECRET}")
     found = SECRET.read_bytes().strip()
     if len(found) < 32:
-        raise ValueError(f"{SECRET} holds no secret: remove it")
+        raise ValueError(f"{SECRET} is damaged: delete it, and run this again")
     return found
 
 
@@ -69,7 +69,7 @@ def answer(method, arguments) -> str:  # type: ignore[no-untyped-def]
         if method == "getcwd":
             return json.dumps({"value": FOLDER})
         if method not in METHODS:
-            raise NameError(f"{method} is not passed on")
+            raise NameError(f"{method} is not a method that the bridge passes on")
         value = getattr(gxsm, method)(*arguments)
         # what `action` returns in Gxsm3 is not initialised: it must not be looked at
         return json.dumps({"value": None if method == "action" else value}, default=packed)
@@ -104,7 +104,7 @@ def serve(client: socket.socket, listener: socket.socket, known: bytes) -> None:
             elif not welcome and hmac.compare_digest(line, known):
                 welcome, reply = True, json.dumps({"value": WELCOME})
             else:
-                print("afspm bridge: sent a client away that said neither the secret nor a call")  # noqa: T201
+                print("afspm bridge: refused a client that sent neither the secret nor a call")  # noqa: T201
                 return
             client.sendall(reply.encode() + b"\n")
             calls += 1
@@ -128,7 +128,7 @@ def run() -> None:
                     with client:
                         serve(client, listener, known)
                 except OSError as error:
-                    print(f"afspm bridge: the client is gone: {error}")  # noqa: T201
+                    print(f"afspm bridge: lost the client: {error}")  # noqa: T201
     print("afspm bridge: ended")  # noqa: T201
 
 

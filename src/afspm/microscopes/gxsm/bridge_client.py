@@ -62,17 +62,19 @@ class BridgeLink:
         hint = f"run the bridge.py of this version, and use its ~/.afspm/{secret_file.name} (secret_file)"
         try:
             if os.name == "posix" and secret_file.stat().st_mode & 0o077:
-                raise ControllerLost("others can read the bridge's secret", where=str(secret_file), hint="chmod 600")
+                raise ControllerLost(
+                    "other users can read the bridge's secret", where=str(secret_file), hint="chmod 600"
+                )
             reply = self._tcp.ask("the secret", secret_file.read_bytes().strip() + b"\n", _read)
         except OSError as error:
             self.close()
             raise ControllerLost(f"the bridge's secret can't be read: {error}", hint=hint) from error
         except ControllerLost as error:
             self.close()
-            raise ControllerLost(f"the bridge did not welcome us: {error}", where=where, hint=hint) from error
+            raise ControllerLost(f"the bridge refused the connection: {error}", where=where, hint=hint) from error
         if reply != _WELCOME:
             self.close()
-            raise ControllerLost("is not the bridge of this version of afspm", where=where, hint=hint)
+            raise ControllerLost("the bridge is of another version of afspm", where=where, hint=hint)
         self._is_welcome = True
 
 
@@ -86,7 +88,7 @@ def _read(receiver: Receiver) -> dict[str, Any]:
         parts.append(receiver.some())
         size += len(parts[-1])
     if size > _LONGEST or b"\n" in parts[-1][:-1]:
-        raise BadReply("more than one answer to a call")
+        raise BadReply("the bridge answered a call more than once")
     return _reply(b"".join(parts))
 
 
@@ -99,7 +101,7 @@ def _reply(line: bytes) -> dict[str, Any]:
     try:
         reply = _REPLY.decode(line.decode())
     except (ValueError, RecursionError) as error:
-        raise BadReply(f"the bridge replied what is none: {error}") from error
+        raise BadReply(f"the bridge sent an unreadable reply: {error}") from error
     if not isinstance(reply, dict) or len(reply) != 1 or not reply.keys() <= {"value", "error"}:
         raise BadReply(f"the bridge replied {line[:100]!r}")
     return reply

@@ -77,7 +77,7 @@ def decoded(hardware: Hardware, slots: list[float]) -> Doing:
     """
     value = slots[0] if slots else math.nan
     if not (0.0 <= value < _MOST_BITS and value == int(value)):
-        raise BadReply(f"GXSM says {slots} of what it is doing")
+        raise BadReply(f"GXSM reports its state as {slots}, which is not a set of bits")
     bits = int(value)
     if hardware is Hardware.RPSPMC:
         running = bool(bits & 2)  # a scan or a spectrum: it does not tell

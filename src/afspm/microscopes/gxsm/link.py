@@ -59,11 +59,11 @@ class Address:
         if kind == "shm":
             block, _, process = rest.partition("@")
             if "/" in block:
-                raise ConfigError(f"{block!r} is no name of shared memory", where="address", hint=HINT)
+                raise ConfigError(f"{block!r} is not a name of shared memory", where="address", hint=HINT)
             return cls(block=block or BLOCK, process=process or PROCESS)
         host, _, port = text.rpartition(":")
         if not host or not port.isdigit():
-            raise ConfigError(f"{text!r} is no address", where="address", hint=HINT)
+            raise ConfigError(f"{text!r} is not an address", where="address", hint=HINT)
         return cls(host=host, port=int(port))
 
 
@@ -101,14 +101,14 @@ class Asking:
         """A number. Raises BadReply: another thing. As `Link.call`."""
         value = self.call(method, *arguments)
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise BadReply(f"GXSM replied {value!r:.100} to {method}{arguments}, which is no number")
+            raise BadReply(f"GXSM replied {value!r:.100} to {method}{arguments}, which is not a number")
         return float(value)
 
     def text(self, method: str, *arguments: str | int | float) -> str:
         """A text. Raises BadReply: another thing. As `Link.call`."""
         value = self.call(method, *arguments)
         if not isinstance(value, str):
-            raise BadReply(f"GXSM replied {value!r:.100} to {method}{arguments}, which is no text")
+            raise BadReply(f"GXSM replied {value!r:.100} to {method}{arguments}, which is not a text")
         return value
 
     def numbers(self, method: str, *arguments: str | int | float) -> list[float]:

@@ -42,7 +42,7 @@ class _Array:
 
 def _array(content: Any, kind: Any, shape: Any, order: Any) -> np.ndarray:
     if not (isinstance(kind, _DType) and isinstance(content, bytes | bytearray) and order in ("C", "F")):
-        raise BadReply("an array that is none")
+        raise BadReply("a malformed array")
     return np.frombuffer(bytes(content), kind.numpy).reshape(tuple(shape), order=order)
 
 
@@ -66,7 +66,7 @@ for _core in ("numpy.core", "numpy._core"):  # before numpy 2, and since
 class _Unpickler(pickle._Unpickler):  # type: ignore[name-defined, misc, unused-ignore]
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _ALLOWED:
-            raise BadReply(f"GXSM's reply asks for {f'{module} {name}'[:100]!r}, which is not run")
+            raise BadReply(f"GXSM's reply refers to {f'{module} {name}'[:100]!r}, which afspm does not run")
         return _ALLOWED[module, name]
 
 
@@ -83,7 +83,7 @@ def loads(content: bytes) -> Any:
     except RecursionError:
         raise BadReply("GXSM's reply is nested too deeply") from None
     except Exception as error:  # whatever the bytes make of the unpickler
-        raise BadReply(f"GXSM's reply is no pickle of a value: {type(error).__name__}: {error}") from error
+        raise BadReply(f"GXSM's reply is not a pickle of a value: {type(error).__name__}: {error}") from error
 
 
 class _Values:

@@ -61,7 +61,7 @@ def find(process: str) -> GxsmProcess:
     if not found:
         raise NoProcess(f"no process is called {process!r}", hint="is Gxsm4 running?")
     if len(found) > 1:
-        hint = 'one can be chosen by its number: address = "shm:@<number>"'
+        hint = 'choose one by its process number: address = "shm:@<number>"'
         raise ControllerLost(f"{len(found)} processes are called {process!r}", hint=hint)
     if not _expects_signals(found[0].pid):
         raise ControllerLost(

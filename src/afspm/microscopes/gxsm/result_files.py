@@ -117,7 +117,7 @@ class GxsmFiles(ResultFiles):
             ended["begun_ns"] = ended["begun_ns"] or end_ns
         self._sizes, self._whole, self._before = {}, {}, set()
         if not is_whole:
-            self._give_up("it was stopped, or never began: GXSM still has the scan before in its first or last row")
+            self._give_up("it was stopped or never began: GXSM's first or last row still holds the previous scan")
 
     def next_s(self) -> float | None:
         """When to look again at the latest."""
@@ -135,7 +135,7 @@ class GxsmFiles(ResultFiles):
             if not any(scan.values.any() for content in files.values() for scan in content.scans):
                 gaps = [file for file in files if ended["what"] == SCAN]  # stopped in its first line
             if gaps and (over or not self._rewritten):
-                self._give_up(f"was stopped: {gaps[0]} lacks lines")
+                self._give_up(f"it was stopped: {gaps[0]} lacks lines")
             elif files and not gaps and (over or self._all(ended, files, now_s)):
                 self._take(ended, files)
             elif over:
@@ -201,20 +201,22 @@ class GxsmFiles(ResultFiles):
     def _missing(self, ended: Entry) -> str:
         folder = _folder(ended)
         if folder is None:
-            return "GXSM does not say where it saves: did it begin at all, is a channel set?"
+            return "GXSM does not say where it saves: check that it began and that a channel is set"
         if not folder.is_absolute():
-            return f"its folder {folder} depends on where GXSM was started: choose another, or set scan_dir, probe_dir"
+            return f"its folder {folder} is relative to where GXSM was started: set scan_dir, probe_dir"
         if not folder.is_dir():
-            return f"its folder {folder} can't be seen from here (scan_dir, probe_dir)"
+            return f"its folder {folder} does not exist on this computer: set scan_dir and probe_dir"
         if self._before:
-            return f"what GXSM saved in {folder} is a scan of before: did it begin at all?"
+            return f"GXSM saved an earlier scan in {folder}: check that this one began"
         if ended["what"] == SCAN:
-            return f"no new file in {folder} is of it: did it begin at all, is a channel set, and saved (AS)?"
-        return f"no new .vpdata in {folder}: is probe Auto Save on at GXSM's panel, and this its folder (probe_dir)?"
+            return (
+                f"no new file in {folder} belongs to it: check that it began, and that a channel is set and saved (AS)"
+            )
+        return f"no new .vpdata in {folder}: switch on Auto Save of probes in GXSM, and set probe_dir to its folder"
 
     def _give_up(self, why: str) -> None:
         ended, self._kept["ended"] = self._kept["ended"], None
-        self._log.error("nothing comes of the %s: %s", ended["what"], why)
+        self._log.error("the %s has no result: %s", ended["what"], why)
         if self._before:
             self._saw(ended, self._before)
         self.broken_off = True
@@ -223,7 +225,9 @@ class GxsmFiles(ResultFiles):
         if ended["what"] == SCAN:
             absent = sorted(set(ended["channels"]) - endings(files).keys())
             if set(absent) - set(self._kept["absent"]):
-                self._log.warning("GXSM did not save %s: it is not waited for as long from now on", ", ".join(absent))
+                self._log.warning(
+                    "GXSM did not save %s; the translator waits less long for it from now on", ", ".join(absent)
+                )
             self._kept["absent"] = absent
             self._saw(ended, {content.start_ns for content in files.values() if content.start_ns})
             self.upwards = any(content.upwards for content in files.values())

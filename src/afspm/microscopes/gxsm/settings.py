@@ -38,8 +38,8 @@ def user_unit_m(ask: Asking) -> float:
     shown, number = ask.text("gets", "RangeX").strip(), ask.number("get", "RangeX")
     digits, _, unit = shown.partition(" ")
     if "," in digits:
-        hint = "start it with LC_NUMERIC=C"
-        raise AfspmError(f"GXSM shows {shown!r}: with a decimal comma it would take 12.5 for 12", hint=hint)
+        hint = "start GXSM with LC_NUMERIC=C"
+        raise AfspmError(f"GXSM shows {shown!r}, with a decimal comma: it would read 12.5 as 12", hint=hint)
     try:
         read, unit_m = float(digits), units.convert(1.0, _UNITS.get(unit.strip(), unit.strip()), "m")
     except (ValueError, AfspmError) as error:
@@ -97,7 +97,7 @@ class ScanFrame:
         region = self.region()
         u_m, v_m = in_frame(region, xy_m)
         if self._ask.number("moveto_scan_xy", u_m / ANGSTROM_M, v_m / ANGSTROM_M) != 0.0:
-            reason = f"GXSM moves the tip within the scan frame alone, and ({xy_m[0]:g}, {xy_m[1]:g}) m is not in it"
+            reason = f"GXSM moves the tip only within the scan frame; ({xy_m[0]:g}, {xy_m[1]:g}) m is outside"
             raise Refused(ControlResponse.PARAM_ERROR, reason)
 
     def tip(self) -> tuple[float, float]:

@@ -31,7 +31,7 @@ _NAME_BYTES: Final = 64
 _STATUS, _LENGTH, _CONTENT = 100, 128, 136
 _REQUEST: Final = 1
 _FAILURES: Final = {
-    -1: "its result, or an error, can't be passed on",
+    -1: "GXSM can't pass on the result or error",
     -2: "GXSM has no Python",
     -3: "wrong flags",
     -4: "GXSM has no such function",
@@ -115,7 +115,7 @@ class SharedMemoryLink:
         content = pickle.dumps(arguments, 4)
         name = method.encode()
         if len(name) >= _NAME_BYTES or len(content) > _BYTES - _CONTENT:
-            raise GxsmError("can't be passed to GXSM: too long", where=method[:_NAME_BYTES])
+            raise GxsmError("the call is too long for GXSM's shared memory", where=method[:_NAME_BYTES])
         self._memory[:_NAME_BYTES] = name.ljust(_NAME_BYTES, b"\0")
         self._memory[_CONTENT : _CONTENT + len(content)] = content
         struct.pack_into("<Q", self._memory, _LENGTH, len(content))
@@ -147,7 +147,9 @@ class SharedMemoryLink:
             looks += 1
             self._see_alive()
             if self._monotonic_s() >= until_s:
-                hint = "a call that blocks silences GXSM until it is started anew; started with -s it never answers"
+                hint = (
+                    "after a call that blocks, GXSM answers only when it is restarted; started with -s it never answers"
+                )
                 raise ControllerLost(complaint, where=self._where, hint=hint)
             self._closed.wait(_SOON_S if looks < _LOOKS_SOON else _LATER_S)
 
@@ -172,7 +174,9 @@ class SharedMemoryLink:
         try:
             file = path.open("a")
         except OSError as error:
-            raise ControllerLost(f"the lock of GXSM's callers can't be had: {error}", where=str(path)) from error
+            raise ControllerLost(
+                f"the lock file of GXSM's callers can't be opened: {error}", where=str(path)
+            ) from error
         with file:
             while True:
                 try:
@@ -180,6 +184,8 @@ class SharedMemoryLink:
                     break
                 except BlockingIOError:
                     if self._monotonic_s() >= until_s:
-                        raise ControllerLost("another program does not let go of GXSM", where=str(path)) from None
+                        raise ControllerLost(
+                            "another program keeps GXSM's shared memory locked", where=str(path)
+                        ) from None
                     self._closed.wait(_LATER_S)
             yield

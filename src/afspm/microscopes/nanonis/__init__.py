@@ -96,7 +96,10 @@ class Nanonis(Driver):
         self._activity = Activity(session, self._files, self._probe, self.memory, self.clock, self.log)
         folder = self._session_dir or Path(session.ask("Util.SessionPathGet")[0])
         if not folder.is_dir():
-            self.log.warning("%s can't be seen from here: all data is fetched over TCP (set session_dir)", folder)
+            self.log.warning(
+                "the session folder %s does not exist on this computer: data is fetched over TCP (or set session_dir)",
+                folder,
+            )
 
     def close(self) -> None:
         if self._session is not None:
@@ -146,7 +149,7 @@ class Nanonis(Driver):
             return [Scan(as_region(ended["frame"]), image.name, image.unit, image.values) for image in found]
         curve, self._activity.curve = self._activity.curve, None
         if curve is None:
-            raise FileError("Nanonis was not asked for its data")
+            raise FileError("its data was not requested from Nanonis")
         return [fetched.spectrum(curve, ended["what"], (ended["position"][0], ended["position"][1]))]
 
     def lines(self, start: int) -> Sequence[ScanLines]:
@@ -181,7 +184,7 @@ class Nanonis(Driver):
         self._activity.refuse_safe_tip()
         kind = str(self._kept[names.SPEC_KIND])
         if MODULES[kind] not in self._there.opened:
-            raise Refused(ControlResponse.ACTION_ERROR, f"Nanonis has no module {MODULES[kind]}, or can't open it")
+            raise Refused(ControlResponse.ACTION_ERROR, f"Nanonis can't open the module {MODULES[kind]}")
         self._activity.start_curve(kind)
 
     @action(names.STOP_SPEC)
@@ -216,7 +219,7 @@ class Nanonis(Driver):
             try:
                 stop()
             except protocol.NanonisError as error:
-                self.log.error("what is going on can't be stopped, the tip is withdrawn all the same: %s", error)
+                self.log.error("the measurement can't be stopped: %s; the tip is withdrawn all the same", error)
         self._ask("ZCtrl.Withdraw", _AT_ONCE, _NO_TIMEOUT)
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
@@ -267,5 +270,5 @@ def _addresses(text: str) -> list[tuple[str, int]]:
     except ValueError:
         found = []
     if not found:
-        raise ConfigError(f"{text!r} is no address", where="address", hint='"host:port,port"')
+        raise ConfigError(f"{text!r} is not an address", where="address", hint='"host:port,port"')
     return found

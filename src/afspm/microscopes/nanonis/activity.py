@@ -177,7 +177,7 @@ class Activity:
     def refuse_safe_tip(self) -> None:
         """Raise Refused where the tip was withdrawn in an emergency: nothing is to be measured then."""
         if self._ask("ZCtrl.StatusGet")[0] == _SAFE_TIP:
-            reason = "Nanonis' safe tip has withdrawn the tip: find out why; x-engage brings it back"
+            reason = "Nanonis' safe tip withdrew the tip: find out why, then run x-engage to bring it back"
             raise Refused(ControlResponse.ACTION_ERROR, reason)
 
     def _scanning(self, told: str | None) -> ScopeStatus:
@@ -233,7 +233,7 @@ class Activity:
             return True
         if self._clock.now_s() < self._probe.arrives_s + _LATEST_S:
             return False
-        self._log.error("the tip does not arrive where it was sent")
+        self._log.error("the tip did not reach the position that it was sent to")
         self._probe.give_up()
         return True
 
@@ -241,7 +241,7 @@ class Activity:
         """Return True if it has withdrawn the tip, which is logged once."""
         safe = z_controller == _SAFE_TIP
         if safe and not self._was_safe:
-            self._log.error("Nanonis' safe tip has withdrawn the tip: nothing is measured until that is put right")
+            self._log.error("Nanonis' safe tip withdrew the tip: nothing is measured until it is engaged again")
         self._was_safe = safe
         return safe
 

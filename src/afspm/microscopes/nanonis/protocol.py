@@ -85,7 +85,7 @@ def function(name: str) -> Function:
         InvalidValue: there is none, or it is not known here.
     """
     if name not in functions():
-        raise InvalidValue(f"no function {name[:50]!r} of Nanonis is known")
+        raise InvalidValue(f"Nanonis has no function {name[:50]!r}")
     return functions()[name]
 
 
@@ -97,7 +97,7 @@ def request(name: str, arguments: Sequence[Any], release: int = NEWEST) -> bytes
     """
     fields = function(name).arguments
     if len(arguments) != len(fields):
-        raise InvalidValue(f"{name} has {len(fields)} arguments, {len(arguments)} were given")
+        raise InvalidValue(f"{name} takes {len(fields)} arguments, got {len(arguments)}")
     body = b""
     for (code, since), value in zip(fields, arguments, strict=True):
         if since <= release:
@@ -117,7 +117,7 @@ def body_bytes(header: bytes, asked: str) -> int:
     raw_name, size, _, _ = _HEADER.unpack(header)
     name = text_of(raw_name.split(b"\0", 1)[0])
     if name != asked:
-        raise BadReply(f"Nanonis replied to {name!r} when it was asked for {asked}")
+        raise BadReply(f"Nanonis replied to {name!r} instead of {asked}")
     if not 0 <= size <= LARGEST_BODY:
         raise BadReply(f"Nanonis announced {size} bytes in reply to {asked}")
     return int(size)
@@ -140,8 +140,8 @@ def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[
         except BadReply:
             status = 0
         if status == 0:
-            hint = f"it was read as of release {release}" if _depends_on_release(name) else ""
-            raise BadReply(f"the reply to {name} is not what it should be: {whole.what}", hint=hint) from None
+            hint = f"it was read as release {release} sends it" if _depends_on_release(name) else ""
+            raise BadReply(f"the reply to {name} is malformed: {whole.what}", hint=hint) from None
     if status:
         raise NanonisError(f"Nanonis: {text or 'no reason given'} (error {status})", where=name)
     return found

@@ -113,7 +113,7 @@ class NanonisFiles(ResultFiles):
         missed = str(file or ended["told"] or f"in {ended['folder']}")
         try:
             if not ended.get("seen", True):
-                raise FileError("it was never seen running")
+                raise FileError("the controller never reported it as running")
             content = fetch(ended)
             if missing := lines_missing(content):
                 raise FileError(f"{missing} of its {content[0].values.shape[0]} lines were not scanned")
@@ -121,11 +121,11 @@ class NanonisFiles(ResultFiles):
             self._kept["ended"] = dict(ended)  # once it is found again
             raise
         except AfspmError as error:
-            self._log.error("no file of the %s (%s), and it can't be fetched: %s", ended["what"], missed, error)
+            self._log.error("the %s has no file (%s), and can't be fetched over TCP: %s", ended["what"], missed, error)
             self.broken_off = True
             return
         if ended["told"] != "":
-            self._log.warning("no whole file of the %s (%s): it was fetched from Nanonis", ended["what"], missed)
+            self._log.warning("the %s has no complete file (%s); it was fetched over TCP", ended["what"], missed)
         self._kept["fetched"] += 1
         path = self._own_folder / f"nanonis-{self._kept['fetched']:04d}.nc"
         fetched.write(path, content, ended["end_ns"])

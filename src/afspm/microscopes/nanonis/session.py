@@ -68,8 +68,8 @@ class Session:
         try:
             product, version, host_release, engine_release = self.ask("Util.VersionGet")
         except NanonisError:
-            self.controller = f"Nanonis, taken as release {_WITHOUT_VERSION}"
-            self._log.warning("Nanonis can't tell its release: taken as %d (set release)", _WITHOUT_VERSION)
+            self.controller = f"Nanonis, assumed to be release {_WITHOUT_VERSION}"
+            self._log.warning("Nanonis does not report its release; assuming %d (or set release)", _WITHOUT_VERSION)
             return _WITHOUT_VERSION
         self.controller = f"{product} {version}, release {host_release}"
         self._log.info("%s (real-time engine %d)", self.controller, engine_release)
@@ -79,7 +79,7 @@ class Session:
         try:
             self.ask(f"{module}.Open")
         except NanonisError as error:
-            self._log.warning("%s can't be used: %s", module, error)
+            self._log.warning("the module %s of Nanonis is not available: %s", module, error)
             return False
         return True
 
@@ -170,7 +170,7 @@ class Listener:
             return error
         except Exception as error:  # whatever it says, this connection goes on being listened to, or is made anew
             self._for_scan = False
-            return BadReply(f"what Nanonis says of a measurement can't be: {error!r}")
+            return BadReply(f"Nanonis sent an unreadable message on a measurement: {error!r}")
 
     def _next_end_of_scan(self) -> Heard | None:
         """Ask again and again: so a connection that has died is noticed, and a spectrum gets its turn."""

@@ -104,7 +104,9 @@ class ScanSpeed(Group):
         width_m = self._numbers("Scan.FrameGet")[2]
         backward_m_s = forward_m_s * ratio
         if min(forward_m_s, backward_m_s) <= 0.0:
-            raise refuse_value(names.SCAN_SPEED, f"{forward_m_s} m/s, and {ratio} times that back, is no speed")
+            raise refuse_value(
+                names.SCAN_SPEED, f"{forward_m_s} m/s forward and {ratio} times that backward are not above 0"
+            )
         keep_speed = 1  # 0 in what SpeedGet replies
         times_s = width_m / forward_m_s, width_m / backward_m_s
         self._ask("Scan.SpeedSet", forward_m_s, backward_m_s, *times_s, keep_speed, ratio)
@@ -123,7 +125,7 @@ class Gains(Group):
         merged = self.merged(values)
         proportional, integral = float(merged[names.ZCTRL_PGAIN]), float(merged[names.ZCTRL_IGAIN])
         if proportional <= 0.0 or integral <= 0.0:
-            reason = "Nanonis has I = P / T: with P or I at 0 there is no time constant T"
+            reason = "both must be above 0: Nanonis sets the time constant T = P / I"
             raise refuse_value(f"{names.ZCTRL_PGAIN}, {names.ZCTRL_IGAIN}", reason)
         self._ask("ZCtrl.GainSet", proportional, proportional / integral, integral)
 

@@ -33,7 +33,7 @@ class Fault:
         if self.kind not in KINDS:
             raise ConfigError(f"there is no fault {self.kind!r}", where="kind", hint=", ".join(KINDS))
         if self.count < 1 or self.duration_s < 0:
-            raise ConfigError(f"{self} affects nothing")
+            raise ConfigError(f"{self} has no effect")
 
 
 class Faults:
@@ -94,4 +94,4 @@ class Faults:
     def maybe_refuse(self) -> None:
         """Raises Refused as long as that fault is in force."""
         if self.strikes("refuse") is not None:
-            raise Refused(ControlResponse.FAILURE, "the controller refused without a reason (a simulated fault)")
+            raise Refused(ControlResponse.FAILURE, "the controller refused (a simulated fault)")

@@ -166,7 +166,7 @@ class Instrument:
                 self._save_spectrum(doing)
         except AfspmError as error:
             # as with a controller that fails: it is free again, and there is no file
-            self._log.error("the simulated %s failed: %s", doing["what"], error)
+            self._log.error("the simulated %s failed: %s; it has no file", doing["what"], error)
         if doing["what"] in ("scan", "spectrum"):
             self._settle()
 
@@ -365,7 +365,7 @@ class Instrument:
             try:
                 self._actions[event.action](at_s)
             except Refused as refused:
-                self._log.warning("at the panel: %s", refused)
+                self._log.warning("a scripted action at the panel was refused: %s", refused)
 
     def _note(self, time_s: float, event: str, facts: Kept) -> None:
         if not self._drawing():

@@ -84,7 +84,7 @@ def chosen(rows: list[ScanRow], numbers: str) -> list[ScanRow]:
     for part in numbers.split(","):
         match = re.fullmatch(r"\s*(\d+)\s*(-\s*(\d*))?\s*", part)
         if match is None:
-            raise InvalidValue(f"{part!r} is no number of a scan", hint="e.g. 3, 1-5,8 or 7-")
+            raise InvalidValue(f"{part!r} is not a number of a scan", hint="e.g. 3, 1-5,8 or 7-")
         first = int(match[1])
         until = int(match[3] or last) if match[2] else first
         if first not in by_number or until not in by_number or until < first:
