@@ -272,7 +272,7 @@ def test_a_component_is_started_anew(night: Night, page: Any) -> None:
     before = night.until(lambda: night.follower.overview.processes.get("series")).starts
     page.click("button[aria-label='Restart series']")
     page.click(".question button:has-text('Restart')")
-    said(page, "series will be started anew")
+    said(page, "series is being restarted")
     state = night.until(
         lambda: (
             (s := night.follower.overview.processes["series"]).starts > before

@@ -60,7 +60,7 @@ class Access:
         self._passwords = Passwords(host, hashed(password) if password else password_hash, people, now_s)
         if self._passwords.is_unprotected:
             raise ConfigError(
-                f"at {host} other computers can reach the dashboard, and it has no password", where="dashboard",
+                f"other computers can reach the dashboard at {host}, and it has no password", where="dashboard",
                 hint="set people or password_hash (`afspm dashboard --make-password`), or "
                 f"{PASSWORD} in the environment; or listen on 127.0.0.1",
             )  # fmt: skip

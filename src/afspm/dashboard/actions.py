@@ -37,7 +37,7 @@ class ActionResult:
     each: Mapping[str, ActionResult] = field(default_factory=dict)
 
 
-_NOT_SIGNED_IN = ActionResult("Sign in first: what is done is in the record with a name.", ok=False)
+_NOT_SIGNED_IN = ActionResult("Sign in first: the record keeps the name with each action.", ok=False)
 
 
 def not_signed_in() -> Future[ActionResult]:
@@ -62,7 +62,7 @@ class Actions:
 
     def end(self) -> ActionResult:
         """End the experiment for everybody."""
-        return _result(self._commands.end(), "The experiment ends")
+        return _result(self._commands.end(), "The experiment is ending")
 
     def flag(self, problem: int) -> ActionResult:
         """Raise a problem."""
@@ -81,7 +81,7 @@ class Actions:
 
     def restart(self, process: str) -> ActionResult:
         """Have a process ended and started anew."""
-        return _result(self._commands.restart(process), f"{process} will be started anew")
+        return _result(self._commands.restart(process), f"{process} is being restarted")
 
     def note(self, text: str, scan_ns: int | None = None, time_ns: int | None = None) -> ActionResult:
         """Write a note on a scan, on a moment, or on now."""
@@ -158,7 +158,7 @@ def _result(response: Response, done: str) -> ActionResult:
 def refusal(response: Response) -> str:
     """Return why something was not done, for a person."""
     code = ControlResponse(response.code).name if response.code in ControlResponse._value2member_map_ else response.code
-    return f"Refused: {response.reason or 'no reason was given'} ({code})"
+    return f"Refused: {response.reason or 'no reason given'} ({code})"
 
 
 def _in_force(parameter: str, response: Response) -> str:
@@ -244,6 +244,6 @@ class Steering:
             result = ActionResult(str(error), ok=False)
         except Exception as error:
             self._log.exception("an action of %s failed", person)
-            result = ActionResult(f"that failed: {type(error).__name__}: {error}", ok=False)
+            result = ActionResult(f"The action failed: {type(error).__name__}: {error}", ok=False)
         self._log.debug("%s: %s%s", person, result.text, "" if result.ok else " (not done)")
         return result

@@ -34,7 +34,7 @@ class Chart:
 def drift_chart(points: Sequence[DriftPoint]) -> Chart:
     """Return where the sample has drifted to, and how fast, against time: figure 7 of the paper."""
     if not points:
-        return Chart('<p class="nothing">Nobody tracks drift in this experiment.</p>')
+        return Chart('<p class="nothing">This experiment does not track drift.</p>')
     points = points[-MOST_DRIFT:]
     time_ms = np.array([point.time_ns / 1e6 for point in points])
     xy = np.array([point.translation_m for point in points])

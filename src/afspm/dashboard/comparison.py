@@ -28,9 +28,9 @@ def difference(first: ChannelFrame, second: ChannelFrame, how: Levelling) -> tup
     """
     if first.values.shape != second.values.shape:
         (rows, columns), (others, along) = first.values.shape, second.values.shape
-        raise InvalidValue(f"{columns} × {rows} and {along} × {others} pixels have no difference")
+        raise InvalidValue(f"{columns} × {rows} and {along} × {others} pixels can't be subtracted")
     if first.unit != second.unit:
-        raise InvalidValue(f"values in {first.unit or '1'} and {second.unit or '1'} have no difference")
+        raise InvalidValue(f"values in {first.unit or '1'} and {second.unit or '1'} can't be subtracted")
     before, after = levelled(first.values, how), levelled(second.values, how)
     moved_m, words = _displacement(first.region, second.region, before, after)
     change = _moved(after, first.region, moved_m) - before
@@ -43,13 +43,13 @@ def _displacement(first: Region, second: Region, before: Array, after: Array) ->
     """Return by how much the second picture lies elsewhere than the first, within the frame; and that in words."""
     unmoved = (0.0, 0.0)
     if not all(math.isclose(a, b, rel_tol=_ALIKE) for a, b in zip(first.size_m, second.size_m, strict=True)):
-        return unmoved, "not registered, since the sizes differ: pixel by pixel"
+        return unmoved, "not registered, because the sizes differ: compared pixel by pixel"
     frame = Region((0.0, 0.0), first.size_m)
     found = estimator("correlation").register(DriftScan(before, frame, 0.0, 1.0), DriftScan(after, frame, 2.0, 3.0))
     if not found.accepted:
-        return unmoved, f"not registered, pixel by pixel: {found.reason}"
+        return unmoved, f"not registered ({found.reason}): compared pixel by pixel"
     x, y = map(float, found.displacement_m)
-    return (x, y), f"registered: the second was moved by {typeset_position((-x, -y))}"
+    return (x, y), f"registered: the second scan was moved by {typeset_position((-x, -y))}"
 
 
 def _moved(values: Array, region: Region, displacement_m: tuple[float, float]) -> Array:

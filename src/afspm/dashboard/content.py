@@ -23,7 +23,7 @@ from afspm.web.watch import Watch
 ANEW_S = 0.4  # at most that often, however much is published
 SLOWLY_S = 2.0  # for what takes longer to make
 OLD_AFTER_S = 8.0  # a supervisor tells of its processes every 2 s
-NOT_HEARD_OF = "not heard of"
+NOT_HEARD_OF = "never heard from"
 _STARTING = "starting"
 _AS_USUAL = {_STARTING, "alive", "ended"}
 
@@ -176,13 +176,13 @@ def unheard(watch: Watch, overview: Overview) -> dict[str, int]:
 def trouble(watch: Watch) -> str:
     """Return why what is shown may not be how it is; empty if it is."""
     if watch.ended:
-        return "The experiment has ended. What is shown is how it ended."
+        return "The experiment has ended. This page shows its final state."
     if not watch.connected:
-        return "Nothing has been heard of the experiment yet."
+        return "Waiting for the first message of the experiment."
     silent_s = watch.silent_s()
     if silent_s > OLD_AFTER_S:
         why = f" {said[0].upper()}{said[1:]}." if (said := watch.cut_off()) else ""
-        return f"No word from the experiment for {duration_text(silent_s)}: what is shown is that old.{why}"
+        return f"The experiment has been silent for {duration_text(silent_s)}: this page is that old.{why}"
     return ""
 
 
@@ -270,7 +270,7 @@ def refusals_html(refusals: Iterable[JournalEntry], most: int = 40) -> str:
         return '<p class="nothing">Nothing has been refused.</p>'
     rows = "".join(
         f'<li><time>{time_of_day(one.time_ns)}</time> <b class="{tint_class(one.who)}">{escape(one.who)}</b> '
-        f"{escape(one.what)}<q>{escape(one.reason) or 'no reason was given'}</q></li>"
+        f"{escape(one.what)}<q>{escape(one.reason) or 'no reason given'}</q></li>"
         for one in newest
     )
     return f'<ul class="refusals">{rows}</ul>'

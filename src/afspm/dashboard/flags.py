@@ -9,12 +9,12 @@ from afspm.model import ControlMode, ControlState, Problem
 from afspm.record.overview import Overview
 
 _ADVICE = {
-    Problem.TIP_SHAPE_CHANGED: "condition or change the tip, then clear it.",
-    Problem.DEVICE_MALFUNCTION: "check microscope, controller and log; clear it when the tip is safe.",
-    Problem.FEEDBACK_NON_OPTIMAL: "adjust setpoint and gains until trace and retrace agree, then clear it.",
-    Problem.THERMAL_DRIFT: "find the place again, or wait until the drift is slower, then clear it.",
+    Problem.TIP_SHAPE_CHANGED: "condition or change the tip, then clear the problem.",
+    Problem.DEVICE_MALFUNCTION: "check microscope, controller and log; clear the problem when the tip is safe.",
+    Problem.FEEDBACK_NON_OPTIMAL: "adjust setpoint and gains until trace and retrace agree, then clear the problem.",
+    Problem.THERMAL_DRIFT: "find the place again, or wait until the drift is slower, then clear the problem.",
 }
-_OTHER = "solve it, then clear it."
+_OTHER = "solve the problem, then clear it."
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ class Live:
             return Response(status_code=204)
         drawn = await asyncio.to_thread(self._drawn, asked)
         if drawn is None:
-            return PlainTextResponse("the values of this scan are not kept here any more", 404)
+            return PlainTextResponse("the values of this scan are no longer kept here", 404)
         headers = {"X-Frame": drawn.head(self._facts(drawn.frame)), "Cache-Control": "no-store"}
         return Response(drawn.png, media_type="image/png", headers=headers)
 
@@ -116,7 +116,7 @@ class Live:
         """
         found = await asyncio.to_thread(self._thumbnails.png, time, channel)
         if found is None:
-            return PlainTextResponse("the values of this scan are not kept here any more", 404)
+            return PlainTextResponse("the values of this scan are no longer kept here", 404)
         headers = {"Cache-Control": "private, max-age=86400, immutable"}
         return Response(found, media_type="image/png", headers=headers)
 

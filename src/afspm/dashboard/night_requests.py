@@ -66,7 +66,7 @@ class NightRequests:
     def _compared(self, first: int, second: int, channel: str, how: Levelling) -> Response:
         one, other = self._archive.frame(first, channel), self._archive.frame(second, channel)
         if one is None or other is None:
-            return PlainTextResponse("the values of one of them can't be read", 404)
+            return PlainTextResponse("the values of one of the two scans can't be read", 404)
         try:
             change, words = difference(one, other, how)
         except InvalidValue as error:
@@ -83,7 +83,7 @@ class NightRequests:
         """Answer with the report of the night."""
         file = self._night.folder / REPORT_FILE
         if not file.is_file():
-            return PlainTextResponse(f"there is no report yet: `afspm report {self._night.folder}` writes it", 404)
+            return PlainTextResponse(f"the run has no report yet: `afspm report {self._night.folder}` writes it", 404)
         return FileResponse(file, media_type="text/html")
 
 

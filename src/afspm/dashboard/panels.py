@@ -147,7 +147,7 @@ class HealthPanel:
     def __init__(self, session: SteeringSession) -> None:
         self._session = session
         self._rows: dict[str, HealthRow] = {}
-        self._nothing = ui.html("Nothing has been heard of processes yet.", sanitize=False).classes("nothing")
+        self._nothing = ui.html("No process has reported yet.", sanitize=False).classes("nothing")
         self._list = ui.element("div").classes("processes").props('role="table" aria-label="Processes"')
 
     def show(self, processes: Sequence[ProcessState], unheard: Mapping[str, int]) -> None:
@@ -198,10 +198,10 @@ def process_words(state: ProcessState, unheard_ns: int | None = None) -> tuple[s
     condition = state.condition.name.lower().replace("_", " ")
     since = f"since {time_of_day(state.since_ns)}"
     if unheard_ns is not None:
-        gone = f"for {duration_text(unheard_ns / NS_PER_S)}: its supervisor is gone, or can't be reached"
+        gone = f"for {duration_text(unheard_ns / NS_PER_S)}: its supervisor has ended or can't be reached"
         condition, since = NOT_HEARD_OF, gone
     elif state.step_age_s >= 1.0:
-        since = f"on its step for {duration_text(state.step_age_s)}"
+        since = f"in the same step for {duration_text(state.step_age_s)}"
     restarts = "" if state.starts <= 1 else f"restarted {state.starts - 1} time{'s' if state.starts > 2 else ''}"
     if state.last_exit and state.starts > 1:
         restarts += f" (last: {state.last_exit})"

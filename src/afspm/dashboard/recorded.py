@@ -90,7 +90,7 @@ def serve(settings: RecordedSettings, tell: Callable[[str], object], stopped: th
         signal.signal(number, lambda *_: stopped.set())
     server.start()
     url = url_of(settings.host, bound.getsockname()[1], encrypted=encrypted)
-    tell(f"the dashboard stays at {url}; Ctrl-C to close")
+    tell(f"the dashboard is at {url}; press Ctrl-C to close it")
     while not stopped.wait(1.0):  # on Windows a signal does not end a wait without a limit
         pass
     wait_told(0.0)

@@ -63,7 +63,7 @@ def map_html(content: MapContent, *, whole: bool = True) -> str:
     if content.probe_m is not None and (whole or not corners):
         corners.append(np.array([content.probe_m]))
     if not corners:
-        return '<p class="nothing">No place is known yet.</p>'
+        return '<p class="nothing">No scan or spectrum yet.</p>'
     view = MapView.around(np.concatenate(corners))
     probe = content.probe_m
     shapes = [
@@ -77,7 +77,7 @@ def map_html(content: MapContent, *, whole: bool = True) -> str:
         "" if probe is None else _probe(view, probe),
     ]
     away = "" if probe is None or view.contains(probe) else _away(view, probe)
-    more = f"<p>{left_out} older places are not drawn.</p>" if left_out else ""
+    more = f"<p>{left_out} older places are left out.</p>" if left_out else ""
     words = f"{counted(len(places), 'place')} with scans and {counted(len(spectra), 'spectrum', 'spectra')}"
     aspect = view.width / view.height
     return (
@@ -264,5 +264,5 @@ def _drift_words(tip_to_sample: Array | None) -> str:
     factor, unit = scale(max(abs(x), abs(y)), "m")
     return (
         f'<p class="map-drift">Sample coordinates; the sample has moved by ({-x * factor:.3g}, {-y * factor:.3g}) '
-        f"{unit} under the tip, and what it may reach with it.</p>"
+        f"{unit} under the tip, and so has the area within reach.</p>"
     )

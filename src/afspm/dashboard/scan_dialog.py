@@ -43,7 +43,7 @@ class ScanChoice:
         """
         size_m = (_length_m(width), _length_m(height))
         if not pixels.strip().isdigit() or not 1 <= int(pixels) <= MOST_PIXELS:
-            raise InvalidValue(f"pixels are a whole number from 1 to {MOST_PIXELS}")
+            raise InvalidValue(f"pixels must be a whole number from 1 to {MOST_PIXELS}")
         return ScanChoice(replace(self.region, size_m=size_m), _shape(int(pixels), size_m))
 
 

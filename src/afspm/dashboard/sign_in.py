@@ -20,10 +20,10 @@ VISITOR = "afspm_visitor"
 SIGN_IN = "/login"
 PUBLIC = (SIGN_IN, "/assets/dashboard.css")
 TLS_HINT = (
-    "This connection is not encrypted: whoever is in between can read the password and steer. "
+    "This connection is not encrypted: others on the network can read the password and then steer. "
     "Set certificate and certificate_key of the dashboard in the experiment file."
 )
-WRONG = "That is not right. Each person has a password; the one for all lets you look, without a name."
+WRONG = "Wrong name or password. Each person has a password; the common one, without a name, lets you look."
 _HEADERS = {
     "x-frame-options": "DENY",
     "x-content-type-options": "nosniff",
@@ -96,7 +96,7 @@ def add_sign_in(app: FastAPI, access: Access, title: str, *, encrypted: bool, on
         cookie = await asyncio.to_thread(access.enter, name, password, address)
         if cookie is None:
             wait_s = access.wait_s(address)
-            later = f"Too many wrong ones: try again in {wait_s:.0f} s." if wait_s else WRONG
+            later = f"Too many failed attempts: try again in {wait_s:.0f} s." if wait_s else WRONG
             return page(person, later, 429 if wait_s else 403)
         return _set_cookie(RedirectResponse("/", 303), cookie, secure=encrypted)
 
@@ -115,7 +115,9 @@ def _page(access: Access, title: str, person: str, wrong: str, hint: str) -> str
         person=html.escape(person),
         password="" if access.is_open else _PASSWORD,
         wrong=f'<p class="wrong" role="alert">{html.escape(wrong)}</p>' if wrong else "",
-        look='<a href="/">Only look</a>' if access.lets_look else "<small>Without a name you may only look.</small>",
+        look='<a href="/">Watch without signing in</a>'
+        if access.lets_look
+        else "<small>Without a name you can watch but not steer.</small>",
         hint=f'<p class="hint">{html.escape(hint)}</p>' if hint else "",
     )
 

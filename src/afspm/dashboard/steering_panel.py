@@ -18,11 +18,9 @@ from afspm.drawing.timeline import tint_class
 from afspm.formatting import time_of_day, typeset_position
 from afspm.model import ControlMode
 
-_MANUAL = "Scan here and Spectrum here, over the scan, measure where you point."
+_MANUAL = "Scan here and Spectrum here, beside the scan, measure where you point."
 _TAKE_OVER = "In MANUAL you can set parameters, scan and take spectra here."
-_ADJUST = (
-    "These hold from the next line on, while a component measures. In MANUAL you can set all parameters, and scan."
-)
+_ADJUST = "Changes hold from the next line on. In MANUAL you can set all parameters, and scan."
 
 
 class ModeButtons:
@@ -123,7 +121,7 @@ class SteeringPanel:
         await self._parameters.show()
 
     async def _ask_end(self) -> None:
-        if await asked("End the experiment?", "All components stop; what was measured is kept.", "End it") and (
+        if await asked("End the experiment?", "All components stop. All measurements are kept.", "End it") and (
             await asked("Really?", "The experiment can't be continued from here.", "Yes, end the experiment")
         ):
             self._session.do(lambda a: a.end())
@@ -133,7 +131,7 @@ class SteeringPanel:
             self._session.do(lambda a: a.stop_scan())
         elif await asked(
             "Stop the scan?",
-            "A component is in control. To stop its scan the mode is set to MANUAL first; components go on when you "
+            "A component is in control. This sets the mode to MANUAL, then stops the scan; components go on when you "
             "hand back.",
             "Set MANUAL and stop",
         ):
@@ -152,5 +150,5 @@ class SteeringPanel:
 
 async def ask_restart(session: SteeringSession, name: str) -> None:
     """Start a process anew, after a question."""
-    if await asked(f"Restart {name}?", "It is ended and started anew; what it keeps on disk stays.", "Restart"):
+    if await asked(f"Restart {name}?", "The process is ended and restarted. Its data on disk is kept.", "Restart"):
         session.do(lambda a: a.restart(name))

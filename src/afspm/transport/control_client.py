@@ -100,7 +100,7 @@ class ControlClient:
         try:
             return self._interpret(frames)
         except WireError as error:
-            self._log.warning(f"dropped a reply from {self._address}: {error}")
+            self._log.warning(f"dropped a malformed reply from {self._address}: {error}")
             return []
 
     def follow(self) -> list[Incoming]:
@@ -117,7 +117,7 @@ class ControlClient:
 
     def _interpret(self, frames: list[bytes]) -> list[Incoming]:
         if len(frames) < 2 or frames[0]:
-            raise WireError("there is no empty frame before it")
+            raise WireError("the empty frame before it is missing")
         response = wire.decode_response(frames[1:])
         if self._until_known is not None:
             # an answer with an id is to what an earlier process of this name has asked one of ours

@@ -62,8 +62,8 @@ class Keys:
             return None
         if name is None:
             raise ConfigError(
-                "it is not known whose key to expect at this address", where=address,
-                hint="name its owner in the keys of this process",
+                "no key is set for the process at this address", where=address,
+                hint="name the owner of this address in the keys of this process",
             )  # fmt: skip
         for key, owner in self.peers.items():
             if owner == name:
@@ -113,13 +113,13 @@ def load(folder: str | Path, name: str, servers: Mapping[str, str] | None = None
     secret_file = folder / "private" / f"{_checked(name)}.key_secret"
     if not secret_file.exists() and (folder / "public" / f"{name}.key").exists():
         raise ConfigError(
-            f"the secret key of {name!r} is not here, only the public one",
+            f"the secret key of {name!r} is missing; only the public one exists",
             where=str(secret_file),
-            hint=f"copy it from where it was made; if it is lost, delete public/{name}.key everywhere and make another",
+            hint=f"copy it from the computer where it was made; if it is lost, delete public/{name}.key everywhere, then make a new one",
         )
     entries = _read(secret_file, name)
     if "secret-key" not in entries:
-        raise ConfigError("there is no secret key in this file", where=str(secret_file))
+        raise ConfigError("this file holds no secret key", where=str(secret_file))
     require_private(secret_file)
     public = folder / "public"
     return Keys(
@@ -132,8 +132,8 @@ def require_private(file: Path) -> None:
     mode = file.stat().st_mode if sys.platform != "win32" else 0
     if mode & 0o077:
         raise ConfigError(
-            f"others may read this secret: its mode is {stat.S_IMODE(mode):04o}", where=str(file),
-            hint=f"if nobody did: chmod 600 {file.name}; else make another",
+            f"other users may read this secret key: its mode is {stat.S_IMODE(mode):04o}", where=str(file),
+            hint=f"if none has read it: chmod 600 {file.name}; otherwise make a new key",
         )  # fmt: skip
 
 
@@ -213,7 +213,7 @@ def _checked(name: str) -> str:
 
 def _write(file: Path, entries: Mapping[str, bytes], *, mode: int) -> None:
     lines = [f'    {key} = "{value.decode()}"' for key, value in entries.items()]
-    text = "\n".join(["#   ZeroMQ CURVE certificate of afspm. Keep a secret key to yourself.", "metadata", "curve",
+    text = "\n".join(["#   ZeroMQ CURVE certificate of afspm. Do not share a secret key.", "metadata", "curve",
                       *lines, ""])  # fmt: skip
     # created with its mode: a secret is never readable by others, not even for a moment
     descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode)
@@ -230,5 +230,5 @@ def _read(file: Path, name: str) -> dict[str, bytes]:
         ) from error
     entries = {key: value.encode() for key, value in _ENTRY.findall(text)}
     if "public-key" not in entries:
-        raise ConfigError("this is not a certificate: it has no public key", where=str(file))
+        raise ConfigError("the file is not a certificate: it has no public key", where=str(file))
     return entries

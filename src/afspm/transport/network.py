@@ -181,7 +181,7 @@ class Network:
         everywhere = self.keys is not None and self.keys.everywhere
         if not everywhere and not self._insecure and not is_local(address):
             raise ConfigError(
-                "this address can be reached from other computers, and there are no keys",
+                "other computers can reach this address, and the experiment has no keys",
                 where=address,
                 hint="make keys with `afspm keys`, or use 127.0.0.1; "
                 "insecure = true lets anyone on the network move the tip",
@@ -210,9 +210,9 @@ def is_local(address: str) -> bool:
 
 def _bind_hint(error: zmq.ZMQError) -> str:
     if error.errno == zmq.EADDRINUSE:
-        return "another program uses this port: an earlier experiment that still runs?"
+        return "another program uses this port: end an earlier experiment that still runs, or change the port"
     if error.errno == zmq.EADDRNOTAVAIL:
-        return "this computer has no such address: is this process meant to run on another one (--only)?"
+        return "this computer does not have this address: start the process on the computer that has it (--only)"
     return ""
 
 

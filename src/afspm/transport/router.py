@@ -198,8 +198,8 @@ class Router:
         if self._keys is not None and not self._has_refused:
             self._has_refused = True
             self._log.warning(
-                f"refused a connection to {self.address}: it has shown no key that is known here; programs that know "
-                "nothing of keys are let in by [security] plain = true"
+                f"refused a connection to {self.address}: its key is missing or unknown; [security] plain = true "
+                "admits programs without keys"
             )
 
 

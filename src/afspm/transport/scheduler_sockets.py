@@ -34,7 +34,7 @@ class SchedulerSockets:
         sockets = launch.sockets
         if sockets.publish is None or sockets.serve is None or sockets.control is None or not sockets.subscribe:
             raise ConfigError(
-                "a scheduler needs four addresses: publish, serve, and control and subscribe of its translator",
+                "a scheduler needs four addresses: publish, serve, control and subscribe",
                 where=launch.name,
             )
         self._network = Network.from_launch(launch.name, launch.keys)

@@ -125,9 +125,9 @@ class Subscriber:
 def _check(prefixes: tuple[str, ...], name: str) -> None:
     if len(Marker(topic(name, 10**9), 10**18, prefixes).encode()) > LONGEST:
         raise ConfigError(
-            f"{len(prefixes)} prefixes are more than a publisher takes: {LONGEST} bytes",
+            f"{len(prefixes)} prefixes are longer than the {LONGEST} bytes that a publisher takes",
             where=name,
-            hint="subscribe to what the envelopes have in common, or to all of them",
+            hint="subscribe to a common beginning of the envelopes, or to all envelopes",
         )
 
 

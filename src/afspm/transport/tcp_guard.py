@@ -165,9 +165,9 @@ class TcpGuard:
     def _excess(self, descriptor: int, backlog: ConnectionBacklog, info: TcpInfo, now_s: float, settled: bool) -> str:
         unread = backlog.unread(info.received, now_s, settled=settled and self._most_unread > MOST_SUBSCRIBED_BYTES)
         if unread > self._most_unread or backlog.is_unfinished():
-            return f"{unread >> 10} kB of what it sent are unread or unfinished"
+            return f"{unread >> 10} kB that it sent are unread or incomplete"
         unsent = backlog.unsent(info, self._published + self._replayed[descriptor])
-        return f"{unsent >> 20} MB wait for it" if unsent > self._most_unsent else ""
+        return f"{unsent >> 20} MB wait to be sent to it" if unsent > self._most_unsent else ""
 
 
 def tcp_info(descriptor: int) -> TcpInfo | None:
@@ -190,7 +190,7 @@ def _disconnect(descriptor: int, port: int, why: str) -> None:
     """End a connection to `port` as if the peer had hung up; what is on its way is dropped."""
     with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
         if connection.getsockname()[1] == port:  # else the number was given to another connection since
-            _log.warning("disconnected %s: %s", connection.getpeername(), why)
+            _log.warning("disconnected the client %s: %s", connection.getpeername(), why)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
             connection.shutdown(socket.SHUT_RDWR)
 

@@ -118,16 +118,14 @@ class ZmqPort(BasePort[Incoming]):
     def send(self, frames: Sequence[bytes]) -> None:
         if self._control is None:
             raise ConfigError(
-                "this component was given no scheduler to ask", where=self._name, hint="control = address"
+                "this component has no address of a scheduler", where=self._name, hint="control = address"
             )
         if (answer := self._control.send(frames)) is not None:
             self._wake_up.post(ReplyReceived(answer))
 
     def publish(self, envelope: str, payload: bytes) -> None:
         if self._publisher is None:
-            raise ConfigError(
-                "this component was given no address to publish on", where=self._name, hint="publish = address"
-            )
+            raise ConfigError("this component has no address to publish on", where=self._name, hint="publish = address")
         self._publisher.publish(self._published.stamp(envelope, payload))
 
 

@@ -95,7 +95,7 @@ class ZmqServerPort(BasePort[Served]):
         user = user_of(frames[0]) if self._has_keys else None
         if self._allowed is not None and self._has_keys and user != self._allowed:
             self._asked_by_version_1 = None  # it hears why, whichever version it is of
-            self.reply([b"\1", b"", f"only {self._allowed} may ask here, not {user}".encode()])
+            self.reply([b"\1", b"", f"only {self._allowed} may send requests to this address, not {user}".encode()])
         elif parts[start:] == [*QUESTION] and property_of(frames[0], "Socket-Type") == "DEALER":
             self.reply(ANSWER)  # a REQ socket is that of a scheduler of version 1, which passes on what it is asked
         else:
@@ -123,7 +123,7 @@ class ZmqServerPort(BasePort[Served]):
 
     def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:
         if self._publisher is None:
-            raise ConfigError("there is no address to publish on", hint="publish = address")
+            raise ConfigError("the process has no address to publish on", hint="publish = address")
         self._publisher.publish(self._published.stamp(envelope, payload, time_ns, keep=keep))
 
     def kill(self) -> None:

@@ -48,7 +48,7 @@ class Archive:
             with open_run(self._folder) as run:
                 return run.overview(PAST, problems)
         except (AfspmError, ImportError) as error:
-            self._log.debug("the past can't be read: %s", error)
+            self._log.debug("the earlier part of the run can't be read: %s", error)
             return None
 
     def frame(self, time_ns: int, channel: str) -> ChannelFrame | None:
@@ -63,7 +63,7 @@ class Archive:
             try:
                 frame = _find(self._folder, time_ns, channel)
             except (AfspmError, ImportError, KeyError) as error:
-                self._log.debug("a scan that can't be read: %s", error)
+                self._log.debug("a scan can't be read: %s", error)
                 return None
             if frame is not None:
                 self._read[key] = frame

@@ -31,7 +31,7 @@ def wrong_origin(
     if only_here and not is_loopback(_host_of(host)):
         return f"this {what} is for this computer only, and not for {host!r}"
     if origin is not None and origin not in allowed and urlsplit(origin).netloc != host:
-        return f"a page of {origin} may not ask this {what}"
+        return f"a page of {origin} may not send requests to this {what}"
     return None
 
 

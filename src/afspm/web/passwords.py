@@ -146,13 +146,13 @@ def _require_hash(person: str, kept: str) -> None:
     setting = f"people, {person!r}" if person else "password_hash"
     if person != check_name(person):
         raise ConfigError(
-            f"{setting}: that can't be a name",
+            f"{setting}: this is not a valid name",
             hint=f"letters, digits, spaces, - . and ', at most {LONGEST_NAME}",
         )  # fmt: skip
     if (kept or person) and not is_hash(kept):
         raise ConfigError(
             f"{setting} is not the hash of a password",
-            hint="`afspm dashboard --make-password` makes one; the password itself doesn't belong into the file",
+            hint="`afspm dashboard --make-password` makes one; do not write the password itself into the file",
         )  # fmt: skip
 
 

@@ -40,7 +40,7 @@ def listening(
     raise ConfigError(
         f"the {what} can't listen at {host}, port {port}: {failed.strerror or failed}",
         where=what,
-        hint="is another one running there? choose another with port, or leave it away",
+        hint="another program may use it; set another port, or leave port out",
     ) from failed
 
 
@@ -106,7 +106,7 @@ class WebServer:
             config.load()
         except (OSError, ValueError) as error:
             raise ConfigError(
-                f"certificate and certificate_key can't be used: {error}", hint="two PEM files"
+                f"certificate or certificate_key can't be loaded: {error}", hint="both must be PEM files"
             ) from error
         self._socket = bound
         self._server = uvicorn.Server(config)

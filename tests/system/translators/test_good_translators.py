@@ -137,7 +137,7 @@ def test_a_spectrum_too_short_to_be_stopped_is_said_to_be(file: Path) -> None:
         CheckOptions([file], runs=file.parent / "runs", speed=5000.0, only=["spectrum/cancel", "spectrum/order"])
     )
     outcomes = {result.name: (result.outcome, result.line) for result in report.results}
-    assert outcomes["spectrum/cancel"] == (CheckOutcome.SKIPPED, "a spectrum is over sooner than it could be stopped")
+    assert outcomes["spectrum/cancel"] == (CheckOutcome.SKIPPED, "a spectrum ends before it can be stopped")
     assert outcomes["spectrum/order"] == (CheckOutcome.PASSED, "")
 
 
@@ -206,7 +206,7 @@ def test_ctrl_c_in_the_middle_of_a_scan_puts_everything_back(file: Path) -> None
         assert process.stdout is not None
         output = process.stdout.read()
         assert process.wait(DEADLINE_S) == 130
-    assert "not finished: interrupted" in output
+    assert "not completed: interrupted" in output
     (folder,) = (file.parent / "runs").glob("test-*")
     written = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     assert written["unrestored"] == []
@@ -230,7 +230,7 @@ def test_a_translator_that_does_not_find_its_controller_is_said_to_with_what_it_
     file = tmp_path / "experiment.toml"
     file.write_text('[microscope]\ncomponent = true\nclass = "deaf.Deaf"\n', encoding="utf-8")
     report = run(CheckOptions([file], runs=tmp_path / "runs"))
-    assert "a controller that is found" in report.lost
+    assert "a connection to the controller" in report.lost
     assert "nobody is at home" in report.lost
     assert not report.passed
 

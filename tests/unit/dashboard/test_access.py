@@ -79,7 +79,7 @@ def test_a_plain_password_in_the_file_is_refused() -> None:
         access(people={"Ada": "analytical"})
     with pytest.raises(ConfigError, match="not the hash"):
         access(people={"Ada": ""})
-    with pytest.raises(ConfigError, match="can't be a name"):
+    with pytest.raises(ConfigError, match="not a valid name"):
         access(people={"a:b": ADAS})
 
 

@@ -145,7 +145,7 @@ def test_places_that_a_component_has_found_are_on_the_map() -> None:
 def test_ten_thousand_places_are_drawn_as_far_as_that_makes_sense_and_the_rest_is_told() -> None:
     scans = [taken(i, Region((i * 1e-6, 0.0), (1e-6, 1e-6))) for i in range(10_000)]
     html = map_html(MapContent(scans))
-    assert "8500 older places are not drawn" in html
+    assert "8500 older places are left out" in html
     assert len(shapes(html, "scan")) == 1500
 
 
@@ -178,7 +178,7 @@ def test_an_interrupted_scan_is_marked() -> None:
 
 
 def test_an_empty_map_says_so() -> None:
-    assert "No place is known" in map_html(MapContent())
+    assert "No scan or spectrum yet" in map_html(MapContent())
 
 
 # --- the time line ---
@@ -304,11 +304,11 @@ def test_processes_of_a_computer_that_is_gone_are_not_told_of_as_alive() -> None
     assert silent == {"series": (ELSEWHERE - 1 - 29) * S}, "and what has ended there has ended"
     state = watch.overview.processes["series"]
     assert process_words(state, silent["series"])[:2] == (
-        "not heard of", "for 9 min 30 s: its supervisor is gone, or can't be reached",
+        "never heard from", "for 9 min 30 s: its supervisor has ended or can't be reached",
     )  # fmt: skip
     html = time_line_html(watch.overview, ELSEWHERE * S, silent)
-    assert html.count("process-not-heard-of") == 1
-    assert "process-not-heard-of" not in time_line_html(gone(), ELSEWHERE * S)
+    assert html.count("process-never-heard-from") == 1
+    assert "process-never-heard-from" not in time_line_html(gone(), ELSEWHERE * S)
 
 
 def test_a_simulated_night_passes_faster_and_nobody_is_gone_for_that() -> None:
@@ -346,7 +346,7 @@ def test_what_was_only_predicted_is_drawn_as_dots() -> None:
 
 def test_no_drift_is_said() -> None:
     chart = drift_chart([])
-    assert "Nobody tracks drift" in chart.words
+    assert "does not track drift" in chart.words
     assert chart.options is None
 
 

@@ -80,7 +80,7 @@ def test_settings_without_sense_are_refused_before_it_runs() -> None:
 
 def test_an_emulator_has_a_name_or_is_one_of_the_users() -> None:
     assert registry.emulator(f"{Tiny.__module__}.Tiny") is Tiny
-    with pytest.raises(ConfigError, match="there is not an emulator 'veeco'"):
+    with pytest.raises(ConfigError, match="there is no emulator 'veeco'"):
         registry.emulator("veeco")
     with pytest.raises(ConfigError, match="is not an emulator"):
         registry.emulator("pathlib.Path")

@@ -125,7 +125,7 @@ def test_a_secret_that_others_may_read_is_refused(tmp_path: Path) -> None:
     assert stat.S_IMODE((tmp_path / "keys" / "private").stat().st_mode) == 0o700
     loose = tmp_path / "keys" / "private" / "series.key_secret"
     loose.chmod(0o640)
-    with pytest.raises(ConfigError, match="others may read this secret: its mode is 0640"):
+    with pytest.raises(ConfigError, match="other users may read this secret key: its mode is 0640"):
         handed(experiment(tmp_path, '[security]\nkeys = "keys"\n'))
 
 

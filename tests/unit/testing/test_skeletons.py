@@ -35,7 +35,7 @@ def test_what_can_not_be_a_package_is_refused(name: str, tmp_path: Path) -> None
 def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "work.txt").write_text("of years")
-    with pytest.raises(FileError, match="there is such a folder already"):
+    with pytest.raises(FileError, match="this folder already exists"):
         write("driver", "mine", tmp_path)
     assert [file.name for file in (tmp_path / "mine").iterdir()] == ["work.txt"]
 

@@ -82,7 +82,7 @@ def test_a_forged_header_is_not_the_address_of_whoever_asks() -> None:
 def test_what_is_no_certificate_is_refused(certificate: Path) -> None:
     with listening("127.0.0.1", 0) as bound:
         for wrong in (certificate.with_name("none.crt"), PAGE):
-            with pytest.raises(ConfigError, match="certificate and certificate_key can't be used"):
+            with pytest.raises(ConfigError, match="certificate or certificate_key can't be loaded"):
                 WebServer(hello, bound, wrong, certificate.with_suffix(".key"))
 
 

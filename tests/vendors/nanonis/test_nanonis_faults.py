@@ -95,7 +95,7 @@ def test_fields_of_another_release_than_it_says_are_named(bench: Make) -> None:
     made.strike("wrong-release", duration_s=1e9)
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.NO_RESPONSE
-    assert "the reply to Scan.PropsGet is not what it should be" in response.reason
+    assert "the reply to Scan.PropsGet is malformed" in response.reason
     assert "it was read as of release 14573" in response.reason
 
 

@@ -46,7 +46,7 @@ def write(kind: str, name: str, into: Path) -> Path:
                 text = file.read_text(encoding="utf-8")
                 written.write_text(text.replace(own_module, module).replace(own_class, class_name), encoding="utf-8")
     except FileExistsError:
-        raise FileError("there is such a folder already", where=str(target), hint="choose another name") from None
+        raise FileError("this folder already exists", where=str(target), hint="choose another name") from None
     except OSError as error:
         raise FileError(f"can't be written: {error.strerror or error}", where=str(target)) from error
     return target

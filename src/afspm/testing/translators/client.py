@@ -140,7 +140,7 @@ MOVED_S = 60.0
 _STOPS = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
 
 
-_ANSWERS = "a scheduler that answers (of a run that goes on: one with `[security] plain = true`)"
+_ANSWERS = "a scheduler that answers (of a running experiment: one with `[security] plain = true`)"
 
 
 class CheckClient:
@@ -182,12 +182,12 @@ class CheckClient:
                 STARTED_S,
                 "a ScopeStateMsg of the translator",
             )
-            self.wait(lambda: self.state is not ScopeState.UNDEFINED, STARTED_S, "a controller that is found")
+            self.wait(lambda: self.state is not ScopeState.UNDEFINED, STARTED_S, "a connection to the controller")
         except Failed as failure:
             raise Lost(str(failure)) from failure
         response = self._asked_by(self._link, ControlRequest.REQUEST_CTRL, 0)
         if not response.ok:
-            raise Lost(f"control is not given: {answer_in_words(response)}")
+            raise Lost(f"control was refused: {answer_in_words(response)}")
         self.quiet()
         self.at_start = tuple(self.observations.all)
 
@@ -312,7 +312,9 @@ class CheckClient:
             try:
                 self.wait(lambda: self.state is ScopeState.FREE, self.real_s(MOVED_S), "SS_FREE")
             except Failed as failure:
-                raise Lost(f"it does not come to rest: {failure} ({told(self.observations.since(mark))})") from failure
+                raise Lost(
+                    f"the microscope does not become free: {failure} ({told(self.observations.since(mark))})"
+                ) from failure
         if self._stirred:
             self.quiet()
 

@@ -282,7 +282,7 @@ class CheckMeasurements:
                 self._kept[what] = failure
                 raise
         if isinstance(found, Exception):
-            raise Skipped(f"there is no {what}, as was told before")
+            raise Skipped(f"{what} is not supported, as reported before")
         return found
 
 

@@ -27,9 +27,11 @@ _REPORTS = pytest.StashKey[list[CheckReport]]()
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("afspm translators")
-    group.addoption("--overlay", action="append", default=[], metavar="FILE", help="laid over the experiment file")
-    group.addoption("--without-process", action="append", default=[], metavar="NAME", help="runs already: is joined")
-    group.addoption("--runs", default="runs", metavar="DIR", help="where to make the run's folder")
+    group.addoption("--overlay", action="append", default=[], metavar="FILE", help="merged over the experiment file")
+    group.addoption(
+        "--without-process", action="append", default=[], metavar="NAME", help="is already running: join it"
+    )
+    group.addoption("--runs", default="runs", metavar="DIR", help="the folder in which to make the run's folder")
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:

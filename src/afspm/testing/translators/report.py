@@ -80,7 +80,7 @@ class CheckReport:
 
 def show_beginning(report: CheckReport, console: Console) -> None:
     """Print what will be checked."""
-    told = report.support.controller or "its controller does not tell its version"
+    told = report.support.controller or "its controller does not report its version"
     simulated = " SIMULATED" if report.simulated else ""
     console.print(Text.assemble((report.translator, "bold"), f": {told}", (simulated, "bold yellow")), soft_wrap=True)
 
@@ -95,7 +95,7 @@ def show_end(report: CheckReport, console: Console) -> None:
         for line in lines:
             console.print(Text(f"{what}: {line}", "bold red"), soft_wrap=True)
     if report.lost:
-        console.print(Text(f"not finished: {report.lost}", "bold red"), soft_wrap=True)
+        console.print(Text(f"not completed: {report.lost}", "bold red"), soft_wrap=True)
     console.print(Text(summary(report), "bold green" if report.passed else "bold red"), soft_wrap=True)
     if report.folder:
         console.print(f"log, files and report.json: {report.folder}", markup=False, soft_wrap=True, style="dim")
@@ -106,7 +106,7 @@ def summary(report: CheckReport) -> str:
     counts = [f"{report.count(outcome)} {outcome.value}" for outcome in CheckOutcome if report.count(outcome)]
     unsupported = sum(told is None for told in report.support.parameters.values())
     unsupported += sum(has is False for has in report.support.actions.values())
-    verdict = "the translator does what it should" if report.passed else "the translator does not do what it should"
+    verdict = "the translator passes the suite" if report.passed else "the translator fails the suite"
     return f"{', '.join(counts) or 'nothing checked'}; {unsupported} actions and parameters not supported: {verdict}"
 
 
@@ -116,7 +116,7 @@ def _actions(report: CheckReport) -> Table:
         table.add_column(column)
     for name, has in report.support.actions.items():
         of_base = "base" if name in names.BASE_ACTIONS else ""
-        said = {True: Text("yes", "green"), False: Text("no", "yellow"), None: Text("it does not say", "yellow")}[has]
+        said = {True: Text("yes", "green"), False: Text("no", "yellow"), None: Text("not reported", "yellow")}[has]
         table.add_row(name, of_base, said)
     return table
 
@@ -130,6 +130,6 @@ def _parameters(report: CheckReport) -> Table:
         if told is None:
             table.add_row(name, of_base, Text("no", "yellow"), "")
             continue
-        settable = {True: "yes, set", False: "yes, only read", None: "yes"}[report.support.settable.get(name)]
+        settable = {True: "yes, set", False: "yes, read-only", None: "yes"}[report.support.settable.get(name)]
         table.add_row(name, of_base, Text(settable, "green"), f"{told.value} {told.unit or ''}".rstrip())
     return table

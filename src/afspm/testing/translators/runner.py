@@ -128,7 +128,7 @@ def chosen(only: Collection[str] = ()) -> list[Check]:
     """
     found = [one for one in all_checks() if not only or any(part in one.name for part in only)]
     if not found:
-        raise ConfigError(f"there is no check {' or '.join(only)}", hint="afspm test-translator --list")
+        raise ConfigError(f"no check is called {' or '.join(only)}", hint="afspm test-translator --list")
     return found
 
 

@@ -115,9 +115,9 @@ def prepare(options: CheckOptions) -> Experiment:
     schedulers = experiment.resolved.with_role(Role.SCHEDULER)
     if any(getattr(scheduler.component, "frame", None) is Frame.SAMPLE for scheduler in schedulers):
         raise ConfigError(
-            "a translator is checked in tip coordinates, and this scheduler has the sample's",
+            "a translator is checked in tip coordinates, but this scheduler uses sample coordinates",
             where=str(options.files[0]),
-            hint="give a file with the microscope alone",
+            hint="give an experiment file with nothing but the microscope",
         )
     return experiment
 

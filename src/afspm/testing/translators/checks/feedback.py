@@ -24,7 +24,7 @@ def in_force(kit: CheckMeasurements) -> Feedback:
     """Return the newest feedback."""
     feedback = kit.client.observations.newest(Feedback)
     if feedback is None and not any(map(kit.support.has, _NUMBERS.values())):
-        raise Skipped("the microscope tells nothing of a feedback")
+        raise Skipped("the microscope reports no feedback")
     if feedback is None:
         raise Failed("ZCtrlParameters at the start", told(kit.client.observations.all[:10]))
     return feedback
@@ -62,7 +62,7 @@ def _stepped(kit: CheckMeasurements, fields: Iterable[str]) -> Feedback:
     values = {name: getattr(now, name) for name in fields if kit.support.has(_NUMBERS[name])}
     values = {name: value * _STEP for name, value in values.items() if value}
     if not values:
-        raise Skipped("they are not supported, or are 0, which can't be changed by a little")
+        raise Skipped("they are not supported, or are 0 and can't be changed by a fraction")
     return Feedback(**values)
 
 
@@ -76,7 +76,7 @@ def one(kit: CheckMeasurements) -> None:
     set_and_require(kit, _stepped(kit, ["integral_gain"]))
 
 
-@check("feedback/as-parameters", "what is set of the feedback is what its parameters then say")
+@check("feedback/as-parameters", "the parameters report what was set of the feedback")
 def as_parameters(kit: CheckMeasurements) -> None:
     wanted = _stepped(kit, _NUMBERS)
     set_and_require(kit, wanted)
@@ -92,7 +92,7 @@ def on_off(kit: CheckMeasurements) -> None:
     before = in_force(kit).on
     kit.support.settable[names.FEEDBACK_ON] = False
     if before is None:
-        raise Skipped("the microscope does not say whether its feedback is on")
+        raise Skipped("the microscope does not report whether its feedback is on")
     for on in (not before, before):
         set_and_require(kit, Feedback(on=on))
         if kit.support.has(names.FEEDBACK_ON):

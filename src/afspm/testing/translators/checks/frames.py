@@ -21,7 +21,7 @@ from afspm.testing.translators.registry import check
 from afspm.testing.verdicts import Failed, Skipped, expect, near
 
 
-@check("published/in-force", "what is in force is published at the start, the state last")
+@check("published/in-force", "the settings in force are published at the start, the state last")
 def published_in_force(kit: CheckMeasurements) -> None:
     heard = kit.client.at_start
     wanted: list[tuple[type, tuple[str, ...]]] = [
@@ -44,7 +44,7 @@ def free(kit: CheckMeasurements) -> None:
     expect(states[-1] is ScopeState.FREE, "SS_FREE", told(kit.client.at_start))
 
 
-@check("published/frame", "the ScanParameters2d are what the parameters say", needs=(names.SCAN_SIZE_X,))
+@check("published/frame", "the ScanParameters2d agree with the parameters", needs=(names.SCAN_SIZE_X,))
 def frame(kit: CheckMeasurements) -> None:
     parameters = next(
         (one.thing for one in reversed(kit.client.at_start) if isinstance(one.thing, ScanParameters)), None
@@ -137,7 +137,7 @@ def turned(kit: CheckMeasurements) -> None:
     require_in_force(kit, FrameSetting(straight, kit.frames.turned.shape))
 
 
-@check("frame/parameters", "a frame that is set is what its parameters then say", needs=_SIZES)
+@check("frame/parameters", "the parameters report the frame that was set", needs=_SIZES)
 def parameters(kit: CheckMeasurements) -> None:
     ask_for(kit, kit.frames.turned.request(kit.support))
     region, (rows, columns) = kit.frames.turned.region, kit.frames.turned.shape

@@ -51,11 +51,11 @@ def _of(name: str) -> None:
     """Marks the checks of one parameter."""
     what = name.replace("-", " ")
 
-    @check(f"parameter/{name}", f"{what}: set, told as it was set, also in another unit", needs=(name,))
+    @check(f"parameter/{name}", f"{what}: set, and reported as it was set, also in another unit", needs=(name,))
     def is_set(kit: CheckMeasurements) -> None:
         _require_set(kit, name)
 
-    @check(f"refused/{name}", f"{what}: NaN, no number and a wrong unit are refused, and change nothing", needs=(name,))
+    @check(f"refused/{name}", f"{what}: NaN, text and a wrong unit are refused, and change nothing", needs=(name,))
     def is_refused(kit: CheckMeasurements) -> None:
         _require_refused(kit, name)
 
@@ -78,7 +78,7 @@ def _require_set(kit: CheckMeasurements, name: str) -> None:
     kit.support.settable[name] = True
     _require_told(name, value_in(response, name), wanted, unit, "the answer")
     client.settled(client.observations.mark())
-    _require_told(name, client.get(name), wanted, unit, "what is then got")
+    _require_told(name, client.get(name), wanted, unit, "the value read back")
     if unit in _SMALLER:
         _require_other_unit(kit, name, now, unit)
 
@@ -90,7 +90,7 @@ def _set_near(kit: CheckMeasurements, name: str, now: float, step: ParameterStep
         Skipped: the microscope lets none be set.
     """
     if step.from_(now, 1) == now:
-        raise Skipped(f"{name} is {now:g}, which can't be changed by a little")
+        raise Skipped(f"{name} is {now:g} and can't be changed by a fraction")
     response = Response(ControlResponse.FAILURE)
     for sign in (1, -1):
         wanted = _written(step.from_(now, sign), name)
@@ -101,7 +101,7 @@ def _set_near(kit: CheckMeasurements, name: str, now: float, step: ParameterStep
     allowed = response.code in (ControlResponse.PARAM_ERROR, ControlResponse.PARAM_NOT_SUPPORTED)
     expect(allowed, f"REP_SUCCESS or REP_PARAM_ERROR to setting {name} while SS_FREE", answer_in_words(response))
     kit.support.settable[name] = False
-    raise Skipped(f"it can be got, not set: {answer_in_words(response)}")
+    raise Skipped(f"it is read-only: {answer_in_words(response)}")
 
 
 def _require_other_unit(kit: CheckMeasurements, name: str, value: float, unit: str) -> None:
@@ -111,8 +111,8 @@ def _require_other_unit(kit: CheckMeasurements, name: str, value: float, unit: s
     response = kit.client.set(name, text, other)
     expect(response.ok, f"REP_SUCCESS to {name} = {text} {other}", answer_in_words(response))
     kit.client.settled(kit.client.observations.mark())
-    _require_told(name, kit.client.get(name), value, unit, f"what is got after setting {text} {other}")
-    _require_told(name, kit.client.get(name, other), value, unit, f"what is got in {other}")
+    _require_told(name, kit.client.get(name), value, unit, f"the value read back after setting {text} {other}")
+    _require_told(name, kit.client.get(name, other), value, unit, f"the value read back in {other}")
 
 
 def _require_told(name: str, told: Parameter, wanted: float, unit: str, where: str) -> None:

@@ -138,7 +138,7 @@ _SHAPE = (96, 96)
 
 @check(
     "scan/picture",
-    "details fit into a larger scan where they say they are, and as they say they are turned",
+    "details fit into a larger scan at their position and angle",
     needs=(names.START_SCAN,),
 )
 def picture(kit: CheckMeasurements) -> None:
@@ -147,7 +147,7 @@ def picture(kit: CheckMeasurements) -> None:
     larger = kit.take_scan(FrameSetting(kit.frames.whole, _SHAPE))
     found = [likenesses(*_pictures(channel, larger, details)) for channel in _common(larger, details)]
     if not found:
-        raise Failed("the same channels in all scans", "none that all have")
+        raise Failed("the same channels in all scans", "no channel that all have")
     best = max(found, key=lambda likeness: max(likeness.values()))
     name, likeness = best_of(best)
     as_told = best["as told"]
@@ -155,7 +155,7 @@ def picture(kit: CheckMeasurements) -> None:
         raise Skipped(f"no structure is seen in all scans (correlation {likeness:.2f}): noise shows no coordinates")
     if as_told < likeness - CLEARLY:
         raise Failed(
-            "details that fit into a larger scan as they are told",
+            "details that fit into a larger scan at their position and angle",
             f"a correlation of {as_told:.2f}, and of {likeness:.2f} {name}",
         )
     if as_told < LIKE:

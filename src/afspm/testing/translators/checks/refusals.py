@@ -24,13 +24,13 @@ from afspm.wire import messages
 _UNKNOWN = "no-such-thing"
 
 
-@check("refused/unknown-parameter", "a parameter that there is not: REP_PARAM_NOT_SUPPORTED")
+@check("refused/unknown-parameter", "an unknown parameter: REP_PARAM_NOT_SUPPORTED")
 def unknown_parameter(kit: CheckMeasurements) -> None:
     for parameter in (Parameter(_UNKNOWN), Parameter(_UNKNOWN, "1", "m")):
         _require(kit, ControlRequest.PARAM, parameter, ControlResponse.PARAM_NOT_SUPPORTED, f"REQ_PARAM {_UNKNOWN}")
 
 
-@check("refused/unknown-action", "an action that there is not: REP_ACTION_NOT_SUPPORTED")
+@check("refused/unknown-action", "an unknown action: REP_ACTION_NOT_SUPPORTED")
 def unknown_action(kit: CheckMeasurements) -> None:
     can_be_asked = None not in kit.support.actions.values()
     for kind in (ControlRequest.ACTION, *([ControlRequest.ACTION_SUPPORT] if can_be_asked else [])):
@@ -42,12 +42,12 @@ def _require(kit: CheckMeasurements, kind: ControlRequest, subject: object, code
     expect(response.code == code, f"REP_{code.name} to {what}", answer_in_words(response))
 
 
-@check("refused/read-only", "a parameter that can only be read is not set", needs=(names.CONTROLLER,))
+@check("refused/read-only", "a read-only parameter is not set", needs=(names.CONTROLLER,))
 def read_only(kit: CheckMeasurements) -> None:
     require_param_error(kit, names.CONTROLLER, "mine", None, kit.client.get(names.CONTROLLER))
 
 
-@check("refused/too-large", "a frame of a kilometre, or of none, is refused, not clamped", needs=(names.SCAN_SIZE_X,))
+@check("refused/too-large", "a frame of a kilometre, or of size 0, is refused, not clamped", needs=(names.SCAN_SIZE_X,))
 def too_large(kit: CheckMeasurements) -> None:
     kit.client.come_to_rest()
     for name, values in (
@@ -114,7 +114,7 @@ def _require_unchanged(
 _NEEDS = (names.START_SCAN, names.STOP_SCAN)
 
 
-@check("busy/refused", "while a scan runs what would disturb it is REP_NOT_FREE, and it goes on", needs=_NEEDS)
+@check("busy/refused", "during a scan, requests that would disturb it get REP_NOT_FREE, and it goes on", needs=_NEEDS)
 def refused(kit: CheckMeasurements) -> None:
     mark = kit.begin_long_scan(kit.frames.other)
     asked: list[tuple[ControlRequest, object, str, tuple[str, ...]]] = [
@@ -138,10 +138,10 @@ def refused(kit: CheckMeasurements) -> None:
             )  # fmt: skip
     _require_running(kit, mark)
     heard = [one for one in kit.client.observations.since(mark) if one.state is None]
-    expect(not heard, "nothing but SS_SCANNING while what was asked was refused", told(heard))
+    expect(not heard, "nothing but SS_SCANNING while requests were refused", told(heard))
 
 
-@check("busy/answered", "while a scan runs, parameters are told and support of actions is answered", needs=_NEEDS)
+@check("busy/answered", "during a scan, questions for parameters and supported actions are answered", needs=_NEEDS)
 def answered(kit: CheckMeasurements) -> None:
     mark = kit.begin_long_scan(kit.frames.other)
     name = next((one for one, value in kit.support.parameters.items() if value is not None), None)

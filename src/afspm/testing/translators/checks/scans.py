@@ -41,7 +41,7 @@ def require_broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: Scop
 
 @check(
     "scan/cancel",
-    "stop-scan breaks a scan off: SS_INTERRUPTED, SS_FREE, and no scan",
+    "stop-scan stops a scan: SS_INTERRUPTED, SS_FREE, and no scan",
     needs=(names.START_SCAN, names.STOP_SCAN),
 )
 def cancel(kit: CheckMeasurements) -> None:
@@ -49,7 +49,7 @@ def cancel(kit: CheckMeasurements) -> None:
     expect(not scans(heard), "no Scan2d of a scan that was stopped", told(heard))
 
 
-@check("scan/stop-nothing", "stop-scan while nothing runs is a success, and changes nothing", needs=(names.STOP_SCAN,))
+@check("scan/stop-nothing", "stop-scan while nothing runs succeeds, and changes nothing", needs=(names.STOP_SCAN,))
 def stop_nothing(kit: CheckMeasurements) -> None:
     kit.client.come_to_rest()
     mark = kit.client.observations.mark()
@@ -94,7 +94,7 @@ def channels(kit: CheckMeasurements) -> None:
         expect(missing == 0, f"values in all pixels of {scan.channel!r}", f"{missing} that are not finite")
 
 
-@check("scan/frame", "a scan says the frame that was set, and is of that many pixels", needs=_NEEDS)
+@check("scan/frame", "a scan has the frame and the pixels that were set", needs=_NEEDS)
 def frame(kit: CheckMeasurements) -> None:
     require_frame(kit.scan("plain"))
 
@@ -123,7 +123,7 @@ def as_published(kit: CheckMeasurements) -> None:
         raise Failed("the region of the ScanParameters2d before it", wrong)
 
 
-@check("scan/time", "a scan says when it was finished", needs=_NEEDS)
+@check("scan/time", "a scan has the time at which it ended", needs=_NEEDS)
 def time(kit: CheckMeasurements) -> None:
     taken = kit.scan("plain")
     for scan in taken.scans:
@@ -133,7 +133,7 @@ def time(kit: CheckMeasurements) -> None:
 def require_time(time_ns: int | None, taken: Taken, begun: ScopeState, what: str) -> None:
     """That it is of its end: not of its start, of a scan before, or on another clock."""
     if time_ns is None:
-        raise Skipped(f"the {what} does not say when it was taken")
+        raise Skipped(f"the {what} has no time")
     begin_s, free_s = taken.time_s(begun), taken.time_s(ScopeState.FREE)
     lasted_s, at_s = free_s - begin_s, time_ns / 1e9 - begin_s
     # a controller may take its time to save it: what is free late did not end late
@@ -148,18 +148,18 @@ def require_time(time_ns: int | None, taken: Taken, begun: ScopeState, what: str
 
 @check(
     "scan/duration",
-    "a scan lasts about as long as its frame and scan-speed say",
+    "the duration of a scan follows from its frame and scan-speed",
     needs=(names.START_SCAN, names.SCAN_SPEED),
 )
 def duration(kit: CheckMeasurements) -> None:
     taken = kit.scan("plain")
     if taken.expected_s is None or taken.expected_s < SCAN_S / 2:
-        raise Skipped("the speed could not be set so low that it would be seen")
+        raise Skipped("the speed could not be set low enough to measure it")
     lasted_s = taken.time_s(ScopeState.FREE) - taken.time_s(ScopeState.SCANNING)
     least_s, most_s = taken.expected_s / _FASTER, taken.expected_s * _SLOWER + _EDGES_S
     expect(
         least_s <= lasted_s <= most_s,
-        f"a duration of about {taken.expected_s:.3g} s, as scan-speed says (is its unit right?)",
+        f"a duration of about {taken.expected_s:.3g} s, from scan-speed (check its unit)",
         f"{lasted_s:.3g} s",
     )
 
@@ -184,14 +184,14 @@ def again(kit: CheckMeasurements) -> None:
             expect(not same, f"new values for {scan.channel!r}", "those of the scan before, at the same time")
 
 
-@check("scan/not-square", "a frame wider than high, of other pixels, comes out as it was set", needs=_NEEDS)
+@check("scan/not-square", "a frame wider than high, with other pixels, is scanned as it was set", needs=_NEEDS)
 def not_square(kit: CheckMeasurements) -> None:
     require_frame(kit.scan("wide"))
 
 
 @check(
     "scan/turned",
-    "a frame that is turned comes out as it was set, counter-clockwise",
+    "a rotated frame is scanned as it was set, counter-clockwise",
     needs=(names.START_SCAN, names.SCAN_ANGLE),
 )
 def turned(kit: CheckMeasurements) -> None:

@@ -18,7 +18,7 @@ _NEEDS = (names.START_SPEC,)
 
 @check(
     "spectrum/cancel",
-    "stop-spec breaks a spectrum off: SS_INTERRUPTED, SS_FREE, and no spectrum",
+    "stop-spec stops a spectrum: SS_INTERRUPTED, SS_FREE, and no spectrum",
     needs=(names.START_SPEC, names.STOP_SPEC),
 )
 def cancel(kit: CheckMeasurements) -> None:
@@ -28,7 +28,7 @@ def cancel(kit: CheckMeasurements) -> None:
         heard = require_broken_off(kit, mark, names.STOP_SPEC, ScopeState.SPEC)
     except Failed:
         if _was_over(kit, mark, answered_s):
-            raise Skipped("a spectrum is over sooner than it could be stopped") from None
+            raise Skipped("a spectrum ends before it can be stopped") from None
         raise
     expect(not spectra(heard), "no Spec1d of a spectrum that was stopped", told(heard))
 
@@ -44,7 +44,7 @@ def _was_over(kit: CheckMeasurements, mark: int, answered_s: float) -> bool:
     return (first, {*between}, last) == ("SS_SPEC", {"Spec1d"}, "SS_FREE")
 
 
-@check("spectrum/stop-nothing", "stop-spec while nothing runs is a success, and changes nothing", (names.STOP_SPEC,))
+@check("spectrum/stop-nothing", "stop-spec while nothing runs succeeds, and changes nothing", (names.STOP_SPEC,))
 def stop_nothing(kit: CheckMeasurements) -> None:
     kit.client.come_to_rest()
     mark = kit.client.observations.mark()
@@ -62,7 +62,7 @@ def order(kit: CheckMeasurements) -> None:
 @check("spectrum/values", "a spectrum has a kind, variables of different names, and values", needs=_NEEDS)
 def values(kit: CheckMeasurements) -> None:
     for spectrum in kit.spectrum().spectra:
-        expect(spectrum.kind.strip(), "a spectrum that says its type", "an empty type")
+        expect(spectrum.kind.strip(), "a spectrum with a type", "an empty type")
         expect(len(set(spectrum.names)) == len(spectrum.names) >= 2, "two variables or more, of different names",
                ", ".join(spectrum.names) or "none")  # fmt: skip
         expect(len(spectrum.values) >= 2, "two points or more", f"{len(spectrum.values)}")
@@ -70,7 +70,7 @@ def values(kit: CheckMeasurements) -> None:
             expect(bool(np.isfinite(column).any()), f"values of {name!r}", "none that is finite")
 
 
-@check("spectrum/position", "a spectrum says where the probe was", needs=(*_NEEDS, names.PROBE_POS_X))
+@check("spectrum/position", "a spectrum has the position of the probe", needs=(*_NEEDS, names.PROBE_POS_X))
 def position(kit: CheckMeasurements) -> None:
     wanted = kit.frames.other.region.center_m
     for spectrum in kit.spectrum().spectra:
@@ -83,16 +83,16 @@ def position(kit: CheckMeasurements) -> None:
     expect(where is not None, "a ProbePosition", "none")
 
 
-@check("spectrum/time", "a spectrum says when it was taken", needs=_NEEDS)
+@check("spectrum/time", "a spectrum has its time", needs=_NEEDS)
 def time(kit: CheckMeasurements) -> None:
     taken = kit.spectrum()
     begin_s, end_s = taken.time_s(ScopeState.SPEC), taken.time_s(ScopeState.FREE)
     for spectrum in taken.spectra:
         if spectrum.time_ns is None:
-            raise Skipped("the spectrum does not say when it was taken")
+            raise Skipped("the spectrum has no time")
         at_s = spectrum.time_ns / 1e9
         expect(
             begin_s - CLOCK_S <= at_s <= end_s + CLOCK_S,
-            f"a time between the spectrum's begin and its end {end_s - begin_s:.3g} s later",
-            f"{at_s - begin_s:+.6g} s from its begin",
+            f"a time between the spectrum's beginning and its end {end_s - begin_s:.3g} s later",
+            f"{at_s - begin_s:+.6g} s from its beginning",
         )

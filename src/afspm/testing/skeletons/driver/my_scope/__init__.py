@@ -53,14 +53,14 @@ class MyScope(Driver):
         return sorted(str(file) for file in self.controller.folder.glob("*.npz"))
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
-        """All channels of a file; a FileError while it is not whole. Rows and columns ascend with y and x."""
+        """All channels of a file; a FileError while it is incomplete. Rows and columns ascend with y and x."""
         try:
             with np.load(result) as file:
                 x_m, y_m, width_m, height_m = file["frame_m"]
                 region = Region.from_top_left((x_m, y_m), (width_m, height_m), float(file["angle_rad"]))
                 return [Scan(region, "Height", "m", file["height_m"], int(file["time_ns"]), result)]
         except (OSError, ValueError, KeyError) as error:
-            raise FileError(f"is not whole: {error}", where=result) from error
+            raise FileError(f"is incomplete: {error}", where=result) from error
 
     @action(names.START_SCAN)
     def start_scan(self) -> None:
