@@ -40,7 +40,7 @@ class StateFile:
         if state is None or not damage:
             return state
         self._log.critical(
-            "what was in force is damaged, the generation before is taken up, with nobody in control: %s", damage
+            "the newest saved state is damaged, the one before it is used, with no component in control: %s", damage
         )
         return state.without_holder()
 

@@ -27,7 +27,7 @@ _FASTEST_EXPANSION_PER_S = 1e-4  # beyond any sample, and twelve days of it are 
 
 @dataclass(frozen=True)
 class Relaxation:
-    """The effect that is left of a change of temperature or of an approach: total_m * (1 - exp(-t / time_s))."""
+    """The relaxation after a change of temperature or an approach: total_m * (1 - exp(-t / time_s))."""
 
     total_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     time_s: float = 3600.0
@@ -38,17 +38,17 @@ class Relaxation:
 
 @dataclass(frozen=True)
 class DriftSettings:
-    """Everything adds up; (x, y, z), or z alone where it says so.
+    """The sum of all contributions, as (x, y, z) unless said otherwise.
 
     Attributes:
         velocity_m_per_s: constant drift.
         relaxing: any number of exponential relaxations since the start.
-        walk_m_per_sqrt_hour: standard deviation in x and y that a random walk gains in an hour.
+        walk_m_per_sqrt_hour: standard deviation in x and y of a random walk after one hour.
         walk_z_m_per_sqrt_hour: the same for z.
         daily_m: amplitude of a sine of 24 hours.
         rotation_rad_per_s: constant rotation of the sample, counter-clockwise, in rad/s.
-        expansion_per_s: constant expansion in 1/s, at most 1e-4 either way: the part that lengths grow by in a second.
-        about_m: the place (x, y) that rotation and expansion leave where it is, in tip coordinates at the start.
+        expansion_per_s: constant expansion in 1/s, at most 1e-4 either way: relative growth of lengths per second.
+        about_m: the fixed point (x, y) of rotation and expansion, in tip coordinates at the start.
     """
 
     velocity_m_per_s: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -29,10 +29,10 @@ class SensorSettings:
 
     Attributes:
         resonance_hz: far from the sample.
-        oscillation_m: amplitude, which is kept constant.
+        oscillation_m: amplitude, kept constant.
         radius_m: of the apex that is attracted.
         hamaker_j: of the attraction.
-        contact_m: nearer than this the shift grows no more.
+        contact_m: the shift stays constant below this distance.
     """
 
     resonance_hz: float = 300e3
@@ -78,18 +78,18 @@ _GROWN = 10.0  # e-foldings in one step, after which nothing is left but the sat
 
 @dataclass(frozen=True)
 class FeedbackSettings:
-    """The settings in force until they are set otherwise, and the loop's hardware.
+    """The initial settings of the feedback, and the hardware of the loop.
 
     Attributes:
         mode: "amplitude" (tapping; the setpoint is an amplitude in V), "current" (tunnelling; in A) or
             "frequency-shift" (non-contact; in Hz, below zero).
-        integral_gain: in 1/s: an error is gone after about 1 / gain.
+        integral_gain: in 1/s: an error decays in about 1 / gain.
         free_amplitude_v: far from the sample.
         sensitivity_m_per_v: of the detector.
         lag_s, delay_s: of actuator and loop; gains above about 1 / delay_s oscillate.
-        range_m: of the z actuator: so far the tip withdraws when the setpoint is never met.
+        range_m: of the z actuator: the tip withdraws this far if the setpoint is never reached.
         decay_m: the gap over which a tunnelling current falls by e.
-        current_floor_a: the smallest current the logarithm sees.
+        current_floor_a: the smallest current that the logarithmic amplifier resolves.
         sensor: a table of its own, of the mode "frequency-shift".
     """
 

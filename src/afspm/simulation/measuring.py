@@ -23,15 +23,15 @@ from afspm.simulation.tip import TipShape
 
 @dataclass(frozen=True)
 class SignalSettings:
-    """The answer of the sample in phase and current.
+    """The response of the sample in phase and current.
 
     Attributes:
-        dissipation: energy lost to the sample a cycle, as a share of what the cantilever loses itself, mean of both
+        dissipation: energy lost to the sample per cycle, relative to the cantilever's own loss, mean of both
             materials; dissipation_contrast: their difference.
         conductance_s: of the contact when the tip taps gently (mean over the cycle).
         conductance_contrast: ln of the ratio of both materials' conductances.
         current_decay_m: the gap over which that current falls by e.
-        preamplifier_a: where the current amplifier saturates.
+        preamplifier_a: current at which the amplifier saturates.
     """
 
     dissipation: float = 0.12

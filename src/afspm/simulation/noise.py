@@ -16,13 +16,13 @@ class NoiseSettings:
     """Root mean squares, unless it says otherwise.
 
     Attributes:
-        white_m: of the height, each pixel by itself.
+        white_m: of the height, independent for each pixel.
         one_over_f_m: of the height, a time series over the whole scan, power as 1 / frequency.
-        line_offset_m: of the height, each line by itself, trace and retrace alike.
-        scar_probability: of a line to have a stretch where something disturbs the tip.
+        line_offset_m: of the height, independent for each line, the same in trace and retrace.
+        scar_probability: that a line has a disturbed stretch.
         scar_m: by how much.
         hum_m, hum_hz: amplitude and frequency of the mains in the height.
-        debris_jumps_per_s: how often what sticks to a contaminated tip moves.
+        debris_jumps_per_s: how often debris on a contaminated tip moves.
         amplitude_v, phase_deg, current_a, frequency_hz: white, in those channels.
     """
 

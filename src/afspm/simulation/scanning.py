@@ -26,14 +26,14 @@ DIRECTIONS = ("up", "down")
 
 @dataclass(frozen=True)
 class ScannerSettings:
-    """The instrument's mechanics.
+    """Mechanics of the scanner.
 
     Attributes:
-        flatten: what is done to height lines before they are handed out: "none", "offset" or "line" (Flatten1).
+        flatten: levelling of height lines before they are delivered: "none", "offset" or "line" (Flatten1).
         band_limit_px: standard deviation of the blur of every signal.
-        oversampling: grid points a pixel (each axis) on which tip meets sample; 0 for what the size of a scan allows.
+        oversampling: grid points per pixel and axis at which tip and sample meet; 0: as many as the size of the scan allows.
         tilt_x, tilt_y: slope of the sample in its holder, m/m.
-        creep: part of a move that is still missing after a second, gone as 1 - log10(t) decades; 0 for none.
+        creep: part of a move that is still missing after 1 s; it vanishes as 1 - log10(t); 0: none.
         backlash_m: how far the retrace lags behind in x.
     """
 

@@ -25,11 +25,11 @@ class IVSettings:
 
     Attributes:
         range_v: from -range to +range.
-        set_bias_v, set_current_a: at that bias that current flows before the feedback is opened (when tunnelling:
+        set_bias_v, set_current_a: the current that flows at this bias before the feedback is opened (tunnelling:
             the setpoint at the bias in force).
         gap_ev: band gap of material 0; material 1 is a metal.
         band_offset_ev: of the gap's middle against the Fermi level (doping).
-        noise_a: white; relative_noise: a share of the current besides.
+        noise_a: white; `relative_noise` adds a share of the current.
         duration_s: of the curve.
     """
 
@@ -56,9 +56,9 @@ class ForceSettings:
 
     Attributes:
         range_m: from the contact away.
-        trigger_n: the force at which the approach turns round.
+        trigger_n: the force at which the approach reverses.
         modulus_pa: reduced Young's modulus.
-        adhesion_j_per_m2: work of adhesion while pulling off; approaching, a share `approach_share` of it acts.
+        adhesion_j_per_m2: work of adhesion during retraction; during the approach, the share `approach_share` of it acts.
         hamaker_j: of the attraction before contact.
     """
 

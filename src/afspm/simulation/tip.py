@@ -47,7 +47,7 @@ class TipShape:
 
 @dataclass(frozen=True)
 class TipSettings:
-    """The tip at its best, and how bad it gets; sizes of flaws are in units of its radius.
+    """The sharp tip, and its possible flaws, whose sizes are in units of its radius.
 
     Attributes:
         condition: at the start: "sharp", "blunt", "double" or "contaminated".
@@ -76,11 +76,11 @@ class TipRepairSettings:
 
     Attributes:
         pulse_threshold_v: below, a pulse does nothing.
-        pulse_cures, pulse_worsens: probabilities, of a pulse far above the threshold that lasts `pulse_duration_s`.
-        pulse_duration_s: a longer one does more, but not more than two of these; a shorter one less.
-        crash_cures, crash_worsens: probabilities, of a crash `crash_depth_m` deep.
-        crash_depth_m: a crash so many times as deep does what so many of these do, until one of them does anything.
-        crash_speed_m_per_s: slower crashes are that much less likely to do anything.
+        pulse_cures, pulse_worsens: probability for a pulse far above the threshold that lasts `pulse_duration_s`.
+        pulse_duration_s: a longer pulse does more, up to the effect of two; a shorter one does less.
+        crash_cures, crash_worsens: probability for a crash `crash_depth_m` deep.
+        crash_depth_m: an n times deeper crash has n chances of an effect.
+        crash_speed_m_per_s: slower crashes are less likely to have an effect, in proportion.
     """
 
     pulse_threshold_v: float = 2.0
@@ -99,19 +99,19 @@ class TipRepairSettings:
 
 @dataclass(frozen=True)
 class TipChangeSettings(TipRepairSettings):
-    """When the tip changes by itself, and what a repair does to it.
+    """Spontaneous tip changes, and the effect of repairs.
 
     The chances of a repair are made up, so that one is seen to take some trying. How they grow is a simple picture and
     no theory: a crash takes material from the apex, or leaves some there, all along its way in; a pulse moves by its
     field what it can, most of it soon.
 
     Attributes:
-        per_hour: mean number of changes an hour of scanning at a gentle setpoint.
-        per_metre: the same a metre of scanned line.
-        hardness_exponent: both grow as (force against that at a gentle setpoint) to this power.
+        per_hour: mean number of changes per hour of scanning at a gentle setpoint.
+        per_metre: mean number of changes per metre of scanned line.
+        hardness_exponent: both rates grow as (force / force at a gentle setpoint) to this power.
         blunt_weight, double_weight, contaminated_weight: how likely each is.
-        schedule: pairs of seconds after the start and a condition: changes that come for certain.
-        wear_m_per_m: the radius grows so much a metre scanned at a gentle setpoint.
+        schedule: pairs of seconds after the start and a condition: changes at fixed times.
+        wear_m_per_m: growth of the radius per metre scanned at a gentle setpoint.
     """
 
     per_hour: float = 0.0

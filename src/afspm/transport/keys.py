@@ -115,7 +115,7 @@ def load(folder: str | Path, name: str, servers: Mapping[str, str] | None = None
         raise ConfigError(
             f"the secret key of {name!r} is missing; only the public one exists",
             where=str(secret_file),
-            hint=f"copy it from the computer where it was made; if it is lost, delete public/{name}.key everywhere, then make a new one",
+            hint=f"copy it from where it was made; if lost, delete public/{name}.key everywhere and make another",
         )
     entries = _read(secret_file, name)
     if "secret-key" not in entries:

@@ -29,7 +29,7 @@ def wrong_origin(
     """
     host, origin = headers.get("host", ""), headers.get("origin")
     if only_here and not is_loopback(_host_of(host)):
-        return f"this {what} is for this computer only, and not for {host!r}"
+        return f"this {what} serves only this computer, not {host!r}"
     if origin is not None and origin not in allowed and urlsplit(origin).netloc != host:
         return f"a page of {origin} may not send requests to this {what}"
     return None

@@ -85,17 +85,17 @@ class Simulator(Driver):
     """The simulated microscope.
 
     Args:
-        seed: everything that is left to chance follows from it.
+        seed: the seed of every random number.
         surface: a kind, or a table of `kind` and its settings.
         tip, tip_changes, drift, feedback, scanner, noise, signals, iv, force: a table of its own settings.
         initial: values of parameters at the start, by their generic names.
         approach_s: how long engaging and retracting take.
-        faults: what goes wrong when, each a table of `kind`, `at_s`, `count`, `duration_s` (below).
+        faults: faults and their times, each a table of `kind`, `at_s`, `count`, `duration_s` (below).
         fault_action: whether the action "x-fault" makes faults on demand.
-        panel: what a person does at the controller itself, each a table of `at_s` with `set` or `action`.
+        panel: what a person does at the controller's panel, each a table of `at_s` with `set` or `action`.
         parameters: rows added to the table of parameters, or changed in it.
         actions: generic actions added: `{name = {set = {<parameter> = <value>}}}`.
-        poll_period_s: how often it is looked at, in real seconds, when nothing is about to happen.
+        poll_period_s: how often its state is read, in real seconds, while nothing is due.
         result_timeout_s: how long after a scan or spectrum its file may take to appear.
         live_lines_s: how often lines of a running scan are published, 0: not at all; by default twice a real second.
     """

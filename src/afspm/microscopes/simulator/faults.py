@@ -16,12 +16,12 @@ class Fault:
     """One fault.
 
     Attributes:
-        kind: "slow": answers come `duration_s` of real time late. "hang": the process stands still for `duration_s`
-            of real time. "refuse": the controller refuses what it is asked to do. "lose": answers are never sent.
-            "crash": the process ends at once. "half-file": the next file is written half, and whole after
+        kind: "slow": answers are delayed by `duration_s` of real time. "hang": the process hangs for `duration_s`
+            of real time. "refuse": the controller refuses requests. "lose": answers are never sent.
+            "crash": the process ends at once. "half-file": the next file is written to half, and completed after
             `duration_s` of the experiment.
         at_s: experiment seconds after the start.
-        count: so many requests are affected ("slow", "refuse", "lose").
+        count: number of requests affected ("slow", "refuse", "lose").
     """
 
     kind: str

@@ -47,7 +47,7 @@ NS_PER_S = 1_000_000_000
 
 @dataclass(frozen=True)
 class PanelEvent:
-    """An act of a person at the controller's own panel, which nobody asked the translator for.
+    """An action of a person at the controller's own panel, without a request to the translator.
 
     Attributes:
         at_s: experiment seconds after the start.

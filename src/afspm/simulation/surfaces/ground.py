@@ -14,7 +14,7 @@ from afspm.simulation.surfaces.relief import Relief, Sites, around, grain, patch
 
 @dataclass(frozen=True)
 class Steps:
-    """Terraces that rise along a direction, one `step_m` each; meandering edges, here and there an island.
+    """Terraces that rise along a direction by one `step_m` each, with meandering edges and a few islands.
 
     Attributes:
         angle_deg: direction of the rise, counter-clockwise from x.
@@ -50,7 +50,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class Rough:
-    """Self-affine ground: sputtered, etched or fractured.
+    """A self-affine surface: sputtered, etched or fractured.
 
     Attributes:
         rms_m: of the heights over areas far larger than `largest_m`.
@@ -75,7 +75,7 @@ class Rough:
 
 @dataclass(frozen=True)
 class Flat:
-    """Nothing to see: for calibrating noise and drift."""
+    """A flat surface, to measure noise."""
 
     roughness_rms_m: float = 0.0
 
@@ -92,12 +92,12 @@ _LARGEST = 2.5  # no particle is larger than this many mean radii
 
 @dataclass(frozen=True)
 class Particles:
-    """Spheres resting on a slightly rough substrate, here denser, there sparser.
+    """Spheres on a slightly rough substrate, unevenly distributed.
 
     Attributes:
-        spacing_m: mean distance: one particle an area of spacing squared, before crowding.
+        spacing_m: mean distance: on average one particle on an area of spacing squared, before crowding.
         spread: standard deviation of ln(radius).
-        crowding: 0 strewn evenly, 1 gathered in places.
+        crowding: 0: distributed evenly; 1: gathered in clusters.
     """
 
     radius_m: float = 22e-9

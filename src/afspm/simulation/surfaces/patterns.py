@@ -16,7 +16,7 @@ from afspm.simulation.surfaces.relief import Relief, around, grain, patches, smo
 
 @dataclass(frozen=True)
 class Lattice:
-    """A hexagonal lattice, slightly strained so that it never quite repeats, with vacancies and adatoms.
+    """A hexagonal lattice with vacancies and adatoms, slightly strained, so that it never repeats exactly.
 
     Attributes:
         constant_m: distance of neighbours.
@@ -93,12 +93,12 @@ _FRAME = 588  # channel bits of an EFM frame of a compact disc; lengths of bumps
 
 @dataclass(frozen=True)
 class Stamper:
-    """Bumps of 3 to 11 channel bits' length on straight tracks (at 20 mm radius they look straight).
+    """Bumps 3 to 11 channel bits long on straight tracks.
 
     Attributes:
         angle_deg: direction of the tracks, counter-clockwise from x.
         bit_m: length of a channel bit on the disc.
-        flank_m: width of the bumps' sides, seen from above.
+        flank_m: width of the bumps' flanks, seen from above.
     """
 
     pitch_m: float = 1.6e-6

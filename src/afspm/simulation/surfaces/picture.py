@@ -82,12 +82,12 @@ READERS: dict[str, Reader] = {".npy": read_array, **dict.fromkeys(files.FORMATS,
 
 @dataclass(frozen=True)
 class Picture:
-    """Heights of a file, its centre at the origin; beyond its borders it goes on mirrored, so without a seam.
+    """Heights of a file, centred at the origin and mirrored at its borders, so without a seam.
 
     Attributes:
         path: an image (bright is high) or an SPM file.
-        width_m: of the picture, first to last pixel; 0 for what an SPM file says. An image has none of its own.
-        height_range_m: from lowest to highest; 0 for what an SPM file says.
+        width_m: of the picture, first to last pixel; 0: as in the SPM file. An image needs it.
+        height_range_m: from lowest to highest; 0: as in the SPM file.
     """
 
     path: str
