@@ -80,7 +80,7 @@ def test_a_problem_is_raised_and_cleared(night: Night, page: Any) -> None:
     press(page, "Raise")
     night.until(lambda: 9 in night.control().problems)
     page.wait_for_selector(".flag:has-text('drop-on-the-table'):has-text('flagged by dashboard:Ada')")
-    page.wait_for_selector(".flag .advice:has-text('then clear it')")
+    page.wait_for_selector(".flag .advice:has-text('then clear the problem')")
     page.wait_for_selector(".lane > b:text-is('drop-on-the-table')")
     press(page, "Clear drop-on-the-table")
     night.until(lambda: 9 not in night.control().problems)

@@ -72,7 +72,7 @@ def test_a_key_that_would_come_back_as_another_is_refused(tmp_path: Path) -> Non
 @pytest.mark.parametrize("content", ["{", "[1]", "\0"])
 def test_a_file_that_is_something_else_is_told(tmp_path: Path, content: str) -> None:
     (tmp_path / "x.json").write_text(content)
-    with pytest.raises(FileError, match="remove it"):
+    with pytest.raises(FileError, match="delete it"):
         Memory(tmp_path / "x.json")
 
 

@@ -171,7 +171,7 @@ def test_where_neither_can_be_read_nothing_is_guessed(tmp_path: Path) -> None:
     saved(path, b"1")
     path.write_bytes(b"")
     previous_generation(path).write_bytes(b"")
-    with pytest.raises(FileError, match="remove it"):
+    with pytest.raises(FileError, match="delete it"):
         load_checkpoint(path, number)
 
 

@@ -137,7 +137,7 @@ def test_who_may_read_the_run_folder_finds_the_key_for_guests_as_long_as_the_run
         if sys.platform != "win32":
             assert stat.S_IMODE(file.stat().st_mode) == 0o600
             file.chmod(0o644)
-            with pytest.raises(ConfigError, match="others may read"):
+            with pytest.raises(ConfigError, match="other users may read"):
                 _keys_in(tmp_path)
     assert not file.exists()
     assert _keys_in(tmp_path) == {}
