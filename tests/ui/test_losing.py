@@ -43,7 +43,7 @@ def test_data_that_are_old_are_said_to_be(night: Night, opened: Opened) -> None:
     for pid in frozen:
         os.kill(pid, signal.SIGSTOP)
     try:
-        page.wait_for_selector("#trouble:has-text('No word from the experiment for')", timeout=40_000)
+        page.wait_for_selector("#trouble:has-text('The experiment has been silent for')", timeout=40_000)
     finally:
         for pid in reversed(frozen):
             os.kill(pid, signal.SIGCONT)

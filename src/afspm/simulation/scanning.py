@@ -31,7 +31,7 @@ class ScannerSettings:
     Attributes:
         flatten: levelling of height lines before they are delivered: "none", "offset" or "line" (Flatten1).
         band_limit_px: standard deviation of the blur of every signal.
-        oversampling: grid points per pixel and axis at which tip and sample meet; 0: as many as the size of the scan allows.
+        oversampling: grid points per pixel and axis at which tip and sample meet; 0: as many as the scan allows.
         tilt_x, tilt_y: slope of the sample in its holder, m/m.
         creep: part of a move that is still missing after 1 s; it vanishes as 1 - log10(t); 0: none.
         backlash_m: how far the retrace lags behind in x.

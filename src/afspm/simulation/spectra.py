@@ -58,7 +58,7 @@ class ForceSettings:
         range_m: from the contact away.
         trigger_n: the force at which the approach reverses.
         modulus_pa: reduced Young's modulus.
-        adhesion_j_per_m2: work of adhesion during retraction; during the approach, the share `approach_share` of it acts.
+        adhesion_j_per_m2: work of adhesion during retraction; while approaching, `approach_share` of it.
         hamaker_j: of the attraction before contact.
     """
 

@@ -276,7 +276,11 @@ def test_refusals_come_with_who_what_and_why() -> None:
 def test_a_process_is_told_of_in_words() -> None:
     busy = ProcessState("series", "component", ProcessCondition.BUSY, S, 12.4, 3, 7, "killed: frozen")
     condition, since, restarts = process_words(busy)
-    assert (condition, since, restarts) == ("busy", "in the same step for 12 s", "restarted 2 times (last: killed: frozen)")
+    assert (condition, since, restarts) == (
+        "busy",
+        "in the same step for 12 s",
+        "restarted 2 times (last: killed: frozen)",
+    )
     fine = ProcessState("series", "component", ProcessCondition.ALIVE, S)
     assert process_words(fine)[2] == ""
 

@@ -199,7 +199,7 @@ def test_a_scheduler_after_a_power_cut_knows_the_problems_and_gives_control_to_n
     path.write_bytes(left)
     assert StateFile(path, log).load() == saved.without_holder()
     assert saved.without_holder().control.holder is None
-    assert "nobody in control" in caplog.text
+    assert "no component in control" in caplog.text
 
 
 def test_what_is_saved_without_waiting_for_the_disk_has_a_generation_before(tmp_path: Path) -> None:

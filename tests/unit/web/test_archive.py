@@ -110,7 +110,7 @@ def test_a_run_that_is_silent_is_said_to_be_and_why_if_that_is_known() -> None:
     for cut_off, told in said.items():
         watch = Watch(_Later(), cut_off=lambda text=cut_off: text)  # type: ignore[misc]
         watch.take("ScopeStateMsg", ScopeStatus(ScopeState.FREE), S)
-        assert trouble(watch) == f"No word from the experiment for 1 min 00 s: what is shown is that old.{told}"
+        assert trouble(watch) == f"The experiment has been silent for 1 min 00 s: this page is that old.{told}"
 
 
 @pytest.mark.timeout(60)
