@@ -194,32 +194,21 @@ def client_of(launch):
 class NewIds(wire_client.Client):
     """Repeats a request with a new id."""
 
-    def _post(self, frames):
-        if frames is not None:
-            frames = [*frames[:3], f"{self.name}/{self._life}/{next(self._numbers)}".encode()]
-            self._waiting.add(frames[3])
-            self._mine = frames[3]
-        super()._post(frames)
-
     def request(self, number, payload=b""):
-        result = []
-
-        def took():
-            return self.answers.pop(self._mine, None)
-
-        for _ in range(4):
+        for _ in range(1 + self.launch["request_retries"]):
+            asked = f"{self.name}/{self._life}/{next(self._numbers)}".encode()
+            self._waiting.add(asked)
             self.wait(lambda: self.connected, 5.0)
-            self._post([b"", bytes([number]), payload, b""])
-            if self.wait(lambda: result.append(took()) or result[-1], self.launch["request_timeout_s"]):
-                return result[-1]
+            is_over = wire_client.partial(self._is_answered_or_lost, asked, self.connections)
+            self._post([b"", bytes([number]), payload, asked])
+            self.wait(is_over, self.launch["request_timeout_s"])
+            if asked in self.answers:
+                return self.answers.pop(asked)
         return wire_client.Response(3, b"", "", 2)
 
 
 class AnyAnswer(wire_client.Client):
     """Takes whatever answer comes for its own."""
-
-    def _take_answer(self):
-        super()._take_answer()
 
     def request(self, number, payload=b""):
         self._waiting = AllIds()
