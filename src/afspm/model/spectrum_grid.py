@@ -1,11 +1,11 @@
-"""Spectra of a grid as one array: where each of them belongs, and which curves are the two ways of one variable."""
+"""Where each spectrum of a grid belongs, and which curves are the two ways of one variable."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,7 @@ from afspm.errors import InvalidValue
 from afspm.model.geometry import XY
 from afspm.model.spectrum import Spectrum
 
-if TYPE_CHECKING:
-    import xarray
-
 Floats = NDArray[np.float64]
-DIMENSIONS: Final = ("y", "x", "repeat", "direction", "z")
 DIRECTIONS: Final = ("forward", "backward")
 _BACKWARD = re.compile(r"\s*(?:\[bwd\]|\bretrace\b|\bbackward\b|\bbwd\b)", re.IGNORECASE)
 _FORWARD = re.compile(r"\s*(?:\[fwd\]|\btrace\b|\bforward\b|\bfwd\b)", re.IGNORECASE)
@@ -42,50 +38,6 @@ class PointGrid:
     center_m: XY
     angle_rad: float
     cells: tuple[tuple[int, int], ...]
-
-
-def stack(spectra: Sequence[Spectrum], *, interpolate: bool = False) -> xarray.Dataset:
-    """Return the curves of a grid as arrays over `DIMENSIONS`; see `SpectrumTable.stack`.
-
-    Raises:
-        InvalidValue: these spectra do not form a grid, or were not measured alike.
-    """
-    import xarray
-
-    first = _alike(spectra, swept_alike=not interpolate)
-    points = grid([spectrum.position_m for spectrum in spectra if spectrum.position_m is not None])
-    repeats = _repeats(points.cells)
-    curves = [ways(spectrum) for spectrum in spectra]
-    swept = common_sweep([own for own, _ in curves]) if interpolate else curves[0][0]
-    directions = DIRECTIONS[: max(len(own_ways) for _, own_ways in curves)]
-    shape = (len(points.y_m), len(points.x_m), max(repeats) + 1, len(directions), len(swept))
-    units = dict(zip(first.names, first.units, strict=True))
-    arrays = {name: np.full(shape, np.nan) for name in curves[0][1][0]}
-    times = np.full(shape[:3], "NaT", "datetime64[ns]")
-    for spectrum, (own, own_ways), cell, repeat in zip(spectra, curves, points.cells, repeats, strict=True):
-        for direction, names in enumerate(own_ways):
-            for name, curve in names.items():
-                arrays[name][(*cell, repeat, direction)] = at(swept, own, curve) if interpolate else curve
-        if spectrum.time_ns is not None:
-            times[(*cell, repeat)] = np.datetime64(spectrum.time_ns, "ns")
-    swept_attributes = {"long_name": first.names[0], "units": first.units[0]}
-    return xarray.Dataset(
-        {name: (DIMENSIONS, values, {"units": units.get(name, "")}) for name, values in arrays.items()},
-        {
-            "y": ("y", points.y_m, {"units": "m"}),
-            "x": ("x", points.x_m, {"units": "m"}),
-            "repeat": range(shape[2]),
-            "direction": list(directions),
-            "z": ("z", swept, swept_attributes),
-            "time": (DIMENSIONS[:3], times),
-        },
-        {
-            "kind": first.kind,
-            "frame": first.frame.value,
-            "angle_rad": points.angle_rad,
-            "center_m": points.center_m,
-        },
-    )
 
 
 def grid(positions_m: Sequence[XY]) -> PointGrid:
@@ -150,7 +102,7 @@ def _axis(along_m: Floats, spacing_m: float) -> tuple[Floats, NDArray[np.int64]]
     return order[0] + step * np.arange(count + 1), lines
 
 
-def _repeats(cells: Sequence[tuple[int, int]]) -> list[int]:
+def repeats(cells: Sequence[tuple[int, int]]) -> list[int]:
     """Return how many were measured at the same point before, for each."""
     seen: dict[tuple[int, int], int] = {}
     found = []
@@ -160,7 +112,7 @@ def _repeats(cells: Sequence[tuple[int, int]]) -> list[int]:
     return found
 
 
-def _alike(spectra: Sequence[Spectrum], *, swept_alike: bool) -> Spectrum:
+def alike(spectra: Sequence[Spectrum], *, swept_alike: bool) -> Spectrum:
     """Return the first, after which all others are measured."""
     if not spectra:
         raise InvalidValue("there are no spectra to stack")

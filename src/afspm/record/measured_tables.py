@@ -14,6 +14,9 @@ from afspm.record.tables import ScanRow, SpectrumRow, Table
 if TYPE_CHECKING:
     import xarray
 
+    from afspm.model import Scan
+    from afspm.model.spectrum_stack import Quantity, SpectrumStack
+
 R = TypeVar("R", ScanRow, SpectrumRow)
 Query = Callable[[str], list[Any]]
 
@@ -74,9 +77,33 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
             InvalidValue: these spectra do not form a grid, or were not measured alike.
             FileError: a file is missing or damaged.
         """
-        from afspm.model.spectrum_grid import stack
+        return self._stacked(interpolate=interpolate).to_xarray()
 
-        return stack([self._read(row) for row in self._rows], interpolate=interpolate)
+    def map(self, quantity: Quantity, at: float | None = None, *, unit: str = "", direction: str = "forward") -> Scan:
+        """Return a map of a quantity over the grid, as a scan with one channel: the mean over repeats.
+
+            run.spectra.map("Current", at=0.5).plot()
+            run.spectra.map(lambda spectrum: spectrum["Current"].max(), unit="A")
+
+        Args:
+            quantity: the name of a variable, which is taken at one value of what was swept; or a function that makes a
+                number of one spectrum.
+            at: that value, in the unit of what was swept.
+            unit: of what the function returns.
+            direction: "forward" or "backward" along the sweep.
+
+        Raises:
+            InvalidValue: these spectra do not form a grid of at least two by two, or there is no such quantity.
+            FileError: a file is missing or damaged.
+        """
+        from afspm.model.spectrum_stack import map_of
+
+        return map_of([self._read(row) for row in self._rows], quantity, at, unit, direction)
+
+    def _stacked(self, *, interpolate: bool) -> SpectrumStack:
+        from afspm.model.spectrum_stack import stacked
+
+        return stacked([self._read(row) for row in self._rows], interpolate=interpolate)
 
     def where(self, wanted: Callable[[SpectrumRow], bool]) -> SpectrumTable:
         return self._with(row for row in self._rows if wanted(row))

@@ -7,7 +7,8 @@ import pytest
 
 from afspm.errors import InvalidValue
 from afspm.model import Spectrum
-from afspm.model.spectrum_grid import grid, stack
+from afspm.model.spectrum_grid import grid
+from afspm.model.spectrum_stack import stacked
 
 BIAS = np.linspace(-1.0, 1.0, 11)
 XY = tuple[float, float]
@@ -26,28 +27,28 @@ def places(columns: int, rows: int, angle_rad: float = 0.0) -> list[XY]:
 
 def test_curves_lie_where_they_were_measured() -> None:
     spectra = [iv(place, current) for current, place in enumerate(places(3, 2), 1)]
-    stacked = stack(spectra[::-1])
-    assert stacked.Current.dims == ("y", "x", "repeat", "direction", "z")
-    assert stacked.Current.shape == (2, 3, 1, 2, 11)
-    assert stacked.x.values == pytest.approx([0.0, 2e-9, 4e-9])
-    assert stacked.y.values == pytest.approx([0.0, 3e-9])
-    assert stacked.x.attrs["units"] == "m"
-    there, back = stacked.Current.isel(y=1, x=0, repeat=0)
+    arrays = stacked(spectra[::-1]).to_xarray()
+    assert arrays.Current.dims == ("y", "x", "repeat", "direction", "z")
+    assert arrays.Current.shape == (2, 3, 1, 2, 11)
+    assert arrays.x.values == pytest.approx([0.0, 2e-9, 4e-9])
+    assert arrays.y.values == pytest.approx([0.0, 3e-9])
+    assert arrays.x.attrs["units"] == "m"
+    there, back = arrays.Current.isel(y=1, x=0, repeat=0)
     assert there.values == pytest.approx(4 * BIAS)
     assert back.values == pytest.approx(8 * BIAS)
-    assert list(stacked.direction.values) == ["forward", "backward"]
-    assert stacked.Current.attrs["units"] == "A"
-    assert stacked.z.attrs == {"long_name": "Bias", "units": "V"}
-    assert stacked.attrs["kind"] == "IV"
+    assert list(arrays.direction.values) == ["forward", "backward"]
+    assert arrays.Current.attrs["units"] == "A"
+    assert arrays.z.attrs == {"long_name": "Bias", "units": "V"}
+    assert arrays.attrs["kind"] == "IV"
 
 
 def test_what_is_missing_is_nan_and_what_was_repeated_is_counted() -> None:
     measured = [place for number, place in enumerate(places(3, 3)) if number != 4]
-    stacked = stack([iv(place) for place in [*measured, measured[0]]])
-    assert dict(stacked.sizes) == {"y": 3, "x": 3, "repeat": 2, "direction": 2, "z": 11}
-    assert np.isnan(stacked.Current.isel(y=1, x=1)).all()
-    assert np.isfinite(stacked.Current.isel(y=0, x=0)).all()
-    assert np.isnat(stacked.time.values).sum() == 18 - 9
+    arrays = stacked([iv(place) for place in [*measured, measured[0]]]).to_xarray()
+    assert dict(arrays.sizes) == {"y": 3, "x": 3, "repeat": 2, "direction": 2, "z": 11}
+    assert np.isnan(arrays.Current.isel(y=1, x=1)).all()
+    assert np.isfinite(arrays.Current.isel(y=0, x=0)).all()
+    assert np.isnat(arrays.time.values).sum() == 18 - 9
 
 
 @pytest.mark.parametrize("angle_rad", [0.3, -0.4, 0.7])
@@ -63,21 +64,21 @@ def test_a_sweep_that_turns_round_has_two_directions() -> None:
     z = np.linspace(0.0, 1e-7, 8)
     sweep = np.concatenate([z, z[::-1]])
     spectrum = Spectrum((0.0, 0.0), "force", ("Z", "Force"), ("m", "N"), np.stack([sweep, np.arange(16.0)], axis=1))
-    stacked = stack([spectrum])
-    assert list(stacked.direction.values) == ["forward", "backward"]
-    assert stacked.Force.values.ravel().tolist() == [*range(8), *range(15, 7, -1)]
+    arrays = stacked([spectrum]).to_xarray()
+    assert list(arrays.direction.values) == ["forward", "backward"]
+    assert arrays.Force.values.ravel().tolist() == [*range(8), *range(15, 7, -1)]
 
 
 def test_what_forms_no_grid_is_refused_with_the_reason() -> None:
     random = np.random.default_rng(0)
     with pytest.raises(InvalidValue, match="no grid"):
-        stack([iv((float(x), float(y))) for x, y in random.uniform(0, 1e-7, (9, 2))])
+        stacked([iv((float(x), float(y))) for x, y in random.uniform(0, 1e-7, (9, 2))]).to_xarray()
     with pytest.raises(InvalidValue, match="different kinds"):
-        stack([iv((0.0, 0.0)), iv((0.0, 0.0), kind="force")])
+        stacked([iv((0.0, 0.0)), iv((0.0, 0.0), kind="force")]).to_xarray()
     with pytest.raises(InvalidValue, match="swept differently: 11 points of Bias from -2 to 2 V instead"):
-        stack([iv((0.0, 0.0)), iv((0.0, 0.0), bias=2 * BIAS)])
+        stacked([iv((0.0, 0.0)), iv((0.0, 0.0), bias=2 * BIAS)]).to_xarray()
     with pytest.raises(InvalidValue, match="position of spectrum 1"):
-        stack([iv(None)])
+        stacked([iv(None)]).to_xarray()
 
 
 def test_force_curves_that_begin_at_the_surface_come_to_common_values_if_wanted() -> None:
@@ -87,9 +88,9 @@ def test_force_curves_that_begin_at_the_surface_come_to_common_values_if_wanted(
         values = np.stack([z, 3.0 * z, 3.0 * z], axis=1)
         spectra.append(Spectrum(place, "force", ("Z", "Force", "Force [bwd]"), ("m", "N", "N"), values))
     with pytest.raises(InvalidValue, match=r"swept differently.*interpolate=True"):
-        stack(spectra)
-    stacked = stack(spectra, interpolate=True)
-    assert stacked.z.values[[0, -1]] == pytest.approx([0.0, 1e-7])
-    assert stacked.Force.isel(x=1, direction=1).values.ravel() == pytest.approx(3.0 * stacked.z.values)
+        stacked(spectra).to_xarray()
+    arrays = stacked(spectra, interpolate=True).to_xarray()
+    assert arrays.z.values[[0, -1]] == pytest.approx([0.0, 1e-7])
+    assert arrays.Force.isel(x=1, direction=1).values.ravel() == pytest.approx(3.0 * arrays.z.values)
     with pytest.raises(InvalidValue, match="no values in common"):
-        stack([iv((0.0, 0.0)), iv((0.0, 0.0), bias=BIAS + 9.0)], interpolate=True)
+        stacked([iv((0.0, 0.0)), iv((0.0, 0.0), bias=BIAS + 9.0)], interpolate=True).to_xarray()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import struct
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from record_lab import REGION, Night
 
 import afspm
 from afspm.errors import FileError, InvalidValue
-from afspm.model import ScopeState
+from afspm.model import ScopeState, Spectrum
 from afspm.record.export import chosen, export
 from afspm.record.run import Run
 from afspm.record.store import RecordStore
@@ -114,6 +115,84 @@ def test_gwyddion_gets_the_curves_of_a_spectrum(run: Run, tmp_path: Path) -> Non
     ((kind, curve),) = model["curves"]
     assert (kind, model["y_unit"][1]["unitstr"], curve["description"]) == ("GwyGraphCurveModel", "A", "Current")
     assert np.array_equal(curve["ydata"], run.spectrum(0)["Current"])
+
+
+def spectra_of_a_grid(night: Night, store: RecordStore, folder: Path) -> Run:
+    """Two rows of three spectra; the current at a bias of 1 V is 1, 2 … 6 A."""
+    bias = np.linspace(-1.0, 2.0, 31)
+    for number in range(6):
+        place = (number % 3 * 2e-9, number // 3 * 3e-9)
+        values = np.column_stack((bias, (number + 1) * bias, (number + 1) * bias))
+        taken = Spectrum(place, "IV", ("Bias", "Current", "Current Retrace"), ("V", "A", "A"), values, night.now_ns)
+        store.take([night.state(ScopeState.SPEC), night.packet(taken, "Spec1d_IV"), night.state(ScopeState.FREE)])
+    return afspm.open_run(folder)
+
+
+def test_spectra_of_a_grid_are_volume_data_for_gwyddion(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    import gwyfile  # a reader by others
+
+    *_, file = export(spectra_of_a_grid(night, store, tmp_path), "gwy", tmp_path / "out")
+    assert file.name == "grid-01-IV.gwy"
+    content = gwyfile.load(str(file))
+    assert [content[f"/brick/{number}/title"] for number in (0, 1)] == ["Current, forward", "Current, backward"]
+    brick = content["/brick/0"]
+    assert (brick["xres"], brick["yres"], brick["zres"]) == (3, 2, 31)
+    planes = brick["data"].reshape(31, 2, 3)
+    assert planes[20].tolist() == pytest.approx(np.array([[4, 5, 6], [1, 2, 3]]))  # at 1 V, y downwards
+    assert (brick["xreal"], brick["xoff"], brick["yoff"]) == pytest.approx((6e-9, -1e-9, -4.5e-9))
+    assert (brick["zoff"], brick["zreal"]) == pytest.approx((-1.05, 3.1))
+    assert [brick[f"si_unit_{axis}"]["unitstr"] for axis in "xyzw"] == ["m", "m", "V", "A"]
+
+
+def test_spectra_of_a_grid_are_one_nexus_file(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    *_, name = export(spectra_of_a_grid(night, store, tmp_path), "h5", tmp_path / "out")
+    with h5py.File(name) as file:
+        data = file["entry"][file["entry"].attrs["default"]]
+        assert list(data.attrs["axes"]) == ["y", "x", "bias"]
+        assert data[data.attrs["signal"]][:, :, 20] == pytest.approx(np.array([[1, 2, 3], [4, 5, 6]]))
+        assert data["x"][:].tolist() == pytest.approx([0.0, 2e-9, 4e-9])
+
+
+def test_a_spectrum_that_is_damaged_is_missing_in_the_grid(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    run = spectra_of_a_grid(night, store, tmp_path)
+    (tmp_path / run.spectra[4].file).write_bytes(b"no file")
+    told: list[str] = []
+    *_, name = export(run, "h5", tmp_path / "out", tell=told.append)
+    assert len(told) == 1
+    with h5py.File(name) as file:
+        assert np.isnan(file["entry/forward/current"][1, 1]).all()
+        assert file["entry/forward/current"][1, 2, 20] == pytest.approx(6.0)
+
+
+def test_a_map_of_a_grid_is_a_scan(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    spectra = spectra_of_a_grid(night, store, tmp_path).spectra
+    current = spectra.map("Current", at=1.0)
+    assert current.values == pytest.approx(np.array([[1, 2, 3], [4, 5, 6]]))
+    assert (current.unit, current.channel) == ("A", "Current at 1 V")
+    assert current.region.size_m == pytest.approx((4e-9, 3e-9))
+    slope = spectra.map(lambda one: float(np.polyfit(one["Bias"], one["Current"], 1)[0]), unit="S")
+    assert slope.values == pytest.approx(current.values)
+
+
+@pytest.mark.parametrize(
+    ("asked", "why"),
+    [
+        ({"quantity": "Current", "at": 3.0}, "swept from -1 to 2 V, not to 3 V"),
+        ({"quantity": "Current"}, "give at="),
+        ({"quantity": "Force", "at": 1.0}, "no variable 'Force'"),
+        ({"quantity": "Current", "at": 1.0, "direction": "up"}, "there is forward, backward"),
+    ],
+)
+def test_a_map_of_what_was_not_measured_is_refused(
+    night: Night, store: RecordStore, tmp_path: Path, asked: dict[str, Any], why: str
+) -> None:
+    spectra = spectra_of_a_grid(night, store, tmp_path).spectra
+    with pytest.raises(InvalidValue, match=re.escape(why)):
+        spectra.map(**asked)
+    with pytest.raises(InvalidValue, match="at least two columns"):
+        spectra[:3].map("Current", at=1.0)
 
 
 def test_netcdf_is_read_by_xarray(run: Run, tmp_path: Path) -> None:

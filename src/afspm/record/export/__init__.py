@@ -8,6 +8,7 @@ from importlib import import_module
 from pathlib import Path
 
 from afspm.errors import FileError, InvalidValue
+from afspm.record.export.grids import grids
 from afspm.record.measured_files import write_synced
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
@@ -16,6 +17,9 @@ __all__ = ["FORMATS", "chosen", "export"]
 
 FORMATS = {"h5": "nexus", "gwy": "gwyddion", "nc": "netcdf", "png": "png", "csv": "tables"}
 """By suffix, the module of this package; its `write(run, row)` yields the ends of names and contents of files."""
+
+GRIDS = ("h5", "gwy")
+"""The formats in which the spectra of a grid are one file, too; its `grid_file(stack, metadata)` makes it."""
 
 Writer = Callable[[Run, ScanRow | SpectrumRow], Iterator[tuple[str, bytes]]]
 
@@ -49,6 +53,8 @@ def export(
         for name, content in module.tables(run, wanted, spectra) if to == "csv" else ():
             yield _written(folder / name, content)
         yield from _one_by_one(module.write, run, [*wanted, *spectra], folder, tell)
+        for name, stack in grids(run, spectra) if to in GRIDS else ():
+            yield _written(folder / f"{name}.{to}", module.grid_file(stack, run.metadata))
     except OSError as error:
         raise FileError(f"can't be written: {error}", where=str(folder)) from error
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.model import Scan, Spectrum
+from afspm.model.spectrum_stack import SpectrumStack, mean_over_repeats
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 
@@ -73,6 +74,55 @@ def spectrum_file(spectrum: Spectrum, meta: Mapping[str, str]) -> bytes:
         items.append((f"/0/graph/graph/{number}/visible", "b", True))
     items.append(("/0/meta", "o", _object("GwyContainer", [(k, "s", v) for k, v in meta.items()])))
     return _MAGIC + _object("GwyContainer", items)
+
+
+def grid_file(stack: SpectrumStack, metadata: Mapping[str, str]) -> bytes:
+    """The spectra of a grid as volume data: a brick for each variable and direction, the mean over repeats.
+
+    What was not measured has the median of the brick, since Gwyddion knows no NaN there.
+    """
+    meta = _object("GwyContainer", [(name, "s", text) for name, text in {"kind": stack.kind, **metadata}.items()])
+    items: list[Item] = []
+    for number, (title, unit, values) in enumerate(_bricks(stack)):
+        items.append((f"/brick/{number}", "o", _brick(stack, np.nan_to_num(values, nan=_typical(values)), unit)))
+        items.append((f"/brick/{number}/title", "s", title))
+        items.append((f"/brick/{number}/visible", "b", True))
+        items.append((f"/brick/{number}/meta", "o", meta))
+    return _MAGIC + _object("GwyContainer", items)
+
+
+def _bricks(stack: SpectrumStack) -> Iterator[tuple[str, str, NDArray[np.float64]]]:
+    """Yield title, unit and values, shape (y, x, z), of each variable and direction."""
+    for name, curves in stack.curves.items():
+        for number, direction in enumerate(stack.directions):
+            yield f"{name}, {direction}", stack.units[name], mean_over_repeats(curves)[:, :, number]
+
+
+def _brick(stack: SpectrumStack, values: NDArray[np.float64], unit: str) -> bytes:
+    rows, columns, count = values.shape
+    order, points = np.argsort(stack.swept), stack.points
+    pixel_x, pixel_y = (float(np.ptp(axis)) / (len(axis) - 1) for axis in (points.x_m, points.y_m))
+    step = float(np.ptp(stack.swept)) / max(count - 1, 1)
+    planes = np.moveaxis(values[::-1, :, order], 2, 0)
+    return _object(
+        "GwyBrick",
+        [
+            ("xres", "i", columns),
+            ("yres", "i", rows),
+            ("zres", "i", count),
+            ("xreal", "d", columns * pixel_x),
+            ("yreal", "d", rows * pixel_y),
+            ("zreal", "d", count * step),
+            ("xoff", "d", float(points.x_m[0]) - pixel_x / 2),
+            ("yoff", "d", -(float(points.y_m[-1]) + pixel_y / 2)),
+            ("zoff", "d", float(stack.swept.min()) - step / 2),
+            ("si_unit_x", "o", _unit("m")),
+            ("si_unit_y", "o", _unit("m")),
+            ("si_unit_z", "o", _unit(stack.swept_unit)),
+            ("si_unit_w", "o", _unit(unit)),
+            ("data", "D", planes.reshape(-1)),
+        ],
+    )
 
 
 def _field(scan: Scan, values: NDArray[np.float64], unit: str) -> bytes:

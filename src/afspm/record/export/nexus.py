@@ -3,11 +3,39 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
 
 from afspm.clock import iso_utc
+from afspm.model.spectrum_stack import SpectrumStack, mean_over_repeats
+from afspm.record.nexus import field_names
+from afspm.record.nxspm import group, values
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
+
+
+def grid_file(stack: SpectrumStack, metadata: Mapping[str, str]) -> bytes:
+    """The spectra of a grid: an NXdata over (y, x, swept variable) for each direction, the mean over repeats."""
+    import h5py
+
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        file.attrs.update(NX_class="NXroot", default="entry", creator="afspm")
+        entry = group(file, "entry", "NXentry")
+        entry.attrs["default"] = stack.directions[0]
+        entry["title"] = f"{stack.kind}, {len(stack.points.x_m)} x {len(stack.points.y_m)}"
+        group(entry, "sample", "NXsample")["name"] = metadata.get("sample", "")
+        (swept, *fields) = field_names([stack.swept_name, *stack.curves], ("x", "y"))
+        for number, direction in enumerate(stack.directions):
+            data = group(entry, direction, "NXdata")
+            data.attrs.update(signal=fields[0], axes=["y", "x", swept], angle_deg=math.degrees(stack.points.angle_rad))
+            data.attrs["auxiliary_signals"] = fields[1:] or [fields[0]]
+            values(data, "y", stack.points.y_m, "m", "y before the grid was turned")
+            values(data, "x", stack.points.x_m, "m", "x before the grid was turned")
+            values(data, swept, stack.swept, stack.swept_unit, stack.swept_name)
+            for field, (name, curves) in zip(fields, stack.curves.items(), strict=True):
+                values(data, field, mean_over_repeats(curves)[:, :, number], stack.units[name], name)
+    return content.getvalue()
 
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
