@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 VENV = ROOT / ".venv"
 TOOLS = ROOT / "build" / "tools"
 UV_VERSION = "uv>=0.5,<1"
-EXTRAS = ("dashboard", "features", "messages", "study", "testing", "xarray")
+EXTRAS = ("dashboard", "features", "gateway", "messages", "study", "testing", "xarray")
 """What the tests use; Jupyter they install where they need it."""
 
 

@@ -18,6 +18,7 @@ import python_api
 
 from afspm import components
 from afspm.dashboard import Dashboard
+from afspm.gateway import Gateway
 from afspm.logic import arbitration, diagram
 from afspm.microscopes.simulator import Simulator
 from afspm.microscopes.simulator.faults import Fault
@@ -59,7 +60,10 @@ def _done(do: arbitration.ControlChange) -> str:
 
 def component_pages() -> str:
     """Each ready-made component: what it does, and its settings."""
-    found = {name: getattr(components, name) for name in components.__all__} | {"Dashboard": Dashboard}
+    found = {name: getattr(components, name) for name in components.__all__} | {
+        "Dashboard": Dashboard,
+        "Gateway": Gateway,
+    }
     return "\n".join(_class_page(name, found[name]) for name in sorted(found))
 
 

@@ -15,14 +15,14 @@ from fastapi import Depends, FastAPI, Response
 from fastapi.responses import PlainTextResponse
 
 from afspm.dashboard.conditions import Conditions
-from afspm.dashboard.pictures import Look, PictureCache, RenderedFrame, number_or_none
+from afspm.dashboard.pictures import Look, PictureCache, RenderedFrame
 from afspm.dashboard.scan_facts import Facts, began_ns, scan_facts
 from afspm.dashboard.thumbnails import Thumbnails
 from afspm.drawing.palette import DIVERGING, LEVELS, PALETTES
 from afspm.drawing.profile import profile
 from afspm.drawing.raster import png
 from afspm.web.archive import Archive
-from afspm.web.frames import ChannelFrame
+from afspm.web.frames import ChannelFrame, number_or_none
 from afspm.web.watch import Bell, Watch
 
 POLL_S = 20.0  # then the browser asks anew: what is in between may close connections that say nothing for longer

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import threading
 from dataclasses import dataclass
 from functools import lru_cache
@@ -92,8 +91,3 @@ def _draw(frame: ChannelFrame, look: Look) -> RenderedFrame:
     values = levelled(frame.values, look.levelling)
     span = value_range(values, look.contrast)
     return RenderedFrame(frame, look, values, span, png(indices(values, span), look.palette))
-
-
-def number_or_none(value: float) -> float | None:
-    """Return a number as JSON has it, which knows no NaN."""
-    return value if math.isfinite(value) else None

@@ -33,6 +33,7 @@ SHORT_NAME_PACKAGES = (
     "afspm.emulators.asylum",
     "afspm.emulators.gxsm",
     "afspm.dashboard",
+    "afspm.gateway",
 )
 # By where they come from: a class of the user is recognised by what it is derived from.
 _ROLE_BY_BASE = (

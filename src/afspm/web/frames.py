@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 
@@ -153,3 +154,8 @@ class FrameStore:
     def _next(self) -> int:
         self._number += 1
         return self._number
+
+
+def number_or_none(value: float) -> float | None:
+    """Return a number as JSON has it, which knows no NaN."""
+    return value if math.isfinite(value) else None

@@ -121,18 +121,18 @@ class PersonCommands:
         self._settle(lambda o: o.probe_position is not None and _near(o.probe_position.xy_m, at_m))
         return None
 
-    def act_when_free(self, action: str, request_id: str = "") -> Response:
+    def act_when_free(self, action: str, next_id: Callable[[], str] = str) -> Response:
         """Ask for an action, again and again while the microscope is not free.
 
         Args:
-            request_id: under which it is done once, however often it is asked for.
+            next_id: returns the id of the next attempt, under which it is done once, however often it is asked for.
         """
         until_s = self._link.clock.monotonic_s() + FREE_S
         while True:
             self._watch.wait_free(until_s - self._link.clock.monotonic_s())
             with self._watch.reading():
                 seen = self._watch.changes
-            response = self._ask(ControlRequest.ACTION, action, request_id)
+            response = self._ask(ControlRequest.ACTION, action, next_id())
             if response.code != ControlResponse.NOT_FREE or self._link.clock.monotonic_s() >= until_s:
                 return response
             self._watch.wait_for(lambda _, n=seen: self._watch.changes != n, 1.0)  # type: ignore[misc]

@@ -161,10 +161,13 @@ class Bell:
         self._event.set()
         self._event = asyncio.Event()
 
-    async def wait(self, timeout_s: float) -> None:
-        """Wait until it rings, or the time is up."""
-        with contextlib.suppress(TimeoutError):
+    async def wait(self, timeout_s: float) -> bool:
+        """Wait until it rings; return False when the time is up."""
+        try:
             await asyncio.wait_for(self._event.wait(), timeout_s)
+        except TimeoutError:
+            return False
+        return True
 
 
 class Audience:

@@ -1,0 +1,137 @@
+"""`Gateway`: the component that lets whatever speaks HTTP take part in an experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from afspm.addresses import Listens
+from afspm.client.component import Component
+from afspm.clock import ExperimentClock
+from afspm.errors import ConfigError
+from afspm.model import Frame
+from afspm.process.priority import step_back
+from afspm.record.run_json import experiment_name
+from afspm.record.run_lock import cut_off_message
+from afspm.web.archive import Archive
+from afspm.web.passwords import Passwords, is_loopback
+from afspm.web.server import WebServer, listening, url_of
+from afspm.web.watch import Bell, Watch
+
+if TYPE_CHECKING:
+    from afspm.process.context import ProcessContext
+
+USUAL_PORT = 8090
+MOST_CONNECTIONS = 200
+
+
+class Gateway(Component):
+    """Serves a JSON API over HTTP: state, parameters, scans, control, measurements, events.
+
+    Each name acts as `<gateway>:<name>`, with the roles and limits of that. Control has a lease, which the scheduler
+    keeps: a client that vanishes loses control as a process that dies does. It asks for nothing by itself; all others
+    have the processor first.
+
+    Args:
+        host: the address to listen at. At any other than this computer's own, `people` and a certificate are needed.
+        port: 0 for any that is free; None: 8090, or any if that is taken. A restart takes the same one.
+        people: who may command: the hash of each name's token, as `afspm dashboard --make-password` prints it. Without
+            any, every name may, from this computer.
+        certificate, certificate_key: PEM files, for https.
+        origins: of pages elsewhere that may ask, e.g. "http://localhost:3000"; by default none may.
+
+    Raises:
+        ConfigError: others could come in without a token, or listen in; the port is taken …
+    """
+
+    requires = ("afspm[gateway]",)
+    listens = ("",)
+    longest_step_s = 60.0  # the first import of everything, on a busy computer
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: Annotated[int | None, Listens(host="host", keyed=False)] = None,
+        people: Mapping[str, str] | None = None,
+        certificate: Path | None = None,
+        certificate_key: Path | None = None,
+        origins: Sequence[str] = (),
+    ) -> None:
+        if (certificate is None) != (certificate_key is None):
+            raise ConfigError("certificate and certificate_key belong together", where="gateway")
+        if not is_loopback(host) and not (people and certificate):
+            raise ConfigError(
+                f"at {host} other computers can reach the gateway: it needs people, certificate and certificate_key",
+                where="gateway",
+                hint="`afspm dashboard --make-password` makes a line of people; or listen on 127.0.0.1",
+            )
+        if any(one in ("*", "null") for one in origins):
+            raise ConfigError("origins names pages one by one", where="gateway", hint='e.g. ["http://localhost:3000"]')
+        self._host, self._port = host, port
+        self._passwords = Passwords(host, "", people or {}, ExperimentClock.real().now_s)
+        self._certificate = None if certificate is None else Path(certificate)
+        self._certificate_key = None if certificate_key is None else Path(certificate_key)
+        self._origins = tuple(origins)
+        self._server: WebServer | None = None
+
+    def run_process(self, context: ProcessContext) -> int:
+        step_back()
+        self._context = context
+        return super().run_process(context)
+
+    def on_start(self) -> None:
+        from afspm.gateway.application import application
+        from afspm.gateway.events import EventHistory, fill
+        from afspm.gateway.measurements import Measurements
+        from afspm.gateway.services import GatewayServices
+        from afspm.web.persons import Persons
+
+        launch, problems = self._context.launch, self._context.problems
+        state_dir = Path(launch.state_dir) if launch.state_dir else None
+        bound = listening(self._host, self._port or None, self._usual_ports(), what="gateway")
+        archive = Archive(self.run_dir if launch.run_dir else None)
+        watch = self._watch = Watch(self.clock, problems, archive.past(problems), lambda: cut_off_message(self.run_dir))
+        bell = Bell()
+        watch.on_change(bell.ring)
+        self._history = EventHistory(problems)
+        fill(self._history, self.run_dir, state_dir, self.clock.now_ns())
+        kept = state_dir / f"{self.name}.measurements.json" if state_dir else None
+        self._measurements = Measurements(kept, watch, self.clock.monotonic_s)
+        self._persons = Persons(launch, self.clock, watch)
+        services = GatewayServices(
+            watch, bell, archive, self._history, self._measurements, self._persons,
+            experiment_name(self.run_dir, "afspm"), self.simulated,
+            Frame.SAMPLE if launch.sample_coordinates else Frame.TIP,
+        )  # fmt: skip
+        app = application(services, self._passwords, host=self._host, origins=self._origins)
+        self._server = WebServer(
+            app, bound, self._certificate, self._certificate_key, most_connections=MOST_CONNECTIONS
+        )
+        self._server.start()
+        self._say_where(bound.getsockname()[1])
+
+    def on_message(self, envelope: str, message: object) -> None:
+        time_ns = self.packet.time_ns if self.packet and self.packet.time_ns is not None else self.clock.now_ns()
+        name = envelope.partition("_")[0]
+        self._measurements.on_packet(message, time_ns)
+        self._history.take(name, message, time_ns)
+        self._watch.take(name, message, time_ns, envelope)  # which wakes those who wait: last
+
+    def on_end(self) -> None:
+        if self._server is not None:
+            self._watch.end()
+            self._persons.close()
+            self._server.stop()
+
+    def _usual_ports(self) -> tuple[int, ...]:
+        """Return the port of the last start, where clients look for us."""
+        before = self.memory.get("port")
+        earlier = (before,) if isinstance(before, int) else ()
+        return earlier if self._port == 0 else (*earlier, USUAL_PORT)
+
+    def _say_where(self, port: int) -> None:
+        url = url_of(self._host, port, encrypted=self._certificate is not None)
+        self.memory.update({"port": port, "url": url})
+        self.memory.save()
+        self.log.info("the gateway is at %s", url)

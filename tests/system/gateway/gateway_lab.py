@@ -1,0 +1,184 @@
+"""An experiment with a gateway, and a client that has nothing but Python's standard library."""
+
+from __future__ import annotations
+
+import base64
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from http.client import HTTPConnection
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+AFSPM = (sys.executable, "-P", "-c", "from afspm.cli import main; main()")
+DEADLINE_S = 60.0
+EXPERIMENT = """
+[clock]
+speed = {speed}
+
+[microscope]
+component = true
+class = "Simulator"
+seed = 1
+initial = {{ scan-speed = "2 um/s" }}
+
+[scheduler]
+component = true
+class = "Scheduler"
+
+[gateway]
+component = true
+class = "Gateway"
+port = 0
+
+[limits]
+region = {{ x = ["-5 um", "5 um"], y = ["-5 um", "5 um"] }}
+
+[limits.tip-bias-voltage]
+max = "3 V"
+"""
+SERIES = """
+[series]
+component = true
+class = "ScanSeries"
+size = ["1 um", "1 um"]
+pixels = [32, 32]
+every = "{every}"
+scans = {scans}
+"""
+REGION = {"center_m": [0.0, 0.0], "size_m": [1e-6, 1e-6]}
+
+
+@dataclass
+class Answer:
+    status: int
+    body: Any
+    headers: dict[str, str]
+
+    @property
+    def code(self) -> str:
+        code: str = self.body["code"]
+        return code
+
+
+@dataclass
+class Event:
+    id: str
+    kind: str
+    data: Any
+
+
+class Client:
+    """Asks a gateway, in a connection for each request."""
+
+    def __init__(self, url: str, name: str = "", token: str = "") -> None:
+        self.address = urlsplit(url).netloc
+        self.headers = {"Connection": "close"}
+        if name:
+            shown = base64.b64encode(f"{name}:{token}".encode()).decode()
+            self.headers["Authorization"] = f"Basic {shown}"
+
+    def ask(self, method: str, path: str, body: Any = None, **headers: str) -> Answer:
+        connection = HTTPConnection(self.address, timeout=DEADLINE_S)
+        try:
+            sent = None if body is None else json.dumps(body)
+            kind = {} if body is None else {"Content-Type": "application/json"}
+            connection.request(method, f"/v1{path}", sent, {**self.headers, **kind, **headers})
+            answer = connection.getresponse()
+            read, told = answer.read(), dict(answer.headers)
+            is_json = told.get("content-type", "").startswith("application/json")
+            return Answer(answer.status, json.loads(read) if is_json else read, told)
+        finally:
+            connection.close()
+
+    def get(self, path: str) -> Any:
+        answer = self.ask("GET", path)
+        assert answer.status == 200, answer
+        return answer.body
+
+    def done(self, method: str, path: str, body: Any = None) -> Any:
+        answer = self.ask(method, path, body)
+        assert answer.status in (200, 202), answer
+        return answer.body
+
+    def until_measured(self, key: str) -> Any:
+        """The measurement at its end."""
+        end_s = time.monotonic() + DEADLINE_S
+        while (found := self.get(f"/measurements/{key}?wait_s=5"))["state"] == "running":
+            assert time.monotonic() < end_s, found
+        return found
+
+    def events(self, path: str = "/events", last: str = "") -> Iterator[Event]:
+        """What is streamed, until the gateway closes or vanishes."""
+        connection = HTTPConnection(self.address, timeout=DEADLINE_S)
+        connection.request("GET", f"/v1{path}", headers={**self.headers, **({"Last-Event-ID": last} if last else {})})
+        stream, parts = connection.getresponse(), dict[str, str]()
+        assert stream.status == 200, stream.read()
+        try:
+            while line := stream.readline().decode():
+                name, _, value = line.rstrip("\n").partition(": ")
+                if name:
+                    parts[name] = value
+                elif "event" in parts:
+                    yield Event(parts["id"], parts["event"], json.loads(parts["data"]))
+                    parts = {}
+        except (OSError, ValueError):
+            pass  # cut off
+        finally:
+            connection.close()
+
+
+class GatewayRun:
+    """`afspm run` of an experiment with a gateway."""
+
+    def __init__(self, folder: Path, more: str = "", speed: float = 60.0, file: Path | None = None) -> None:
+        if file is None:
+            file = folder / "experiment.toml"
+            file.write_text(EXPERIMENT.format(speed=speed) + more, encoding="utf-8")
+        command = (*AFSPM, "run", "--verbose", "--no-report", str(file), "--runs", str(folder / "runs"))
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, cwd=folder, text=True
+        )
+        self.lines: list[str] = []
+        self._changed = threading.Condition()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        self.folder = Path(self.wait_for("processes, into ").split(", into ")[1])
+        self.url = self.wait_for("the gateway is at ").rsplit(" ", 1)[1]
+
+    def client(self, name: str = "", token: str = "") -> Client:
+        return Client(self.url, name, token)
+
+    def wait_for(self, wanted: str, count: int = 1) -> str:
+        """The line that contains `wanted`, the `count`-th of that kind."""
+        with self._changed:
+            self._changed.wait_for(lambda: len(self.said(wanted)) >= count, DEADLINE_S)
+        assert len(self.said(wanted)) >= count, f"no line with {wanted!r}:\n" + "\n".join(self.lines)
+        return self.said(wanted)[count - 1]
+
+    def said(self, wanted: str) -> list[str]:
+        return [line for line in self.lines if wanted in line]
+
+    def pid(self, name: str) -> int:
+        """The process id of the component's newest process."""
+        started = [line for line in self.lines if f" {name} " in line and "started, process" in line]
+        return int(started[-1].rsplit(" ", 1)[1])
+
+    def end(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        self._reader.join(DEADLINE_S)
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        with self.process.stdout as pipe:
+            for line in pipe:
+                with self._changed:
+                    self.lines.append(line.rstrip())
+                    self._changed.notify_all()

@@ -1,0 +1,191 @@
+"""A program that has nothing but HTTP takes part in an experiment."""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from http.client import HTTPConnection
+from itertools import pairwise
+
+import numpy as np
+import psutil
+import pytest
+from gateway_lab import REGION, SERIES, Client, Event, GatewayRun
+
+import afspm
+
+Started = Callable[..., GatewayRun]
+
+
+def test_a_night_by_http_alone_is_in_the_record_under_its_name(started: Started) -> None:
+    run = started()
+    ada, looker = run.client("ada"), run.client()
+    assert looker.get("/state")["microscope"]["state"] == "FREE"
+    speed = looker.get("/parameters/scan-speed")
+    assert (speed["value"], speed["unit"]) == (pytest.approx(2e-6), "m/s")
+    assert {one["name"] for one in looker.get("/parameters")} > {"scan-speed", "tip-bias-voltage", "x-feedback-on"}
+    assert {one["name"] for one in looker.get("/actions")} > {"stop-scan", "x-retract"}
+
+    assert looker.ask("POST", "/control", {}).code == "name-needed"
+    assert ada.ask("POST", "/scans", {"region": REGION}).code == "not-in-control"
+    assert ada.done("POST", "/control", {"lease_s": 30}) == {"holder": "gateway:ada", "lease_s": 30}
+    refused = run.client("max").ask("POST", "/control", {})
+    assert (refused.status, refused.code) == (409, "already-under-control")
+    assert "gateway:ada" in refused.body["reason"]
+
+    assert ada.done("PUT", "/parameters/tip-bias-voltage", {"value": "500 mV"})["value"] == pytest.approx(0.5)
+    over = ada.ask("PUT", "/parameters/tip-bias-voltage", {"value": 4.0})
+    assert (over.status, over.code) == (422, "parameter-refused")
+    far = ada.ask("POST", "/scans", {"region": {**REGION, "center_m": [1e-5, 0]}})
+    assert (far.status, far.code) == (422, "parameter-refused")
+    assert ada.ask("PUT", "/parameters/no-such", {"value": 1}).code == "not-supported"
+    assert ada.ask("POST", "/actions/x-no-such").code == "not-supported"
+
+    begun = ada.ask("POST", "/scans", {"region": REGION, "shape": [16, 24], "key": "first"})
+    assert (begun.status, begun.headers["location"]) == (202, "/v1/measurements/first")
+    done = ada.until_measured("first")
+    assert done["state"] == "done"
+    assert ada.done("POST", "/scans", {"region": REGION, "shape": [16, 24], "key": "first"}) == done
+    assert ada.ask("POST", "/scans", {"region": REGION, "key": "first"}).code == "key-used"
+    scan = looker.get(f"/scans/{done['result']}")
+    assert scan == looker.get("/scans/newest")
+    assert (scan["shape"], scan["holder"], scan["region"]["size_m"]) == ([16, 24], "gateway:ada", [1e-6, 1e-6])
+    values = np.load(io.BytesIO(looker.get("/scans/newest/values?channel=Height")))
+    told = looker.get("/scans/newest/values?channel=Height&format=base64")
+    again = np.frombuffer(base64.b64decode(told["base64"]), told["dtype"]).reshape(told["shape"])
+    assert values.shape == (16, 24)
+    assert np.array_equal(values, again)
+    assert looker.get("/scans/newest/values?format=png").startswith(b"\x89PNG")
+    assert looker.ask("GET", "/scans/newest/values?channel=None").code == "not-found"
+
+    ada.done("POST", "/spectra", {"position_m": [1e-7, 0], "key": "curve"})
+    curve = ada.until_measured("curve")
+    told = looker.get(f"/spectra/{curve['result']}")
+    assert told["position_m"] == pytest.approx([1e-7, 0.0], abs=2e-8)
+    assert np.load(io.BytesIO(looker.get("/spectra/newest/values"))).shape[1] == len(told["variables"])
+
+    ada.done("PUT", "/problems/tip-shape-changed")
+    assert {"name": "tip-shape-changed", "flagged": True} in looker.get("/problems")
+    lost = ada.ask("POST", "/scans", {"key": "second"})
+    assert lost.code == "not-in-control"
+    ada.done("DELETE", "/problems/tip-shape-changed")
+    ada.done("POST", "/notes", {"text": "the light was on", "scan": done["result"]})
+    ada.done("PUT", "/mode", {"mode": "MANUAL"})
+    assert ada.ask("POST", "/control", {}).code == "wrong-mode"
+    ada.done("PUT", "/mode", {"mode": "AUTOMATED"})
+    ada.done("POST", "/end")
+    assert run.process.wait(30.0) == 0
+
+    with afspm.open_run(run.folder) as record:
+        assert {row.holder for row in record.scans} == {"gateway:ada"}
+        assert [note.text for note in record.notes] == ["the light was on"]
+        keys = [entry.key for entry in record.journal if entry.key and entry.response == 0]
+        assert keys == ["first", "curve"]
+        assert {entry.who for entry in record.refusals} == {"gateway:ada"}
+
+
+def test_a_client_that_vanishes_in_a_scan_loses_control_and_the_scan_is_stopped(started: Started) -> None:
+    run = started(SERIES.format(every="10 min", scans=3), speed=60.0)
+    ada = run.client("ada")
+    ada.done("POST", "/control?wait_s=20", {"lease_s": 2})
+    ada.done("PUT", "/parameters/scan-speed", {"value": "100 nm/s"})
+    ada.done("POST", "/scans", {"region": REGION, "shape": [128, 128], "key": "long"})
+    begun_s = time.monotonic()
+    while time.monotonic() < begun_s + 4.0:
+        assert run.client("ada").ask("PUT", "/control", {"lease_s": 2}).status == 200
+        time.sleep(0.5)  # as a client does that renews its lease
+    run.wait_for("gateway:ada")
+    lost = next(one for one in ada.events("/events?kinds=control") if one.data["data"]["holder"] != "gateway:ada")
+    assert lost.data["data"]["holder"] in (None, "series")
+    failed = ada.until_measured("long")
+    assert (failed["state"], failed["refusal"]["code"]) == ("failed", "interrupted")
+    assert ada.ask("PUT", "/control", {}).code == "not-in-control"
+
+
+def test_a_killed_gateway_goes_on_with_its_scans_and_its_clients_with_their_events(started: Started) -> None:
+    run = started(speed=20.0)
+    ada = run.client("ada")
+    ada.done("POST", "/control", {"lease_s": 60})
+    asked = {"region": REGION, "shape": [32, 32], "key": "survives"}
+    seen: list[Event] = []
+    reader = threading.Thread(target=lambda: seen.extend(ada.events("/events?after=0")))
+    reader.start()
+    ada.done("POST", "/scans", asked)
+    os.kill(run.pid("gateway"), signal.SIGKILL)
+    reader.join(20.0)
+    run.wait_for("the gateway is at ", count=2)
+    assert run.said("the gateway is at ")[1].endswith(run.url), "clients find it where it was"
+    ada.done("PUT", "/control", {"lease_s": 60})
+    assert ada.until_measured("survives")["state"] == "done"
+    assert ada.done("POST", "/scans", asked)["state"] == "done"
+    assert len(ada.get("/scans")) == 1
+    for event in ada.events("/events", last=seen[-1].id):
+        seen.append(event)
+        if event.kind == "scan":
+            break
+    ids = [int(event.id) for event in seen]
+    assert all(a < b for a, b in pairwise(ids)), "none twice"
+    assert "missed" not in {event.kind for event in seen}
+    states = [event.data["data"]["state"] for event in seen if event.kind == "state"]
+    assert "SCANNING" in states
+    ada.done("POST", "/end")
+
+
+def test_twenty_clients_at_a_time_are_not_noticed_by_the_experiment(started: Started) -> None:
+    scans = 8
+    run = started(SERIES.format(every="1 min", scans=scans) + "end_when_done = true\n", speed=20.0)
+    over, refused, failed = threading.Event(), list[str](), list[str]()
+
+    def watch(number: int) -> None:
+        client = run.client(f"client {number}")
+        while not over.is_set():
+            try:
+                client.get("/state")
+                client.get("/parameters")
+                client.get("/scans?limit=5")
+                if client.get("/scans"):
+                    client.get("/scans/newest/values")
+                    client.get("/scans/newest/values?format=png")
+                refused.append(client.ask("POST", "/actions/x-retract").code)
+            except OSError:
+                return
+            except AssertionError as error:
+                failed.append(str(error))
+
+    def stream() -> None:
+        for _ in run.client().events("/events?after=0"):
+            pass
+
+    stalled = HTTPConnection(Client(run.url).address)
+    stalled.request("GET", "/v1/events?after=0")  # and never reads
+    threads = [threading.Thread(target=watch, args=(i,), daemon=True) for i in range(16)]
+    threads += [threading.Thread(target=stream, daemon=True) for _ in range(4)]
+    for one in threads:
+        one.start()
+    gateway, most_bytes = psutil.Process(run.pid("gateway")), 0
+    while run.process.poll() is None:
+        try:
+            most_bytes = max(most_bytes, gateway.memory_info().rss)
+        except psutil.NoSuchProcess:
+            break
+        time.sleep(0.2)
+    over.set()
+    stalled.close()
+    assert run.process.wait(60.0) == 0
+    assert not [line for line in run.lines if "WARNING" in line or "ERROR" in line], run.lines
+    assert set(refused) <= {"not-in-control", "experiment-ended", "no-response"}
+    assert len(refused) > 100
+    assert not [one for one in failed if "experiment" not in one], failed[:3]
+    assert most_bytes < 400 << 20
+    with afspm.open_run(run.folder) as record:
+        rows = [row for row in record.scans if not row.interrupted]
+        assert len(rows) == scans
+        began = [row.began_ns for row in rows if row.began_ns is not None]
+        late_s = [abs((b - a) * 1e-9 - 60.0) for a, b in pairwise(began)]
+        assert max(late_s) < 5.0, late_s
+        assert {row.holder for row in rows} == {"series"}
