@@ -52,7 +52,8 @@ def application(
         app.include_router(routes.router(), prefix=PREFIX)
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _no_route)
-    app.add_exception_handler(RefusedRequest, _refused)
+    for error in (RefusedRequest, Exception):
+        app.add_exception_handler(error, _refused)
     guarded: AsgiApp = GatewayGuard(app, passwords, host, origins)
     if not origins:
         return guarded

@@ -172,7 +172,11 @@ class CommandRoutes:
 
     async def end_experiment(self, asked: Request) -> DoneModel:
         """End the experiment for everybody."""
-        await self._services.command(asked, lambda commands: commands.end())
+        try:
+            await self._services.command(asked, lambda commands: commands.end())
+        except RefusedRequest as error:
+            if error.model.code is not RefusalCode.EXPERIMENT_ENDED:  # which may come before the answer
+                raise
         return DoneModel()
 
     # --- within ---

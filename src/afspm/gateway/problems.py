@@ -8,7 +8,8 @@ from http import HTTPStatus
 from pydantic import BaseModel, ConfigDict, Field
 
 from afspm.errors import AfspmError, ExperimentEnded, NoResponse
-from afspm.model import ControlResponse, Response, ResponseDetail
+from afspm.model import HAS_ENDED, ControlResponse, Response, ResponseDetail
+from afspm.process.parent import StopRequested
 
 
 class RefusalCode(Enum):
@@ -148,13 +149,13 @@ def refused(response: Response) -> RefusedRequest:
     return RefusedRequest(code, response.reason or code.value, may_have_been_done=is_unknown)
 
 
-def of_error(error: Exception) -> RefusedRequest:
+def of_error(error: BaseException) -> RefusedRequest:
     """Return an error as a refusal."""
     match error:
         case RefusedRequest():
             return error
-        case ExperimentEnded():
-            return RefusedRequest(_C.EXPERIMENT_ENDED, str(error))
+        case ExperimentEnded() | StopRequested():
+            return RefusedRequest(_C.EXPERIMENT_ENDED, str(error) or HAS_ENDED)
         case NoResponse():
             return RefusedRequest(_C.NO_RESPONSE, str(error), may_have_been_done=True)
         case AfspmError():

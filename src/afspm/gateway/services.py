@@ -16,6 +16,7 @@ from afspm.gateway.measurements import Measurements
 from afspm.gateway.problems import RefusalCode, RefusedRequest, of_error, refused
 from afspm.gateway.stream import StreamCount
 from afspm.model import Frame, Response
+from afspm.process.parent import StopRequested
 from afspm.web.archive import Archive
 from afspm.web.person_commands import PersonCommands
 from afspm.web.persons import Persons
@@ -75,7 +76,7 @@ class GatewayServices:
         try:
             # a client that goes away in between does not call off what the scheduler is asked for
             return await asyncio.shield(asyncio.wrap_future(self.persons.submit(person, action)))
-        except Exception as error:
+        except (Exception, StopRequested) as error:  # the second: the experiment ended meanwhile
             raise of_error(error) from error
         finally:
             self.waiting[person] -= 1
