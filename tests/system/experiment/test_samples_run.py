@@ -25,7 +25,7 @@ QUICKER: dict[str, tuple[str, int, int]] = {
     "spectroscopy_grid": ("[curves]\ncounts = [2, 2]\n", 0, 4),
     "picture": ("[clock]\nspeed = 600.0\n[details]\npixels = [16, 12]\n", 3, 0),
     "own_component": (SERIES, 2, 0),
-    "other_language": (SERIES, 2, 0),
+    "other_language": ("[flattest]\npixels = 32\n", 2, 0),
     "two_computers": (SERIES, 2, 0),
     "wide_and_narrow": ("[list]\nrounds = 1\npixels = [16, 16]\n", 4, 0),
     "feedback_gains": ('[series]\nduration = "90 min"\npixels = [32, 32]\n', 4, 0),

@@ -48,14 +48,26 @@ def require_scans(experiment: JudgedExperiment, answer: Answer, asked: dict[str,
 
 
 def _require_published(experiment: JudgedExperiment, message: str, told: dict[str, Any]) -> None:
-    """Raise Failed unless exactly this was published."""
-    key = (told.get("envelope"), told.get("timestamp_ns"))
-    experiment.pump(lambda: any((one.envelope, one.time_ns) == key for one in experiment.packets(message)), 5.0)
-    for packet in experiment.packets(message):
-        if (packet.envelope, packet.time_ns) == key:
-            compare(told, packet)
-            return
-    raise Failed(f"a {message} that was published", f"envelope and timestamp {key}")
+    """Raise Failed unless exactly this was published. A client need not tell which packet its own measurement was."""
+    told = {"message": message, **told}
+    wrong: list[Failed] = []
+
+    def is_there() -> bool:
+        wrong.clear()
+        for packet in experiment.packets(message):
+            of_packet = {"envelope": packet.envelope, "timestamp_ns": packet.time_ns}
+            if any(told.get(name, value) not in (value, None) for name, value in of_packet.items()):
+                continue
+            try:
+                compare({**told, **of_packet}, packet)
+            except Failed as failure:
+                wrong.append(failure)
+            else:
+                return True
+        return False
+
+    if not experiment.pump(is_there, 5.0):
+        raise wrong[-1] if wrong else Failed(f"a {message} that was published", str(told))
 
 
 @client_check(

@@ -156,7 +156,10 @@ def refusals(bench: ClientBench) -> None:
             (program.do("action", name="x-no-such-thing"), "REP_ACTION_NOT_SUPPORTED"),
             (program.do("set_parameter", name="tip-bias-voltage", value="5", unit="V"), "REP_PARAM_ERROR"),
             (program.do("set_parameter", name="tip-bias-voltage", value="5", unit="kg"), "REP_PARAM_ERROR"),
-            (program.do("request_control", problem=4, timeout_s=1.0), "REP_WRONG_EXP_PROBLEM"),
+            (
+                program.do("request", number=ControlRequest.REQUEST_CTRL, object=in_base64(b"\4")),
+                "REP_WRONG_EXP_PROBLEM",
+            ),
         ]
         for answer, response in refused:
             told = answer.get("response")
