@@ -55,7 +55,7 @@ def bounds(pair: Pair) -> Bounds:
     known = np.zeros((7, 7))
     known[3:, 3:] = _linear_precision(how, first.width_px[1])
     fixed = [0, 1] if how.gain == 1.0 and not how.bend else [0, 1, 2]
-    kept = fixed if not (how.drift_px or how.rotation_deg) else [*fixed, 3, 4, 5, 6]
+    kept = fixed if not (how.drift_px or how.rotation_deg or how.calibration) else [*fixed, 3, 4, 5, 6]
     full = np.linalg.inv((information + known)[np.ix_(kept, kept)])[:2, :2]
     return Bounds(np.linalg.inv(plain), np.linalg.inv(information[:2, :2]), full)
 
@@ -94,7 +94,7 @@ def unknown_rough(how: Condition, size: int = 128) -> float:
 
 
 def row_precision(how: Condition, width: int) -> Array:
-    """Of `width` pixels of one row, with an unknown straight line in it."""
+    """Of `width` pixels of one row, with an unknown straight line in it, or what more was taken away from it."""
     covariance = how.white**2 * np.eye(width)
     if how.one_over_f:
         count = 2 * 128 * 128
@@ -102,11 +102,12 @@ def row_precision(how: Condition, width: int) -> Array:
         k = np.arange(1, count // 2 + 1)
         # Slow noise is a line in a row: what is slower than sixteen rows adds nothing but rounding.
         fast = k >= count // (16 * 128)
-        power = np.where(fast, one_over_f_power(count), 0.0)
+        power = np.where(fast, one_over_f_power(count, how.exponent), 0.0)
         series = np.zeros(count // 2 + 1)
         series[1:] = power / 2
         covariance += how.one_over_f**2 * linalg.toeplitz(np.fft.irfft(series, count)[lags] * count)
-    lines = np.stack([np.ones(width), np.linspace(-1.0, 1.0, width)], axis=1)
+    x = np.linspace(-1.0, 1.0, width)
+    lines = np.stack([x**k for k in range(1 + max(1, how.flatten or 0))], axis=1)
     precision = np.linalg.inv(covariance)
     seen = precision @ lines
     return np.asarray(precision - seen @ np.linalg.solve(lines.T @ seen, seen.T))
@@ -117,4 +118,5 @@ def _linear_precision(how: Condition, height_px: float) -> Array:
     shear = 2 * (how.drift_px / height_px) ** 2
     turn = math.radians(how.rotation_deg) ** 2 / 3
     covariance = np.diag([0.0, shear, 0.0, shear]) + turn * np.outer((0, 1, -1, 0), (0, 1, -1, 0))
+    covariance += how.calibration**2 * np.diag([1.0, 0.0, 0.0, 1.0])
     return np.linalg.inv(covariance + 1e-12 * np.eye(4))

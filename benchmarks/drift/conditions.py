@@ -20,40 +20,64 @@ class Condition:
     Attributes:
         white: noise of each pixel by itself.
         row_offset: offset of each row by itself.
-        one_over_f: noise of the whole scan as a time series, power as 1 / frequency.
+        row_memory: correlation of the offsets of neighbouring rows.
+        row_tilt: rise over each row by itself.
+        one_over_f: noise of the whole scan as a time series, power as 1 / frequency^exponent.
         scars: share of the rows with a stretch where something disturbs the tip.
+        spikes: share of the pixels that are off by some rms heights.
+        lost: share of the rows of which nothing was kept.
         tilt: up to this much rise over the image.
-        flatten: the straight line fitted to each row is taken away (Flatten1).
+        bow: up to this much of a parabola over the image.
+        flatten: order of the polynomial fitted to each row that is taken away; None: none is.
         gain: the contrast of the second scan lies between 1 / gain and gain.
         bend: contrast is not linear: up to this much of z² / 2 is added to z.
         drift_px: standard deviation of each component of the drift during a scan; scans are independent of each other.
         rotation_deg: the second scan is turned by up to this much.
         overlap: least and most.
-        second_tip_px: distance of a second apex that the second scan has.
+        calibration: standard deviation of how much longer the axes of the second scan are, each by itself.
+        creep_px: how far lines start beside their place; gone to 1/e within `creep_length_px`.
+        aspect: height of a pixel over its width.
+        blunt: radius of the tip, over the usual one.
+        double_px: distance of a second apex that the tip has in both scans.
+        second_tip_px: distance of a second apex that the second scan alone has.
+        turned_round: the second scan is taken in the other direction.
         elsewhere: the scans show two places of the sample that have nothing in common.
     """
 
     white: float
     row_offset: float = 0.0
+    row_memory: float = 0.0
+    row_tilt: float = 0.0
     one_over_f: float = 0.0
+    exponent: float = 1.0
     scars: float = 0.0
+    spikes: float = 0.0
+    lost: float = 0.0
     tilt: float = 0.0
-    flatten: bool = False
+    bow: float = 0.0
+    flatten: int | None = None
     gain: float = 1.0
     bend: float = 0.0
     drift_px: float = 0.0
     rotation_deg: float = 0.0
     overlap: tuple[float, float] = (0.8, 1.0)
+    calibration: float = 0.0
+    creep_px: float = 0.0
+    creep_length_px: float = 8.0
+    aspect: float = 1.0
+    blunt: float = 1.0
+    double_px: float = 0.0
     second_tip_px: float = 0.0
+    turned_round: bool = False
     elsewhere: bool = False
 
 
 _REAL = {
-    "white": 1 / 20, "row_offset": 0.2, "one_over_f": 0.15, "scars": 0.02, "tilt": 1.0, "flatten": True, "gain": 1.1,
+    "white": 1 / 20, "row_offset": 0.2, "one_over_f": 0.15, "scars": 0.02, "tilt": 1.0, "flatten": 1, "gain": 1.1,
     "drift_px": 0.7, "overlap": (0.75, 1.0),
 }  # fmt: skip
 _HARD = {
-    "white": 1 / 10, "row_offset": 0.5, "one_over_f": 0.3, "scars": 0.06, "tilt": 1.0, "flatten": True, "gain": 1.7,
+    "white": 1 / 10, "row_offset": 0.5, "one_over_f": 0.3, "scars": 0.06, "tilt": 1.0, "flatten": 1, "gain": 1.7,
     "bend": 0.2, "drift_px": 1.4, "rotation_deg": 1.0, "overlap": (0.5, 0.7),
 }  # fmt: skip
 
@@ -62,7 +86,7 @@ CONDITIONS: dict[str, Condition] = {
     "white30": Condition(1 / 30),
     "white10": Condition(1 / 10),
     "white3": Condition(1 / 3),
-    "flat30": Condition(1 / 30, row_offset=0.3, tilt=1.0, flatten=True),
+    "flat30": Condition(1 / 30, row_offset=0.3, tilt=1.0, flatten=1),
     "real": Condition(**_REAL),  # type: ignore[arg-type]
     "hard": Condition(**_HARD),  # type: ignore[arg-type]
     "dtip": Condition(**_REAL, second_tip_px=2.5),  # type: ignore[arg-type]
@@ -78,33 +102,54 @@ def measured(image: Array, condition: Condition, random: np.random.Generator, ga
     level = image - image.mean()
     seen = gain * (level + bend / 2 * level**2)
     seen += condition.white * random.standard_normal(image.shape)
-    seen += condition.row_offset * random.standard_normal((ny, 1))
+    seen += condition.row_offset * _remembered(random.standard_normal((ny, 1)), condition.row_memory)
+    if condition.row_tilt:
+        seen += condition.row_tilt * random.standard_normal((ny, 1)) * np.linspace(-0.5, 0.5, nx)
     if condition.one_over_f:
-        seen += condition.one_over_f * _one_over_f(ny * nx * 2, random).reshape(ny, 2 * nx)[:, :nx]
+        series = _one_over_f(ny * nx * 2, random, condition.exponent)
+        seen += condition.one_over_f * series.reshape(ny, 2 * nx)[:, :nx]
     for row in np.flatnonzero(np.less(random.random(ny), condition.scars)):
         start, length = random.integers(nx), 1 + int(random.exponential(0.4 * nx))
         seen[row, start : start + length] += random.choice((-1.0, 1.0)) * abs(random.normal(1.0, 0.4))
+    if condition.spikes:
+        seen += 3.0 * random.standard_normal(image.shape) * (random.random(image.shape) < condition.spikes)
+    x, y = np.linspace(-0.5, 0.5, nx), np.linspace(-0.5, 0.5, ny)[:, None]
     slope = condition.tilt * random.uniform(-1.0, 1.0, 2)
-    seen += slope[0] * np.linspace(-0.5, 0.5, nx) + slope[1] * np.linspace(-0.5, 0.5, ny)[:, None]
-    return flattened(seen) if condition.flatten else seen
+    seen += slope[0] * x + slope[1] * y
+    if condition.bow:
+        seen += 4.0 * condition.bow * (random.uniform(-1.0, 1.0) * x**2 + random.uniform(-1.0, 1.0) * y**2)
+    if condition.flatten is not None:
+        seen = flattened(seen, condition.flatten)
+    if condition.lost:
+        seen[random.random(ny) < condition.lost] = np.nan
+    return np.asarray(seen)
 
 
-def flattened(image: Array) -> Array:
-    """Each row less the straight line fitted to it (Flatten1)."""
+def flattened(image: Array, order: int = 1) -> Array:
+    """Each row less the polynomial fitted to it (Flatten1)."""
     x = np.linspace(-1.0, 1.0, image.shape[1])
-    level = image - image.mean(axis=1, keepdims=True)
-    return np.asarray(level - np.outer(level @ x / (x @ x), x))
+    powers, _ = np.linalg.qr(np.stack([x**k for k in range(order + 1)], axis=1))
+    return np.asarray(image - (image @ powers) @ powers.T)
 
 
-def one_over_f_power(count: int) -> Array:
+def _remembered(values: Array, memory: float) -> Array:
+    """Of the same variance, each like the one before."""
+    from scipy.signal import lfilter
+
+    if not memory:
+        return values
+    return np.asarray(lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], values, axis=0))
+
+
+def one_over_f_power(count: int, exponent: float = 1.0) -> Array:
     """Variance that each frequency k / count, k from 1 to count / 2, brings to a series of unit variance."""
-    k = np.arange(1, count // 2 + 1)
-    return np.asarray(1 / k / np.sum(1 / k))
+    power = np.arange(1, count // 2 + 1, dtype=np.float64) ** -exponent
+    return np.asarray(power / np.sum(power))
 
 
-def _one_over_f(count: int, random: np.random.Generator) -> Array:
-    """A time series of even length, unit rms on average, zero mean and a power spectrum as 1 / frequency."""
-    amplitude = np.sqrt(one_over_f_power(count)) * count / 2
+def _one_over_f(count: int, random: np.random.Generator, exponent: float) -> Array:
+    """A time series of even length, unit rms on average, zero mean and a power spectrum as 1 / frequency^exponent."""
+    amplitude = np.sqrt(one_over_f_power(count, exponent)) * count / 2
     spectrum = np.zeros(count // 2 + 1, dtype=np.complex128)
     spectrum[1:] = amplitude * (random.standard_normal(count // 2) + 1j * random.standard_normal(count // 2))
     return np.asarray(np.fft.irfft(spectrum, count))

@@ -12,6 +12,7 @@ from scipy import ndimage
 from afspm.drift.registration import DriftScan, Prior
 from afspm.model import Region
 from benchmarks.drift.conditions import CONDITIONS, Array, Condition, measured
+from benchmarks.drift.families import HALVES, Half, Relief, drawn_condition, drawn_surface, source
 from benchmarks.drift.surfaces import SURFACES, Grid, imaged
 
 PIXEL_M = 2e-6 / 128
@@ -25,13 +26,16 @@ ELSEWHERE_PX = 60.0
 class Frame:
     """How one scan lies on the sample: pixel offsets `q` from its middle show the sample at `origin + matrix @ q`.
 
-    All in standard pixels.
+    All in standard pixels. At the start of a line, on the left, the tip creeps: what is seen there lies further on by
+    `creep_px`, less by 1/e every `creep_length_px`.
     """
 
     shape: tuple[int, int]
     step_px: tuple[float, float]
     origin_px: Array
     matrix: Array
+    creep_px: float = 0.0
+    creep_length_px: float = 1.0
 
     @property
     def width_px(self) -> Array:
@@ -49,8 +53,23 @@ class Frame:
     def sample_px(self, q_px: Array) -> Array:
         """Where in the sample offsets, shape (2, …), lie."""
         middle: Array = self.origin_px.reshape(2, *[1] * (q_px.ndim - 1))
-        moved: Array = middle + np.einsum("ij,j...->i...", self.matrix, q_px)
+        moved: Array = middle + np.einsum("ij,j...->i...", self.matrix, q_px + self._crept_px(q_px))
         return moved
+
+    def seen_px(self, sample_px: Array) -> Array:
+        """The offset (2,) at which a place (2,) of the sample is seen."""
+        straight = np.asarray(np.linalg.solve(self.matrix, sample_px - self.origin_px), dtype=np.float64)
+        q = straight
+        for _ in range(20):
+            q = straight - self._crept_px(q)
+        return q
+
+    def _crept_px(self, q_px: Array) -> Array:
+        crept = np.zeros_like(q_px)
+        if self.creep_px:
+            along = np.maximum(q_px[0] + self.width_px[0] / 2, 0.0)
+            crept[0] = self.creep_px * np.exp(-along / self.creep_length_px)
+        return crept
 
 
 @dataclass(frozen=True)
@@ -144,6 +163,7 @@ def pair(
     *,
     samplings: tuple[Sampling, Sampling] | None = None,
     prior_sd_px: float | None = None,
+    half: Half | None = None,
 ) -> Pair:
     """A pair that depends on nothing but the arguments.
 
@@ -154,12 +174,17 @@ def pair(
         samplings: of both scans, in place of `size`.
         prior_sd_px: give a prior about the true displacement, wrong by so much (for a pair without one: about the
             displacement that it would have if it had an overlap).
+        half: draw the parameters of surface and condition too; see `families`.
     """
-    how = CONDITIONS[condition]
-    random = np.random.default_rng([seed, list(SURFACES).index(surface), list(CONDITIONS).index(condition)])
-    first, second = samplings or (Sampling.square(size),) * 2
-    frames = _frames(first, second, how, random)
-    views = _views(surface, frames, how, seed, random)
+    numbers = (seed, list(SURFACES).index(surface), list(CONDITIONS).index(condition))
+    if half is None:
+        how, relief, random = CONDITIONS[condition], SURFACES[surface], np.random.default_rng(numbers)
+    else:
+        random = source(half, *numbers)
+        how, relief = drawn_condition(condition, random), drawn_surface(surface, random)
+    first, second = samplings or (Sampling((size, size), (1.0, how.aspect)),) * 2
+    frames = framed(first, second, how, random)
+    views = _views(relief, frames, how, [*numbers[:2], *([] if half is None else [HALVES.index(half)])], random)
     scale = 1.0 / float(views[0].at(frames[0].sample_px(frames[0].offsets_px())).std())
     gain = math.exp(random.uniform(-1.0, 1.0) * math.log(how.gain))
     centers_m = [random.uniform(-20.0, 20.0, 2) * PIXEL_M for _ in frames]
@@ -169,18 +194,18 @@ def pair(
             region=Region(tuple(center_m), tuple(f.width_px * PIXEL_M)),
             start_s=k * 900.0,
             end_s=k * 900.0 + ROW_S * f.shape[0],
-            upwards=True,
+            upwards=not (k and how.turned_round),
             key=f"{surface}-{condition}-{seed}-{k}",
         )
         for k, (f, view, center_m, k_gain) in enumerate(zip(frames, views, centers_m, (1.0, gain), strict=True))
     ]
-    truth = _truth(frames, centers_m)
-    known = None if prior_sd_px is None else _prior(truth, prior_sd_px, how, first.shape[0], random)
+    truth = truth_of(frames, centers_m)
+    known = None if prior_sd_px is None else prior_of(truth, prior_sd_px, how, first.shape[0], random)
     unit_view = replace(views[0], coefficients=scale * views[0].coefficients)
     return Pair(surface, how, scans[0], scans[1], None if how.elsewhere else truth, known, frames, unit_view, gain)
 
 
-def _frames(first: Sampling, second: Sampling, how: Condition, random: np.random.Generator) -> tuple[Frame, Frame]:
+def framed(first: Sampling, second: Sampling, how: Condition, random: np.random.Generator) -> tuple[Frame, Frame]:
     """Two frames that overlap as the condition says, the middle of the overlap at the origin of the sample."""
     widths = [np.array([(n - 1) * s for n, s in zip(g.shape[::-1], g.step_px, strict=True)]) for g in (first, second)]
     smaller, larger = np.minimum(*widths), np.maximum(*widths)
@@ -190,48 +215,54 @@ def _frames(first: Sampling, second: Sampling, how: Condition, random: np.random
     low, high = np.maximum(-widths[0] / 2, -widths[1] / 2 + shift), np.minimum(widths[0] / 2, widths[1] / 2 + shift)
     middle = (low + high) / 2
     angles = (0.0, math.radians(how.rotation_deg) * random.uniform(-1.0, 1.0))
-    frames = []
+    frames: list[Frame] = []
     for sampling, origin, angle in zip((first, second), (-middle, shift - middle), angles, strict=True):
         # The sample moves by `drift` while the rows are scanned: a row at q_y sees what lies drift q_y / height before.
-        drift = how.drift_px * random.standard_normal(2)
+        drift = how.drift_px * random.standard_normal(2) * (-1.0 if frames and how.turned_round else 1.0)
         shear = np.eye(2) - np.outer(drift, (0.0, 1.0 / ((sampling.shape[0] - 1) * sampling.step_px[1])))
         turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
-        frames.append(Frame(sampling.shape, sampling.step_px, origin, turn @ shear))
+        if frames and how.calibration:
+            shear = shear @ np.diag(1.0 + how.calibration * random.standard_normal(2))
+        frames.append(Frame(sampling.shape, sampling.step_px, origin, turn @ shear, how.creep_px, how.creep_length_px))
     return frames[0], frames[1]
 
 
 def _views(
-    surface: str, frames: tuple[Frame, Frame], how: Condition, seed: int, random: np.random.Generator
+    surface: Relief, frames: tuple[Frame, Frame], how: Condition, seeds: list[int], random: np.random.Generator
 ) -> tuple[View, View]:
     """What the tip sees of the sample in each scan; once if it is the same."""
     corners = np.array([[-0.5, -0.5, 0.5, 0.5], [-0.5, 0.5, -0.5, 0.5]])
     reach = max(np.abs(f.sample_px(corners * f.width_px[:, None])).max() for f in frames)
     grid = Grid(reach + MARGIN_PX)
-    second_tip = None
-    if how.second_tip_px:
-        direction = random.uniform(0.0, 2 * math.pi)
-        second_tip = (how.second_tip_px * math.cos(direction), how.second_tip_px * math.sin(direction))
-    number = list(SURFACES).index(surface)
+    double, second_tip = (_apart(far_px, random) for far_px in (how.double_px, how.second_tip_px))
 
     def relief(grid: Grid, place: int) -> Array:
-        specimen = np.random.default_rng([seed, number, 1])
-        height = SURFACES[surface](grid, specimen, np.random.default_rng([seed, number, 2, place]))
+        specimen = np.random.default_rng([*seeds, 1])
+        height = surface(grid, specimen, np.random.default_rng([*seeds, 2, place]))
         level: Array = (height - height.mean()) / height.std()
         return level
 
     height = relief(grid, 0)
-    first = View.of(grid, imaged(height))
+    first = View.of(grid, imaged(height, double, how.blunt))
     if how.elsewhere:  # and not the same distance from what every place has near its origin
         x, y = random.uniform(-ELSEWHERE_PX, ELSEWHERE_PX, 2)
-        return first, View.of(grid, imaged(relief(Grid(grid.half_px, (x, y)), 1)))
-    return first, View.of(grid, imaged(height, second_tip)) if second_tip else first
+        return first, View.of(grid, imaged(relief(Grid(grid.half_px, (x, y)), 1), double, how.blunt))
+    return first, View.of(grid, imaged(height, second_tip, how.blunt)) if second_tip else first
 
 
-def _truth(frames: tuple[Frame, Frame], centers_m: list[Array]) -> Truth:
+def _apart(far_px: float, random: np.random.Generator) -> tuple[float, float] | None:
+    """(x, y) in any direction; None for nothing."""
+    if not far_px:
+        return None
+    direction = random.uniform(0.0, 2 * math.pi)
+    return far_px * math.cos(direction), far_px * math.sin(direction)
+
+
+def truth_of(frames: tuple[Frame, Frame], centers_m: list[Array]) -> Truth:
     first, second = frames
     back = np.linalg.inv(second.matrix)
-    middle = np.linalg.solve(first.matrix, -first.origin_px)  # of the overlap, which is the origin of the sample
-    there = back @ -second.origin_px
+    middle = first.seen_px(np.zeros(2))  # of the overlap, which is the origin of the sample
+    there = second.seen_px(np.zeros(2))
     low = np.maximum(-first.width_px / 2, -second.width_px / 2 - (there - middle))
     high = np.minimum(first.width_px / 2, second.width_px / 2 - (there - middle))
     area = np.prod(np.maximum(high - low, 0.0)) / min(np.prod(first.width_px), np.prod(second.width_px))
@@ -243,7 +274,7 @@ def _truth(frames: tuple[Frame, Frame], centers_m: list[Array]) -> Truth:
     )
 
 
-def _prior(truth: Truth, sd_px: float, how: Condition, rows: int, random: np.random.Generator) -> Prior:
+def prior_of(truth: Truth, sd_px: float, how: Condition, rows: int, random: np.random.Generator) -> Prior:
     sd_m = sd_px * PIXEL_M
     return Prior(
         mean_m=truth.displacement_m + sd_m * random.standard_normal(2),

@@ -49,11 +49,22 @@ class Grid:
         return xy_px[::-1] * OVERSAMPLING + self.count // 2
 
 
-def stamper(grid: Grid, specimen: Random, place: Random) -> Array:
+def stamper(
+    grid: Grid,
+    specimen: Random,
+    place: Random,
+    *,
+    pitch: float = 102.0,
+    half_width: float = 16.0,
+    bit: float = 17.8,
+    flank: float = 6.0,
+    turned_deg: float = 15.0,
+    texture: float = 0.01,
+    texture_px: float = 6.0,
+) -> Array:
     """Bumps on tracks 102 px apart, 32 px wide, 3 to 11 bits of 17.8 px long; one ends near the origin."""
-    pitch, half_width, bit, flank = 102.0, 16.0, 17.8, 6.0
     x, y = grid.axis_px[None, :] + grid.middle_px[0], grid.axis_px[:, None] + grid.middle_px[1]
-    angle = math.radians(specimen.uniform(-15.0, 15.0))
+    angle = math.radians(specimen.uniform(-turned_deg, turned_deg))
     along = x * math.cos(angle) + y * math.sin(angle) + place.uniform(-15.0, 15.0)
     across = y * math.cos(angle) - x * math.sin(angle) + place.uniform(-20.0, 20.0)
     track = np.round(across / pitch)
@@ -69,12 +80,12 @@ def stamper(grid: Grid, specimen: Random, place: Random) -> Array:
         past = np.maximum(half_width - to_end, 0.0)
         inside = half_width - np.hypot(past, across[here] - number * pitch)
         height[here] = _smooth_step(inside / flank + 0.5)
-    return height + 0.01 * _self_affine(grid, place, longest_px=6.0)
+    return height + texture * _self_affine(grid, place, longest_px=texture_px)
 
 
-def rough(grid: Grid, specimen: Random, place: Random) -> Array:
+def rough(grid: Grid, specimen: Random, place: Random, *, longest_px: float = ROUGH_PX, hurst: float = 0.8) -> Array:
     """Self-affine ground of Hurst exponent 0.8 up to 40 px."""
-    return _self_affine(grid, place, longest_px=ROUGH_PX)
+    return _self_affine(grid, place, longest_px=longest_px, hurst=hurst)
 
 
 def rough_power(f2: Array) -> Array:
@@ -82,11 +93,21 @@ def rough_power(f2: Array) -> Array:
     return self_affine_amplitude(f2, longest_px=ROUGH_PX) ** 2 * np.exp(-f2 * (2 * math.pi * BAND_PX) ** 2)
 
 
-def particles(grid: Grid, specimen: Random, place: Random) -> Array:
+def particles(
+    grid: Grid,
+    specimen: Random,
+    place: Random,
+    *,
+    area_px2: float = 400.0,
+    radius_px: float = 4.5,
+    spread: float = 0.35,
+    ground: float = 0.15,
+    ground_px: float = 10.0,
+) -> Array:
     """Spheres of 2 to 9 px radius, one on 400 square px, on almost flat ground."""
-    height = 0.15 * _self_affine(grid, place, longest_px=10.0)
-    count = place.poisson((2 * grid.half_px) ** 2 / 400)
-    radii = np.clip(4.5 * np.exp(0.35 * place.standard_normal(count)), 2.0, 9.0)
+    height = ground * _self_affine(grid, place, longest_px=ground_px)
+    count = place.poisson((2 * grid.half_px) ** 2 / area_px2)
+    radii = np.clip(radius_px * np.exp(spread * place.standard_normal(count)), radius_px * 0.44, radius_px * 2.0)
     for radius, center in zip(radii, place.uniform(-grid.half_px, grid.half_px, (count, 2)), strict=True):
         for window, square in _around(grid, center, radius):
             np.maximum(height[window], radius + np.sqrt(np.maximum(radius**2 - square, 0.0)), out=height[window],
@@ -94,16 +115,28 @@ def particles(grid: Grid, specimen: Random, place: Random) -> Array:
     return height
 
 
-def lattice(grid: Grid, specimen: Random, place: Random) -> Array:
+def lattice(
+    grid: Grid,
+    specimen: Random,
+    place: Random,
+    *,
+    spacing: float = 8.0,
+    defects: float = 7.0,
+    depth: float = 4.0,
+    texture: float = 0.0,
+    stretch: float = 1.0,
+) -> Array:
     """Atoms 8 px apart in a hexagonal lattice, about seven vacancies and adatoms on 128 x 128 px.
 
-    There is one in each seventh of that area: where a view has none, nobody can tell one atom from the next.
+    There is one in each seventh of that area: where a view has none, nobody can tell one atom from the next. The
+    lattice is stretched along one axis of the grid.
     """
-    spacing, angle = 8.0, specimen.uniform(0.0, math.pi / 3)
+    angle = specimen.uniform(0.0, math.pi / 3)
     x, y = grid.axis_px[None, :], grid.axis_px[:, None]
     shift = place.uniform(0.0, spacing, 2)
     height = np.zeros((grid.count, grid.count))
     wave = 4 * math.pi / (math.sqrt(3) * spacing)
+    x = x / stretch
     for k in range(3):
         cos, sin = math.cos(angle + k * math.pi / 3), math.sin(angle + k * math.pi / 3)
         # cos(a + b) of a column and a row, without a cosine for every point
@@ -113,30 +146,41 @@ def lattice(grid: Grid, specimen: Random, place: Random) -> Array:
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     # the rows of atoms are at right angles to the waves
     axes = turn @ np.array([[math.cos(math.pi / 6), -0.5], [0.5, math.cos(math.pi / 6)]]) @ cell
-    apart = 128.0 / math.sqrt(7.0)
+    apart = 128.0 / math.sqrt(defects)
     corners = np.arange(-grid.half_px - place.uniform(0.0, apart), grid.half_px, apart)
     for corner in itertools.product(corners, repeat=2):
         wanted = corner + place.uniform(0.0, apart, 2)
-        site = axes @ np.round(np.linalg.solve(axes, wanted - shift)) + shift
-        depth, width = (-4.0, 2.6) if place.random() < 0.6 else (4.0, 3.0)
-        for window, square in _around(grid, site, 5 * width):
-            height[window] += depth * np.exp(-square / (2 * width**2))
-    return height
+        site = axes @ np.round(np.linalg.solve(axes, wanted / (stretch, 1.0) - shift)) + shift
+        sign, width = (-1.0, 2.6) if place.random() < 0.6 else (1.0, 3.0)
+        for window, square in _around(grid, site * (stretch, 1.0), 5 * width):
+            height[window] += sign * depth * np.exp(-square / (2 * width**2))
+    return height + texture * _self_affine(grid, place, longest_px=spacing) if texture else height
 
 
-def steps(grid: Grid, specimen: Random, place: Random) -> Array:
+def steps(
+    grid: Grid,
+    specimen: Random,
+    place: Random,
+    *,
+    terrace: float = 60.0,
+    edge: float = 3.0,
+    wander: float = 0.4,
+    wander_px: float = 40.0,
+    kinks: float = 0.08,
+    texture: float = 0.0,
+) -> Array:
     """Terraces about 60 px wide between meandering steps, levelled as a whole."""
-    terrace, edge = 60.0, 3.0
     angle = math.radians(specimen.uniform(0.0, 360.0))
     x, y = grid.axis_px[None, :], grid.axis_px[:, None]
     plane = (x * math.cos(angle) + y * math.sin(angle)) / terrace
-    wander = _smooth(grid, place, 40.0) + 0.08 * _smooth(grid, place, 5.0)
-    height = plane + 0.4 * wander + place.random()
+    meander = _smooth(grid, place, wander_px) + kinks * _smooth(grid, place, 5.0)
+    height = plane + wander * meander + place.random()
     step = np.round(height)
-    return step - 0.5 + _smooth_step((height - step) * terrace / edge + 0.5) - plane
+    stairs = step - 0.5 + _smooth_step((height - step) * terrace / edge + 0.5) - plane
+    return stairs + texture * _self_affine(grid, place, longest_px=10.0) if texture else stairs
 
 
-SURFACES: dict[str, Callable[[Grid, Random, Random], Array]] = {
+SURFACES: dict[str, Callable[..., Array]] = {
     "stamper": stamper,
     "rough": rough,
     "particles": particles,
@@ -145,15 +189,16 @@ SURFACES: dict[str, Callable[[Grid, Random, Random], Array]] = {
 }
 
 
-def imaged(height: Array, second_tip_px: tuple[float, float] | None = None) -> Array:
+def imaged(height: Array, second_tip_px: tuple[float, float] | None = None, blunt: float = 1.0) -> Array:
     """What a tip makes of a surface of unit rms: dilated by a parabola, and of limited band.
 
     Args:
+        blunt: radius of the tip, over the usual one.
         second_tip_px: (x, y) of a second apex as sharp as the first, one rms height shorter.
     """
-    reach = math.ceil(TIP_PX * OVERSAMPLING * math.sqrt(max(np.ptp(height), 1e-9)))
-    reach = min(reach, 6 * OVERSAMPLING)
-    tip = -((np.arange(-reach, reach + 1) / (TIP_PX * OVERSAMPLING)) ** 2)
+    width = TIP_PX * OVERSAMPLING * math.sqrt(blunt)
+    reach = min(math.ceil(width * math.sqrt(max(np.ptp(height), 1e-9))), 6 * OVERSAMPLING)
+    tip = -((np.arange(-reach, reach + 1) / width) ** 2)
     touched = height
     for axis in (0, 1):  # the dilation by a parabola of revolution is that along x after that along y
         touched = _dilated(touched, tip, axis)
@@ -200,9 +245,20 @@ def self_affine_amplitude(f2: Array, *, longest_px: float, hurst: float = 0.8) -
     return np.asarray(np.maximum(f2, longest_px**-2) ** (-(hurst + 1) / 2))
 
 
-def _self_affine(grid: Grid, random: Random, *, longest_px: float) -> Array:
+def contaminated(height: Array, grid: Grid, place: Random, *, blobs: float) -> Array:
+    """With `blobs` drops of 2 to 6 px on 128 x 128 px, each up to three times the rms height."""
+    height, unit = height.copy(), height.std()
+    count = place.poisson(blobs * (2 * grid.half_px / 128) ** 2)
+    for center in place.uniform(-grid.half_px, grid.half_px, (count, 2)):
+        width, high = place.uniform(2.0, 6.0), unit * place.uniform(0.5, 3.0)
+        for window, square in _around(grid, center, 4 * width):
+            height[window] += high * np.exp(-square / (2 * width**2))
+    return height
+
+
+def _self_affine(grid: Grid, random: Random, *, longest_px: float, hurst: float = 0.8) -> Array:
     """A Gaussian field of unit rms."""
-    return _field(grid, random, lambda f2: self_affine_amplitude(f2, longest_px=longest_px))
+    return _field(grid, random, lambda f2: self_affine_amplitude(f2, longest_px=longest_px, hurst=hurst))
 
 
 def _smooth(grid: Grid, random: Random, length_px: float) -> Array:

@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from afspm.drift.estimators import estimator
 from afspm.drift.registration import Registration
+from benchmarks.drift import cuts
 from benchmarks.drift.bounds import bounds
 from benchmarks.drift.conditions import Array
+from benchmarks.drift.cuts import Cut
+from benchmarks.drift.families import Half
 from benchmarks.drift.pairs import PIXEL_M, Pair, Sampling, pair
 
 FAILED_PX = 1.0  # further off than this is no estimate
@@ -29,8 +32,10 @@ class Outcome:
         cell: what the pair stands for, as the part names it.
         error_px: (x, y) estimate less truth at the middle of the overlap; NaN without an estimate or a truth.
         chi2: of the error and the covariance, both at the centre that the estimator chose.
-        bound_px, white_bound_px: roots of the traces of Cb and C.
+        bound_px, white_bound_px: roots of the traces of Cb and C; NaN where the noise is not known.
         cpu_s: of this process.
+        half: of the families; None: a pair like all others of its surface and condition.
+        quality: what the estimator says of it.
     """
 
     cell: str
@@ -44,6 +49,8 @@ class Outcome:
     bound_px: float
     white_bound_px: float
     cpu_s: float
+    half: Half | None = None
+    quality: dict[str, float] = field(default_factory=dict)
 
     @property
     def off_px(self) -> float:
@@ -72,18 +79,26 @@ class Trial:
     size: int = 128
     samplings: tuple[Sampling, Sampling] | None = None
     prior_sd_px: float | None = None
+    half: Half | None = None
+
+    def made(self) -> Pair | Cut:
+        """The pair."""
+        if self.half is not None and self.surface == cuts.SURFACE:
+            return cuts.cut(self.condition, self.seed, self.half, self.prior_sd_px)
+        return pair(
+            self.surface, self.condition, self.seed, self.size, samplings=self.samplings,
+            prior_sd_px=self.prior_sd_px, half=self.half,
+        )  # fmt: skip
 
     def run(self) -> list[Outcome]:
-        made = pair(
-            self.surface, self.condition, self.seed, self.size, samplings=self.samplings, prior_sd_px=self.prior_sd_px
-        )
+        made = self.made()
         full = white = math.nan
-        if made.truth is not None:
+        if isinstance(made, Pair) and made.truth is not None:
             best = bounds(made)
             full, white = math.sqrt(np.trace(best.full)), math.sqrt(np.trace(best.white))
         return [self._outcome(made, name, full, white) for name in self.estimators]
 
-    def _outcome(self, made: Pair, name: str, bound_px: float, white_bound_px: float) -> Outcome:
+    def _outcome(self, made: Pair | Cut, name: str, bound_px: float, white_bound_px: float) -> Outcome:
         register = estimator(BASELINES.get(name, name)).register
         began_s = time.process_time()
         found = register(made.reference, made.scan, made.prior)
@@ -98,13 +113,15 @@ class Trial:
             reason=found.reason,
             error_px=error,
             chi2=chi2,
+            quality=dict(found.quality),
             bound_px=bound_px,
             white_bound_px=white_bound_px,
             cpu_s=cpu_s,
+            half=self.half,
         )
 
 
-def _errors(made: Pair, found: Registration) -> tuple[tuple[float, float], float]:
+def _errors(made: Pair | Cut, found: Registration) -> tuple[tuple[float, float], float]:
     """Error at the middle of the overlap in pixels, and chi square at the centre of the estimate."""
     if made.truth is None or not np.isfinite(found.displacement_m).all():
         return (math.nan, math.nan), math.nan
@@ -128,6 +145,8 @@ class Cell:
         failed, accepted, wrong: shares of all.
         bias_px: mean error, (x, y), of those that did not fail.
         covered: share of the accepted whose 95 % ellipse has the truth in it.
+        right_accepted: share of those that did not fail.
+        beyond_three: accepted ones with the truth outside of three times that ellipse.
         ms: median, of the processor's time.
     """
 
@@ -142,6 +161,8 @@ class Cell:
     bias_px: tuple[float, float]
     covered: float
     ms: float
+    right_accepted: float
+    beyond_three: int
 
     @property
     def ratio(self) -> float:
@@ -163,6 +184,8 @@ class Cell:
             wrong=_of([o.wrong for o in every]),
             bias_px=(_of([o.error_px[0] for o in good]), _of([o.error_px[1] for o in good])),
             covered=_of([o.chi2 <= ELLIPSE_95 for o in sure]),
+            right_accepted=_of([o.accepted for o in good]),
+            beyond_three=sum(not o.chi2 <= 9 * ELLIPSE_95 for o in sure if not math.isnan(o.off_px)),
             ms=1e3 * _of([o.cpu_s for o in every], lambda a: float(np.median(a))),
         )
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks.drift import cuts, families, pairs
 from benchmarks.drift.bounds import bounds, row_precision, unknown_rough
 from benchmarks.drift.conditions import CONDITIONS, Array, flattened, measured
 from benchmarks.drift.pairs import HEIGHT_M, PIXEL_M, Sampling, pair
@@ -22,7 +23,13 @@ QUIET: dict[str, Any] = {
     "one_over_f": 0.0,
     "scars": 0.0,
     "tilt": 0.0,
-    "flatten": False,
+    "flatten": None,
+    "row_tilt": 0.0,
+    "spikes": 0.0,
+    "lost": 0.0,
+    "bow": 0.0,
+    "creep_px": 0.0,
+    "gain": 1.0,
     "bend": 0.0,
 }
 
@@ -38,11 +45,17 @@ def found_at(scan: DriftScan, xy_m: Array) -> Array:
 
 @pytest.mark.parametrize("surface", SURFACES)
 @pytest.mark.parametrize("samplings", [None, (Sampling.square(128), Sampling((150, 200), (0.7, 0.8)))])
+@pytest.mark.parametrize("half", [None, "unseen"])
 def test_without_noise_a_scan_moved_by_the_truth_is_the_other(
-    surface: str, samplings: tuple[Sampling, Sampling] | None, monkeypatch: pytest.MonkeyPatch
+    surface: str,
+    samplings: tuple[Sampling, Sampling] | None,
+    half: families.Half | None,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setitem(CONDITIONS, "hard", replace(CONDITIONS["hard"], **QUIET, gain=1.0))
-    made = pair(surface, "hard", seed=3, samplings=samplings)
+    drawn = families.drawn_condition
+    monkeypatch.setattr(pairs, "drawn_condition", lambda name, random: replace(drawn(name, random), **QUIET))
+    monkeypatch.setitem(CONDITIONS, "hard", replace(CONDITIONS["hard"], **QUIET))
+    made = pair(surface, "hard", seed=3, samplings=samplings, half=half)
     truth = made.truth
     assert truth is not None
     assert np.abs(truth.linear).max() > 1e-3  # turned and sheared: a displacement alone would not do
@@ -180,3 +193,35 @@ def test_the_published_estimator_is_as_inexact_and_as_trusting_as_it_was_measure
     assert 0.06 < found.rms_px < 0.26
     (elsewhere,) = Trial("", "particles", "null", 1, (PUBLISHED,)).run()
     assert elsewhere.accepted
+
+
+def test_every_pair_of_a_family_has_parameters_of_its_own_and_no_half_has_those_of_the_other() -> None:
+    drawn = [pair("lattice", "hard", seed, half=half).condition for half in families.HALVES for seed in range(3)]
+    assert len({(how.white, how.exponent, how.blunt) for how in drawn}) == 6
+
+
+def test_no_sample_of_a_real_image_is_in_both_halves() -> None:
+    fitted, unseen = ({name[:10] for name, _ in cuts.IMAGES[half]} for half in families.HALVES)
+    assert not fitted & unseen
+
+
+def test_where_a_line_creeps_its_start_is_seen_elsewhere_and_its_end_is_not() -> None:
+    frame = pairs.Frame((128, 128), (1.0, 1.0), np.zeros(2), np.eye(2), creep_px=1.0, creep_length_px=6.0)
+    there = np.array([[-63.5, 63.5], [0.0, 0.0]])
+    assert frame.sample_px(there)[0] == pytest.approx([-62.5, 63.5], abs=1e-6)
+    assert frame.seen_px(np.array([-50.0, 3.0])) == pytest.approx([-50.0 - np.exp(-13.4 / 6.0), 3.0], abs=0.01)
+
+
+@pytest.mark.skipif(not cuts.there_are_images(), reason="the data of real microscopes are not here")
+def test_a_pair_cut_from_a_real_image_matches_itself_at_its_truth(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = families.drawn_condition
+    quiet = {**QUIET, "scars": 0.0}
+    monkeypatch.setattr(cuts, "drawn_condition", lambda name, random: replace(drawn(name, random), **quiet))
+    monkeypatch.setattr(cuts, "_noise", lambda half, random: np.zeros((cuts.PIXELS, cuts.PIXELS)))
+    made = cuts.cut("real", 2, "unseen")
+    assert made.truth is not None
+    x_m, y_m = made.reference.region.pixels_m(made.reference.values.shape)
+    there_m = np.stack([x_m, y_m]) + np.apply_along_axis(made.truth.at, 0, np.stack([x_m, y_m]))
+    moved = found_at(made.scan, there_m)
+    seen = np.isfinite(moved)
+    assert np.corrcoef(moved[seen], made.reference.values[seen])[0, 1] > 0.999
