@@ -8,7 +8,7 @@ import re
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
@@ -36,7 +36,7 @@ class RunSummary:
         name: of the experiment.
         began_ns, ended_ns: the first and last that was published, in experiment time; None: nothing was.
         state: how it ended, in words.
-        microscope: vendor and model, as far as they are known.
+        metadata: sample, person, project, technique … as far as they are known.
         scans: the whole ones; spectra: their number.
         problems: the names of those that were flagged.
         notes: the texts of all notes.
@@ -48,11 +48,7 @@ class RunSummary:
     began_ns: int | None = None
     ended_ns: int | None = None
     state: str = ""
-    sample: str = ""
-    person: str = ""
-    project: str = ""
-    technique: str = ""
-    microscope: str = ""
+    metadata: Mapping[str, str] = field(default_factory=dict)
     simulated: bool = False
     scans: int = 0
     spectra: int = 0
@@ -69,8 +65,14 @@ class RunSummary:
     def texts(self) -> dict[str, str]:
         """Return the fields that are looked through, by name."""
         lists = {"problem": self.problems, "note": self.notes}
-        named = ("folder", "name", "state", "sample", "person", "project", "technique", "microscope")
-        return {name: getattr(self, name) for name in named} | {name: "\n".join(all_) for name, all_ in lists.items()}
+        texts = {"folder": self.folder, "name": self.name, "state": self.state, "microscope": self.microscope}
+        texts |= {name: self.metadata.get(name, "") for name in ("sample", "person", "project", "technique")}
+        return texts | {name: "\n".join(all_) for name, all_ in lists.items()}
+
+    @property
+    def microscope(self) -> str:
+        """Vendor and model, as far as they are known."""
+        return " ".join(filter(None, (self.metadata.get("vendor"), self.metadata.get("microscope"))))
 
 
 FIELDS: Final = tuple(RunSummary("", "").texts())
@@ -110,9 +112,7 @@ def _read_word(word: str) -> tuple[str, str]:
 
 def _has(texts: Mapping[str, str], words: Sequence[tuple[str, str]]) -> bool:
     folded = {name: text.casefold() for name, text in texts.items()}
-    return all(
-        word in folded[field] if field else any(word in text for text in folded.values()) for field, word in words
-    )
+    return all(word in folded[name] if name else any(word in text for text in folded.values()) for name, word in words)
 
 
 def _was_within(run: RunSummary, since: date | None, until: date | None) -> bool:
@@ -207,20 +207,15 @@ def _summary(folder: Path) -> RunSummary:
 
 
 def _read(run: Run) -> RunSummary:
-    metadata, overview = run.metadata, run.overview(("ControlState",))
+    overview = run.overview(("ControlState",))
     began = next(iter(overview.controls.spans), None)
-    microscope = " ".join(filter(None, (metadata.get("vendor"), metadata.get("microscope"))))
     return RunSummary(
         folder="",
         name=run.name,
         began_ns=None if began is None else began.start_ns,
         ended_ns=run.newest_ns or None,
         state=describe_state(run.folder),
-        sample=metadata.get("sample", ""),
-        person=metadata.get("person", ""),
-        project=metadata.get("project", ""),
-        technique=metadata.get("technique", ""),
-        microscope=microscope,
+        metadata=run.metadata,
         simulated=run.simulated,
         scans=sum(not scan.interrupted for scan in run.scans),
         spectra=len(run.spectra),

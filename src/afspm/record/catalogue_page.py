@@ -23,6 +23,7 @@ from afspm.storage.atomic import replace_file
 PAGE_FILE: Final = "index.html"
 _PICTURES: Final = 4
 """So many scans of a run are shown, spread over it."""
+_ABOUT: Final = ("sample", "person", "project")
 _REPORT: Final = "report.html"
 _CSS: Final = """
 .runs{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(20rem,100%),1fr));gap:1rem}
@@ -72,7 +73,9 @@ def _lines(run: RunSummary) -> list[str]:
     """Return what a card says, as HTML."""
     if run.damage:
         return [f"<b>{escape(run.damage)}</b>"]
-    about = " · ".join(filter(None, (run.sample, run.person, run.project, "" if run.simulated else run.microscope)))
+    about = " · ".join(
+        filter(None, (*(run.metadata.get(name) for name in _ABOUT), "" if run.simulated else run.microscope))
+    )
     period = "" if run.began_ns is None or run.ended_ns is None else period_text(run.began_ns, run.ended_ns, UTC)
     problems = f"<b>{escape(', '.join(run.problems))}</b>" if run.problems else ""
     return [

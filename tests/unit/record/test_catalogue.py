@@ -49,7 +49,7 @@ def names(root: Path, *words: str) -> list[str]:
 
 def test_every_run_is_there_with_what_it_was(root: Path) -> None:
     gold, mica = sorted(find_runs(root), key=lambda run: run.folder)
-    assert (gold.folder, gold.scans, gold.sample, gold.microscope) == (
+    assert (gold.folder, gold.scans, gold.metadata["sample"], gold.microscope) == (
         "gold-1",
         1,
         METADATA["sample"],
