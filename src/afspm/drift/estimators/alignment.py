@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from afspm.drift.estimators.images import Unusable, flatten_rows
 from afspm.drift.estimators.noise import LEAST_NOISE, FineFilter, denoised, noise_metric, products, seen, without_lines
-from afspm.drift.estimators.warp import COUNT, LINEAR, SLOPES, WarpedPair, derivative
+from afspm.drift.estimators.warp import BEND, COUNT, GAIN, LINEAR, SLOPES, WarpedPair, derivative
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Both = tuple[Array, Array]
 
-SHIFT: Index = np.array([0, 1, 6], dtype=np.intp)  # of theta: the shift and the gain
+SHIFT: Index = np.array([0, 1, GAIN], dtype=np.intp)  # of theta: the shift and the gain
+COARSE: Index = np.array([*range(LINEAR.stop), GAIN, BEND], dtype=np.intp)
 ALL: Index = np.arange(COUNT, dtype=np.intp)
 ROUNDS = 4
 SETTLED_PX = 1e-3
@@ -25,7 +26,7 @@ SETTLED_PX = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Believed:
-    """The prior of theta: its mean and inverse covariance, (8,) and (8, 8)."""
+    """The prior of theta: its mean and inverse covariance, (n,) and (n, n)."""
 
     mean: Array
     precision: Array
@@ -36,7 +37,7 @@ class Fit:
     """Where it has come to, and the equations there, per block of the image and over the variance of the noise.
 
     Attributes:
-        theta: (8,), see `WarpedPair`.
+        theta: (COUNT,), see `WarpedPair`.
         curvature: (n, 8, 8), H'QJ with J the gradient without noise and H what of it is known.
         spread: (n, 8, 8), H'QH, the covariance of `slope`.
         slope: (n, 8), H'Qr.

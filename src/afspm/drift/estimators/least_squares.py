@@ -17,7 +17,7 @@ from afspm.drift.estimators.acceptance import (
     outliers,
 )
 from afspm.drift.estimators.alignment import (
-    ALL,
+    COARSE,
     SHIFT,
     Believed,
     averaged,
@@ -29,12 +29,13 @@ from afspm.drift.estimators.alignment import (
 from afspm.drift.estimators.images import CommonGrid, Unusable, onto_common_grid, prepare
 from afspm.drift.estimators.noise import FineFilter, shared_information, without_lines
 from afspm.drift.estimators.search import ExpectedShift, MaskedCorrelation, Scorer, candidates, shear_by_drift
-from afspm.drift.estimators.warp import COUNT, LINEAR, OverlapBox, Scene, WarpedPair
+from afspm.drift.estimators.warp import COUNT, CREEP, LINEAR, OverlapBox, Scene, WarpedPair
 from afspm.drift.registration import DriftScan, LinearSeen, Prior, Registration
 
 Array = NDArray[np.float64]
 
 WIDEST = (0.01, 0.03)  # of what shear and turn are thought possible at first, by x and by y
+CREEP_SD_PX = 0.5  # of each part
 GAIN_SD = 1.0  # of the logarithm
 BEND_SD = 0.15
 BORDER_PX = 1  # where a filter and a spline have to guess what lies beyond
@@ -43,7 +44,7 @@ SURROGATES_PX = 32  # the farthest shift that a match is compared with
 
 
 class LeastSquares:
-    """Registers two scans as I2(q + d/2) e^(-g/2) = I1(q - d/2) e^(g/2) + noise with d = u + A q.
+    """Registers two scans as I2(q + d/2) e^(-g/2) = I1(q - d/2) e^(g/2) + noise with d = u + A q + creep of the lines.
 
     1. `prepare`: rows flattened, outliers cut; scans that hold nothing refused. `grid`: a common pixel.
     2. `search` and `score`: candidates by normalised cross-correlation, the likeliest of them.
@@ -113,7 +114,7 @@ def _coarse(scene: Scene, expected: ExpectedShift | None) -> tuple[Array, float,
     pair = WarpedPair(*small.smooth_splines, box)
     theta = np.concatenate([best[0].shift_px, np.zeros(COUNT - 2)])
     theta = least_squares(pair, theta, _believed(scaled), SHIFT, steps=4)
-    theta = least_squares(pair, theta, _believed(scaled), ALL, steps=4)
+    theta = least_squares(pair, theta, _believed(scaled), COARSE, steps=4)
     theta[:2] = theta[:2] * factor + offset
     return theta, best[0].likelihood, best[1]
 
@@ -124,7 +125,7 @@ def _fine(
     """theta and its covariance, and its linear map before what shear is plausible was reckoned with."""
     fine = FineFilter.of(scene.first.values, scene.second.values)
     values = fine.applied(scene.first.values), fine.applied(scene.second.values)
-    pair = WarpedPair(*scene.splines(values, order=5), box.without_border(BORDER_PX))
+    pair = WarpedPair(*scene.splines(values, order=5), box.without_border(BORDER_PX), theta[:2])
     believed = _believed(expected)
     fit = generalised_least_squares(pair, theta, believed, fine)
     spread = covariance(fit, believed)
@@ -146,7 +147,9 @@ def _from_reference(linear: Array) -> Array:
 
 def _believed(expected: ExpectedShift | None) -> Believed:
     mean, precision = np.zeros(COUNT), np.zeros((COUNT, COUNT))
-    precision[2:, 2:] = np.diag(1.0 / np.square([*WIDEST, *WIDEST, GAIN_SD, BEND_SD]))
+    precision[2:, 2:] = np.diag(
+        1.0 / np.square([*WIDEST, *WIDEST, *[CREEP_SD_PX] * (CREEP.stop - CREEP.start), GAIN_SD, BEND_SD])
+    )
     if expected is not None:
         mean[:2], precision[:2, :2] = expected.mean, np.linalg.inv(expected.covariance)
     return Believed(mean, precision)
@@ -172,9 +175,9 @@ def _evidence(
     likelihoods: tuple[float, float],
     expected: ExpectedShift | None,
 ) -> MatchEvidence:
-    one, two, known = WarpedPair(*scene.smooth_splines, box).warped(theta)
+    one, two, known = WarpedPair(*scene.smooth_splines, box, theta[:2]).warped(theta)
     one, two = without_lines(one, known), without_lines(two, known)
-    edges = WarpedPair(*scene.band_splines, box).warped(theta)
+    edges = WarpedPair(*scene.band_splines, box, theta[:2]).warped(theta)
     share, correlation = agreement(one, two, known)
     elsewhere = MaskedCorrelation(known, known, SURROGATES_PX)
     by_shift, edges_by_shift = elsewhere.of(one, two), elsewhere.of(edges[0], edges[1])

@@ -109,12 +109,12 @@ HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it th
 
 
 def seen(columns: Array, weight: Array, metric: Array | None) -> Array:
-    """Return Q f less what lines explain of it: the product with another image g is f'Qg free of both their lines.
+    """Return Q f less what parabolas explain of it: the product with another image g is f'Qg free of both of theirs.
 
-    Generalised least squares row by row: each row has an offset and a tilt of its own, and noise with a memory. A row
-    is scanned in seconds and the next one begins anew (feedback, flattening, drift of the z piezo), so nothing is
-    assumed of the offset and tilt of a row, and the noise within it is white plus 1/f, with covariance C and Q =
-    C^-1. What is left of a row f after the nuisance B = [1, x] is fitted in this metric, f - B (B'QB)^-1 B'Q f,
+    Generalised least squares row by row: each row has a parabola of its own, and noise with a memory. A row is scanned
+    in seconds and the next one begins anew (feedback, flattening by up to the second order, drift of the z piezo), so
+    nothing is assumed of its parabola, and the noise within it is white plus 1/f, with covariance C and Q = C^-1. What
+    is left of a row f after the nuisance B = [1, x, x²] is fitted in this metric, f - B (B'QB)^-1 B'Q f,
     carries all that the row tells (Frisch and Waugh, Econometrica 1, 387, 1933; Aitken, Proc. R. Soc. Edinb. 55, 42,
     1936).
 
@@ -138,9 +138,9 @@ def _seen(columns: Array, weight: Array, metric: Array | None) -> Array:
     """Of rows that fit into the processor's cache, which halves the time."""
     root = np.sqrt(weight)[:, None, :]
     x = np.linspace(-1.0, 1.0, columns.shape[2])
-    rows, lines = columns * root, np.concatenate([root, root * x], axis=1)
+    rows, lines = columns * root, np.concatenate([root, root * x, root * x**2], axis=1)
     rows_q, lines_q = (rows, lines) if metric is None else (_along_rows(rows, metric), _along_rows(lines, metric))
-    gram = lines @ lines_q.transpose(0, 2, 1) + 1e-9 * np.eye(2)  # there may be rows of which nothing is known
+    gram = lines @ lines_q.transpose(0, 2, 1) + 1e-9 * np.eye(3)  # there may be rows of which nothing is known
     fitted = np.linalg.solve(gram, lines_q @ rows.transpose(0, 2, 1)).transpose(0, 2, 1)
     rows_q -= fitted @ lines_q
     rows_q *= root
@@ -153,7 +153,7 @@ def _along_rows(columns: Array, metric: Array) -> Array:
 
 
 def without_lines(values: Array, known: NDArray[np.bool_]) -> Array:
-    """Each row, [y, x], less the straight line fitted to it; 0 where nothing is known."""
+    """Each row, [y, x], less the parabola fitted to it; 0 where nothing is known."""
     return seen(values[:, None], known.astype(np.float64), None)[:, 0]
 
 

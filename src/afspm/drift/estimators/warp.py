@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
@@ -129,20 +129,30 @@ class OverlapBox:
         return np.array([self.x.mean(), self.y.mean()])
 
 
-COUNT = 8  # of the parameters theta of a pair
-LINEAR = slice(2, 6)  # the linear map among them
-SLOPES = 6  # the first of them: they act through the gradient
+CREEP_PX = (4.0, 9.0)  # within which what a line starts with is gone to 1/e
+LINEAR = slice(2, 6)  # the linear map among the parameters theta of a pair
+CREEP = slice(6, 6 + 2 * len(CREEP_PX))  # from the left and from the right, for each length
+SLOPES = CREEP.stop  # the first of them: they act through the gradient
+GAIN, BEND, COUNT = SLOPES, SLOPES + 1, SLOPES + 2
 
 
 @dataclass(frozen=True, eq=False)
 class WarpedPair:
-    """Two images on a box. Parameters are theta = (ux, uy, axx, axy, ayx, ayy, g, h): shift u px and linear map A about
-    the centre of the box, d(q) = u + A (q - centre); logarithm g of the gain of the second over the first, and h, by
-    how much more the second is bent (heights z appear as z + h z² / 2: feedback and tip do that to edges)."""
+    """Two images on a box.
+
+    Parameters are theta = (ux, uy, axx, axy, ayx, ayy, c.., g, h): shift u px and linear map A about the centre of the
+    box, d(q) = u + A (q - centre); how far lines creep at their start, px, the same in both scans; logarithm g of the
+    gain of the second over the first, and h, by how much more the second is bent (heights z appear as z + h z² / 2:
+    feedback and tip do that to edges).
+
+    Attributes:
+        shift_px: (2,) about u: by which the lines of both start at different places of the box.
+    """
 
     first: Spline
     second: Spline
     box: OverlapBox
+    shift_px: Array = field(default_factory=lambda: np.zeros(2))
 
     def warped(self, theta: Array) -> tuple[Array, Array, Mask]:
         """I1(q - d/2) and I2(q + d/2), each with half of the other's contrast, and where both are known.
@@ -150,23 +160,39 @@ class WarpedPair:
         Both are moved by half: so both carry equal interpolation noise, the gradient of their mean is not correlated
         with the noise of their difference, and the shift is not pulled towards whole pixels.
         """
-        if theta[LINEAR].any() or self.first.order != 3:
+        if theta[2:SLOPES].any() or self.first.order != 3:
             (one, known1), (two, known2) = self._both(theta)
         else:
             x, y, (dx, dy) = self.box.x, self.box.y, theta[:2]
             one, known1 = self.first.on_grid(x - dx / 2, y - dy / 2)
             two, known2 = self.second.on_grid(x + dx / 2, y + dy / 2)
-        one, two = np.exp(theta[6] / 2) * one, np.exp(-theta[6] / 2) * two
-        return one + theta[7] / 4 * one**2, two - theta[7] / 4 * two**2, known1 & known2
+        one, two = np.exp(theta[GAIN] / 2) * one, np.exp(-theta[GAIN] / 2) * two
+        return one + theta[BEND] / 4 * one**2, two - theta[BEND] / 4 * two**2, known1 & known2
 
     def _both(self, theta: Array) -> tuple[tuple[Array, Mask], tuple[Array, Mask]]:
         cx, cy = self.box.center
         x, y = np.meshgrid(self.box.x, self.box.y)
-        dx = theta[0] + theta[2] * (x - cx) + theta[3] * (y - cy)
+        dx = theta[0] + theta[2] * (x - cx) + theta[3] * (y - cy) + theta[CREEP] @ self._creep
         dy = theta[1] + theta[4] * (x - cx) + theta[5] * (y - cy)
         return self.first.at(x - dx / 2, y - dy / 2), self.second.at(x + dx / 2, y + dy / 2)
 
-    def columns(self, gx: Array, gy: Array, mean: Array, residual: Array, free: Iterable[int] = range(8)) -> Array:
+    @cached_property
+    def _creep(self) -> Array:
+        """(creep, x): what creep of a pixel at the start of all lines adds to the displacement along them; nothing at
+        the centre of the box."""
+        found = []
+        at = np.append(self.box.x, self.box.center[0])
+        for side in (1.0, -1.0):
+            start1, start2 = (
+                side * (at + sign * self.shift_px[0] / 2) + (spline.coefficients.shape[1] - 1) / 2
+                for spline, sign in ((self.first, -1.0), (self.second, 1.0))
+            )
+            for length in CREEP_PX:
+                row = np.exp(-np.maximum(start1, 0.0) / length) - np.exp(-np.maximum(start2, 0.0) / length)
+                found.append(row[:-1] - row[-1])
+        return np.array(found)
+
+    def columns(self, gx: Array, gy: Array, mean: Array, residual: Array, free: Iterable[int] = range(COUNT)) -> Array:
         """[y, column, x]: the derivatives of the residual by what is free of theta, given the gradient of the mean; and
         the residual."""
         by = (*self._by_slopes(gx, gy), -mean, (mean, -mean / 2))
@@ -180,7 +206,7 @@ class WarpedPair:
         """The columns that there is a gradient in, where they are products as their factors."""
         cx, cy = self.box.center
         x, y = self.box.x[None, :] - cx, self.box.y[:, None] - cy
-        return gx, gy, (gx, x), (gx, y), (gy, x), (gy, y)
+        return gx, gy, (gx, x), (gx, y), (gy, x), (gy, y), *((gx, row) for row in self._creep)
 
 
 def _product(column: Array | tuple[Array, Array]) -> Array:
