@@ -1,0 +1,144 @@
+//! One scan or spectrum, followed through what the scheduler publishes. Pure: packets in, an outcome out.
+
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+
+use crate::model::{Message, Packet, Region, ScopeStatus};
+use crate::proto::ScopeState;
+
+const FITS: f64 = 1e-2; // of the size: a controller's rounding, not another region
+const SPOT_M: f64 = 20e-9; // a scanner with sensors reports where the tip was, some nanometres from where it was sent
+const MOVED: f64 = 0.5; // of the size: where drift is corrected, a scan lies where it turned out to have been taken
+const SHEARED: f64 = 0.1;
+
+/// What is to be measured; None leaves what is set.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum Target {
+    Scan { region: Option<Region>, shape: Option<[usize; 2]>, drifts: bool },
+    Spectrum { at_m: Option<[f64; 2]>, kind: Option<String>, drifts: bool },
+}
+
+impl Target {
+    pub fn what(&self) -> &'static str {
+        if matches!(self, Target::Scan { .. }) {
+            "scan"
+        } else {
+            "spectrum"
+        }
+    }
+
+    pub fn start(&self) -> &'static str {
+        if matches!(self, Target::Scan { .. }) {
+            "start-scan"
+        } else {
+            "start-spec"
+        }
+    }
+
+    fn busy(&self) -> ScopeState {
+        if matches!(self, Target::Scan { .. }) {
+            ScopeState::SsScanning
+        } else {
+            ScopeState::SsSpec
+        }
+    }
+
+    /// Return whether a packet can be a result of this; None if it is none of its kind.
+    fn fits(&self, packet: &Packet) -> Option<bool> {
+        match (self, &packet.message) {
+            (Target::Scan { region, shape, drifts }, Message::Scan(scan)) => {
+                let is_near = |wanted: &Region| {
+                    if !drifts {
+                        return wanted.is_near(&scan.region, FITS);
+                    }
+                    let [x, y] = [0, 1].map(|i| wanted.center_m[i] - scan.region.center_m[i]);
+                    let there = Region { center_m: scan.region.center_m, ..*wanted };
+                    x.hypot(y) <= MOVED * wanted.size_m[0].min(wanted.size_m[1]) && there.is_near(&scan.region, SHEARED)
+                };
+                Some(shape.is_none_or(|shape| shape == scan.shape) && region.as_ref().is_none_or(is_near))
+            }
+            (Target::Spectrum { at_m, kind, drifts }, Message::Spectrum(spectrum)) => {
+                let is_near = match (at_m, spectrum.position_m) {
+                    (Some(wanted), Some(found)) if !drifts => {
+                        (wanted[0] - found[0]).hypot(wanted[1] - found[1]) <= SPOT_M
+                    }
+                    _ => true,
+                };
+                Some(is_near && kind.as_ref().is_none_or(|kind| *kind == spectrum.kind))
+            }
+            _ => None,
+        }
+    }
+}
+
+/// How a cycle ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Outcome {
+    Completed,
+    /// The microscope says that it was stopped.
+    Interrupted,
+    /// The microscope is free and there is nothing: it was started anew in the middle, say.
+    Vanished,
+    /// The results can't be those asked for.
+    Another,
+}
+
+/// The busy state, then results, then FREE.
+pub struct Cycle {
+    target: Target,
+    /// What is not newer than this belongs to something earlier.
+    since_ns: Option<i64>,
+    /// It was asked for in an earlier life, or control was lost: others may have measured since.
+    resumed: bool,
+    pub begun: bool,
+    pub outcome: Option<Outcome>,
+    /// Results that fit.
+    pub results: Vec<Arc<Packet>>,
+    other: bool,
+}
+
+impl Cycle {
+    pub fn new(target: Target, since_ns: Option<i64>, resumed: bool) -> Cycle {
+        Cycle { target, since_ns, resumed, begun: false, outcome: None, results: Vec::new(), other: false }
+    }
+
+    pub fn control_was_lost(&mut self) {
+        self.resumed = true;
+    }
+
+    /// Take in what the scheduler published.
+    pub fn take(&mut self, packet: &Arc<Packet>) {
+        let is_old = match packet.time_ns {
+            Some(time_ns) => self.since_ns.is_some_and(|since_ns| time_ns <= since_ns),
+            None => self.resumed,
+        };
+        if self.outcome.is_some() || is_old {
+            return;
+        }
+        match (&packet.message, self.target.fits(packet)) {
+            (Message::Scope(status), _) => self.take_state(*status),
+            (_, Some(true)) => {
+                self.begun = true;
+                self.results.push(packet.clone());
+            }
+            (_, Some(false)) => self.other |= self.begun,
+            _ => {}
+        }
+    }
+
+    fn take_state(&mut self, status: ScopeStatus) {
+        if status.state == self.target.busy() {
+            self.results.clear(); // what came before this began belongs to another
+            (self.begun, self.other) = (true, false);
+        } else if self.begun && status.state == ScopeState::SsInterrupted {
+            self.outcome = Some(Outcome::Interrupted);
+        } else if self.begun && status.state == ScopeState::SsFree {
+            self.outcome = Some(match (self.results.is_empty(), self.other) {
+                (false, _) => Outcome::Completed,
+                (true, false) => Outcome::Vanished,
+                (true, true) => Outcome::Another,
+            });
+        }
+    }
+}
