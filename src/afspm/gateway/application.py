@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import AsyncIterator, Collection
 from http import HTTPStatus
 from importlib import metadata
@@ -85,5 +86,14 @@ async def _no_route(asked: Request, error: Exception) -> Response:
         HTTPStatus.METHOD_NOT_ALLOWED: RefusalCode.METHOD_NOT_ALLOWED,
     }.get(HTTPStatus(error.status_code), RefusalCode.INVALID)
     response = answer(RefusedRequest(code, f"{asked.method} {asked.url.path[:200]}: {error.detail}"))
-    response.headers.update(error.headers or {})
+    if code is RefusalCode.METHOD_NOT_ALLOWED:
+        response.headers["Allow"] = ", ".join(_methods(asked.app.openapi()["paths"], asked.url.path))
     return response
+
+
+def _methods(paths: dict[str, Any], path: str) -> list[str]:
+    """Return the methods of a path, of which each has a route of its own."""
+    for template, of_path in paths.items():
+        if re.fullmatch(re.sub(r"{\w+}", "[^/]+", template), path):
+            return [method.upper() for method in of_path]
+    return []

@@ -10,7 +10,7 @@ from fastapi.security import HTTPBasic, HTTPBearer
 from starlette.requests import Request
 from starlette.responses import Response as HttpResponse
 
-from afspm.client.targets import ScanTarget, SpectrumTarget, Target
+from afspm.client.targets import ScanTarget, SpectrumTarget, Target, xy_of
 from afspm.errors import AfspmError
 from afspm.gateway.measurements import Measurement
 from afspm.gateway.models import (
@@ -107,8 +107,9 @@ class CommandRoutes:
     async def take_scan(self, asked: Request, answer: HttpResponse, wanted: ScanAsked = _SCAN) -> MeasurementModel:
         """Begin a scan, in control. The answer comes when it has begun; then ask for the measurement."""
         given = wanted.region
-        region = None if given is None else Region(given.center_m, given.size_m, given.angle_rad)
-        target = ScanTarget.of(region, wanted.shape, self._services.frame)
+        region = None if given is None else Region(xy_of(given.center_m), xy_of(given.size_m), given.angle_rad)
+        shape = None if wanted.shape is None else (wanted.shape[0], wanted.shape[1])
+        target = ScanTarget.of(region, shape, self._services.frame)
         return await self._measure(asked, answer, wanted.key, target)
 
     async def take_spectrum(
@@ -141,7 +142,7 @@ class CommandRoutes:
     async def act(self, asked: Request, name: Name) -> DoneModel:
         """Have the microscope do something, in control; returns when it has accepted it. `stop-scan` stops a scan."""
         if name in (names.START_SCAN, names.START_SPEC):
-            raise RefusedRequest(RefusalCode.INVALID, f"{name} is asked for by POST /v1/scans or /v1/spectra")
+            raise RefusedRequest(RefusalCode.NOT_SUPPORTED, f"{name} is asked for by POST /v1/scans or /v1/spectra")
         await self._services.command(asked, lambda commands: commands.act(name))
         return DoneModel()
 

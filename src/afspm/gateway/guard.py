@@ -62,7 +62,8 @@ class GatewayGuard:
                 return ""
             raise RefusedRequest(RefusalCode.NAME_NEEDED, "name and token are missing")
         name, token = _name_and_token(shown)
-        address = asked.client.host if asked.client else ""
+        # a program with a wrong token locks out itself, and no others of its computer
+        address = f"{asked.client.host if asked.client else ''} {name if self._passwords.knows(name) else ''}"
         if not name or name != check_name(name):
             raise RefusedRequest(RefusalCode.UNAUTHORIZED, "that can't be a name")
         if not await asyncio.to_thread(self._passwords.proves, name, token, address):

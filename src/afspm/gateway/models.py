@@ -8,15 +8,31 @@ from __future__ import annotations
 from enum import Enum
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from afspm.gateway.problems import RefusalModel
 from afspm.model.events import LONGEST_NOTE
 
 LONGEST_LEASE_S = 3600.0
-PLACE = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
-LENGTH = Annotated[float, Field(gt=0.0, le=1.0, allow_inf_nan=False)]
-PIXELS = Annotated[int, Field(ge=1, le=16384)]
+
+
+def _no_truth(value: object) -> object:
+    if isinstance(value, bool):
+        raise ValueError("a number, not true or false")  # which Python would take for 1 and 0
+    return value
+
+
+NUMBER = Annotated[float, BeforeValidator(_no_truth), Field(allow_inf_nan=False)]
+PLACE = Annotated[NUMBER, Field(ge=-1.0, le=1.0)]
+LENGTH = Annotated[NUMBER, Field(gt=0.0, le=1.0)]
+PIXELS = Annotated[int, BeforeValidator(_no_truth), Field(ge=1, le=16384)]
+TWO = Field(min_length=2, max_length=2)
+PlacePair = Annotated[list[PLACE], TWO]
+LengthPair = Annotated[list[LENGTH], TWO]
+PixelPair = Annotated[list[PIXELS], TWO]
+Pair = Annotated[list[float], TWO]
+Shape = Annotated[list[int], TWO]
+TEXT = r"^[^\x00-\x08\x0b-\x1f\x7f-\x9f]*[^\s\x00-\x1f\x7f-\x9f][^\x00-\x08\x0b-\x1f\x7f-\x9f]*$"
 ID = Annotated[str, Field(pattern=r"^[0-9]{1,20}$", examples=["1795320000000000000"])]
 KEY = Annotated[
     str, Field(pattern=r"^[A-Za-z0-9._-]{1,64}$", examples=["tile-3"], description="makes it happen once in this run")
@@ -35,9 +51,9 @@ class _Asked(BaseModel):
 class RegionModel(_Asked):
     """A rectangle turned about its centre; x to the right, y upwards."""
 
-    center_m: tuple[PLACE, PLACE] = Field(description="(x, y)", examples=[[0.0, 0.0]])
-    size_m: tuple[LENGTH, LENGTH] = Field(description="(width, height)", examples=[[1e-6, 1e-6]])
-    angle_rad: float = Field(default=0.0, ge=-6.3, le=6.3, allow_inf_nan=False, description="counter-clockwise")
+    center_m: PlacePair = Field(description="(x, y)", examples=[[0.0, 0.0]])
+    size_m: LengthPair = Field(description="(width, height)", examples=[[1e-6, 1e-6]])
+    angle_rad: NUMBER = Field(default=0.0, ge=-6.3, le=6.3, description="counter-clockwise")
 
 
 class MicroscopeModel(_Answer):
@@ -45,8 +61,8 @@ class MicroscopeModel(_Answer):
 
     state: str = Field(examples=["FREE"])
     region: RegionModel | None = Field(default=None, description="of the next scan")
-    shape: tuple[int, int] | None = Field(default=None, description="(rows, columns) of the next scan")
-    probe_m: tuple[float, float] | None = Field(default=None, description="(x, y) where the probe stands")
+    shape: Shape | None = Field(default=None, description="(rows, columns) of the next scan")
+    probe_m: Pair | None = Field(default=None, description="(x, y) where the probe stands")
     feedback_on: bool | None = None
     setpoint: float | None = Field(default=None, description="in the unit of the operating mode")
 
@@ -81,7 +97,7 @@ class ParameterChange(_Asked):
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"value": 0.5, "unit": "V"}, {"value": "500 mV"}]})
 
-    value: Annotated[float, Field(allow_inf_nan=False)] | bool | Annotated[str, Field(min_length=1, max_length=100)]
+    value: NUMBER | bool | Annotated[str, Field(min_length=1, max_length=100)]
     unit: str | None = Field(default=None, min_length=1, max_length=30)
 
 
@@ -100,7 +116,7 @@ class ScanModel(_Answer):
     began: TIME | None
     finished: TIME
     region: RegionModel
-    shape: tuple[int, int] = Field(description="(rows, columns)")
+    shape: Shape = Field(description="(rows, columns)")
     channels: list[ChannelModel]
     holder: str | None = Field(description="who was in control")
     interrupted: bool
@@ -113,7 +129,7 @@ class SpectrumModel(_Answer):
     id: ID
     finished: TIME
     kind: str = Field(examples=["IV"])
-    position_m: tuple[float, float] | None
+    position_m: Pair | None
     variables: list[ChannelModel]
     holder: str | None
 
@@ -132,10 +148,17 @@ class ArrayModel(_Answer):
     NaN is what was not measured.
     """
 
-    shape: tuple[int, int] = Field(description="of a scan (rows, columns), of a spectrum (points, variables)")
+    shape: Shape = Field(description="of a scan (rows, columns), of a spectrum (points, variables)")
     dtype: Literal["<f8"] = "<f8"
     units: list[str]
     base64: str
+
+
+class SpectrumFormat(Enum):
+    """The formats of the values of a spectrum."""
+
+    NPY = "npy"
+    BASE64 = "base64"
 
 
 class LeaseModel(_Asked):
@@ -143,7 +166,7 @@ class LeaseModel(_Asked):
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"lease_s": 60}]})
 
-    lease_s: float = Field(default=60.0, ge=1.0, le=LONGEST_LEASE_S, allow_inf_nan=False)
+    lease_s: NUMBER = Field(default=60.0, ge=1.0, le=LONGEST_LEASE_S)
 
 
 class ControlAsked(LeaseModel):
@@ -176,7 +199,7 @@ class ScanAsked(_Asked):
     )
 
     region: RegionModel | None = None
-    shape: tuple[PIXELS, PIXELS] | None = Field(default=None, description="(rows, columns)")
+    shape: PixelPair | None = Field(default=None, description="(rows, columns)")
     key: KEY | None = None
 
 
@@ -185,7 +208,7 @@ class SpectrumAsked(_Asked):
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"position_m": [0, 0], "key": "iv-1"}, {}]})
 
-    position_m: tuple[PLACE, PLACE] | None = Field(default=None, description="(x, y) that the probe is moved to")
+    position_m: PlacePair | None = Field(default=None, description="(x, y) that the probe is moved to")
     key: KEY | None = None
 
 
@@ -231,7 +254,7 @@ class NoteAsked(_Asked):
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"text": "the light was on"}]})
 
-    text: Annotated[str, Field(min_length=1, max_length=LONGEST_NOTE)]
+    text: Annotated[str, Field(pattern=TEXT, max_length=LONGEST_NOTE)]
     scan: ID | None = Field(default=None, description="that it belongs to")
 
 

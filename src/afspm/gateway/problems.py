@@ -54,12 +54,11 @@ _STATUS = {
     _C.GONE: _S.GONE,
     _C.FORBIDDEN: _S.FORBIDDEN,
     _C.NOT_SUPPORTED: _S.NOT_FOUND,
-    _C.PARAMETER_REFUSED: _S.UNPROCESSABLE_ENTITY,
     _C.NO_RESPONSE: _S.GATEWAY_TIMEOUT,
     _C.EXPERIMENT_ENDED: _S.GONE,
     _C.FAILED: _S.INTERNAL_SERVER_ERROR,
 }
-"""All others: 409, as the request may succeed in another state of the experiment."""
+"""All others: 409. The request is well-formed, and refused by the experiment."""
 _ADVICE = {
     _C.INVALID: "Correct the request; /openapi.json describes it.",
     _C.TOO_LARGE: "Send less: no request needs more than 64 KiB.",
@@ -78,7 +77,7 @@ _ADVICE = {
     _C.NOT_FREE: "Wait until the state is FREE, then send it again.",
     _C.FORBIDDEN: "Have the name given the role in [control.roles] of the experiment file.",
     _C.NOT_SUPPORTED: "Use what the microscope has: GET /v1/parameters, GET /v1/actions.",
-    _C.PARAMETER_REFUSED: "Change the value: a limit or the microscope refuses it.",
+    _C.PARAMETER_REFUSED: "Change the value: its unit, a limit or the microscope does not allow it.",
     _C.ACTION_FAILED: "Look at the microscope, and at the events, before you try again.",
     _C.INTERRUPTED: "Request control again, then send the request again with the same key.",
     _C.NO_RESULT: "Send the request again with the same key.",
@@ -159,5 +158,5 @@ def of_error(error: BaseException) -> RefusedRequest:
         case NoResponse():
             return RefusedRequest(_C.NO_RESPONSE, str(error), may_have_been_done=True)
         case AfspmError():
-            return RefusedRequest(_C.INVALID, str(error))
+            return RefusedRequest(_C.PARAMETER_REFUSED, str(error))
     return RefusedRequest(_C.FAILED, f"{type(error).__name__}: {error}")

@@ -22,6 +22,7 @@ from afspm.gateway.models import (
     ParameterModel,
     ProblemModel,
     ScanModel,
+    SpectrumFormat,
     SpectrumModel,
     StateModel,
     ValueFormat,
@@ -171,7 +172,7 @@ class ReadingRoutes:
     async def spectrum_values(
         self,
         which: Which,
-        format: ValueFormat = ValueFormat.NPY,
+        format: SpectrumFormat = SpectrumFormat.NPY,
     ) -> Response:
         """Return the values of a spectrum, a column for each variable."""
         with self._watch.reading():
@@ -179,9 +180,7 @@ class ReadingRoutes:
             found = next((one for time_ns, one in reversed(kept) if which in (NEWEST, str(time_ns))), None)
         if found is None:
             raise RefusedRequest(RefusalCode.NOT_FOUND, f"the values of a spectrum {which} are not kept here")
-        if format is ValueFormat.PNG:
-            raise RefusedRequest(RefusalCode.INVALID, "there are no pictures of spectra")
-        return await _values(found.values, list(found.units), format, bytes)
+        return await _values(found.values, list(found.units), ValueFormat(format.value), bytes)
 
     async def events(
         self,

@@ -117,7 +117,7 @@ def as_npy(values: NDArray[np.float64]) -> Iterator[bytes]:
 
 def as_base64(values: NDArray[np.float64], units: Sequence[str]) -> Iterator[bytes]:
     """Yield an array as an `ArrayModel`, piece by piece."""
-    model = ArrayModel.model_construct(shape=values.shape, units=list(units), base64="")
+    model = ArrayModel.model_construct(shape=list(values.shape), units=list(units), base64="")
     head, tail = model.model_dump_json().rsplit('""', 1)
     yield f'{head}"'.encode()
     for piece in _pieces(values):

@@ -108,6 +108,10 @@ class Passwords:
         """
         return not self.wait_s(address) and self._proves(person, password, address)
 
+    def knows(self, person: str) -> bool:
+        """Return whether there is a password of this person."""
+        return person in self._hashes
+
     def forgive(self, address: str) -> None:
         """Forget how often an address was wrong."""
         self._failures.pop(address, None)

@@ -90,7 +90,7 @@ class WebServer:
     ) -> None:
         import uvicorn
 
-        logging.getLogger("uvicorn").setLevel(logging.WARNING)
+        logging.getLogger("uvicorn").setLevel(logging.ERROR)  # what clients do wrong is theirs
         config = uvicorn.Config(
             app,
             log_config=None,
