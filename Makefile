@@ -7,7 +7,7 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 SETUP := .venv/.made
 
-.PHONY: demo demo-drift test mutants test-samples test-ui test-translators test-windows test-nexus check bench bench-drift soak chaos simulate power-cut docs clean
+.PHONY: demo demo-drift test mutants test-samples test-ui test-translators test-clients test-windows test-nexus check bench bench-drift soak chaos simulate power-cut docs clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -66,6 +66,11 @@ test-translators: $(TEST)
 	  $(BIN)/afspm test-translator experiments/every_microscope/$$name.toml --frame "500 nm" --runs build/translators \
 	    --report build/translators/$$name.json || failed="$$failed $$name"; \
 	done; test -z "$$failed" || { echo "not as they should be:$$failed"; exit 1; }
+
+## build the clients in other languages, and judge each by `afspm test-client`; what is not installed is skipped: CLIENTS=rust
+CLIENTS ?=
+test-clients: $(TEST)
+	@$(BIN)/python tools/test_clients.py $(CLIENTS)
 
 ## tests with a Windows Python under Wine, on Debian, two folders at a time: make test-windows TESTS="tests/unit/wire"
 # (those of whole experiments take longest: they come first; tip_repair is in components, the Nanonis sample in microscopes)

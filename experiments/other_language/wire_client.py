@@ -289,7 +289,7 @@ class Client:
 
     def ready(self):
         """Wait until the scheduler is there, and all that it has kept for us."""
-        self.wait(lambda: self.connected and all(one.caught_up for one in self._subscriptions))
+        self.wait(lambda: self.connected and self._subscriptions[0].caught_up)
 
     def request(self, number, payload=b""):
         """Send a request until it is answered; return the response."""

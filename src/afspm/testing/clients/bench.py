@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import zmq
 
 from afspm.clock import Clock, ExperimentClock
 from afspm.launch import Launch, Sockets
@@ -18,6 +20,7 @@ from afspm.testing.clients.heartbeats import BeatRecorder
 from afspm.testing.clients.program import ClientProgram, Pump
 from afspm.testing.clients.scripted import ScriptedScheduler
 from afspm.transport import keys
+from afspm.transport.network import Network
 
 BEAT_S = 0.5
 TOKEN = "only-this-client-knows-it"
@@ -95,16 +98,19 @@ class ClientBench:
             yield client
 
     @contextmanager
-    def scripted(self, *, ready: bool = True, owner: str | None = SCHEDULER, **changes: Any) -> Iterator[ScriptedRun]:
+    def scripted(
+        self, *, ready: bool = True, owner: str | None = SCHEDULER, also: str = "", **changes: Any
+    ) -> Iterator[ScriptedRun]:
         """Start a client with a scripted scheduler.
 
         Args:
             ready: wait until it is.
             owner: whose keys the scheduler has; None: none at all.
+            also: the address of another publisher, the judge's.
             changes: to the client's launch line.
         """
         control, publish = self._ports.address(), self._ports.address()
-        launch = replace(self._scripted_launch(control, publish), **changes)
+        launch = replace(self._scripted_launch(control, publish, also), **changes)
         own = None if owner is None else keys.load(self._keys, owner)
         scheduler = ScriptedScheduler(self.clock, control, publish, own)
         with ExitStack() as stack:
@@ -114,11 +120,21 @@ class ClientBench:
                 client.program.succeed("ready")
             yield ScriptedRun(scheduler, client.program, client.beats)
 
-    def _scripted_launch(self, control: str, publish: str) -> Launch:
-        own = keys.load(self._keys, CLIENT, {control: SCHEDULER, publish: SCHEDULER})
+    @contextmanager
+    def second_publisher(self) -> Iterator[tuple[str, Callable[..., None]]]:
+        """Bind a plain publisher of the judge's; yield its address, and what sends frames."""
+        network = Network(keys.load(self._keys, JUDGE))
+        try:
+            socket = network.socket(zmq.PUB)
+            yield network.bind(socket, "tcp://127.0.0.1:0"), lambda *frames: socket.send_multipart(frames) and None
+        finally:
+            network.close()
+
+    def _scripted_launch(self, control: str, publish: str, also: str) -> Launch:
+        own = keys.load(self._keys, CLIENT, {control: SCHEDULER, publish: SCHEDULER, **({also: JUDGE} if also else {})})
         return Launch(
             CLIENT,
-            sockets=Sockets(subscribe=(publish,), control=control),
+            sockets=Sockets(subscribe=(publish, *filter(None, [also])), control=control),
             clock=ExperimentClock.starting_now().as_dict(),
             run_dir=str(self.folder),
             request_timeout_s=1.0,

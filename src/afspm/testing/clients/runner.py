@@ -83,4 +83,8 @@ def _do(check: ClientCheck, bench: ClientBench) -> CheckResult:
     except AfspmError as error:  # what the judge itself wanted to do was not possible, with this client beside it
         bench.begin_anew()
         return result(CheckOutcome.FAILED, f"the experiment with the client in it: {error}", f"→ {check.remedy}")
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        bench.begin_anew()
+        line = f"expected an answer as the page of steps describes it; came one that can't be read ({error!r})"
+        return result(CheckOutcome.FAILED, line, f"→ {check.remedy}")
     return result(CheckOutcome.PASSED)

@@ -63,6 +63,32 @@ def manual(bench: ClientBench) -> None:
         _require_state(experiment, program, in_control=False, holder=None)
 
 
+@client_check(
+    "control/problem",
+    "The client flags a problem, gets control to solve it while others do not, and clears it.",
+    "The object of these requests is one byte: the problem's number, as in `ExperimentProblem`.",
+)
+def problem(bench: ClientBench) -> None:
+    experiment = bench.experiment
+    scope = experiment.scope
+    with bench.client(experiment) as client:
+        program = client.program
+        program.succeed("problem", number=_PROBLEM, set=True)
+        try:
+            flagged = experiment.pump(lambda: _PROBLEM in scope.control_state.problems, KNOWN_S)
+            expect(flagged, f"the problem {_PROBLEM} to be flagged", str(scope.control_state))
+            refused = program.do("request_control", problem=0, timeout_s=0.5)
+            expect(refused.get("response") == "REP_WRONG_EXP_PROBLEM", "REP_WRONG_EXP_PROBLEM", str(refused))
+            program.succeed("request_control", problem=_PROBLEM, timeout_s=10.0)
+            _require_state(experiment, program, in_control=True, problems=[_PROBLEM])
+        finally:
+            program.do("problem", number=_PROBLEM, set=False)
+        cleared = experiment.pump(lambda: not scope.control_state.problems, KNOWN_S)
+        expect(cleared, "no problem any more", str(scope.control_state))
+        _require_state(experiment, program, problems=[])
+        program.do("release_control")
+
+
 def _interrupted(bench: ClientBench, disturb: Callable[[JudgedExperiment, ClientProgram], None]) -> Answer:
     """Have the client take a scan that is disturbed in the middle; return the answer."""
     experiment = bench.experiment

@@ -100,6 +100,27 @@ def _in_an_experiment(bench: ClientBench, experiment: JudgedExperiment) -> None:
 
 
 @client_check(
+    "replay/second-publisher",
+    "A publisher besides the scheduler, which knows no markers, is listened to as well.",
+    "Connect to each address in `sockets.subscribe`, with the key of its owner; "
+    "only the scheduler, the first, is to have caught up.",
+)
+def second_publisher(bench: ClientBench) -> None:
+    with bench.second_publisher() as (address, publish), bench.scripted(also=address, envelopes=("Note",)) as run:
+
+        def again() -> bool:
+            publish(*_notes(1)[0])
+            return run.client.is_answered(step)
+
+        step = run.client.begin("wait", prefix="Note", timeout_s=_PACKET_S)
+        tries = 0
+        while not again() and (tries := tries + 1) < 50:
+            run.scheduler.serve(0.1)
+        answer = run.client.answer(step)
+        expect(answer.ok, "the packet of another component's publisher", str(answer))
+
+
+@client_check(
     "replay/reconnect",
     "After a connection is lost the client asks for what is newer than the newest that it has, "
     "and delivers nothing twice.",
