@@ -121,12 +121,12 @@ class ClientBench:
             yield ScriptedRun(scheduler, client.program, client.beats)
 
     @contextmanager
-    def second_publisher(self) -> Iterator[tuple[str, Callable[..., None]]]:
+    def second_publisher(self) -> Iterator[tuple[str, Callable[..., object]]]:
         """Bind a plain publisher of the judge's; yield its address, and what sends frames."""
         network = Network(keys.load(self._keys, JUDGE))
         try:
             socket = network.socket(zmq.PUB)
-            yield network.bind(socket, "tcp://127.0.0.1:0"), lambda *frames: socket.send_multipart(frames) and None
+            yield network.bind(socket, "tcp://127.0.0.1:0"), lambda *frames: socket.send_multipart(frames)
         finally:
             network.close()
 
