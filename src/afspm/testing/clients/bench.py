@@ -147,7 +147,7 @@ class ClientBench:
     @contextmanager
     def _started(self, launch: Launch, pump: Pump, wake: Any) -> Iterator[JudgedClient]:
         with ExitStack() as stack:
-            beats = BeatRecorder(self.clock)
+            beats = BeatRecorder(self.clock, wake)
             stack.callback(beats.close)
             sockets = replace(launch.sockets, heartbeat=beats.address)
             complete = replace(launch, sockets=sockets, beat_period_s=BEAT_S, beat_token=TOKEN)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -28,10 +29,14 @@ class HeardBeat:
 
 
 class BeatRecorder:
-    """Listens at an address of its own, in a thread of its own, until it is closed."""
+    """Listens at an address of its own, in a thread of its own, until it is closed.
 
-    def __init__(self, clock: Clock) -> None:
-        self._clock = clock
+    Args:
+        heard: called in that thread after each beat.
+    """
+
+    def __init__(self, clock: Clock, heard: Callable[[], None]) -> None:
+        self._clock, self._heard = clock, heard
         self._network = Network()
         self._socket = self._network.socket(zmq.SUB)
         self._socket.setsockopt(zmq.SUBSCRIBE, b"")
@@ -53,6 +58,7 @@ class BeatRecorder:
         while self._stop.fileno() not in dict(poller.poll()):
             while frames := receive_frames(self._socket):
                 self.beats.append(HeardBeat(self._clock.monotonic_s(), [frame.bytes for frame in frames]))
+                self._heard()
 
     def close(self) -> None:
         self._stop.post()

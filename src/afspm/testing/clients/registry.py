@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from afspm.testing.clients.bench import ClientBench
 
-Judging = Callable[["ClientBench"], None]
+Judging = Callable[["ClientBench"], str | None]
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class ClientCheck:
         name: "requests/repeat": what it is about, and what.
         title: what holds, as a sentence.
         remedy: what to do if it does not.
-        do: raises `Failed`.
+        do: raises `Failed`; may return what is worth knowing though all is well.
     """
 
     name: str

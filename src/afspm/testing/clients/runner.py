@@ -74,7 +74,7 @@ def _do(check: ClientCheck, bench: ClientBench) -> CheckResult:
         return CheckResult(check.name, check.title, outcome, line, bench.clock.monotonic_s() - began_s, more)
 
     try:
-        check.do(bench)
+        told = check.do(bench)
     except Failed as failure:
         bench.begin_anew()
         return result(CheckOutcome.FAILED, str(failure), f"→ {check.remedy}")
@@ -87,4 +87,4 @@ def _do(check: ClientCheck, bench: ClientBench) -> CheckResult:
         bench.begin_anew()
         line = f"expected an answer as the page of steps describes it; came one that can't be read ({error!r})"
         return result(CheckOutcome.FAILED, line, f"→ {check.remedy}")
-    return result(CheckOutcome.PASSED)
+    return result(CheckOutcome.PASSED, told or "")

@@ -144,14 +144,18 @@ def spectrum(bench: ClientBench) -> None:
     "A scan of 2048 × 2048 arrives, and heartbeats go on meanwhile.",
     "Do not copy value by value; do not beat in the thread that decodes.",
 )
-def large_scan(bench: ClientBench) -> None:
+def large_scan(bench: ClientBench) -> str:
     experiment = bench.experiment
     asked = scan_step((2048, 2048))
     experiment.scope.set("scan-speed", "1 mm/s")
     try:
         with bench.client(experiment, envelopes=("ScopeStateMsg",)) as client:
             since_s = bench.clock.monotonic_s()
-            require_scans(experiment, client.program.do("scan", **asked), asked)
+            answer = client.program.do("scan", **asked)
             require_beats(client.beats, since_s)
+            require_scans(experiment, answer, asked)
     finally:
         experiment.scope.set("scan-speed", "4 um/s")
+    views = {scan.get("view") for scan in answer["scans"]}
+    words = {True: "are read where they were received", False: "were copied"}
+    return f"the client says that values {words[views.pop()]}" if views <= {True} or views <= {False} else ""

@@ -87,7 +87,7 @@ def published(experiment: JudgedExperiment) -> Counter[str]:
     "Of 1,000 requests whose connection is cut again and again before the reply, each is executed once.",
     "Repeat with the same id after a reconnect, too.",
 )
-def lost_replies(bench: ClientBench) -> None:
+def lost_replies(bench: ClientBench) -> str:
     experiment = bench.experiment
     launch = experiment.launch
     assert launch.sockets.control is not None
@@ -114,6 +114,7 @@ def lost_replies(bench: ClientBench) -> None:
     never = [name for name in names if not counts[name]]
     came = f"{len(twice)} executed more than once and {len(never)} never, of {proxy.cuts} replies that were lost"
     expect(not twice and not never, f"{REQUESTS} requests, each executed once", came)
+    return f"{proxy.cuts} connections were cut before a reply"
 
 
 def _answered(program: ClientProgram, name: str, step: int) -> None:
