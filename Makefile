@@ -7,7 +7,7 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 SETUP := .venv/.made
 
-.PHONY: demo demo-drift test mutants test-samples test-ui test-translators test-clients test-windows test-nexus check bench bench-drift soak chaos simulate power-cut docs clean
+.PHONY: demo demo-drift test mutants test-samples test-ui test-translators test-clients test-windows test-nexus test-bluesky check bench bench-drift soak chaos simulate power-cut docs clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -83,6 +83,11 @@ test-windows: $(TEST)
 ## the files of runs, with the validator of NeXus
 test-nexus: $(TEST)
 	@$(PYTHON) tools/validate_nexus.py
+
+## the microscope in plans of Bluesky, and documents of a run, in an environment of its own (316 MB)
+test-bluesky: $(TEST)
+	@$(PYTHON) tools/bootstrap.py bluesky
+	@build/bluesky-env/bin/python -m pytest -q tests/system/bluesky
 
 ## style, types, and who may import whom
 check: $(SETUP)

@@ -1,7 +1,7 @@
 """Make the environment .venv from the lock file, with nothing but Python 3.11 or later.
 
 Run by the Makefile: `python3 tools/bootstrap.py demo` (what a plain install holds), `test` (and what the tests need) or
-`all` (and the tools of `make check`). Each adds to what is there.
+`all` (and the tools of `make check`). Each adds to what is there. `bluesky` makes an environment apart.
 """
 
 from __future__ import annotations
@@ -18,11 +18,16 @@ TOOLS = ROOT / "build" / "tools"
 UV_VERSION = "uv>=0.5,<1"
 EXTRAS = ("dashboard", "features", "gateway", "messages", "study", "testing", "xarray")
 """What the tests use; Jupyter they install where they need it."""
+APART = {"bluesky": ("--group=test", "--extra=bluesky")}
+"""What has an environment of its own, build/<name>-env: too heavy for all others."""
 
 
 def main(wanted: str) -> None:
     if sys.version_info < (3, 11):  # noqa: UP036  (it is run by whatever python3 there is)
         sys.exit(f"afspm needs Python 3.11 or later, this is {sys.version.split()[0]}")
+    if wanted in APART:
+        _sync(*APART[wanted], folder=ROOT / "build" / f"{wanted}-env")
+        return
     is_new = not VENV.exists()
     _sync("--group=pip")
     if is_new or wanted == "demo":
@@ -32,9 +37,9 @@ def main(wanted: str) -> None:
         _sync(*(f"--group={group}" for group in ["pip", *groups]), *(f"--extra={extra}" for extra in EXTRAS))
 
 
-def _sync(*options: str) -> None:
+def _sync(*options: str, folder: Path = VENV) -> None:
     uv = find_uv()
-    environment = {**os.environ, "UV_PROJECT_ENVIRONMENT": str(VENV), "UV_PYTHON_DOWNLOADS": "never"}
+    environment = {**os.environ, "UV_PROJECT_ENVIRONMENT": str(folder), "UV_PYTHON_DOWNLOADS": "never"}
     environment.pop("VIRTUAL_ENV", None)
     command = [uv, "sync", "--frozen", "--inexact", "--python", sys.executable, "--quiet", "--no-default-groups"]
     if subprocess.run([*command, *options], cwd=ROOT, env=environment).returncode != 0:

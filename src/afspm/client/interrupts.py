@@ -47,5 +47,10 @@ class Interrupts:
             self._has_come = False
             raise KeyboardInterrupt
 
+    def interrupt(self) -> None:
+        """Have the call under way, or the next, raise KeyboardInterrupt as by Ctrl-C. From any thread."""
+        self._has_come = True
+        self._port.wake_up()
+
     def _come(self, _number: int) -> None:
         self._has_come = True

@@ -326,6 +326,10 @@ class Scope(ExperimentView):
 
     # --- leaving ---
 
+    def interrupt(self) -> None:
+        """End the call that waits in another thread, as Ctrl-C does: a measurement under way is stopped."""
+        self._link.interrupts.interrupt()
+
     def close(self) -> None:
         """Leave the experiment; control that is held is given back. `with afspm.connect() as scope:` does it by itself.
 

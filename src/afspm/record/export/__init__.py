@@ -15,9 +15,11 @@ from afspm.record.tables import ScanRow, SpectrumRow
 
 __all__ = ["FORMATS", "chosen", "export"]
 
-FORMATS = {"h5": "nexus", "gwy": "gwyddion", "nc": "netcdf", "png": "png", "csv": "tables"}
+FORMATS = {"h5": "nexus", "gwy": "gwyddion", "nc": "netcdf", "png": "png", "csv": "tables", "documents": "documents"}
 """By suffix, the module of this package; its `write(run, row)` yields the ends of names and contents of files."""
 
+TABLES = ("csv", "documents")
+"""The formats with files about all that was measured; its `tables(run, scans, spectra)` makes them."""
 GRIDS = ("h5", "gwy")
 """The formats in which the spectra of a grid are one file, too; its `grid_file(stack, metadata)` makes it."""
 
@@ -50,7 +52,7 @@ def export(
     module = import_module(f"afspm.record.export.{FORMATS[to]}")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, content in module.tables(run, wanted, spectra) if to == "csv" else ():
+        for name, content in module.tables(run, wanted, spectra) if to in TABLES else ():
             yield _written(folder / name, content)
         yield from _one_by_one(module.write, run, [*wanted, *spectra], folder, tell)
         for name, stack in grids(run, spectra) if to in GRIDS else ():

@@ -1,0 +1,137 @@
+"""The microscope in plans of Bluesky, with its RunEngine, and documents of a run, judged by its event model.
+
+Bluesky takes a hundred megabytes: `make test-bluesky` installs it; elsewhere these tests are skipped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import afspm
+from afspm.model import ScopeState
+
+pytest.importorskip("ophyd_async", reason="Bluesky is not installed: make test-bluesky")
+
+import bluesky.plan_stubs as bps
+import bluesky.plans as bp
+from bluesky import RunEngine
+from bluesky.utils import FailedStatus, RequestAbort, RunEngineInterrupted
+from event_model import DocumentNames, schema_validators
+from ophyd_async.core import init_devices
+
+from afspm.bluesky import Microscope
+
+pytestmark = [pytest.mark.timeout(180), pytest.mark.filterwarnings("ignore")]
+PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "bluesky.md"
+AFSPM = (sys.executable, "-m", "afspm")
+EXPERIMENT = """
+name = "night"
+
+[microscope]
+component = true
+class = "Simulator"
+initial = { scan-speed = "40 um/s", scan-resolution-x = 32, scan-resolution-y = 32 }
+
+[scheduler]
+component = true
+class = "Scheduler"
+
+[limits.tip-bias-voltage]
+max = "3 V"
+"""
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Iterator[Path]:
+    """A running experiment, whose scheduler is up."""
+    (tmp_path / "night.toml").write_text(EXPERIMENT, encoding="utf-8")
+    command = [*AFSPM, "run", "--verbose", "--no-report", "night.toml"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as run:
+        try:
+            assert run.stdout is not None
+            assert any(" scheduler " in line and "is up" in line for line in run.stdout), "it never started"
+            threading.Thread(target=run.stdout.read, daemon=True).start()
+            yield tmp_path / "runs"
+        finally:
+            run.kill()
+
+
+@pytest.fixture
+def scope(runs: Path) -> Microscope:
+    engine = RunEngine()
+    with init_devices():
+        scope = Microscope(runs, parameters=["tip-bias-voltage", "scan-speed"])
+    engine(bps.mv(scope.scan.rows, 32, scope.scan.columns, 32))
+    return scope
+
+
+def test_a_plan_scans_where_its_signals_say(scope: Microscope) -> None:
+    told: list[tuple[str, dict[str, Any]]] = []
+    engine = RunEngine()
+    engine(bps.mv(scope.tip_bias_voltage, 0.25))
+    engine(bp.scan([scope.scan, scope.spectrum], scope.scan.center_x, -1e-6, 1e-6, 3), lambda *one: told.append(one))
+    events = [document for name, document in told if name == "event"]
+    assert [event["data"]["scope-scan-center_x"] for event in events] == pytest.approx([-1e-6, 0.0, 1e-6])
+    assert {event["data"]["scope-scan-height"].shape for event in events} == {(32, 32)}
+    (descriptor,) = [document for name, document in told if name == "descriptor"]
+    assert descriptor["data_keys"]["scope-scan-height"]["units"] == "m"
+    assert descriptor["data_keys"]["scope-spectrum-current"]["units"] == "A"
+    for name, document in told:
+        schema_validators[DocumentNames[name]].validate(_plain(document))
+
+
+def test_a_refusal_fails_the_plan_with_the_reason(scope: Microscope) -> None:
+    with pytest.raises(FailedStatus) as failed:
+        RunEngine()(bps.mv(scope.tip_bias_voltage, 4.0))
+    assert "above the highest allowed" in str(failed.value.__cause__)
+
+
+def test_a_plan_that_is_aborted_stops_its_scan_and_gives_control_back(scope: Microscope, runs: Path) -> None:
+    engine = RunEngine()
+    engine(bps.mv(scope.scan_speed, 2e-7))
+    with afspm.connect(runs, name="watcher") as watcher:
+        begun = threading.Thread(target=_pause_when_scanning, args=(engine, watcher))
+        begun.start()
+        with pytest.raises(RunEngineInterrupted):
+            engine(bp.count([scope.scan]))
+        begun.join()
+        with contextlib.suppress(RequestAbort):
+            engine.abort("enough")
+        assert watcher.wait_until(lambda: watcher.state is ScopeState.FREE, timeout_s=20.0)
+        with watcher.control(timeout_s=20.0):
+            assert watcher.in_control
+    engine(bps.mv(scope.tip_bias_voltage, 0.3))  # and the next plan works
+
+
+def _pause_when_scanning(engine: RunEngine, watcher: afspm.Scope) -> None:
+    assert watcher.wait_until(lambda: watcher.state is ScopeState.SCANNING, timeout_s=60.0)
+    engine.request_pause(defer=False)
+
+
+def test_the_plan_of_the_page_runs_and_the_documents_of_the_run_are_valid(runs: Path, tmp_path: Path) -> None:
+    (code,) = re.findall(r"```python\n# plan\.py\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("(32, 32)") == 3
+    subprocess.run([*AFSPM, "end", "runs", "--yes"], cwd=tmp_path, check=True)
+    subprocess.run([*AFSPM, "export", "runs", "--to", "documents"], cwd=tmp_path, check=True)
+    (file,) = runs.glob("night-*/export/documents/documents.jsonl")
+    documents = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+    for name, document in documents:
+        schema_validators[DocumentNames[name]].validate(document)
+    assert [name for name, _ in documents].count("event") == 4  # three scans, one spectrum
+
+
+def _plain(document: dict[str, Any]) -> dict[str, Any]:
+    plain: dict[str, Any] = json.loads(json.dumps(document, default=lambda value: value.tolist()))
+    return plain
