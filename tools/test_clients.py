@@ -1,7 +1,8 @@
 """Builds and judges the clients in other languages: `make test-clients`, or one of them with CLIENTS=rust.
 
 Each folder in `clients/` has a `conformance.toml`: the programs that it `needs`, what to `install` if they are missing,
-the commands that `build` and test it, and its conformance `programs`, each of which is judged by `afspm test-client`.
+the commands that `build` and test it, and its conformance `programs`, each of which is judged by `afspm test-client`. Its
+`samples` are laid over `experiments/other_language/experiment.toml`, and run.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 RUNS = ROOT / "build" / "clients"
+SAMPLES = ROOT / "experiments" / "other_language"
 
 
 def say(line: str) -> None:
@@ -49,6 +51,7 @@ def judged(file: Path) -> str:
         if subprocess.run(resolved(command), cwd=folder, check=False).returncode:
             return f"not built: {' '.join(command)}"
     wrong = [name for name, command in client["programs"].items() if not passes(name, command, folder)]
+    wrong += [file for file in client.get("samples", {}).values() if not runs_to_its_end(file)]
     return f"not as it should be: {', '.join(wrong)}" if wrong else ""
 
 
@@ -56,9 +59,20 @@ def passes(name: str, command: list[str], folder: Path) -> bool:
     """Judge a conformance program."""
     say(f"\n-- {name}: {' '.join(command)}")
     options = ["--runs", str(RUNS), "--report", str(RUNS / f"{name}.json")]
-    judge = [sys.executable, "-m", "afspm", "test-client", *options, "--", *command]
+    return afspm("test-client", *options, "--", *command, folder=folder)
+
+
+def runs_to_its_end(file: str) -> bool:
+    """Run the sample of a client."""
+    say(f"\n-- sample {file}")
+    return afspm("run", str(SAMPLES / "experiment.toml"), str(SAMPLES / file), "--runs", str(RUNS), "--no-report")
+
+
+def afspm(*arguments: str, folder: Path = ROOT) -> bool:
+    """Run a command of afspm; True if it succeeds."""
     environment = {**os.environ, "PYTHONUTF8": "1"}
-    return subprocess.run(judge, cwd=folder, env=environment, check=False).returncode == 0
+    command = [sys.executable, "-m", "afspm", *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, check=False).returncode == 0
 
 
 def resolved(command: list[str]) -> list[str]:

@@ -1,0 +1,50 @@
+"""`make test-clients` says what is missing, and what was wrong."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def tool() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("test_clients_tool", ROOT / "tools" / "test_clients.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def client(folder: Path, needs: str, build: str) -> Path:
+    file = folder / "conformance.toml"
+    text = f'needs = ["{needs}"]\ninstall = "the tool of example.org"\nbuild = [{build}]\n[programs]\n'
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def test_a_missing_toolchain_is_skipped_aloud(tool: ModuleType, tmp_path: Path) -> None:
+    said = tool.judged(client(tmp_path, "no-such-compiler", ""))
+    assert said == "SKIPPED: there is no no-such-compiler on this computer; install the tool of example.org"
+
+
+def test_a_build_that_fails_is_named(tool: ModuleType, tmp_path: Path) -> None:
+    python = Path(sys.executable).as_posix()
+    said = tool.judged(client(tmp_path, python, f'["{python}", "-c", "raise SystemExit(3)"]'))
+    assert said == f"not built: {python} -c raise SystemExit(3)"
+
+
+def test_every_client_says_how_it_is_built_and_judged(tool: ModuleType) -> None:
+    folders = {file.parent for file in (ROOT / "clients").glob("*/README.md")}
+    assert {folder for folder in folders if not (folder / "conformance.toml").exists()} == set()
+
+
+def test_an_unknown_client_is_an_error(tool: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+    assert tool.main(["cobol"]) == 1
+    assert "there is no client cobol: " in capsys.readouterr().out
