@@ -1,8 +1,8 @@
 """Builds and judges the clients in other languages: `make test-clients`, or one of them with CLIENTS=rust.
 
 Each folder in `clients/` has a `conformance.toml`: the programs that it `needs`, what to `install` if they are missing,
-the commands that `build` and test it, and its conformance `programs`, each of which is judged by `afspm test-client`. Its
-`samples` are laid over `experiments/other_language/experiment.toml`, and run.
+the commands that `build` and test it, and its conformance `programs`, each of which is judged by `afspm test-client`.
+Its `samples` are laid over `experiments/other_language/experiment.toml`, and run.
 """
 
 from __future__ import annotations
