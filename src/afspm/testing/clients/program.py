@@ -20,7 +20,6 @@ from afspm.testing.verdicts import Failed, expect
 
 ANSWER_S = 30.0
 """Longest time for an answer, beside what the step itself may wait."""
-GONE = "it has ended"
 _LAST_WORDS = 3
 
 

@@ -62,7 +62,7 @@ class ScriptedScheduler:
     """
 
     def __init__(self, clock: Clock, control: str, publish: str, keys: Keys | None) -> None:
-        self._clock, self._control, self._publish, self._keys = clock, control, publish, keys
+        self._clock, self._addresses, self._keys = clock, (control, publish), keys
         self._woken: WakeUp[None] = WakeUp()
         self.requests: list[ScriptedRequest] = []
         self.greetings: list[ScriptedRequest] = []
@@ -75,14 +75,15 @@ class ScriptedScheduler:
 
     def open(self) -> None:
         """Bind the sockets, the first time or again."""
+        control, publish = self._addresses
         self._network = Network(self._keys)
         self._router = self._network.socket(zmq.ROUTER)
         self._router.setsockopt(zmq.ROUTER_HANDOVER, 1)
-        self._network.bind(self._router, self._control, requests=True)
+        self._network.bind(self._router, control, requests=True)
         self._publisher = self._network.socket(zmq.XPUB, max_bytes=LONGEST + 1)
         self._publisher.setsockopt(zmq.XPUB_MANUAL, 1)
         self._publisher.setsockopt(zmq.XPUB_VERBOSER, 1)
-        self._network.bind(self._publisher, self._publish)
+        self._network.bind(self._publisher, publish)
         self._poller: Poller[Callable[[], None]] = Poller(self._woken)
         self._poller.register(self._router, self._take_request)
         self._poller.register(self._publisher, self._take_subscription)
@@ -125,11 +126,6 @@ class ScriptedScheduler:
     def send(self, peer: bytes, frames: Sequence[bytes]) -> None:
         """Send a response to a client."""
         self._router.send_multipart([peer, b"", *frames])
-
-    @property
-    def peers(self) -> set[bytes]:
-        """The identities of all that asked for anything."""
-        return {request.peer for request in (*self.requests, *self.greetings)}
 
     def _take_request(self) -> None:
         peer, *frames = [frame.bytes for frame in receive_frames(self._router)]
