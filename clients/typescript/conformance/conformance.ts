@@ -21,19 +21,22 @@ runComponent(async (experiment) => {
   experiment.on("packet", (packet) => packets.push(packet));
   experiment.on("line", (line) => {
     const step = JSON.parse(line) as Step;
-    void answer(experiment, packets, step).then((found) => {
-      const text = JSON.stringify({ id: step.id, ...found });
-      process.stdout.write(`${text.replace(/"timestamp_ns":"(\d+)"/, '"timestamp_ns":$1')}\n`); // a number too long for JSON.stringify
-    });
+    void answer(experiment, packets, step).then((found) => process.stdout.write(`${textOf({ id: step.id, ...found })}\n`));
   });
   await experiment.untilEnd();
 });
+
+/** Return JSON with numbers that JSON.stringify can't write: nanoseconds, and minus zero. */
+function textOf(found: Answer): string {
+  const text = JSON.stringify(found, (_, value: unknown) => (typeof value === "bigint" ? `number:${value}` : Object.is(value, -0) ? "number:-0.0" : value));
+  return text.replace(/"number:([-\d.]+)"/g, "$1");
+}
 
 async function answer(experiment: Experiment, packets: Packet[], step: Step): Promise<Answer> {
   try {
     return { ok: true, ...(await carryOut(experiment, packets, step)) };
   } catch (error) {
-    if (error instanceof RequestError) return { ok: false, response: error.response, reason: error.reason, detail: error.detail };
+    if (error instanceof RequestError) return { ok: false, response: nameOf(error.code), reason: error.reason, detail: error.detail };
     return { ok: false, error: String(error) };
   }
 }
@@ -81,7 +84,7 @@ async function carryOut(experiment: Experiment, packets: Packet[], step: Step): 
 
 async function request(experiment: Experiment, number: number, object?: Uint8Array): Promise<Answer> {
   const { code, reason, detail, payload } = await experiment.request(number, object);
-  return { ok: code === 0, response: responseName(code), reason, detail, ...(payload.length && { object: base64(payload) }) };
+  return { ok: code === 0, response: nameOf(code), reason, detail, ...(payload.length && { object: base64(payload) }) };
 }
 
 async function parameter(experiment: Experiment, { name, value, unit }: { name: string; value: string | null; unit: string | null }): Promise<Answer> {
@@ -94,21 +97,23 @@ async function parameter(experiment: Experiment, { name, value, unit }: { name: 
 
 function factsOf(packet: Packet): Answer {
   const published = decode(packet);
-  const facts = { envelope: packet.envelope, message: messageOf(packet.envelope), timestamp_ns: packet.timeNs === undefined ? null : String(packet.timeNs) };
-  if (published.name === "Scan2d") return { ...facts, ...scanFacts(published.value) };
-  if (published.name === "Spec1d") return { ...facts, ...spectrumFacts(published.value) };
-  if (published.name !== "ScanLines") return facts;
-  const { region } = published.value.parameters;
-  return { ...facts, ...scanFacts({ ...published.value, message: packet.payload, region: region! }) };
+  if (published.name === "Scan2d") return scanFacts(published.value);
+  if (published.name === "Spec1d") return spectrumFacts(published.value);
+  if (published.name === "ScanLines") return scanFacts({ ...published.value, packet, region: published.value.parameters.region! });
+  return packetFacts(packet);
 }
 
-function scanFacts({ channel, unit, region, shape, values, message }: Pick<Scan, "channel" | "unit" | "region" | "shape" | "values" | "message">): Answer {
-  return { channel, unit, center_m: region.centerM, size_m: region.sizeM, angle_deg: (region.angleRad ?? 0) / DEGREE, shape, values: valueFacts(values), view: values.buffer === message.buffer };
+function packetFacts({ envelope, timeNs }: Packet): Answer {
+  return { envelope, message: messageOf(envelope), timestamp_ns: timeNs ?? null };
 }
 
-function spectrumFacts({ kind, names, units, positionM, values, message }: Spectrum): Answer {
+function scanFacts({ channel, unit, region, shape, values, packet }: Pick<Scan, "channel" | "unit" | "region" | "shape" | "values" | "packet">): Answer {
+  return { ...packetFacts(packet), channel, unit, center_m: region.centerM, size_m: region.sizeM, angle_deg: (region.angleRad ?? 0) / DEGREE, shape, values: valueFacts(values), view: values.buffer === packet.payload.buffer };
+}
+
+function spectrumFacts({ kind, names, units, positionM, values, packet }: Spectrum): Answer {
   const shape = [values.length / Math.max(1, names.length), names.length];
-  return { kind, names, units, position_m: positionM ?? null, shape, values: valueFacts(values), view: values.buffer === message.buffer };
+  return { ...packetFacts(packet), kind, names, units, position_m: positionM ?? null, shape, values: valueFacts(values), view: values.buffer === packet.payload.buffer };
 }
 
 function valueFacts(values: Float64Array): Answer {
@@ -121,6 +126,10 @@ function schemaOf(name: string) {
   const schema = REGISTRY.getMessage(`afspm.${name}`);
   if (!schema) throw new Error(`no message ${name}`);
   return schema;
+}
+
+function nameOf(code: number): string | number {
+  return code in wire.ControlResponse ? responseName(code) : code;
 }
 
 function base64(bytes: Uint8Array): string {

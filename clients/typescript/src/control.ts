@@ -59,9 +59,18 @@ export class ControlHold {
 
   /** Have control until `giveUp` is called: a second call only sees that it is there. */
   async keep(solving: number, deadline: Deadline): Promise<void> {
-    if (this.isKept) await this.regain(deadline);
-    else await this.acquire(solving, deadline);
+    if (!this.isKept) await this.acquire(solving, deadline);
+    else if (this.solving === solving) await this.regain(deadline);
+    else await this.change(solving, deadline);
     this.isKept = true;
+  }
+
+  /** Have control for another problem than now: the scheduler says whether that may be. */
+  private async change(solving: number, deadline: Deadline): Promise<void> {
+    const response = await this.link.requests.request(ControlRequest.REQ_REQUEST_CTRL, Uint8Array.of(solving), undefined, deadline);
+    if (response.code !== ControlResponse.REP_SUCCESS) throw new Refused("control", response.code, response.reason, response.detail);
+    this.solving = solving;
+    this.held = true;
   }
 
   async giveUp(): Promise<void> {

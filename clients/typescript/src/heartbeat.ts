@@ -4,7 +4,7 @@ import { Worker } from "node:worker_threads";
 import type { Launch } from "./launch.js";
 
 const TURN_MS = 100;
-const CLOSED_WITHIN_MS = 300;
+const CLOSED_WITHIN_MS = 1000;
 
 /** What the thread is told when it starts. */
 export interface HeartbeatData {

@@ -16,19 +16,19 @@ function beat(kind: number): void {
   sending = sending.then(() => socket.send(frames));
 }
 
-/** The first beat goes out as soon as the supervisor listens: one sent before would be lost. */
-async function beatAtOnce(): Promise<void> {
-  for await (const [subscription] of socket) if (subscription?.[0] === 1) beat(ALIVE);
+/** Wait until the supervisor listens: a beat sent before would be lost. */
+async function heard(): Promise<void> {
+  for (;;) if ((await socket.receive())[0]?.[0] === 1) return;
 }
 
 socket.connect(address);
-void beatAtOnce();
 const timer = setInterval(() => beat(ALIVE), periodMs);
-parentPort?.once("message", () => {
+const isHeard = heard().then(() => beat(ALIVE));
+parentPort?.once("message", async () => {
   clearInterval(timer);
+  await isHeard;
   beat(CLOSING);
-  void sending.then(() => {
-    socket.close();
-    parentPort?.close();
-  });
+  await sending;
+  socket.close();
+  parentPort?.close();
 });

@@ -4,6 +4,7 @@ import { closeSync, fsyncSync, mkdirSync, openSync, readFileSync, renameSync, rm
 import { dirname, join } from "node:path";
 import { createHash } from "node:crypto";
 import { InvalidValue } from "./errors.js";
+import type { Packet } from "./frames.js";
 
 /** What was asked for and not finished yet. */
 export interface Intent {
@@ -15,9 +16,9 @@ export interface Intent {
   readonly interruptions: readonly string[];
 }
 
-/** What is kept of a measurement: its messages, and what interrupted it. */
+/** What is kept of a measurement: its packets, and what interrupted it. */
 export interface Kept {
-  readonly messages: readonly Uint8Array[];
+  readonly packets: readonly Packet[];
   readonly interruptions: readonly string[];
 }
 
@@ -25,7 +26,7 @@ interface Head {
   readonly key: string;
   readonly facts: string;
   readonly interruptions: readonly string[];
-  readonly sizes: readonly number[];
+  readonly packets: readonly { readonly envelope: string; readonly timeNs?: string; readonly size: number }[];
 }
 
 export class KeyedResults {
@@ -57,13 +58,17 @@ export class KeyedResults {
     const head = JSON.parse(bytes.toString("utf8", 0, end)) as Head;
     if (head.key !== key || head.facts !== facts) throw new InvalidValue(`the key ${key} was used for another measurement: ${head.facts}`);
     let at = end + 1;
-    return { interruptions: head.interruptions, messages: head.sizes.map((size) => bytes.subarray(at, (at += size))) };
+    const packets = head.packets.map(({ envelope, timeNs, size }) => {
+      return { envelope, timeNs: timeNs === undefined ? undefined : BigInt(timeNs), payload: bytes.subarray(at, (at += size)) };
+    });
+    return { interruptions: head.interruptions, packets };
   }
 
-  fulfil(key: string, facts: string, { messages, interruptions }: Kept): void {
+  fulfil(key: string, facts: string, { packets, interruptions }: Kept): void {
     if (!this.folder) return;
-    const head: Head = { key, facts, interruptions, sizes: messages.map((message) => message.length) };
-    write(this.path(key), [Buffer.from(`${JSON.stringify(head)}\n`), ...messages]);
+    const heads = packets.map(({ envelope, timeNs, payload }) => ({ envelope, ...(timeNs !== undefined && { timeNs: String(timeNs) }), size: payload.length }));
+    const head: Head = { key, facts, interruptions, packets: heads };
+    write(this.path(key), [Buffer.from(`${JSON.stringify(head)}\n`), ...packets.map(({ payload }) => payload)]);
     this.intent = undefined;
     rmSync(join(this.folder, "pending.json"), { force: true });
   }

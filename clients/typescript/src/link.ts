@@ -39,8 +39,8 @@ export function decode(packet: Packet): Published {
   const { payload } = packet;
   const name = messageOf(packet.envelope);
   switch (name) {
-    case "Scan2d": return { name, value: Scan.decode(payload), packet };
-    case "Spec1d": return { name, value: Spectrum.decode(payload), packet };
+    case "Scan2d": return { name, value: Scan.decode(packet), packet };
+    case "Spec1d": return { name, value: Spectrum.decode(packet), packet };
     case "ScanLines": return { name, value: ScanLines.decode(payload), packet };
     case "ScopeStateMsg": return { name, value: fromBinary(ScopeStateMsgSchema, payload).scopeState ?? ScopeState.SS_UNDEFINED, packet };
     case "ControlState": return { name, value: decodeControlState(payload), packet };

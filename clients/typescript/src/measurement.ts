@@ -88,7 +88,7 @@ export class Measurements {
     if (key !== undefined) {
       checkKey(key);
       const kept = this.results.find(key, target.facts);
-      if (kept) return { things: kept.messages.map(target.decode), interruptions: kept.interruptions };
+      if (kept) return { things: kept.packets.map(target.decode), interruptions: kept.interruptions };
     }
     if (this.busy) throw new InvalidValue("a measurement is under way already: await it before the next");
     this.busy = true;
@@ -99,7 +99,7 @@ export class Measurements {
       await this.takeUp(task);
       const things = await this.finish(task);
       this.channels.set(target.what, new Set(things.map(target.nameOf)));
-      if (key !== undefined) this.results.fulfil(key, target.facts, { messages: things.map((thing) => thing.message), interruptions: task.interruptions });
+      if (key !== undefined) this.results.fulfil(key, target.facts, { packets: things.map((thing) => thing.packet), interruptions: task.interruptions });
       return { things, interruptions: task.interruptions };
     } catch (error) {
       if (key !== undefined && task.watch && !task.watch.isOver) {

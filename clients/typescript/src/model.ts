@@ -2,6 +2,7 @@
 
 import { create, fromBinary, toBinary } from "@bufbuild/protobuf";
 import { InvalidValue, WireError } from "./errors.js";
+import type { Packet } from "./frames.js";
 import { ControlMode, ControlStateSchema, ScopeState } from "./generated/control_pb.js";
 import { ScanLinesSchema } from "./generated/lines_pb.js";
 import {
@@ -53,13 +54,13 @@ export class Scan {
     readonly timeNs: bigint | undefined,
     /** Where the controller saved it; empty if it did not. */
     readonly filename: string,
-    /** The `Scan2d` as it came. */
-    readonly message: Uint8Array,
+    /** As it came. */
+    readonly packet: Packet,
   ) {}
 
   /** Decode a `Scan2d`. Throws WireError, InvalidValue. */
-  static decode(message: Uint8Array): Scan {
-    const { rest, chunks } = split(message, SCAN_VALUES);
+  static decode(packet: Packet): Scan {
+    const { rest, chunks } = split(packet.payload, SCAN_VALUES);
     const scan = fromBinary(Scan2dSchema, rest);
     const { region, shape } = parametersOf(scan.params ?? create(ScanParameters2dSchema));
     const values = doubles(chunks);
@@ -68,7 +69,7 @@ export class Scan {
     if (values.length && values.length !== pixels[0] * pixels[1]) {
       throw new WireError(`a scan of ${pixels[0]} x ${pixels[1]} pixels with ${values.length} values`);
     }
-    return new Scan(region, pixels, scan.channel ?? "", scan.params?.data?.units ?? "", values, timeOf(scan.timestamp), scan.filename ?? "", message);
+    return new Scan(region, pixels, scan.channel ?? "", scan.params?.data?.units ?? "", values, timeOf(scan.timestamp), scan.filename ?? "", packet);
   }
 
   /** Return the value of a pixel. */
@@ -130,13 +131,13 @@ export class Spectrum {
     readonly values: Float64Array,
     readonly timeNs: bigint | undefined,
     readonly filename: string,
-    /** The `Spec1d` as it came. */
-    readonly message: Uint8Array,
+    /** As it came. */
+    readonly packet: Packet,
   ) {}
 
   /** Decode a `Spec1d`. Throws WireError, InvalidValue. */
-  static decode(message: Uint8Array): Spectrum {
-    const outer = split(message, SPECTRUM_DATA);
+  static decode(packet: Packet): Spectrum {
+    const outer = split(packet.payload, SPECTRUM_DATA);
     const spectrum = fromBinary(Spec1dSchema, outer.rest);
     const inner = split(outer.chunks.at(-1) ?? new Uint8Array(), SPECTRUM_VALUES);
     const data = fromBinary(SpecDataSchema, inner.rest);
@@ -144,7 +145,7 @@ export class Spectrum {
     if (data.names.length !== data.units.length || values.length % Math.max(1, data.names.length)) {
       throw new WireError(`a spectrum of ${data.names.length} names, ${data.units.length} units and ${values.length} values`);
     }
-    return new Spectrum(placeOf(spectrum.position), spectrum.type ?? "", data.names, data.units, values, timeOf(spectrum.timestamp), spectrum.filename ?? "", message);
+    return new Spectrum(placeOf(spectrum.position), spectrum.type ?? "", data.names, data.units, values, timeOf(spectrum.timestamp), spectrum.filename ?? "", packet);
   }
 
   /** Return one variable by its name, a value for each point. */

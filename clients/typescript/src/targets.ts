@@ -1,5 +1,6 @@
 /** A scan or a spectrum as it should be taken, and whether a published result is one. Pure. */
 
+import type { Packet } from "./frames.js";
 import { ScopeState } from "./generated/control_pb.js";
 import type { Published } from "./link.js";
 import { type Region, Scan, type ScanParameters, type Shape, Spectrum, type XY } from "./model.js";
@@ -22,7 +23,7 @@ export interface Target<T extends Scan | Spectrum> {
   fits(result: T): boolean;
   /** Return what is there once in a result: the channel of a scan. */
   nameOf(result: T): string;
-  decode(message: Uint8Array): T;
+  decode(packet: Packet): T;
 }
 
 export class ScanTarget implements Target<Scan> {
@@ -38,7 +39,7 @@ export class ScanTarget implements Target<Scan> {
 
   of = (published: Published) => (published.name === "Scan2d" ? published.value : undefined);
   nameOf = (scan: Scan) => scan.channel;
-  decode = (message: Uint8Array) => Scan.decode(message);
+  decode = (packet: Packet) => Scan.decode(packet);
 
   fits(scan: Scan): boolean {
     if (this.shape && !isSameShape(this.shape, scan.shape)) return false;
@@ -67,7 +68,7 @@ export class SpectrumTarget implements Target<Spectrum> {
 
   of = (published: Published) => (published.name === "Spec1d" ? published.value : undefined);
   nameOf = () => ""; // there is one in a result, and the next may be of another kind
-  decode = (message: Uint8Array) => Spectrum.decode(message);
+  decode = (packet: Packet) => Spectrum.decode(packet);
 
   fits(spectrum: Spectrum): boolean {
     if (this.kind !== undefined && spectrum.kind !== this.kind) return false;

@@ -63,7 +63,7 @@ for (const { type, envelope, frames } of golden.published) {
 
 test("a scan has its values in their order, and its region in metres and radians", () => {
   const { hex: reference } = golden.messages.find(({ name }) => name === "scan 3x2")!;
-  const scan = Scan.decode(bytes(reference));
+  const scan = Scan.decode({ envelope: "Scan2d", payload: bytes(reference), timeNs: undefined });
   assert.deepEqual([...scan.values], [0, 1.5, -2.25, 1e-9, 3e300, -0]);
   assert.deepEqual(scan.shape, [2, 3]);
   assert.equal(scan.at(1, 0), 1e-9);

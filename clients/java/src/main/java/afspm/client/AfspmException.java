@@ -1,0 +1,12 @@
+package afspm.client;
+
+/** The base of all errors of this library. They are unchecked: most end the component, and its supervisor starts it again. */
+public class AfspmException extends RuntimeException {
+    public AfspmException(String what) {
+        super(what);
+    }
+
+    public AfspmException(String what, Throwable cause) {
+        super(what, cause);
+    }
+}

@@ -1,0 +1,148 @@
+package afspm.client;
+
+import java.io.BufferedReader;
+import java.io.IOException;
+import java.io.InputStreamReader;
+import java.nio.charset.StandardCharsets;
+import java.util.concurrent.CompletableFuture;
+import java.util.concurrent.ExecutionException;
+import java.util.concurrent.TimeUnit;
+import java.util.concurrent.TimeoutException;
+import java.util.function.Consumer;
+import java.util.logging.ConsoleHandler;
+import java.util.logging.Formatter;
+import java.util.logging.LogRecord;
+import java.util.logging.Logger;
+
+/** Runs a component that {@code afspm run} has started. */
+public final class Component {
+    /** Exit codes, by which a process tells its supervisor why it ends. Every other is a crash: it is started again. */
+    public static final int DONE = 0;
+    public static final int CRASHED = 1;
+    /** The settings can't work: a restart would fail the same way. */
+    public static final int CONFIG = 78;
+    /** The experiment ended. */
+    public static final int ENDED = 80;
+    /** Standard input has ended. */
+    public static final int STOPPED = 81;
+
+    private static final long AFTER_THE_END_MS = 1000; // to handle what came before it
+    private static final long AFTER_A_STOP_MS = 200; // the parent that stops us kills us soon
+
+    private Component() {
+    }
+
+    /** Run a component, and end the process when {@code main} returns, the experiment ends, or standard input does. */
+    public static void run(Consumer<Experiment> main) {
+        run(main, line -> { }, Experiment.LONGEST_STEP_S);
+    }
+
+    /**
+     * Run a component, and end the process when {@code main} returns, the experiment ends, or standard input does.
+     *
+     * @param main what the component does; when it returns, the component is done
+     * @param onLine takes the further lines of standard input, in a thread of their own
+     * @param longestStepS how many seconds may pass between two calls before the process counts as frozen
+     */
+    public static void run(Consumer<Experiment> main, Consumer<String> onLine, double longestStepS) {
+        logToStandardError();
+        BufferedReader input = new BufferedReader(new InputStreamReader(System.in, StandardCharsets.UTF_8));
+        int code;
+        try {
+            String line = input.readLine();
+            if (line == null) {
+                System.exit(STOPPED);
+            }
+            try (Experiment experiment = new Experiment(Launch.parse(line), longestStepS)) {
+                CompletableFuture<Integer> done = begin(main, experiment);
+                thread("standard input", () -> read(input, onLine, experiment));
+                code = awaitEnd(experiment, done);
+            }
+        } catch (AfspmException | IOException error) {
+            code = exitCodeOf(error);
+        }
+        Runtime.getRuntime().halt(code); // nothing is left to do, and a thread of the user may still run
+    }
+
+    private static CompletableFuture<Integer> begin(Consumer<Experiment> main, Experiment experiment) {
+        CompletableFuture<Integer> done = new CompletableFuture<>();
+        CompletableFuture<Void> begun = new CompletableFuture<>();
+        thread("component", () -> {
+            try {
+                begun.complete(null);
+                main.accept(experiment);
+                done.complete(DONE);
+            } catch (Throwable error) {
+                done.complete(exitCodeOf(error));
+            }
+            experiment.link().change(() -> { });
+        });
+        begun.join();
+        experiment.start();
+        return done;
+    }
+
+    /** Wait until the component is done, or there is nothing more to do; return the exit code. */
+    private static int awaitEnd(Experiment experiment, CompletableFuture<Integer> done) {
+        try {
+            experiment.link().await(done::isDone, Long.MAX_VALUE);
+            return done.join();
+        } catch (AfspmException reason) {
+            long graceMs = reason instanceof ExperimentEndedException ? AFTER_THE_END_MS : AFTER_A_STOP_MS;
+            try {
+                done.get(graceMs, TimeUnit.MILLISECONDS);
+            } catch (TimeoutException | ExecutionException | InterruptedException late) {
+                Link.LOG.fine("the component goes on after the end");
+            }
+            return exitCodeOf(reason);
+        }
+    }
+
+    private static void read(BufferedReader input, Consumer<String> onLine, Experiment experiment) {
+        try {
+            for (String line = input.readLine(); line != null; line = input.readLine()) {
+                onLine.accept(line);
+            }
+        } catch (IOException error) {
+            Link.LOG.fine("standard input can't be read: " + error);
+        } finally {
+            experiment.link().fail(new StopRequestedException("standard input has ended"));
+        }
+    }
+
+    private static int exitCodeOf(Throwable error) {
+        if (error instanceof ExperimentEndedException) {
+            return ENDED;
+        }
+        if (error instanceof StopRequestedException) {
+            return STOPPED;
+        }
+        if (error instanceof ConfigException) {
+            Link.LOG.severe(error.getMessage());
+            return CONFIG;
+        }
+        error.printStackTrace();
+        return CRASHED;
+    }
+
+    private static void thread(String name, Runnable task) {
+        Thread thread = new Thread(task, name);
+        thread.setDaemon(true);
+        thread.start();
+    }
+
+    /** Have the log begin each line with its level, which the supervisor knows. */
+    private static void logToStandardError() {
+        ConsoleHandler handler = new ConsoleHandler();
+        handler.setFormatter(new Formatter() {
+            @Override
+            public String format(LogRecord line) {
+                String level = line.getLevel().getName().replace("SEVERE", "ERROR");
+                return level + " " + formatMessage(line) + System.lineSeparator();
+            }
+        });
+        Logger logger = Logger.getLogger("afspm");
+        logger.setUseParentHandlers(false);
+        logger.addHandler(handler);
+    }
+}

@@ -1,0 +1,219 @@
+package afspm.client;
+
+import afspm.Control.ControlRequest;
+import afspm.Control.ControlResponse;
+import java.util.function.Supplier;
+
+/**
+ * This component's hold on control: asking for it, waiting for it, noticing that it is gone, giving it back. Answers of
+ * the scheduler grant control; its published state takes it away, once that has named us: a state from before the grant
+ * may still be under way.
+ */
+final class ControlHold {
+    private static final double ASK_AGAIN_S = 10; // should a published control state ever not reach us
+
+    private final Link link;
+    private boolean isHeld;
+    private boolean wasNamed;
+    private boolean isKept;
+    private String whyLost = "";
+    private int depth;
+    private int solving;
+
+    ControlHold(Link link) {
+        this.link = link;
+        link.listeners.add((packet, isScheduler) -> {
+            if (isScheduler && packet.value() instanceof ControlState) {
+                take((ControlState) packet.value());
+            }
+        });
+    }
+
+    boolean isHeld() {
+        synchronized (link) {
+            return isHeld;
+        }
+    }
+
+    /** Whether control is wanted and not there. */
+    boolean wasLost() {
+        synchronized (link) {
+            return depth > 0 && !isHeld;
+        }
+    }
+
+    String whyLost() {
+        synchronized (link) {
+            return whyLost;
+        }
+    }
+
+    /** Have control while {@code body} runs; within another such call it is that one's. */
+    <T> T hold(Supplier<T> body, int problem, long deadline) {
+        acquire(problem, deadline);
+        try {
+            return body.get();
+        } finally {
+            relinquish();
+        }
+    }
+
+    /** Have control until {@link #relinquish} was called as often. */
+    void acquire(int problem, long deadline) {
+        synchronized (link) {
+            if (depth > 0 && problem != 0 && problem != solving) {
+                throw new InvalidValueException("control is held to solve problem " + solving + ", not " + problem);
+            }
+            solving = depth == 0 ? problem : solving;
+            depth += 1;
+        }
+        try {
+            regain(deadline);
+        } catch (RuntimeException error) {
+            relinquish();
+            throw error;
+        }
+    }
+
+    void relinquish() {
+        boolean isLast;
+        synchronized (link) {
+            depth -= depth > 0 ? 1 : 0;
+            isLast = depth == 0;
+        }
+        if (isLast) {
+            release();
+        }
+    }
+
+    /** Have control until {@link #giveUp} is called: a second call only sees that it is there. */
+    void keep(int problem, long deadline) {
+        if (isKept) {
+            regain(deadline);
+        } else {
+            acquire(problem, deadline);
+        }
+        isKept = true;
+    }
+
+    void giveUp() {
+        if (isKept) {
+            relinquish();
+        }
+        isKept = false;
+    }
+
+    /** Be in control: at once if we are, else ask, wait for the control state to change, and ask again. */
+    void regain(long deadline) {
+        String reported = "";
+        while (!isHeld()) {
+            int states = link.count("ControlState");
+            int connections = link.requests.connections();
+            Response refusal = ask(deadline);
+            if (refusal == null) {
+                return;
+            }
+            String obstacle = refusal.reason().isEmpty() ? obstacle() : refusal.reason();
+            if (!obstacle.equals(reported)) {
+                Link.LOG.info(link.launch.name + " waits for control: " + obstacle);
+            }
+            reported = obstacle;
+            link.await(() -> connections != link.requests.connections()
+                    || (link.count("ControlState") != states && (isSolved() || obstacle().isEmpty())), Time.earlier(ASK_AGAIN_S, deadline));
+            if (Time.isOver(deadline)) {
+                throw new ControlLostException("control was not given in time", refusal);
+            }
+        }
+    }
+
+    /** Give back control that an earlier life of this component had and nothing here wants now. */
+    void releaseInherited() {
+        ControlState state = link.control();
+        boolean isInherited;
+        synchronized (link) {
+            isInherited = depth == 0 && !isHeld && state != null && state.holder().equals(link.launch.name);
+        }
+        if (isInherited) {
+            link.requests.sendOnly(ControlRequest.REQ_RELEASE_CTRL_VALUE);
+        }
+    }
+
+    /** The scheduler says that we are not in control. */
+    void lost(String why) {
+        link.change(() -> {
+            isHeld = false;
+            whyLost = why;
+        });
+    }
+
+    /** Give control back, if we have it. */
+    void release() {
+        if (!isHeld()) {
+            return;
+        }
+        link.change(() -> isHeld = false);
+        if (link.over() != null) {
+            link.requests.sendOnly(ControlRequest.REQ_RELEASE_CTRL_VALUE);
+            return;
+        }
+        try {
+            link.requests.ask(ControlRequest.REQ_RELEASE_CTRL_VALUE, Requests.NOTHING, Time.deadline(link.launch.requestTimeoutS));
+        } catch (AfspmException error) {
+            Link.LOG.fine("control was not given back: " + error.getMessage());
+        }
+    }
+
+    /** Ask once. Returns the refusal if it has to be waited for; null: control is ours. */
+    private Response ask(long deadline) {
+        Response response = link.requests.ask(ControlRequest.REQ_REQUEST_CTRL_VALUE, new byte[] {(byte) solving}, deadline);
+        switch (response.code()) {
+            case ControlResponse.REP_SUCCESS_VALUE:
+                link.change(() -> {
+                    isHeld = true;
+                    wasNamed = link.control() != null && link.control().holder().equals(link.launch.name);
+                });
+                return null;
+            case ControlResponse.REP_WRONG_EXP_PROBLEM_VALUE:
+                if (isSolved()) {
+                    throw new ControlLostException("problem " + solving + " is not flagged: there is nothing to solve", response);
+                }
+                return response;
+            case ControlResponse.REP_ALREADY_UNDER_CONTROL_VALUE:
+            case ControlResponse.REP_WRONG_CONTROL_MODE_VALUE:
+                return response;
+            default:
+                throw new RefusedException("control", response);
+        }
+    }
+
+    private boolean isSolved() {
+        return solving != 0 && (link.control() == null || !link.control().problems().contains(solving));
+    }
+
+    /** Return what stands between us and control, for a person; empty if nothing does. */
+    private String obstacle() {
+        ControlState state = link.control();
+        if (state == null) {
+            return "";
+        }
+        if (state.isManual()) {
+            return "the mode is MANUAL";
+        }
+        if (solving != 0 ? !state.problems().contains(solving) : !state.problems().isEmpty()) {
+            return "problems " + state.problems() + " are flagged";
+        }
+        return state.holder().isEmpty() || state.holder().equals(link.launch.name) ? "" : state.holder() + " is in control";
+    }
+
+    private void take(ControlState state) {
+        if (!isHeld) {
+            return;
+        }
+        if (state.holder().equals(link.launch.name)) {
+            wasNamed = true;
+        } else if (wasNamed) {
+            String obstacle = obstacle();
+            lost(obstacle.isEmpty() ? "it was revoked" : obstacle);
+        }
+    }
+}

@@ -1,0 +1,152 @@
+package afspm.client;
+
+import com.google.gson.Gson;
+import java.io.IOException;
+import java.io.UncheckedIOException;
+import java.nio.ByteBuffer;
+import java.nio.channels.FileChannel;
+import java.nio.charset.StandardCharsets;
+import java.nio.file.Files;
+import java.nio.file.Path;
+import java.nio.file.Paths;
+import java.nio.file.StandardCopyOption;
+import java.nio.file.StandardOpenOption;
+import java.util.ArrayList;
+import java.util.Arrays;
+import java.util.Collections;
+import java.util.List;
+import java.util.UUID;
+
+/** Keyed measurements happen once: the intent is on disk before the request, the result after it. */
+final class KeyedResults {
+    private static final Gson GSON = new Gson();
+    private static final int LONGEST_KEY = 100;
+
+    /** What was asked for and not finished yet. */
+    static final class Intent {
+        String key;
+        String facts;
+        int attempt;
+        /** What was published until then is older. */
+        long sinceNs;
+        List<String> interruptions;
+        /** What the target is made of: a region and shape, or a place and kind. */
+        double[] place;
+        int rows;
+        int columns;
+        String kind;
+    }
+
+    /** What is kept of a measurement; its messages follow in the file. */
+    static final class Kept {
+        String key;
+        String facts;
+        List<String> interruptions;
+        int[] sizes;
+        transient List<byte[]> messages = new ArrayList<>();
+    }
+
+    private final Path folder;
+    private Intent pending;
+
+    /** @param stateDir of the run; empty: nothing is kept over a restart */
+    KeyedResults(String stateDir, String name) {
+        folder = stateDir.isEmpty() ? null : Paths.get(stateDir, name + ".keyed");
+        byte[] text = folder == null ? null : readOrNothing(folder.resolve("pending.json"));
+        pending = text == null ? null : GSON.fromJson(new String(text, StandardCharsets.UTF_8), Intent.class);
+    }
+
+    /** Return the intent that was written down and not fulfilled; null if there is none. */
+    Intent pending() {
+        return pending;
+    }
+
+    void intend(Intent intent) {
+        pending = intent;
+        if (folder != null) {
+            write(folder.resolve("pending.json"), Collections.singletonList(GSON.toJson(intent).getBytes(StandardCharsets.UTF_8)));
+        }
+    }
+
+    /** Return what an earlier life, or an earlier call, measured; null if there is nothing. */
+    Kept find(String key, String facts) {
+        byte[] bytes = folder == null ? null : readOrNothing(path(key));
+        if (bytes == null) {
+            return null;
+        }
+        int end = 0;
+        while (bytes[end] != '\n') {
+            end++;
+        }
+        Kept kept = GSON.fromJson(new String(bytes, 0, end, StandardCharsets.UTF_8), Kept.class);
+        if (!kept.key.equals(key) || !kept.facts.equals(facts)) {
+            throw new InvalidValueException("the key " + key + " was used for another measurement: " + kept.facts);
+        }
+        int at = end + 1;
+        for (int size : kept.sizes) {
+            kept.messages.add(Arrays.copyOfRange(bytes, at, at + size));
+            at += size;
+        }
+        return kept;
+    }
+
+    void fulfil(String key, String facts, List<byte[]> messages, List<String> interruptions) {
+        pending = null;
+        if (folder == null) {
+            return;
+        }
+        Kept kept = new Kept();
+        kept.key = key;
+        kept.facts = facts;
+        kept.interruptions = interruptions;
+        kept.sizes = messages.stream().mapToInt(message -> message.length).toArray();
+        List<byte[]> parts = new ArrayList<>(messages);
+        parts.add(0, (GSON.toJson(kept) + "\n").getBytes(StandardCharsets.UTF_8));
+        write(path(key), parts);
+        try {
+            Files.deleteIfExists(folder.resolve("pending.json"));
+        } catch (IOException error) {
+            throw new UncheckedIOException(error);
+        }
+    }
+
+    /** @throws InvalidValueException the key can't be part of a request's id */
+    static void check(String key) {
+        boolean isPrintable = key.chars().noneMatch(one -> one == '/' || Character.isISOControl(one));
+        if (key.isEmpty() || !isPrintable || key.getBytes(StandardCharsets.UTF_8).length > LONGEST_KEY) {
+            throw new InvalidValueException("'" + key + "' can't be a key: 1 to " + LONGEST_KEY + " printable characters without '/'");
+        }
+    }
+
+    private Path path(String key) {
+        return folder.resolve(UUID.nameUUIDFromBytes(key.getBytes(StandardCharsets.UTF_8)) + ".result");
+    }
+
+    private static byte[] readOrNothing(Path file) {
+        try {
+            return Files.exists(file) ? Files.readAllBytes(file) : null;
+        } catch (IOException error) {
+            throw new UncheckedIOException(error);
+        }
+    }
+
+    /** Write a file as a whole, or not at all, and see it on the disk. */
+    private static void write(Path file, List<byte[]> parts) {
+        Path made = file.resolveSibling(file.getFileName() + ".new");
+        try {
+            Files.createDirectories(file.getParent());
+            try (FileChannel channel = FileChannel.open(made, StandardOpenOption.CREATE, StandardOpenOption.TRUNCATE_EXISTING,
+                    StandardOpenOption.WRITE)) {
+                for (byte[] part : parts) {
+                    for (ByteBuffer bytes = ByteBuffer.wrap(part); bytes.hasRemaining();) {
+                        channel.write(bytes);
+                    }
+                }
+                channel.force(true);
+            }
+            Files.move(made, file, StandardCopyOption.REPLACE_EXISTING, StandardCopyOption.ATOMIC_MOVE);
+        } catch (IOException error) {
+            throw new UncheckedIOException(error);
+        }
+    }
+}

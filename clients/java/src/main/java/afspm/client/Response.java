@@ -1,0 +1,111 @@
+package afspm.client;
+
+import afspm.Control.ControlResponse;
+import java.nio.charset.StandardCharsets;
+import java.util.ArrayList;
+import java.util.List;
+
+/** The answer to a request. */
+public final class Response {
+    /** Details: what a program must know beside the code. */
+    public static final int NOT_SENT = 1;
+    public static final int OUTCOME_UNKNOWN = 2;
+    public static final int EXPERIMENT_ENDED = 3;
+
+    private static final byte[] NOTHING = {};
+
+    private final int code;
+    private final byte[] object;
+    private final String reason;
+    private final String id;
+    private final int detail;
+
+    Response(int code, byte[] object, String reason, String id, int detail) {
+        this.code = code;
+        this.object = object;
+        this.reason = reason;
+        this.id = id;
+        this.detail = detail;
+    }
+
+    /** Decode one to five frames; those that a newer peer appends are ignored. */
+    static Response decode(List<byte[]> frames) {
+        if (frames.isEmpty() || frames.get(0).length != 1) {
+            throw new WireException("a response whose first frame is not one byte");
+        }
+        byte[] detail = frame(frames, 4);
+        return new Response(frames.get(0)[0] & 0xff, frame(frames, 1), text(frame(frames, 2)), text(frame(frames, 3)),
+                detail.length == 0 ? 0 : detail[0] & 0xff);
+    }
+
+    /** Return [code] and, where there is any of it, [object, reason, id, detail]. */
+    List<byte[]> encode() {
+        List<byte[]> frames = new ArrayList<>();
+        frames.add(new byte[] {(byte) code});
+        frames.add(object);
+        frames.add(reason.getBytes(StandardCharsets.UTF_8));
+        frames.add(id.getBytes(StandardCharsets.UTF_8));
+        frames.add(detail == 0 ? NOTHING : new byte[] {(byte) detail});
+        while (frames.size() > 1 && frames.get(frames.size() - 1).length == 0) {
+            frames.remove(frames.size() - 1);
+        }
+        return frames;
+    }
+
+    /** Return the same with another code. */
+    Response as(int other) {
+        return new Response(other, object, reason, id, detail);
+    }
+
+    /** Return the number of a {@code ControlResponse}. */
+    public int code() {
+        return code;
+    }
+
+    /** Return an object in bytes, such as the {@code ParameterMsg} in force; mostly empty. */
+    public byte[] object() {
+        return object;
+    }
+
+    /** Return why it is no success, for a person. */
+    public String reason() {
+        return reason;
+    }
+
+    /** Return the id of the request that it answers; empty if that had none. */
+    public String id() {
+        return id;
+    }
+
+    public int detail() {
+        return detail;
+    }
+
+    public boolean ok() {
+        return code == ControlResponse.REP_SUCCESS_VALUE;
+    }
+
+    /** Whether it is not known if the microscope has carried out what it was asked for. */
+    boolean isUnanswered() {
+        return code == ControlResponse.REP_NO_RESPONSE_VALUE || detail == NOT_SENT || detail == OUTCOME_UNKNOWN;
+    }
+
+    /** Whether it says that control is not ours. */
+    boolean isNotInControl() {
+        return code == ControlResponse.REP_NOT_IN_CONTROL_VALUE || code == ControlResponse.REP_WRONG_CONTROL_MODE_VALUE;
+    }
+
+    /** Return the name of a response, such as "REP_PARAM_ERROR"; of one without a name the number. */
+    public static String name(int code) {
+        ControlResponse known = ControlResponse.forNumber(code);
+        return known == null ? String.valueOf(code) : known.name();
+    }
+
+    private static byte[] frame(List<byte[]> frames, int index) {
+        return index < frames.size() ? frames.get(index) : NOTHING;
+    }
+
+    private static String text(byte[] bytes) {
+        return new String(bytes, StandardCharsets.UTF_8);
+    }
+}

@@ -1,0 +1,124 @@
+package afspm.client;
+
+import afspm.Control.ScopeState;
+
+/** A scan or a spectrum as it should be taken, and whether a published result is one. Pure. */
+abstract class Target<T> {
+    static final double SAME = 1e-6; // of the size: closer than any controller positions
+    static final double FITS = 1e-2; // of the size: a controller's rounding, not another region
+    private static final double SPOT_M = 20e-9; // a scanner with sensors reports where the tip was, not where it was sent
+    private static final double MOVED = 0.5; // of the size: where drift is corrected, a scan lies where it turned out to be
+    private static final double SHEARED = 0.1; // of the size: and is as large, and as turned, as it turned out to be
+
+    final String what;
+    final String start;
+    final ScopeState busy;
+    /** What it consists of, by which a later life of the component recognises it. */
+    final String facts;
+
+    private Target(String what, String start, ScopeState busy, String facts) {
+        this.what = what;
+        this.start = start;
+        this.busy = busy;
+        this.facts = what + " " + facts;
+    }
+
+    /** Return the result in a packet; null if there is none. */
+    abstract T of(Packet packet);
+
+    abstract boolean fits(T result);
+
+    /** Return what is there once in a result: the channel of a scan. */
+    abstract String nameOf(T result);
+
+    abstract T decode(byte[] message);
+
+    abstract byte[] encode(T result);
+
+    /** A scan to take; no region, or no rows, leaves what is set. */
+    static final class OfScan extends Target<Scan> {
+        final ScanParameters wanted;
+        /** Places are those of the sample, and a scan lies where it turned out to have been taken. */
+        final boolean moves;
+
+        OfScan(ScanParameters wanted, boolean moves) {
+            super("scan", "start-scan", ScopeState.SS_SCANNING, wanted.toString());
+            this.wanted = wanted;
+            this.moves = moves;
+        }
+
+        @Override
+        Scan of(Packet packet) {
+            return packet.scan();
+        }
+
+        @Override
+        boolean fits(Scan scan) {
+            ScanParameters taken = new ScanParameters(scan.region(), scan.rows(), scan.columns());
+            Region region = wanted.region();
+            if (!moves || region == null) {
+                return wanted.isSetBy(taken, FITS);
+            }
+            boolean isClose = region.distanceM(scan.region()) <= MOVED * Math.min(region.widthM(), region.heightM());
+            return isClose && new ScanParameters(region.movedTo(scan.region()), wanted.rows(), wanted.columns()).isSetBy(taken, SHEARED);
+        }
+
+        @Override
+        String nameOf(Scan scan) {
+            return scan.channel();
+        }
+
+        @Override
+        Scan decode(byte[] message) {
+            return new Scan(message);
+        }
+
+        @Override
+        byte[] encode(Scan scan) {
+            return scan.message();
+        }
+    }
+
+    /** A spectrum to take; no place, or no kind, leaves what is set. */
+    static final class OfSpectrum extends Target<Spectrum> {
+        final double[] atM;
+        final String kind;
+        private final boolean moves;
+
+        OfSpectrum(double[] atM, String kind, boolean moves) {
+            super("spectrum", "start-spec", ScopeState.SS_SPEC, java.util.Arrays.toString(atM) + " " + kind);
+            this.atM = atM;
+            this.kind = kind;
+            this.moves = moves;
+        }
+
+        @Override
+        Spectrum of(Packet packet) {
+            return packet.spectrum();
+        }
+
+        @Override
+        boolean fits(Spectrum spectrum) {
+            if (kind != null && !kind.equals(spectrum.kind())) {
+                return false;
+            }
+            double[] there = spectrum.positionM();
+            return atM == null || there == null || moves || Math.hypot(there[0] - atM[0], there[1] - atM[1]) <= SPOT_M;
+        }
+
+        @Override
+        String nameOf(Spectrum spectrum) {
+            return ""; // there is one in a result, and the next may be of another kind
+        }
+
+        @Override
+        Spectrum decode(byte[] message) {
+            return new Spectrum(message);
+        }
+
+        @Override
+        byte[] encode(Spectrum spectrum) {
+            return spectrum.message();
+        }
+    }
+}
