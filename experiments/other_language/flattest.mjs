@@ -20,6 +20,7 @@ runComponent(async (experiment) => {
   await experiment.note(`the flattest place, ${(flattest.roughness * 1e9).toFixed(3)} nm rms, is at (${nanometres}) nm`, detail.scans[0]);
   experiment.log("INFO", `scanned the flattest place at (${nanometres}) nm`);
   await experiment.end();
+  await experiment.untilEnd();
 });
 
 /** Return the root mean square of the heights of a square tile about its plane. */

@@ -12,7 +12,6 @@ import java.util.function.Consumer;
 import java.util.logging.ConsoleHandler;
 import java.util.logging.Formatter;
 import java.util.logging.LogRecord;
-import java.util.logging.Logger;
 
 /** Runs a component that {@code afspm run} has started. */
 public final class Component {
@@ -141,8 +140,7 @@ public final class Component {
                 return level + " " + formatMessage(line) + System.lineSeparator();
             }
         });
-        Logger logger = Logger.getLogger("afspm");
-        logger.setUseParentHandlers(false);
-        logger.addHandler(handler);
+        Link.LOG.setUseParentHandlers(false);
+        Link.LOG.addHandler(handler);
     }
 }

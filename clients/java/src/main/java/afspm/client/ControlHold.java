@@ -88,12 +88,26 @@ final class ControlHold {
 
     /** Have control until {@link #giveUp} is called: a second call only sees that it is there. */
     void keep(int problem, long deadline) {
-        if (isKept) {
+        if (!isKept) {
+            acquire(problem, deadline);
+        } else if (problem == solving) {
             regain(deadline);
         } else {
-            acquire(problem, deadline);
+            change(problem, deadline);
         }
         isKept = true;
+    }
+
+    /** Have control for another problem than now: the scheduler says whether that may be. */
+    private void change(int problem, long deadline) {
+        Response response = link.requests.ask(ControlRequest.REQ_REQUEST_CTRL_VALUE, new byte[] {(byte) problem}, deadline);
+        if (!response.ok()) {
+            throw new RefusedException("control", response);
+        }
+        link.change(() -> {
+            solving = problem;
+            isHeld = true;
+        });
     }
 
     void giveUp() {

@@ -138,6 +138,11 @@ public final class Experiment implements AutoCloseable {
         return link.await(condition, Time.deadline(timeoutS));
     }
 
+    /** Wait for the end of the experiment, which throws {@link ExperimentEndedException}. */
+    public void untilEnd() {
+        link.await(() -> false, Long.MAX_VALUE);
+    }
+
     // --- measuring ---
 
     /** Take a scan of a region (null: what is set) in so many pixels (0: what is set). */

@@ -37,13 +37,15 @@ final class KeyedResults {
         String kind;
     }
 
-    /** What is kept of a measurement; its messages follow in the file. */
+    /** What is kept of a measurement; the messages of its packets follow in the file. */
     static final class Kept {
         String key;
         String facts;
         List<String> interruptions;
-        int[] sizes;
-        transient List<byte[]> messages = new ArrayList<>();
+        List<String> envelopes = new ArrayList<>();
+        List<Long> timesNs = new ArrayList<>();
+        List<Integer> sizes = new ArrayList<>();
+        transient List<Packet> packets = new ArrayList<>();
     }
 
     private final Path folder;
@@ -83,14 +85,15 @@ final class KeyedResults {
             throw new InvalidValueException("the key " + key + " was used for another measurement: " + kept.facts);
         }
         int at = end + 1;
-        for (int size : kept.sizes) {
-            kept.messages.add(Arrays.copyOfRange(bytes, at, at + size));
-            at += size;
+        for (int i = 0; i < kept.sizes.size(); i++) {
+            byte[] message = Arrays.copyOfRange(bytes, at, at + kept.sizes.get(i));
+            kept.packets.add(new Packet(kept.envelopes.get(i), message, kept.timesNs.get(i)));
+            at += message.length;
         }
         return kept;
     }
 
-    void fulfil(String key, String facts, List<byte[]> messages, List<String> interruptions) {
+    void fulfil(String key, String facts, List<Packet> packets, List<String> interruptions) {
         pending = null;
         if (folder == null) {
             return;
@@ -99,8 +102,13 @@ final class KeyedResults {
         kept.key = key;
         kept.facts = facts;
         kept.interruptions = interruptions;
-        kept.sizes = messages.stream().mapToInt(message -> message.length).toArray();
-        List<byte[]> parts = new ArrayList<>(messages);
+        List<byte[]> parts = new ArrayList<>();
+        for (Packet packet : packets) {
+            kept.envelopes.add(packet.envelope());
+            kept.timesNs.add(packet.timeNs());
+            kept.sizes.add(packet.payload().length);
+            parts.add(packet.payload());
+        }
         parts.add(0, (GSON.toJson(kept) + "\n").getBytes(StandardCharsets.UTF_8));
         write(path(key), parts);
         try {

@@ -121,7 +121,7 @@ final class Measurements {
             KeyedResults.Kept kept = results.find(key, target.facts);
             if (kept != null) {
                 List<T> things = new ArrayList<>();
-                kept.messages.forEach(message -> things.add(target.decode(message)));
+                kept.packets.forEach(packet -> things.add(target.of(packet)));
                 return new Measured<>(things, kept.interruptions);
             }
         }
@@ -133,9 +133,9 @@ final class Measurements {
             Map<String, T> found = finish(task);
             channels.put(target.what, new HashSet<>(found.keySet()));
             if (key != null) {
-                List<byte[]> messages = new ArrayList<>();
-                found.values().forEach(thing -> messages.add(target.encode(thing)));
-                results.fulfil(key, target.facts, messages, task.interruptions);
+                List<Packet> packets = new ArrayList<>();
+                found.values().forEach(thing -> packets.add(target.packetOf(thing)));
+                results.fulfil(key, target.facts, packets, task.interruptions);
             }
             return new Measured<>(new ArrayList<>(found.values()), task.interruptions);
         } catch (RuntimeException error) {

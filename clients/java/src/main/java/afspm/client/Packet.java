@@ -15,18 +15,27 @@ public final class Packet {
     private final long timeNs;
     private final Object value;
 
+    Packet(String envelope, byte[] payload, long timeNs) {
+        this.envelope = envelope;
+        this.payload = payload;
+        this.timeNs = timeNs;
+        try {
+            value = Wire.decode(this);
+        } catch (InvalidProtocolBufferException error) {
+            throw new WireException("no " + message() + ": " + error.getMessage());
+        }
+    }
+
     /** Decode two or three frames. */
-    Packet(List<byte[]> frames) {
+    static Packet decode(List<byte[]> frames) {
         if (frames.size() < 2 || frames.size() > 3 || frames.get(0).length > LONGEST_ENVELOPE) {
             throw new WireException("a packet of " + frames.size() + " frames instead of two or three");
         }
-        envelope = new String(frames.get(0), StandardCharsets.UTF_8);
-        payload = frames.get(1);
         try {
-            timeNs = frames.size() < 3 || frames.get(2).length == 0 ? 0 : Time.ns(Timestamp.parseFrom(frames.get(2)));
-            value = Wire.decode(message(), payload);
+            long timeNs = frames.size() < 3 || frames.get(2).length == 0 ? 0 : Time.ns(Timestamp.parseFrom(frames.get(2)));
+            return new Packet(new String(frames.get(0), StandardCharsets.UTF_8), frames.get(1), timeNs);
         } catch (InvalidProtocolBufferException error) {
-            throw new WireException("no " + message() + ": " + error.getMessage());
+            throw new WireException("no time: " + error.getMessage());
         }
     }
 

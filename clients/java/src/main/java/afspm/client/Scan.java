@@ -9,7 +9,7 @@ import java.nio.DoubleBuffer;
 public final class Scan {
     private static final int VALUES = 4;
 
-    private final byte[] message;
+    private final Packet packet;
     private final Region region;
     private final int rows;
     private final int columns;
@@ -19,9 +19,9 @@ public final class Scan {
     private final long timeNs;
     private final String filename;
 
-    /** Decode a {@code Scan2d}; the bytes become part of this object. */
-    Scan(byte[] message) {
-        Values split = new Values(ByteBuffer.wrap(message), VALUES);
+    /** Decode a {@code Scan2d}; its bytes become part of this object. */
+    Scan(Packet packet) {
+        Values split = new Values(ByteBuffer.wrap(packet.payload()), VALUES);
         Scan2d scan;
         try {
             scan = Scan2d.parseFrom(split.rest);
@@ -29,7 +29,7 @@ public final class Scan {
             throw new WireException("no Scan2d: " + error.getMessage());
         }
         ScanParameters parameters = ScanParameters.of(scan.getParams());
-        this.message = message;
+        this.packet = packet;
         this.region = parameters.region();
         this.rows = parameters.rows();
         this.columns = parameters.columns();
@@ -114,8 +114,8 @@ public final class Scan {
         return filename;
     }
 
-    /** Return the {@code Scan2d} as it came. */
-    byte[] message() {
-        return message;
+    /** Return the packet that it came in. */
+    public Packet packet() {
+        return packet;
     }
 }

@@ -61,7 +61,8 @@ final class Sockets {
 
     /** The connection events of one socket, in the order in which they happened. */
     static final class Monitor {
-        static final int CONNECTED = zmq.ZMQ.ZMQ_EVENT_HANDSHAKE_SUCCEEDED;
+        /** JeroMQ 0.6 has no event for the end of the handshake; what is sent from its begin on waits for the end. */
+        static final int CONNECTED = zmq.ZMQ.ZMQ_EVENT_HANDSHAKE_PROTOCOL;
         static final int DISCONNECTED = zmq.ZMQ.ZMQ_EVENT_DISCONNECTED;
         final ZMQ.Socket socket;
 

@@ -13,7 +13,7 @@ public final class Spectrum {
     private static final int DATA = 4;
     private static final int VALUES = 5;
 
-    private final byte[] message;
+    private final Packet packet;
     private final double[] positionM;
     private final String kind;
     private final List<String> names;
@@ -22,9 +22,9 @@ public final class Spectrum {
     private final long timeNs;
     private final String filename;
 
-    /** Decode a {@code Spec1d}; the bytes become part of this object. */
-    Spectrum(byte[] message) {
-        Values outer = new Values(ByteBuffer.wrap(message), DATA);
+    /** Decode a {@code Spec1d}; its bytes become part of this object. */
+    Spectrum(Packet packet) {
+        Values outer = new Values(ByteBuffer.wrap(packet.payload()), DATA);
         ByteBuffer data = outer.chunks.isEmpty() ? ByteBuffer.allocate(0) : outer.chunks.get(outer.chunks.size() - 1);
         Values inner = new Values(data, VALUES);
         Spec1d spectrum;
@@ -35,7 +35,7 @@ public final class Spectrum {
         } catch (InvalidProtocolBufferException error) {
             throw new WireException("no Spec1d: " + error.getMessage());
         }
-        this.message = message;
+        this.packet = packet;
         positionM = Wire.place(spectrum.getPosition());
         kind = spectrum.getType();
         names = Collections.unmodifiableList(rest.getNamesList());
@@ -97,8 +97,8 @@ public final class Spectrum {
         return filename;
     }
 
-    /** Return the {@code Spec1d} as it came. */
-    byte[] message() {
-        return message;
+    /** Return the packet that it came in. */
+    public Packet packet() {
+        return packet;
     }
 }

@@ -114,7 +114,7 @@ final class Subscription {
             listener.onKill();
             return;
         }
-        Packet packet = new Packet(frames);
+        Packet packet = Packet.decode(frames);
         if (isNew(packet)) {
             listener.onPacket(packet);
         }

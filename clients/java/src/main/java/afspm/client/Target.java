@@ -31,9 +31,7 @@ abstract class Target<T> {
     /** Return what is there once in a result: the channel of a scan. */
     abstract String nameOf(T result);
 
-    abstract T decode(byte[] message);
-
-    abstract byte[] encode(T result);
+    abstract Packet packetOf(T result);
 
     /** A scan to take; no region, or no rows, leaves what is set. */
     static final class OfScan extends Target<Scan> {
@@ -69,13 +67,8 @@ abstract class Target<T> {
         }
 
         @Override
-        Scan decode(byte[] message) {
-            return new Scan(message);
-        }
-
-        @Override
-        byte[] encode(Scan scan) {
-            return scan.message();
+        Packet packetOf(Scan scan) {
+            return scan.packet();
         }
     }
 
@@ -112,13 +105,8 @@ abstract class Target<T> {
         }
 
         @Override
-        Spectrum decode(byte[] message) {
-            return new Spectrum(message);
-        }
-
-        @Override
-        byte[] encode(Spectrum spectrum) {
-            return spectrum.message();
+        Packet packetOf(Spectrum spectrum) {
+            return spectrum.packet();
         }
     }
 }

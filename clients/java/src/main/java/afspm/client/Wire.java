@@ -69,12 +69,13 @@ final class Wire {
     }
 
     /** Decode a message of those that are followed here; null for all others. */
-    static Object decode(String name, byte[] payload) throws InvalidProtocolBufferException {
-        switch (name) {
+    static Object decode(Packet packet) throws InvalidProtocolBufferException {
+        byte[] payload = packet.payload();
+        switch (packet.message()) {
             case "Scan2d":
-                return new Scan(payload);
+                return new Scan(packet);
             case "Spec1d":
-                return new Spectrum(payload);
+                return new Spectrum(packet);
             case "ScanLines":
                 return new ScanLines(payload);
             case "ScopeStateMsg":
