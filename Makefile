@@ -7,7 +7,7 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 SETUP := .venv/.made
 
-.PHONY: demo demo-drift test mutants test-samples test-ui test-translators test-clients test-windows test-nexus test-bluesky check bench bench-drift soak chaos simulate power-cut docs clean
+.PHONY: demo demo-drift test mutants test-samples test-ui test-translators test-clients test-windows test-hosts test-nexus test-bluesky check bench bench-drift soak chaos simulate power-cut docs clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -41,7 +41,7 @@ COLLECTED := .venv/.tests-collected
 MUTANTS := tests/simulation/test_mutants.py
 SAMPLES := tests/system/experiment/test_samples_run.py
 test: $(COLLECTED)
-	@PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(TESTS_AT_A_TIME) --ignore $(SAMPLES) --ignore $(MUTANTS)
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(TESTS_AT_A_TIME) --ignore $(SAMPLES) --ignore $(MUTANTS) --ignore tests/system/hosts
 
 # asserts are rewritten once, not by each of the processes that run tests; what can't be collected is told by them
 $(COLLECTED): $(TEST) $(shell find tests -name '*.py')

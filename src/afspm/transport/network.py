@@ -41,6 +41,9 @@ _STALLED_MS = 5_000
 _WINDOWS_MAXRT = 5  # of ws2ipdef.h; Python's socket module has no name for it
 _RECONNECT_MS, _RECONNECT_MAX_MS = 20, 200
 _HANDSHAKE_MS = 5_000
+# Systems repeat an attempt to connect after 1, 3, 7, 15, 31 s …: one that was begun while the link was down would not
+# notice its return for half a minute. Instead it is given up, and begun again.
+_CONNECT_MS = 2_000
 _OPTIONS = (
     (zmq.LINGER, _LINGER_MS),
     (zmq.SNDHWM, QUEUE_LENGTH),
@@ -51,6 +54,7 @@ _OPTIONS = (
     (zmq.RECONNECT_IVL, _RECONNECT_MS),
     (zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS),
     (zmq.HANDSHAKE_IVL, _HANDSHAKE_MS),
+    (zmq.CONNECT_TIMEOUT, _CONNECT_MS),
 )
 _HEARTBEATS = (
     (zmq.HEARTBEAT_IVL, _ALIVE_CHECK_MS),
