@@ -102,16 +102,29 @@ def resume(found: ResumableRun, options: RunOptions, terminal: TextIO | None = N
     experiment.require_valid(options.only, options.without)
     with lock_run(folder):
         _wait_until_gone(facts, folder)
-        common = _common(experiment, options, facts, folder)
-        require_free(running.addresses_of(running.dry_run(experiment, options)))
+        starts = running.dry_run(experiment, options)
+        common = running.common_identity(experiment, starts, _own(experiment, options, found), options, terminal)
+        if facts.get(RUN) and common.run != facts[RUN]:
+            what = "the scheduler has begun another run meanwhile"
+            raise ConfigError(what, where=str(folder), hint="begin a new run here, too: `afspm run FILE --only …`")
+        require_free(running.addresses_of(starts))
         names = [*facts.get("processes", ()), *found.added]
         return running.go(experiment, options, common, folder, found.name, terminal, names)
 
 
-def _common(experiment: Experiment, options: RunOptions, facts: dict[str, Any], folder: Path) -> RunIdentity:
-    """As before, with real time, or the simulated time after the last that anybody has seen."""
+def _own(experiment: Experiment, options: RunOptions, found: ResumableRun) -> RunIdentity:
+    """Return what this part had before, with real time, or the simulated time after the last that anybody has seen.
+
+    Where parts run on other computers, to which time has gone on, it has gone on here.
+    """
+    facts = found.facts
     simulated = bool(facts.get("simulated")) or experiment.simulated(options.only, options.without)
-    clock = _clock_after(facts, folder) if simulated else experiment.clock()
+    if not simulated:
+        clock = experiment.clock()
+    elif options.only or options.without:
+        clock = ExperimentClock.from_dict(facts["clock"])
+    else:
+        clock = _clock_after(facts, found.folder)
     return RunIdentity(clock, str(facts.get(RUN) or new_identity()), simulated)
 
 

@@ -86,7 +86,7 @@ def run(experiment: Experiment, options: RunOptions = RunOptions(), terminal: Te
     key_handout.hand_over(experiment, first)
     names = [start.launch.name for start in first]
     require_free(addresses_of(first))
-    common = _common(experiment, first, own, options, terminal)
+    common = common_identity(experiment, first, own, options, terminal)
     folder = run_folder.create(options.runs, experiment.name, now())
     with lock_run(folder):
         run_folder.write_experiment(folder, experiment.expanded(secrets=False))
@@ -237,7 +237,7 @@ def _own(experiment: Experiment, options: RunOptions) -> RunIdentity:
     return RunIdentity(clock, run_identity.new_identity(), simulated)
 
 
-def _common(
+def common_identity(
     experiment: Experiment,
     starts: Sequence[ProcessStart],
     own: RunIdentity,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import itertools
 import socket
@@ -141,7 +142,7 @@ class Network:
             socket.setsockopt(zmq.CURVE_SECRETKEY, self.keys.secret)
             socket.setsockopt(zmq.ZAP_DOMAIN, b"afspm")
         try:
-            socket.bind(address)
+            socket.bind(_bindable(address))
         except zmq.ZMQError as error:
             raise TransportError(
                 f"can't bind: {zmq.strerror(error.errno or 0)}", where=address, hint=_bind_hint(error)
@@ -208,6 +209,45 @@ def is_local(address: str) -> bool:
             if not ipaddress.ip_address(host).is_loopback:
                 return False
         except ValueError:
+            return False
+    return True
+
+
+def _bindable(address: str) -> str:
+    """Return where to listen for those who connect to an address: by a host name, at all addresses of this computer.
+
+    The name may lead to another address tomorrow, and on the computer itself often leads to a loopback one.
+
+    Raises:
+        TransportError: the name is not known, or that of another computer.
+    """
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    if not address.startswith("tcp://") or not _is_name(host):
+        return address
+    try:
+        found = {str(entry[4][0]) for entry in socket.getaddrinfo(host, None, socket.AF_INET)}
+    except OSError as error:
+        raise TransportError(f"can't bind: {host!r} is no name that is known here", where=address) from error
+    if not any(map(_is_ours, found)):
+        what = f"can't bind: {host!r} is another computer: {', '.join(sorted(found))}"
+        raise TransportError(what, where=address, hint="is this process meant to run there (--only)?")
+    return f"tcp://*:{port}"
+
+
+def _is_name(host: str) -> bool:
+    """Return whether this is a host's name, and not an address, a wildcard, or a network interface."""
+    interfaces = {name for _, name in socket.if_nameindex()} | {"*", "localhost"}
+    with contextlib.suppress(ValueError):
+        ipaddress.ip_address(host.strip("[]"))
+        return False
+    return host not in interfaces
+
+
+def _is_ours(ip: str) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        try:
+            probe.bind((ip, 0))
+        except OSError:
             return False
     return True
 

@@ -241,9 +241,9 @@ class HostsLab:
         lines = [line.split() for path in found for line in path.read_text(encoding="utf-8").splitlines()]
         return sorted((float(time_s), said) for time_s, *said in lines)
 
-    def enough(self) -> None:
-        """Let the components take no more scans than those that they have begun."""
-        for name in TILERS:
+    def enough(self, *names: str) -> None:
+        """Let these components, or both, take no more scans than those that they have begun."""
+        for name in names or TILERS:
             (self.folder / name / "enough").touch()
 
     def is_done(self, name: str) -> bool:

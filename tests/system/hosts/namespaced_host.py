@@ -73,7 +73,7 @@ class Host:
 
     def move(self, address: str) -> None:
         """Give it another address."""
-        for change in (f"add {address}/24", f"del {self.known[self.name]}/24"):
+        for change in (f"del {self.known[self.name]}/24", f"add {address}/24"):  # as others are secondary to the first
             self.check_output("ip", "address", *change.split(), "dev", DEVICE)
         self._network.readdress(self.name, address)
 

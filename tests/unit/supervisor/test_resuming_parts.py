@@ -10,12 +10,13 @@ from typing import Any
 
 import pytest
 
+from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Role, load
 from afspm.experiment.experiment import load_expanded
 from afspm.supervisor import run as running
-from afspm.supervisor.resume import ResumableRun, _wait_until_gone
-from afspm.supervisor.run import ONLY, WITHOUT, RunOptions, dry_run, facts_to_resume
+from afspm.supervisor.resume import ResumableRun, _own, _wait_until_gone
+from afspm.supervisor.run import ONLY, RUN, WITHOUT, RunOptions, dry_run, facts_to_resume
 
 PARTS = """
 [clock]
@@ -132,3 +133,19 @@ def test_without_its_emulator_an_experiment_does_not_have_the_time_of_a_simulati
     with pytest.raises(ConfigError, match="nothing here proves that its microscope is simulated"):
         running.run(load(tmp_path / "night.toml"), options)
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("only", [(), ("microscope", "scheduler")])
+def test_simulated_time_goes_on_where_other_computers_have_parts_of_the_run(
+    only: tuple[str, ...], tmp_path: Path
+) -> None:
+    (tmp_path / "night.toml").write_text(PARTS, encoding="utf-8")
+    experiment = load(tmp_path / "night.toml")
+    before = ExperimentClock(1000.0, 5000.0, 60.0)
+    facts = {"simulated": True, RUN: "a", "clock": {**before.as_dict(), "monotonic": "of an earlier boot"}}
+    found = ResumableRun(tmp_path, "night", experiment, facts, (tmp_path,))
+    clock = _own(experiment, RunOptions(only=only), found).clock
+    if only:
+        assert clock.now_s() == pytest.approx(before.now_s(), abs=60.0)
+    else:  # nothing has happened meanwhile
+        assert clock.now_s() < 6000.0

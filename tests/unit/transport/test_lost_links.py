@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import zmq
 
+from afspm.errors import TransportError
 from afspm.transport import network
 from afspm.transport.network import Monitor, Network
 
@@ -40,3 +41,27 @@ def test_an_attempt_to_connect_is_given_up_and_begun_again(
     monitor = Monitor(ours, dealer, zmq.EVENT_CONNECT_RETRIED)
     ours.connect(dealer, f"tcp://127.0.0.1:{unreachable}")
     assert monitor.socket.poll(5_000), "the system alone would try for two minutes"
+
+
+def test_a_host_name_listens_at_every_address_of_the_computer(open_: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Debian's own name leads to 127.0.1.1, where no other computer could connect."""
+    entry = (socket.AF_INET, socket.SOCK_STREAM, 0, "", ("127.0.0.1", 0))
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_: [entry])
+    ours = open_(Network(insecure=True))
+    bound = ours.bind(ours.socket(zmq.ROUTER), "tcp://microscope-7:*")
+    assert bound.startswith("tcp://0.0.0.0:")
+
+
+@pytest.mark.parametrize(("ip", "told"), [("192.0.2.7", "another computer: 192.0.2.7"), ("", "no name")])
+def test_the_name_of_another_computer_is_refused(
+    open_: Any, monkeypatch: pytest.MonkeyPatch, ip: str, told: str
+) -> None:
+    def lookup(*_: object) -> Any:
+        if not ip:
+            raise socket.gaierror
+        return [(socket.AF_INET, socket.SOCK_STREAM, 0, "", (ip, 0))]
+
+    monkeypatch.setattr(socket, "getaddrinfo", lookup)
+    ours = open_(Network(insecure=True))
+    with pytest.raises(TransportError, match=told):
+        ours.bind(ours.socket(zmq.ROUTER), "tcp://microscope-7:29001")
