@@ -69,9 +69,9 @@ class TipClassifier(Component):
     def on_control(self, control_state: ControlState) -> None:
         was, self._problems = self._is_flagged, control_state.problems
         if self._is_flagged and not was and self.counter.bad < self.counter.flag_after:
-            self.counter.good = 0  # somebody else saw something: only scans from now on can tell that it is over
+            self.counter.good = 0  # flagged by another component or person: only later scans can tell that it is over
         elif was and not self._is_flagged:
-            self.counter.bad = 0  # somebody has seen to it: only scans from now on can tell that it is bad again
+            self.counter.bad = 0  # repaired, or cleared by a person: only later scans can tell that it is bad again
             self.judge.trust()
             self._save()
 
@@ -98,18 +98,17 @@ class TipClassifier(Component):
         self._remember(pair.trace)
 
     def _tell(self, scan: Scan, verdict: Verdict) -> None:
-        """Flag or clear; then the verdict, so that who waits for it finds the flag as it should be."""
+        """Flag after a bad verdict, so that a solver knows where; clear before a good one, so that it finds no flag."""
         self.log.info("%s: %s (%s)", _name(scan), verdict.opinion.value, verdict.why)
-        if verdict.opinion is Opinion.BAD and self.counter.wants_flag and not self._is_flagged:
-            self.log.warning("the tip has changed: %s", verdict.why)
-            self.scope.flag(self.problem)
-        elif self.counter.wants_clear and self._is_flagged:
+        if self.counter.wants_clear and self._is_flagged:
             self.log.info("the tip is good again: %s", verdict.why)
             self.scope.clear(self.problem)
         if verdict.opinion in _SCORES:
-            self.publish(
-                tip_verdict.verdict_message(scan, _SCORES[verdict.opinion]), f"{tip_verdict.MESSAGE}_{self.name}"
-            )
+            message = tip_verdict.verdict_message(scan, _SCORES[verdict.opinion])
+            self.publish(message, f"{tip_verdict.MESSAGE}_{self.name}")
+        if verdict.opinion is Opinion.BAD and self.counter.wants_flag and not self._is_flagged:
+            self.log.warning("the tip has changed: %s", verdict.why)
+            self.scope.flag(self.problem)
 
     def _remember(self, scan: Scan) -> None:
         if scan.time_ns is not None:

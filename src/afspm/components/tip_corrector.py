@@ -1,7 +1,8 @@
-"""`TipCorrector`: makes the tip good again when somebody flagged it, within what it is allowed to do."""
+"""`TipCorrector`: repairs a tip that was flagged, within what it is allowed to do."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 from afspm.client.component import Component
@@ -17,17 +18,21 @@ from afspm.errors import AfspmError, ConfigError, ControlLost, FileError, NoResp
 from afspm.model import Problem, Region, Scan, ScanSet, names
 from afspm.units import Duration, Length, Speed, Voltage
 
+Frame = list[list[float]]
+"""Region and pixels in JSON's types: centre, size and angle; rows and columns."""
+LAST_FRAMES = 16  # of scans that a verdict may still come for
 VERDICT_WITHIN_S = 20.0  # real time: a classifier that says nothing for that long will not
 
 
 class TipCorrector(Component):
     """Solves `tip-shape-changed`: pulses of the bias, one after the other, then controlled crashes, deeper and deeper.
 
-    After each it takes a test scan, of the size of the experiment's scans. Whoever judges scans (the
-    `TipClassifier`) clears the flag when the tip is good, which takes control from the corrector: the experiment goes
-    on. The lists below are all that one repair may do, over restarts too; what a limit of the experiment file or the
-    microscope refuses is told and left out. When nothing is left it flags `device-malfunction` and waits for a person:
-    the experiment stands still rather than measuring with a bad tip. Once that flag is removed it may try again.
+    After each it takes a test scan: of the region, with the pixels, of the scan last judged bad, since the fault was
+    seen there; without such a verdict, of the region set last. A component that judges scans (the `TipClassifier`)
+    clears the flag when the tip is good, which takes control from the corrector: the experiment goes on. The lists
+    below are all that one repair may do, over restarts too; what a limit of the experiment file or the microscope
+    refuses is logged and left out. When nothing is left it flags `device-malfunction` and waits for a person: the
+    experiment stops measuring rather than measuring with a bad tip. Once that flag is removed it may try again.
 
     What it does to the sample it does at fresh places about `workshop_center`, and never within `keep_away` of the
     experiment's region or of the test scan. Where control is lost on the way to one of them, to a person who moves the
@@ -38,8 +43,8 @@ class TipCorrector(Component):
     Args:
         workshop_center: (x, y) about which pulses and crashes are made.
         test_center: (x, y) of a first test scan, so that a tip that is worse stays off the experiment's region.
-            Whether it is good is seen best in that region, which is known; there it is tested next, or at once if no
-            place is given here.
+            Whether it is good is seen best where the fault was seen; there it is tested next, or at once if no place
+            is given here.
         pulse_voltages: those of one repair, in order.
         pulse_duration: of each pulse.
         crash_depths: those of one repair, in order, after the pulses.
@@ -92,16 +97,28 @@ class TipCorrector(Component):
         self._workshop = TipWorkshop(self, self.problem, self.workshop_center, self.place_spacing, self.keep_away)
         if self.judge is not None and "judge" in self.memory:
             self.judge.restore(self.memory["judge"])
-        wanted = ("ControlState",) if self.judge is None else ("ControlState", "Scan2d")
-        with self.scope.events(*wanted) as events:
+        frames: dict[int | None, Frame] = {}
+        with self.scope.events("ControlState", "Scan2d", tip_verdict.MESSAGE) as events:
             self._look()
             problems = self.scope.control_state.problems
             for event in events:
                 if isinstance(event.message, Scan):
+                    frames[event.message.time_ns] = _packed(event.message.region, event.message.shape)
+                    if len(frames) > LAST_FRAMES:
+                        del frames[next(iter(frames))]
                     self._learn(event.message, problems)
+                elif event.envelope.startswith(tip_verdict.MESSAGE):
+                    self._note(read_verdict(event.message), frames)
                 else:
                     problems = event.message.problems  # as it was when the scans after it came
                     self._look()
+
+    def _note(self, verdict: tuple[int, float] | None, frames: Mapping[int | None, Frame]) -> None:
+        """Keep the frame of the scan last judged bad, until another is judged good."""
+        if verdict is None or verdict[1] == tip_verdict.UNCLEAR or "region" in self.memory:
+            return
+        self.memory["judged_bad"] = frames.get(verdict[0]) if verdict[1] == tip_verdict.BAD else None
+        self.memory.save()
 
     def _look(self) -> None:
         """Repair if that is wanted."""
@@ -111,7 +128,7 @@ class TipCorrector(Component):
             self.log.info("a person cleared the problem: the tip may be repaired again")
             self._begin_anew()
         if not self.scope.is_flagged(self.problem):
-            if self.memory.get("tried"):
+            if "region" in self.memory:
                 self._begin_anew()
             return
         try:
@@ -125,8 +142,10 @@ class TipCorrector(Component):
         if region is None:
             self._give_up("the microscope does not report its scan region: no place is known to be safe")
             return
-        test = region if self.test_center is None else region.moved_to(self.test_center)
-        looks = (test, region, region) if self.test_center else (region,) * 3
+        bad = self.memory.get("judged_bad")
+        seen, shape = _unpacked(bad) if bad else (region, shape)
+        test = seen if self.test_center is None else seen.moved_to(self.test_center)
+        looks = (test, seen, seen) if self.test_center else (seen,) * 3
         tried = int(self.memory.get("tried", 0))
         self.log.info("repairing the tip%s", f" ({tried} treatments were tried already)" if tried else "")
         with self.scope.events("ControlState", tip_verdict.MESSAGE, timeout_s=VERDICT_WITHIN_S) as answers:
@@ -134,7 +153,7 @@ class TipCorrector(Component):
                 if tried and self._is_cured(looks, shape, answers):  # a kill may have come between treatment and test
                     return
                 for number, treatment in enumerate(self.allowed[tried:], tried + 1):
-                    if self._workshop.treat(number, treatment, (region, test)) and self._is_cured(
+                    if self._workshop.treat(number, treatment, (region, seen, test)) and self._is_cured(
                         looks, shape, answers
                     ):
                         self.log.info("the tip is repaired")
@@ -152,12 +171,9 @@ class TipCorrector(Component):
             if parameters is None or not isinstance(parameters.region, Region):
                 return None, None
             region = parameters.region
-            self.memory["region"] = [*region.center_m, *region.size_m, region.angle_rad]
-            self.memory["shape"] = parameters.shape
+            self.memory["region"] = _packed(region, parameters.shape)
             self.memory.save()
-        x, y, width, height, angle = self.memory["region"]
-        shape = self.memory["shape"]
-        return Region((x, y), (width, height), angle), (shape[0], shape[1]) if shape else None
+        return _unpacked(self.memory["region"])
 
     def _is_cured(self, looks: tuple[Region, ...], shape: tuple[int, int] | None, answers: Events) -> bool:
         """Test scans until it is known whether the tip is good.
@@ -238,9 +254,18 @@ class TipCorrector(Component):
         self.scope.wait_until(lambda: self.scope.is_flagged(problem) is flagged, timeout_s=VERDICT_WITHIN_S)
 
     def _begin_anew(self) -> None:
-        for key in ("tried", "region", "shape", "given_up"):
+        for key in ("tried", "region", "judged_bad", "given_up"):
             self.memory.pop(key, None)
         self.memory.save()
+
+
+def _packed(region: Region, shape: tuple[int, int] | None) -> Frame:
+    return [[*region.center_m, *region.size_m, region.angle_rad], list(shape or ())]
+
+
+def _unpacked(frame: Frame) -> tuple[Region, tuple[int, int] | None]:
+    (x, y, width, height, angle), shape = frame
+    return Region((x, y), (width, height), angle), (int(shape[0]), int(shape[1])) if shape else None
 
 
 class _Blind(AfspmError):

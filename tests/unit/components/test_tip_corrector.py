@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from client_lab import REGION, Kill9, Lab, LabPort, context_of, run
 from tip_scans_lab import HOME, channels
@@ -151,6 +152,40 @@ def test_an_unclear_verdict_is_looked_at_again_without_another_treatment() -> No
 def test_the_first_test_scan_is_apart_and_the_next_where_the_sample_is_known() -> None:
     lab = repaired([UNCLEAR, GOOD], test_center=(0.0, 4e-6))
     assert lab.finished == [REGION.moved_to((0.0, 4e-6)), REGION]
+
+
+ZOOM = Region((1e-6, 1e-6), (2e-7, 2e-7))
+
+
+def flagged_at_a_zoom(verdicts: list[float], *scores: float) -> Repairs:
+    """The zoom is judged, then the next region is set, and then the flag comes."""
+    lab = Repairs(verdicts)
+
+    def judged() -> None:
+        lab.parameters = ScanParameters(ZOOM, (16, 16))
+        scan = Scan(ZOOM, "Height", "m", np.zeros((16, 16)), time_ns=lab.clock.now_ns())
+        lab.publish(scan)
+        for score in scores:
+            lab.publish(verdict_message(scan, score), f"{MESSAGE}_tip_classifier")
+        lab.parameters = ScanParameters(REGION, (8, 8))
+        lab.publish(lab.parameters)
+
+    lab.at(10.0, judged)
+    lab.at(11.0, lambda: lab.flag(TIP))
+    lab.at(5000.0, lab.kill)
+    assert run(corrector(), lab) == ExitCode.ENDED
+    return lab
+
+
+def test_a_repair_is_tested_at_the_region_and_pixels_of_the_scan_judged_bad() -> None:
+    lab = flagged_at_a_zoom([BAD, GOOD], BAD)
+    assert lab.finished == [ZOOM, ZOOM]
+    assert lab.parameters.shape == (16, 16)
+    assert lab.problems == ()
+
+
+def test_a_later_good_verdict_takes_back_where_the_fault_was_seen() -> None:
+    assert flagged_at_a_zoom([GOOD], BAD, GOOD).finished == [REGION]
 
 
 def test_a_tip_that_stays_bad_is_given_up_on_loudly_after_what_is_allowed_and_no_more() -> None:
