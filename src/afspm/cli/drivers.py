@@ -164,21 +164,19 @@ def _emulate(emulator: Emulator, speed: float, folder: Path) -> None:
 
     from afspm.clock import ExperimentClock
     from afspm.emulators.emulator import Crashed
+    from afspm.process import signals
     from afspm.process.log import set_up
 
     log = set_up("emulate", "INFO")
-    for name in ("SIGINT", "SIGTERM", "SIGBREAK"):
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), lambda *_: emulator.stop())
 
     def listening(address: str) -> None:
-        # Windows runs handlers only when the main thread comes back from waiting: this is what brings it back
         signal.set_wakeup_fd(emulator.woken.writer_fileno(), warn_on_full_buffer=False)
         where = f"listening at {address}, files in {folder.resolve()}" if address else "does not listen for now"
         typer.echo(f"SIMULATED {emulator.vendor} controller: {where}")
 
     try:
-        emulator.run(ExperimentClock.starting_now(speed=speed), folder.resolve(), log, listening)
+        with signals.caught(lambda _: emulator.stop(), -1):  # puts back the descriptor of `listening` as well
+            emulator.run(ExperimentClock.starting_now(speed=speed), folder.resolve(), log, listening)
     except Crashed as crash:
         typer.echo(f"SIMULATED crash: {crash}", err=True)
         raise typer.Exit(1) from None

@@ -82,6 +82,7 @@ class StatusText:
             lines.append(Text(told, "bold yellow"))
         lines += [self._control(), *self._problems(), self._scanning(), *self._progress(), *self._processes()]
         lines += self._refusals()
+        lines += self._notes()
         lines += map(log_line, list(self._seen.log)[-log_lines:] if log_lines > 0 else ())
         for line in lines:
             line.no_wrap, line.overflow = False, "fold"
@@ -200,6 +201,13 @@ class StatusText:
             line = _label("refused").append(f"{time_of_day(time_ns)} {who}: {what}{again}")
             yield line.append(f": {reason}" if reason else "", "yellow")
 
+    def _notes(self, most: int = 3) -> Iterator[Text]:
+        """Yield the last notes, with the scan that each belongs to."""
+        numbers = {scan.time_ns: scan.number for scan in self._seen.scans}
+        for note in list(self._seen.notes)[-most:]:
+            on = f" on scan {numbers[note.scan_ns]}" if note.scan_ns in numbers else ""
+            yield _label("note").append(f"{time_of_day(note.time_ns)} {note.who}{on}: {note.text}")
+
     def as_json(self) -> dict[str, Any]:
         """Return the same for programs. Times as ISO 8601 in UTC, durations in experiment seconds."""
         seen, run = self._seen, self._run
@@ -232,6 +240,10 @@ class StatusText:
             "refusals": [
                 {"time": _iso(one.time_ns), "who": one.who, "what": one.what, "reason": one.reason}
                 for one in seen.refusals
+            ],
+            "notes": [
+                {"time": _iso(one.time_ns), "who": one.who, "text": one.text, "scan": _iso(one.scan_ns)}
+                for one in seen.notes
             ],
             "log": [
                 {"time": _iso(line.time_ns), "name": line.name, "level": line.level, "text": line.text}

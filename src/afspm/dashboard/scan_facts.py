@@ -19,7 +19,7 @@ def scan_facts(frame: ChannelFrame, overview: Overview, conditions: Mapping[str,
     """Return what a person wants to know of a scan.
 
     Args:
-        conditions: label and text of the parameters that were in force.
+        conditions: label and text of the parameters that were read when it began; empty where no page was open then.
     """
     region, (rows, columns) = frame.region, frame.values.shape
     size = ("Size", typeset_area(region.size_m))
@@ -30,7 +30,7 @@ def scan_facts(frame: ChannelFrame, overview: Overview, conditions: Mapping[str,
         ("Centre", _centre(region.center_m)),
         *angle,
         ("Pixels", f"{columns} × {rows}"),
-        *conditions.items(),
+        *(conditions or _recorded(frame, overview)).items(),
         *(("Note", note.text) for note in overview.notes if frame.time_ns and note.scan_ns == frame.time_ns),
     ]
 
@@ -45,6 +45,12 @@ def _when(frame: ChannelFrame, overview: Overview, now_ns: int) -> Facts:
     if summary is not None and summary.holder:
         facts.append(("By", summary.holder))
     return [fact for fact in facts if fact[1]]
+
+
+def _recorded(frame: ChannelFrame, overview: Overview) -> Mapping[str, str]:
+    """Return what the record has of the parameters: a number without a unit, which no message tells."""
+    summary = None if frame.time_ns is None else summary_of(frame.time_ns, overview)
+    return {} if summary is None or summary.setpoint is None else {"Setpoint": f"{summary.setpoint:.4g}"}
 
 
 def began_ns(frame: ChannelFrame, overview: Overview) -> int | None:

@@ -77,6 +77,7 @@ class ScanSummary:
         shape: (rows, columns).
         holder: who was in control; None if nobody was, or it is not known.
         interrupted: only a part of it was taken.
+        setpoint: of the feedback when it began, in the unit of the operating mode; None if it was not published.
         number: of the scan in the run, from 1; its channels have the same.
     """
 
@@ -89,6 +90,7 @@ class ScanSummary:
     filename: str = ""
     holder: str | None = None
     interrupted: bool = False
+    setpoint: float | None = None
     number: int = 0
 
     def is_of_scan(self, other: ScanSummary) -> bool:
@@ -276,7 +278,8 @@ class Overview:
         if status.state is ScopeState.SCANNING:
             if before is None or before.state is not ScopeState.SCANNING or self.running is None:
                 holder = self.control.holder if self.control else None
-                self.running = RunningScan(time_ns if before else None, holder, self.scan_parameters)
+                setpoint = self.feedback.setpoint if self.feedback else None
+                self.running = RunningScan(time_ns if before else None, holder, self.scan_parameters, setpoint)
             return
         if status.state is ScopeState.FREE and self.running is not None and self.running.began_ns is not None:
             self._done.append(DoneScan(self.running.parameters, time_ns - self.running.began_ns))
@@ -316,7 +319,8 @@ class Overview:
         last = next(reversed(self._scans.values()), None)
         before = 0 if last is None else last.number
         number = before if last is not None and taken.is_of_scan(last) else before + 1
-        _keep(self._scans, key, replace(taken, number=number))
+        setpoint = self.running.setpoint if self.running else None
+        _keep(self._scans, key, replace(taken, number=number, setpoint=setpoint))
 
     def _take_spectrum(self, spectrum: Spectrum, time_ns: int) -> None:
         taken_ns, holder = spectrum.time_ns or time_ns, self.control.holder if self.control else None

@@ -38,16 +38,18 @@ class RunningScan:
         began_ns: None if its beginning was not seen.
         holder: who was in control when it began.
         parameters: that were in force then; None if they are not known.
+        setpoint: of the feedback then; None if it was not published.
         channels: what has come of each, where the microscope delivers lines.
     """
 
     began_ns: int | None
     holder: str | None
     parameters: ScanParameters | None
+    setpoint: float | None = None
     channels: dict[str, ChannelLines] = field(default_factory=dict)
 
     def take(self, lines: ScanLines) -> None:
-        """ChannelTake lines of the scan."""
+        """Take lines of the scan."""
         if self.began_ns is None:
             self.began_ns = lines.began_ns
         channel = self.channels.get(lines.channel)

@@ -6,6 +6,7 @@ import io
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -128,6 +129,23 @@ def test_what_is_refused_again_and_again_is_said_once(night: Overview) -> None:
         night.take("JournalEntries", model.JournalEntries((entry,)), START + (130 + k) * S)
     assert shown(night).count("asks for control") == 1
     assert "series: asks for control (5 times): flagged: …" in shown(night)
+
+
+def test_notes_are_listed_with_their_scan(night: Overview) -> None:
+    scan_ns = START + 130 * S
+    night.take("Scan2d", model.Scan(REGION, "Height", "m", np.zeros((4, 4)), scan_ns), scan_ns)
+    for note in (
+        model.Note(scan_ns, "terminal:Ada", "scratch [/x]", scan_ns),
+        model.Note(scan_ns + S, "series", "dry"),
+    ):
+        night.take("Note", note, note.time_ns)
+    text = shown(night)
+    assert "terminal:Ada on scan 1: scratch [/x]" in text
+    assert "series: dry" in text
+    told = StatusText(night, ABOUT, START + 160 * S).as_json()["notes"]
+    assert [(one["who"], one["text"], one["scan"] is None) for one in told] == [
+        ("terminal:Ada", "scratch [/x]", False), ("series", "dry", True),
+    ]  # fmt: skip
 
 
 def test_silence_is_said_as_such(night: Overview) -> None:

@@ -13,7 +13,7 @@ from afspm.dashboard.actions import ActionResult
 from afspm.dashboard.conditions import Conditions
 from afspm.dashboard.scan_facts import scan_facts
 from afspm.dashboard.thumbnails import SIDE_PX, Thumbnails
-from afspm.model import ControlMode, ControlState, Region, Scan, ScopeState, ScopeStatus
+from afspm.model import ControlMode, ControlState, Feedback, Region, Scan, ScopeState, ScopeStatus
 from afspm.record.overview import Overview
 from afspm.web.frames import ChannelFrame
 from afspm.web.watch import Watch
@@ -58,6 +58,16 @@ def test_a_finished_scan_is_told_with_number_time_holder_place_and_what_was_set(
         "Scan": "no. 2", "Took": "10 s", "By": "series", "Size": "1 × 0.5 µm", "Centre": "(1, −0.5) µm",
         "Angle": "5.73°", "Pixels": "4 × 2", "Bias": "100 mV",
     }  # fmt: skip
+
+
+def test_a_scan_from_before_the_page_has_the_recorded_setpoint_of_its_beginning() -> None:
+    feedback = [("ZCtrlParameters", Feedback(setpoint=value), time_s * S) for value, time_s in ((0.7, 5), (0.5, 45))]
+    overview = overview_of(sorted([*a_scan(10), *a_scan(40), *a_scan(70), *feedback], key=lambda packet: packet[2]))
+    frames = [ChannelFrame(1, "Height", "m", REGION, VALUES, time_s * S, None, 2) for time_s in (50, 80)]
+    facts = [dict(scan_facts(frame, overview, {}, 90 * S)) for frame in frames]
+    assert [one["Setpoint"] for one in facts] == ["0.7", "0.5"]
+    read = {"Setpoint": "700 mV"}
+    assert dict(scan_facts(frames[0], overview, read, 90 * S))["Setpoint"] == "700 mV"
 
 
 def test_a_growing_scan_is_told_with_when_it_ends() -> None:
