@@ -171,7 +171,7 @@ class TipCorrector(Component):
             if parameters is None or not isinstance(parameters.region, Region):
                 return None, None
             region = parameters.region
-            self.memory["region"] = _packed(region, parameters.shape)
+            self.memory["region"] = _packed(region, parameters.shape if isinstance(parameters.shape, tuple) else None)
             self.memory.save()
         return _unpacked(self.memory["region"])
 

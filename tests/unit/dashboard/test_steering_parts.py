@@ -57,7 +57,7 @@ def test_a_problem_says_what_to_do_and_whether_a_component_does_it() -> None:
     tip, own = flags(overview)
     assert (tip.name, tip.since_ns) == ("tip-shape-changed", S)
     assert tip.advice == "No component works on it. Take over, condition or change the tip, then clear the problem."
-    assert "then clear the problem" in own.advice
+    assert "then clear it" in own.advice
     overview.take("ControlState", ControlState(ControlMode.AUTOMATED, "tip_corrector", (1,)), 2 * S)
     (tip,) = flags(overview)
     assert tip.advice == "tip_corrector is in control to solve it: wait, or take over."
