@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from afspm.cli.joining import NOT_RUNNING, acting, looking
-from afspm.cli.status import _console
+from afspm.cli.joining import NOT_RUNNING, acting, looking, plain_console
 from afspm.errors import NoResponse
 from afspm.record.run_lock import cut_off_message, describe_state, lock_run
 
@@ -83,5 +82,5 @@ def test_a_run_that_has_ended_is_named_from_its_folder_too(
 
 def test_what_is_no_terminal_gets_a_line_for_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     text = 100 * "word "
-    _console().print(text)
+    plain_console().print(text)
     assert capsys.readouterr().out == text + "\n"
