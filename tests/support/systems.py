@@ -14,6 +14,8 @@ import pytest
 WINDOWS: Final = sys.platform == "win32"
 WINE: Final = WINDOWS and hasattr(ctypes.WinDLL("ntdll"), "wine_get_version")
 """A Windows Python runs the tests, but Windows' own functions are those of Wine."""
+PATIENCE: Final = 4.0 if WINE else 1.0
+"""How many times longer tests wait there for what takes time: starting a process takes seconds."""
 KILLED: Final = 1 if WINDOWS else -9
 """The exit code of a process that Popen.kill has ended."""
 KILLED_FROM_OUTSIDE: Final = 15 if WINDOWS else -9

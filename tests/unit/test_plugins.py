@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from site_folder import EXAMPLE_PLUGIN, install
+from systems import PATIENCE
 
 from afspm import plugins
 from afspm.drift.estimators import estimator
@@ -59,7 +60,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def afspm(site: Path, *arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(site)}
     command = [sys.executable, "-m", "afspm", *arguments]
-    return subprocess.run(command, env=environment, cwd=cwd, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(command, env=environment, cwd=cwd, capture_output=True, text=True, timeout=60 * PATIENCE)
 
 
 def test_an_experiment_file_names_drivers_and_components_of_a_plug_in(site: Path, tmp_path: Path) -> None:

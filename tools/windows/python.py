@@ -13,9 +13,11 @@ import shutil
 import struct
 import subprocess
 import sys
+import threading
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
+from typing import IO
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -35,6 +37,8 @@ MATH, OUR_MATH = "api-ms-win-crt-math-l1-1-0.dll", "mingws-and-crt-math-l1-1-0.d
 assert len(MATH) == len(OUR_MATH)  # it is written over the other
 _COMPLEX = re.compile(r"c(a?(sin|cos|tan)h?|exp|log|sqrt|pow|arg|abs)[fl]?")
 _IMPORT = re.compile(r"^\t[0-9a-f]+\t\s*\d+\s+(\S+)", re.MULTILINE)
+LAST_WORDS_S = 2.0
+"""So long output is still read after the end: what the program has left behind holds it open."""
 IN_JAR = "org/bytedeco/cpython/windows-x86_64/"
 ENVIRONMENT = {
     "WINEPREFIX": str(PREFIX),
@@ -50,6 +54,7 @@ def main() -> None:
     if not sys.argv[1:]:
         _install_programs()
         _unpack_python()
+        _build_launcher()
         _install_packages()
         _make_prefix()
         _install_afspm()
@@ -58,19 +63,34 @@ def main() -> None:
     environment = {**os.environ, **ENVIRONMENT}
     for apart in ([str(WINE.with_name("wineserver")), "-p60"], [str(WINE), "wineboot"]):
         subprocess.run(apart, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)
-    # a pipe as standard output, and no terminal as standard input: Wine's console is not that of Windows
+    # a pipe as standard output, since Wine's console is not that of Windows; a terminal as standard input gives it one
+    terminal, ours = os.openpty()
+    threading.Thread(target=_forget, args=(terminal,), daemon=True).start()
     run = subprocess.Popen(
         [str(WINE), str(PYTHON / "python.exe"), *sys.argv[1:]],
         env=environment,
-        stdin=subprocess.DEVNULL,
+        stdin=ours,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
     )
     assert run.stdout is not None
-    for line in run.stdout:
+    passing_on = threading.Thread(target=_pass_on, args=(run.stdout,), daemon=True)
+    passing_on.start()
+    code = run.wait()
+    passing_on.join(LAST_WORDS_S)
+    sys.exit(code)
+
+
+def _forget(terminal: int) -> None:
+    """Read what Wine writes to its console, which says nothing of ours."""
+    while os.read(terminal, 4096):
+        pass
+
+
+def _pass_on(output: IO[bytes]) -> None:
+    for line in output:
         sys.stdout.buffer.write(line.replace(b"\r\n", b"\n"))
         sys.stdout.flush()
-    sys.exit(run.wait())
 
 
 def _install_programs() -> None:
@@ -116,6 +136,14 @@ def _unpack_python() -> None:
     # extensions for any Python 3 (psutil's) look for its stable functions there
     stable = _symbols((PYTHON / "libs" / "python3.lib").read_bytes())
     _build_library(PYTHON / "python3.dll", [f"{name} = python311.{name}" for name in stable])
+
+
+def _build_launcher() -> None:
+    """Build what a virtual environment has as its python.exe."""
+    launcher = PYTHON / "venvlauncher.exe"
+    if not launcher.exists():
+        source = Path(__file__).with_name("venvlauncher.c")
+        subprocess.run([str(GCC), "-O2", "-s", "-static", "-municode", "-o", str(launcher), str(source)], check=True)
 
 
 def _symbols(library: bytes) -> list[str]:

@@ -24,6 +24,7 @@ LONGEST_S = 2400.0
 """So long a process may take; pytest's own limit ends a test that hangs long before that."""
 CRASHES = 5
 """A folder with so many of them is given up."""
+OPTIONS = ("-p", "no:cacheprovider", "-p", "outcomes", "-o", "timeout=480")
 os.environ["AFSPM_OUTCOMES"] = ""
 
 from outcomes import read  # noqa: E402  (beside this file)
@@ -83,17 +84,7 @@ def _run(folder: str, report: Path, log: Path) -> str:
     """Run the tests of a folder that have not begun yet; return how the process ended."""
     with log.open("ab") as output:
         process = subprocess.Popen(
-            [
-                sys.executable,
-                str(HERE / "python.py"),
-                "-m",
-                "pytest",
-                "-p",
-                "no:cacheprovider",
-                "-p",
-                "outcomes",
-                folder,
-            ],
+            [sys.executable, str(HERE / "python.py"), "-m", "pytest", *OPTIONS, folder],
             cwd=ROOT,
             env={**os.environ, "AFSPM_OUTCOMES": str(report), "PYTHONPATH": str(HERE)},
             stdout=output,

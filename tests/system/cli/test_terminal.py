@@ -21,6 +21,7 @@ from afspm.cli.joining import NOT_RUNNING, person
 from afspm.client.connect import find_run
 from afspm.client.follower import Follower
 from afspm.record.run import open_run
+from afspm.record.run_json import latest_run
 
 pytestmark = can_interrupt
 AFSPM = (sys.executable, "-m", "afspm")
@@ -178,7 +179,7 @@ def test_a_report_may_be_had_while_it_goes_on(night: Running) -> None:
 def test_a_run_whose_supervisor_is_killed_is_told_as_cut_off_everywhere(tmp_path: Path) -> None:
     run = Running(tmp_path)
     run.wait_for(r"scan 1 of")
-    folder = str((run.runs / "latest").resolve())
+    folder = str(latest_run(run.runs))
     watching = subprocess.Popen(
         [*AFSPM, "watch", folder], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8"
     )

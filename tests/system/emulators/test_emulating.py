@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -13,12 +12,13 @@ from pathlib import Path
 
 import pytest
 import zmq
+from systems import PATIENCE, can_interrupt, interrupt
 
 from afspm.clock import ExperimentClock
 from afspm.exit_codes import ExitCode
 from afspm.launch import Launch, Sockets
 
-DEADLINE_S = 30.0
+DEADLINE_S = 30.0 * PATIENCE
 HERE = Path(__file__).parent
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(HERE), "PYTHONUNBUFFERED": "1"}
 WORDS = " listens at "
@@ -43,7 +43,7 @@ def ask(address: str, line: str) -> str:
         return client.recv(1000).decode()
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="a console can't be sent Ctrl-C from here")
+@can_interrupt
 def test_from_the_command_line_it_says_where_it_listens_and_ends_on_ctrl_c(tmp_path: Path) -> None:
     arguments = ("afspm", "emulate", "echo.Echo", "greeting=good day", "--port", "0", "--seed", "7", "-o", "files")
     with started(*arguments, cwd=tmp_path) as process:
@@ -52,7 +52,7 @@ def test_from_the_command_line_it_says_where_it_listens_and_ends_on_ctrl_c(tmp_p
         assert line.startswith("SIMULATED Echo controller: listening at 127.0.0.1:")
         assert str(tmp_path / "files") in line
         assert ask(line.split(" at ")[1].split(",")[0], "x") == "good day x, seed 7"
-        process.send_signal(signal.SIGINT)
+        interrupt(process)
         assert process.wait(DEADLINE_S) == 0
     assert (tmp_path / "files").is_dir()
 
@@ -69,7 +69,7 @@ def test_a_port_that_is_taken_is_told_in_one_sentence(vendor: str, tmp_path: Pat
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         with started("afspm", "emulate", vendor, "--port", port, cwd=tmp_path) as process:
-            told = process.communicate(timeout=60.0)
+            told = process.communicate(timeout=2 * DEADLINE_S)
     assert process.returncode == 1
     said = "".join(filter(None, told)).strip()
     assert f"another program listens at port {port}" in said

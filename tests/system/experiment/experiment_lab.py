@@ -14,11 +14,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from systems import freeze, kill
+from systems import PATIENCE, freeze, kill
 
 import afspm
 
-DEADLINE_S = 60.0
+DEADLINE_S = 60.0 * PATIENCE
 AFSPM = (sys.executable, "-P", "-c", "from afspm.cli import main; main()")
 Run = Callable[..., "AfspmRun"]
 

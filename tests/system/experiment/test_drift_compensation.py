@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from drift_rig import Rig, Surveyed, surveyed, table, worker_of
-from systems import KILLED_FROM_OUTSIDE, kill
+from systems import KILLED_FROM_OUTSIDE, PATIENCE, kill
 
 from afspm.model import Region
 
-pytestmark = pytest.mark.timeout(180)
+pytestmark = pytest.mark.timeout(180 * PATIENCE)
 KNOWN_M = 2e-9
 """How well a scan is known to lie; a pixel is 16 nm."""
 PLACED_M = 20e-9

@@ -13,6 +13,7 @@ from systems import can_interrupt, interrupt, wait_until_gone
 
 import afspm
 from afspm.errors import ExperimentEnded
+from afspm.record.run_json import latest_run
 from afspm.supervisor.ports import FreePorts
 
 
@@ -21,7 +22,7 @@ def test_an_experiment_ends_by_itself_and_leaves_its_folder(run: Run, tmp_path: 
     assert one.end() == 0, one.output
     require_each_once(one, 4)
     folder = one.folder
-    assert (tmp_path / "runs" / "latest").resolve() == folder.resolve()
+    assert latest_run(tmp_path / "runs") == folder
     assert "the experiment has ended" in one.output
     assert f"everything is in {folder}" in one.output
     log = (folder / "log.txt").read_text(encoding="utf-8")

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from systems import PATIENCE
 
 ROOT = Path(__file__).parents[3]
 FILES = ROOT / "experiments" / "every_microscope"
 AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
-DEADLINE_S = 90.0
+DEADLINE_S = 90.0 * PATIENCE
 HEIGHTS = {"simulator": "Height", "nanonis": "Z Forward", "asylum": "HeightTrace", "gxsm": "ZS-Topo"}
 ADDRESSES = {"nanonis": "127.0.0.1:{port}", "asylum": "tcp://127.0.0.1:{port}", "gxsm": "127.0.0.1:{port}"}
 NOISE_M = 0.8e-9

@@ -10,11 +10,12 @@ from pathlib import Path
 from queue import Empty, Queue
 
 import pytest
+from systems import PATIENCE
 
 from afspm.launch import Launch
 
 HERE = Path(__file__).parent
-PATIENCE_S = 20.0
+PATIENCE_S = 20.0 * PATIENCE
 HOST = [sys.executable, "-m", "afspm.process.host"]
 
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from systems import WINDOWS, can_interrupt, interrupt
 
 import afspm
 from afspm import wire
@@ -103,15 +103,19 @@ def test_it_ends_as_an_experiment_does_with_its_folder_saying_so(recorded: Path,
         resume.find(folder)
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="there a program can't send these")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+TERMINATE = pytest.param(
+    subprocess.Popen.terminate, marks=pytest.mark.skipif(WINDOWS, reason="there that is a kill"), id="terminate"
+)
+
+
+@pytest.mark.parametrize("stop", [pytest.param(interrupt, marks=can_interrupt), TERMINATE])
 def test_one_that_is_stopped_says_so_in_its_folder_and_to_who_listens(
-    replaying: subprocess.Popen[str], tmp_path: Path, number: signal.Signals
+    replaying: subprocess.Popen[str], tmp_path: Path, stop: Callable[[subprocess.Popen[str]], None]
 ) -> None:
     (folder,) = (tmp_path / "runs").glob("replay-*")
     with Follower(folder) as follower:
         follower.catch_up()
-        replaying.send_signal(number)
+        stop(replaying)
         assert replaying.wait(20.0) == 0
         assert json.loads((folder / "run.json").read_text(encoding="utf-8"))["ended"] == "the replay is over"
         until_s = follower.clock.monotonic_s() + 20.0

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from systems import PATIENCE
 
 from afspm.cli.dashboard import resumed_with_dashboard
 from afspm.clock import NS_PER_S
@@ -18,6 +19,7 @@ from afspm.record.run_lock import lock_run
 from afspm.supervisor import resume
 from afspm.supervisor.run import RunOptions
 
+DEADLINE_S = 60.0 * PATIENCE
 EXPERIMENT = """
 [clock]
 start = 2026-03-14T20:00:00Z
@@ -96,7 +98,7 @@ def test_a_stopped_run_goes_on_where_it_was_and_an_ended_one_does_not(tmp_path: 
     before = memory(run)
     seen_ns = resume.last_seen_ns(run)
     again = afspm_run(away, "--resume", "runs")
-    told = again.communicate(timeout=60.0)[0]
+    told = again.communicate(timeout=DEADLINE_S)[0]
     assert again.returncode == 0, told
     after = memory(run)
     assert after["lives"] == 2, told
@@ -124,7 +126,7 @@ def test_a_killed_run_goes_on_with_a_dashboard_that_it_had_not(tmp_path: Path) -
     facts = json.loads((run / "run.json").read_text(encoding="utf-8"))
     assert set(facts["processes"]) == {"microscope", "scheduler", "short", "recorder", "dashboard"}
     again.terminate()
-    again.communicate(timeout=60.0)
+    again.communicate(timeout=DEADLINE_S)
 
 
 def test_a_run_that_has_a_dashboard_is_resumed_with_that_one(tmp_path: Path) -> None:
@@ -168,6 +170,6 @@ def test_a_lock_is_given_back_by_who_leaves(tmp_path: Path) -> None:
 
 def test_a_run_is_resumed_as_it_was_begun(tmp_path: Path) -> None:
     process = afspm_run(tmp_path, "--resume", "runs", "--speed", "2")
-    told = process.communicate(timeout=60.0)[0]
+    told = process.communicate(timeout=DEADLINE_S)[0]
     assert process.returncode != 0
     assert "a run is resumed as it was begun" in told

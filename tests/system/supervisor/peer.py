@@ -60,7 +60,10 @@ def main() -> int:
             say("has let go")
         case "stuck":  # the same, and waits there
             wait_for_a_beat(beats, beats_sent)
-            ctypes.PyDLL(None).pause()
+            if sys.platform == "win32":
+                ctypes.PyDLL("kernel32").Sleep(-1)
+            else:
+                ctypes.PyDLL(None).pause()
         case "exit":
             beats.close()
             return int(settings["code"])

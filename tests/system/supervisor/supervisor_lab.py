@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from systems import PATIENCE
+
 from afspm.experiment import Role
 from afspm.launch import Launch
 from afspm.logic.supervision.child import ChildPolicy
@@ -18,7 +20,7 @@ from afspm.logic.supervision.restart import RestartPolicy
 from afspm.supervisor.process import Task
 from afspm.supervisor.supervisor import RunOutcome, Supervisor
 
-DEADLINE_S = 20.0
+DEADLINE_S = 20.0 * PATIENCE
 BEAT_S = 0.1
 PEER = Path(__file__).with_name("peer.py")
 QUICK = ChildPolicy(

@@ -11,7 +11,7 @@ from dataclasses import replace
 from queue import Queue
 
 import pytest
-from systems import KILLED, freeze, not_on_wine
+from systems import KILLED, PATIENCE, freeze, not_on_wine
 
 from afspm.errors import AfspmError
 from afspm.launch import Launch
@@ -19,7 +19,7 @@ from afspm.logic.supervision.supervisor_events import Exited
 from afspm.supervisor.child_output import OutputDropped, OutputLine
 from afspm.supervisor.process import ChildEvent, ChildProcess, Task
 
-DEADLINE_S = 15.0
+DEADLINE_S = 15.0 * PATIENCE
 Start = Callable[[str], ChildProcess]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from systems import can_interrupt, interrupt
 
 from afspm.errors import ConfigError
 from afspm.process.memory import Memory
@@ -198,11 +198,11 @@ def test_running_ones_are_joined_and_left_running(file: Path) -> None:
         assert process.poll() is None
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="a console can't be sent Ctrl-C from here")
+@can_interrupt
 def test_ctrl_c_in_the_middle_of_a_scan_puts_everything_back(file: Path) -> None:
     with started("test-translator", "experiment.toml", "-k", "frame/set", "-k", "busy/", cwd=file.parent) as process:
         until(process, "frame/set")  # the next check scans for seconds
-        process.send_signal(signal.SIGINT)
+        interrupt(process)
         assert process.stdout is not None
         output = process.stdout.read()
         assert process.wait(DEADLINE_S) == 130

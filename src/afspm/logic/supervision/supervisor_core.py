@@ -304,13 +304,17 @@ class SupervisorCore:
                 child.life = None
 
     def _release_scheduler(self) -> None:
-        """Kill components that are frozen; once all others have ended let the recorder go, then the scheduler."""
+        """Kill components that are frozen; once all others have ended let the recorder go, then the scheduler.
+
+        One that is busy is not: it would have END_WITHIN_S for what it has yet to write.
+        """
         left = [child for child in self.children.values() if child.life is not None]
         recorders = [child for child in left if child.spec.leaves_last]
         others = [child for child in left if child.spec.role is not Role.SCHEDULER and child not in recorders]
         for child in left:
             if not others and child in (recorders or left):
-                self._command(ProcessAction.CLOSE_INPUT, child)
+                if not (child.life and child.life.is_busy(self._now_s, self._liveness)):
+                    self._command(ProcessAction.CLOSE_INPUT, child)
             elif self._may_be_rescued(child) and child.life and child.life.is_silent(self._now_s, self._liveness):
                 self._command(ProcessAction.KILL, child)
 

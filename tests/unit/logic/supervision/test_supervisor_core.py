@@ -252,6 +252,9 @@ def test_the_recorder_leaves_after_the_other_components_and_before_the_scheduler
     run.exits("series", ExitCode.ENDED)
     assert run.step(TimePassed()) == []
     run.exits("scope", ExitCode.ENDED)
+    run.step(Beaten("recorder", Beat(step_age_s=2.0)))
+    assert run.step(TimePassed()) == [], "it writes"
+    run.beat("recorder")
     assert run.step(TimePassed()) == [(CLOSE, "recorder")]
     run.exits("recorder", ExitCode.ENDED)
     assert run.step(TimePassed()) == [(CLOSE, "scheduler")]
