@@ -141,17 +141,21 @@ def test_a_missing_library_is_told_with_the_extra_that_brings_it(monkeypatch: py
     assert str(refused.value) == 'Sift needs what is not installed: scikit-image (pip install "afspm[features]")'
 
 
-def test_the_limits_of_the_default_may_be_given_as_in_the_experiment_file() -> None:
-    values = np.random.default_rng(3).normal(size=(64, 64)).cumsum(0).cumsum(1)
-    scan = DriftScan(values, Region((0, 0), (1e-6, 1e-6)), 0.0, 1.0)
-    assert estimator("least-squares").register(scan, scan).accepted
-    strict = estimator({"class": "least-squares", "limits": {"information": 1e9}})
-    refused = strict.register(scan, scan)
+def test_how_sure_the_default_must_be_may_be_given_as_in_the_experiment_file() -> None:
+    random = np.random.default_rng(3)
+    values = random.normal(size=(64, 64)).cumsum(0).cumsum(1)
+    first, second = (
+        DriftScan(values + random.normal(size=(64, 64)), Region((0, 0), (1e-6, 1e-6)), 0.0, 1.0) for _ in range(2)
+    )
+    found = estimator("least-squares").register(first, second)
+    assert found.accepted
+    strict = estimator({"class": "least-squares", "wrong_at_most": found.quality["wrong"] / 2})
+    refused = strict.register(first, second)
     assert not refused.accepted
-    assert "in common" in refused.reason
+    assert "wrong with a probability of" in refused.reason
 
 
-@pytest.mark.parametrize(("limits", "wrong"), [({"overlapp": 0.5}, "overlapp"), ({"overlap": "half"}, "half")])
-def test_limits_without_a_meaning_are_refused(limits: dict[str, Any], wrong: str) -> None:
-    with pytest.raises(ConfigError, match=wrong):
-        estimator({"class": "least-squares", "limits": limits})
+@pytest.mark.parametrize("value", [0.0, 1.0, -0.5, True])
+def test_a_probability_that_is_none_is_refused(value: float) -> None:
+    with pytest.raises(ConfigError, match="wrong_at_most"):
+        estimator({"class": "least-squares", "wrong_at_most": value})

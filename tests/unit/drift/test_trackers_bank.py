@@ -572,5 +572,5 @@ def test_trackers_have_names() -> None:
     assert isinstance(tracker("afspm.drift.trackers.paper.PaperTracker", World()), PaperTracker)
     with pytest.raises(ConfigError, match="did you mean 'paper'"):
         tracker("papper", World())
-    with pytest.raises(ConfigError, match="no tracker"):
+    with pytest.raises(ConfigError, match="not a tracker"):
         tracker({"class": "collections.OrderedDict"}, [])  # type: ignore[arg-type]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.drift.estimators.coefficients import SPREAD
 from afspm.drift.estimators.images import Unusable, flatten_rows
 from afspm.drift.estimators.noise import LEAST_NOISE, FineFilter, denoised, noise_metric, products, seen, without_lines
 from afspm.drift.estimators.warp import BEND, COUNT, GAIN, LINEAR, SLOPES, WarpedPair, derivative
@@ -172,7 +173,7 @@ def covariance(fit: Fit, believed: Believed) -> Array:
         raise Unusable("too small to tell how certain a displacement is") from None
     varied = change.T @ change * (n - 1) / n + inverse @ believed.precision @ inverse.T
     size = float(np.trace(np.linalg.solve(model[:2, :2], varied[:2, :2]))) / 2
-    total: Array = max(size, 1.0) * (model + model.T) / 2
+    total: Array = SPREAD * max(size, 1.0) * (model + model.T) / 2
     total[:2, :2] += FLOOR_PX**2 * np.eye(2)
     return total
 

@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.drift.estimators.acceptance import (
-    AcceptanceLimits,
-    MatchEvidence,
-    above_repeats,
-    above_surrogates,
-    agreement,
-    outliers,
-)
+from afspm.drift.estimators.acceptance import MatchEvidence, above_repeats, agreement
 from afspm.drift.estimators.alignment import (
     COARSE,
     SHIFT,
@@ -27,10 +19,11 @@ from afspm.drift.estimators.alignment import (
     shear_models,
 )
 from afspm.drift.estimators.images import CommonGrid, Unusable, onto_common_grid, prepare
-from afspm.drift.estimators.noise import FineFilter, shared_information, without_lines
+from afspm.drift.estimators.noise import FineFilter, without_lines
 from afspm.drift.estimators.search import ExpectedShift, MaskedCorrelation, Scorer, candidates, shear_by_drift
 from afspm.drift.estimators.warp import COUNT, CREEP, LINEAR, OverlapBox, Scene, WarpedPair
 from afspm.drift.registration import DriftScan, LinearSeen, Prior, Registration
+from afspm.errors import ConfigError
 
 Array = NDArray[np.float64]
 
@@ -40,7 +33,8 @@ GAIN_SD = 1.0  # of the logarithm
 BEND_SD = 0.15
 BORDER_PX = 1  # where a filter and a spline have to guess what lies beyond
 FARTHEST_PX = 8.0  # from where the search has found it
-SURROGATES_PX = 32  # the farthest shift that a match is compared with
+ELSEWHERE_PX = 32  # the farthest shift that a match is compared with
+WRONG_AT_MOST = 0.1
 
 
 class LeastSquares:
@@ -53,14 +47,16 @@ class LeastSquares:
     5. `acceptance`: is it a match at all?
 
     Args:
-        limits: what a match must reach; as a table, some of the values of `AcceptanceLimits`.
+        wrong_at_most: the largest probability that a match which is accepted is wrong by more than a pixel.
 
     Raises:
-        ConfigError: a limit that there is not, or that is no number.
+        ConfigError: it is not between 0 and 1.
     """
 
-    def __init__(self, limits: AcceptanceLimits | Mapping[str, float] | None = None):
-        self._limits = limits if isinstance(limits, AcceptanceLimits) else AcceptanceLimits.of(limits or {})
+    def __init__(self, wrong_at_most: float = WRONG_AT_MOST):
+        if isinstance(wrong_at_most, bool) or not 0.0 < wrong_at_most < 1.0:
+            raise ConfigError(f"{wrong_at_most!r} is not between 0 and 1", where="wrong_at_most")
+        self._wrong_at_most = wrong_at_most
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         """See `afspm.drift.registration.Estimator`."""
@@ -84,13 +80,13 @@ class LeastSquares:
         if not (np.isfinite(total).all() and np.hypot(*(theta - start[0])[:2]) < FARTHEST_PX):
             return Registration.refused("no displacement fits: the scans hold nothing in common")
         found = _evidence(scene, box, theta, total, start[1:], expected)
-        registration = self._registration(theta, total, box, grid, found, expected=prior is not None)
+        registration = self._registration(theta, total, box, grid, found)
         return replace(registration, linear_seen=_in_m(seen, grid))
 
     def _registration(
-        self, theta: Array, total: Array, box: OverlapBox, grid: CommonGrid, found: MatchEvidence, *, expected: bool
+        self, theta: Array, total: Array, box: OverlapBox, grid: CommonGrid, found: MatchEvidence
     ) -> Registration:
-        reason = self._limits.refusal(found, expected=expected)
+        reason = found.refusal(self._wrong_at_most)
         return Registration(
             accepted=not reason,
             reason=reason,
@@ -98,7 +94,7 @@ class LeastSquares:
             covariance_m2=grid.to_m @ total[:2, :2] @ grid.to_m.T,
             linear=grid.linear_m(_from_reference(theta[LINEAR].reshape(2, 2))),
             center_m=grid.position_m(box.center - theta[:2] / 2),
-            quality=asdict(found),
+            quality={**asdict(found), "wrong": found.wrong},
         )
 
 
@@ -177,21 +173,15 @@ def _evidence(
 ) -> MatchEvidence:
     one, two, known = WarpedPair(*scene.smooth_splines, box, theta[:2]).warped(theta)
     one, two = without_lines(one, known), without_lines(two, known)
-    edges = WarpedPair(*scene.band_splines, box, theta[:2]).warped(theta)
     share, correlation = agreement(one, two, known)
-    elsewhere = MaskedCorrelation(known, known, SURROGATES_PX)
-    by_shift, edges_by_shift = elsewhere.of(one, two), elsewhere.of(edges[0], edges[1])
+    elsewhere = MaskedCorrelation(known, known, ELSEWHERE_PX)
     return MatchEvidence(
         overlap=float(known.sum() / scene.least_known),
         sd_px=float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[-1])),
         gap=likelihoods[0] - likelihoods[1],
         rival=likelihoods[1] / max(likelihoods[0], 1e-300),
-        information=shared_information(one, two),
         agreement=share,
         correlation=correlation,
-        correlation_gap=above_surrogates(by_shift, elsewhere.origin),
-        edges_gap=above_surrogates(edges_by_shift, elsewhere.origin),
-        above_repeats=above_repeats(by_shift, elsewhere.overlap, elsewhere.origin),
-        outliers=outliers((two - one)[known]),
+        above_repeats=above_repeats(elsewhere.of(one, two), elsewhere.overlap, elsewhere.origin),
         surprise=0.0 if expected is None else expected.surprise(theta[:2], total[:2, :2]),
     )

@@ -87,20 +87,6 @@ def independent_values(first: Array, second: Array) -> float:
     return float(p1.mean() * p2.mean() / max(float(np.mean(p1 * p2)), 1e-300))
 
 
-def shared_information(one: Array, two: Array) -> float:
-    """Mutual information of two aligned images of the same box, nats: -1/2 sum of n ln(1 - coherence²) over rings of
-    frequencies, less what noise alone would give."""
-    from scipy.fft import dctn
-
-    a, b = dctn(one, norm="ortho"), dctn(two, norm="ortho")
-    index = np.minimum((cosine_frequencies(a.shape) * 48).astype(int), 24).ravel()
-    aa, bb, ab, n = (
-        np.bincount(index, v, 25) for v in ((a * a).ravel(), (b * b).ravel(), (a * b).ravel(), np.ones(a.size))
-    )
-    coherence2 = ab**2 / np.maximum(aa * bb, 1e-300)
-    return float(np.sum(-0.5 * n * np.log1p(-np.minimum(coherence2, 1.0 - 1e-12)) - 0.5 * (n > 0)))
-
-
 BLOCK_ROWS = 8
 CACHED = 1 << 15  # numbers
 LEAST_NOISE = 1e-8
