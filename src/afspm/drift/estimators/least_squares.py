@@ -34,7 +34,7 @@ BEND_SD = 0.15
 BORDER_PX = 1  # where a filter and a spline have to guess what lies beyond
 FARTHEST_PX = 8.0  # from where the search has found it
 ELSEWHERE_PX = 32  # the farthest shift that a match is compared with
-WRONG_AT_MOST = 0.1
+WRONG_AT_MOST = 0.15  # of the fitted half, the most with which no more are accepted wrongly
 
 
 class LeastSquares:
