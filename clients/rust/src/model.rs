@@ -43,7 +43,10 @@ impl Region {
         if values.iter().all(|value| value.is_finite()) && self.size_m[0] > 0.0 && self.size_m[1] > 0.0 {
             return Ok(self);
         }
-        Err(Error::Invalid(format!("{self:?} is no region: numbers are finite, sizes above zero")))
+        let Region { center_m: [x, y], size_m: [width, height], angle_rad } = self;
+        Err(Error::Invalid(format!(
+            "{width:e} m x {height:e} m at ({x:e}, {y:e}) m, turned by {angle_rad} rad, is no region: sizes are above zero"
+        )))
     }
 
     /// Return whether two regions differ by less than `tolerance` of their size everywhere.
