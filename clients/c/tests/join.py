@@ -1,4 +1,4 @@
-"""Join a running experiment by the C library alone, as MATLAB's loadlibrary or LabVIEW's Call Library Function Node would.
+"""Join a running experiment by the C library alone, as MATLAB's loadlibrary or LabVIEW would.
 
     python3 join.py libafspm.so RUN_FOLDER
 
@@ -34,7 +34,7 @@ client = c_void_p()
 check(library.afspm_join(sys.argv[2].encode(), b"matlab", byref(client)))
 value, unit = create_string_buffer(ROOM), create_string_buffer(ROOM)
 check(library.afspm_get(client, b"scan-speed", value, ROOM, unit, ROOM))
-print("scan-speed", value.value.decode(), unit.value.decode())
+sys.stdout.write(f"scan-speed {value.value.decode()} {unit.value.decode()}\n")
 
 packets = c_void_p()
 check(library.afspm_scan(client, 0.0, 0.0, 1e-6, 1e-6, 0.0, 32, 64, None, 60.0, byref(packets)))
@@ -45,6 +45,9 @@ for index in range(library.afspm_count(packets)):
     copied = (c_double * count)()
     check(library.afspm_copy_values(packets, index, copied, c_int64(count)))
     same = all(pointer[i] == copied[i] for i in range(count))
-    print(text("channel", packets, index), rows.value, "x", columns.value, text("unit", packets, index), "same" if same else "OTHER")
+    if not same:
+        sys.exit("a copy has other values")
+    channel, measured_in = text("channel", packets, index), text("unit", packets, index)
+    sys.stdout.write(f"{channel}: {rows.value} x {columns.value} values in {measured_in}\n")
 library.afspm_packets_free(packets)
 library.afspm_free(client)
