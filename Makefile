@@ -7,7 +7,7 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 SETUP := .venv/.made
 
-.PHONY: demo demo-drift test mutants test-samples test-ui test-translators test-clients test-windows test-hosts test-nexus test-bluesky check bench bench-drift soak chaos simulate power-cut docs clean
+.PHONY: demo demo-drift test mutants test-samples test-ui test-gateway test-translators test-clients test-windows test-hosts test-nexus test-bluesky check bench bench-drift soak chaos simulate power-cut docs clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -58,6 +58,11 @@ test-samples: $(TEST)
 ## the dashboard in a real browser (Debian's chromium, or another: AFSPM_CHROMIUM=/path); screenshots in build/screenshots
 test-ui: $(TEST)
 	@$(BIN)/pytest tests/ui
+
+## the gateway: against its own OpenAPI description (schemathesis, 25 MB), in several languages, with twenty clients
+test-gateway: $(TEST)
+	@$(PYTHON) tools/bootstrap.py gateway
+	@AFSPM_SCHEMATHESIS_S=240 $(BIN)/pytest tests/system/gateway
 
 ## each base operation of every translator: the simulated microscope's, the image's, and those of emulated controllers
 TRANSLATORS ?= simulator image emulated_nanonis emulated_asylum emulated_gxsm

@@ -1,7 +1,8 @@
 """Make the environment .venv from the lock file, with nothing but Python 3.11 or later.
 
 Run by the Makefile: `python3 tools/bootstrap.py demo` (what a plain install holds), `test` (and what the tests need) or
-`all` (and the tools of `make check`). Each adds to what is there. `bluesky` makes an environment apart.
+`all` (and the tools of `make check`), or `gateway` (what judges the gateway). Each adds to what is there.
+`bluesky` makes an environment apart.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ def main(wanted: str) -> None:
         _compile()
     if wanted != "demo":
         groups = ["test", *(["browser"] if _has_browser() else []), *(["check"] if wanted == "all" else [])]
+        groups += ["gateway"] if wanted == "gateway" else []
         _sync(*(f"--group={group}" for group in ["pip", *groups]), *(f"--extra={extra}" for extra in EXTRAS))
 
 

@@ -22,10 +22,13 @@ def _no_truth(value: object) -> object:
     return value
 
 
-NUMBER = Annotated[float, BeforeValidator(_no_truth), Field(allow_inf_nan=False)]
-PLACE = Annotated[NUMBER, Field(ge=-1.0, le=1.0)]
-LENGTH = Annotated[NUMBER, Field(gt=0.0, le=1.0)]
-PIXELS = Annotated[int, BeforeValidator(_no_truth), Field(ge=1, le=16384)]
+NUMERIC = BeforeValidator(_no_truth)  # last: what comes after it is not in the description
+NUMBER = Annotated[float, Field(allow_inf_nan=False), NUMERIC]
+PLACE = Annotated[float, Field(ge=-1.0, le=1.0), NUMERIC]
+LENGTH = Annotated[float, Field(gt=0.0, le=1.0), NUMERIC]
+ANGLE = Annotated[float, Field(ge=-6.3, le=6.3), NUMERIC]
+SECONDS = Annotated[float, Field(ge=1.0, le=LONGEST_LEASE_S), NUMERIC]
+PIXELS = Annotated[int, Field(ge=1, le=16384), NUMERIC]
 TWO = Field(min_length=2, max_length=2)
 PlacePair = Annotated[list[PLACE], TWO]
 LengthPair = Annotated[list[LENGTH], TWO]
@@ -53,7 +56,7 @@ class RegionModel(_Asked):
 
     center_m: PlacePair = Field(description="(x, y)", examples=[[0.0, 0.0]])
     size_m: LengthPair = Field(description="(width, height)", examples=[[1e-6, 1e-6]])
-    angle_rad: NUMBER = Field(default=0.0, ge=-6.3, le=6.3, description="counter-clockwise")
+    angle_rad: ANGLE = Field(default=0.0, description="counter-clockwise")
 
 
 class MicroscopeModel(_Answer):
@@ -166,7 +169,7 @@ class LeaseModel(_Asked):
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"lease_s": 60}]})
 
-    lease_s: NUMBER = Field(default=60.0, ge=1.0, le=LONGEST_LEASE_S)
+    lease_s: SECONDS = 60.0
 
 
 class ControlAsked(LeaseModel):

@@ -186,7 +186,9 @@ class ReadingRoutes:
         self,
         kinds: Annotated[list[EventKind] | None, Query(description="by default all")] = None,
         after: Annotated[str | None, Query(pattern=r"^[0-9]{1,19}$", description="as Last-Event-ID")] = None,
-        last_event_id: Annotated[str | None, Header(pattern=r"^[0-9]{1,19}$")] = None,
+        last_event_id: Annotated[
+            str | None, Header(pattern=r"^[0-9]{1,19}$", description="sent by EventSource")
+        ] = None,
     ) -> Response:
         """Stream what is published: from now on, or after an event."""
         services = self._services

@@ -35,6 +35,7 @@ class = "Scheduler"
 component = true
 class = "Gateway"
 port = 0
+{settings}
 
 [limits]
 region = {{ x = ["-5 um", "5 um"], y = ["-5 um", "5 um"] }}
@@ -136,10 +137,12 @@ class Client:
 class GatewayRun:
     """`afspm run` of an experiment with a gateway."""
 
-    def __init__(self, folder: Path, more: str = "", speed: float = 60.0, file: Path | None = None) -> None:
+    def __init__(
+        self, folder: Path, more: str = "", speed: float = 60.0, settings: str = "", file: Path | None = None
+    ) -> None:
         if file is None:
             file = folder / "experiment.toml"
-            file.write_text(EXPERIMENT.format(speed=speed) + more, encoding="utf-8")
+            file.write_text(EXPERIMENT.format(speed=speed, settings=settings) + more, encoding="utf-8")
         command = (*AFSPM, "run", "--verbose", "--no-report", str(file), "--runs", str(folder / "runs"))
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, cwd=folder, text=True

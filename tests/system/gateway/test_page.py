@@ -1,0 +1,74 @@
+"""The sample's page, in chromium: it shows each scan where the experiment file names its origin, and nothing where not."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+from gateway_lab import SERIES, GatewayRun
+
+Started = Callable[..., GatewayRun]
+SAMPLE = Path(__file__).parents[3] / "experiments" / "gateway"
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_: Any) -> None:
+        pass
+
+
+@pytest.fixture
+def served() -> Iterator[str]:
+    """The origin of the page, which is not that of the gateway."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(SAMPLE))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+@pytest.fixture
+def browser() -> Iterator[Any]:
+    sync_api = pytest.importorskip("playwright.sync_api", reason="there is no package playwright")
+    program = os.environ.get("AFSPM_CHROMIUM") or shutil.which("chromium")
+    if program is None:
+        pytest.skip("no chromium is found: `apt install chromium`")
+    with sync_api.sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield started
+        started.close()
+
+
+def test_the_page_shows_each_new_scan(started: Started, browser: Any, served: str) -> None:
+    run = started(SERIES.format(every="2 min", scans=3), speed=60.0, settings=f'origins = ["{served}"]')
+    page = browser.new_page()
+    page.goto(f"{served}/page.html?gateway={run.url}")
+    page.wait_for_function("document.querySelector('#scan').naturalWidth == 32", timeout=30_000)
+    first = page.get_attribute("#scan", "src")
+    page.wait_for_function(f"document.querySelector('#scan').src != '{first}'", timeout=30_000)
+    page.wait_for_function("/is in control/.test(document.querySelector('#state').textContent)", timeout=30_000)
+    page.close()
+
+
+def test_a_page_that_is_not_named_hears_nothing_and_does_nothing(started: Started, browser: Any, served: str) -> None:
+    run = started()
+    page = browser.new_page()
+    page.goto(f"{served}/page.html")
+    asked = """async ([address, method, path, body]) => {
+        try {
+            const headers = body ? {"Content-Type": "text/plain"} : {};
+            return (await fetch(`${address}/v1${path}`, {method, headers, body})).status;
+        } catch (error) {
+            return error.name;
+        }
+    }"""
+    for method, path, body in (("GET", "/state", None), ("POST", "/control", None), ("POST", "/end", "{}")):
+        assert page.evaluate(asked, [run.url, method, path, body]) == "TypeError", "the browser keeps it from the page"
+    page.close()
+    state = run.client("ada").get("/state")
+    assert (state["holder"], state["ended"]) == (None, False)
