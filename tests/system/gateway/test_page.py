@@ -1,4 +1,4 @@
-"""The sample's page, in chromium: it shows each scan where the experiment file names its origin, and nothing where not."""
+"""The page of the sample, in chromium: it shows each scan where its origin is named, and nothing where it is not."""
 
 from __future__ import annotations
 
