@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import mmap
 import struct
+import sys
 import threading
 import time
 import weakref
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import cache, cached_property
@@ -79,9 +80,11 @@ def monotonic_id() -> str:
     on macOS since 3.10), but which of Windows' clocks it reads depends on the version of Python. Elsewhere than on
     Linux a boot has no name here: what is handed on by a run has no use after it.
     """
-    try:
-        boot = _BOOT.read_text(encoding="ascii").strip()
-    except OSError:
+    boot = ""
+    if sys.platform == "linux":  # under Wine, too, there may be such a file, for those who are on its drive
+        with suppress(OSError):
+            boot = _BOOT.read_text(encoding="ascii").strip()
+    if not boot:
         import platform
 
         boot = platform.node()

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from experiment_lab import AFSPM, EXPERIMENT, WITNESS, AfspmRun, Run
+from experiment_lab import AFSPM, EXPERIMENT, SPEED, WITNESS, AfspmRun, Run
 
 
 @pytest.fixture
@@ -33,7 +33,12 @@ def run(afspm_run: Run, tmp_path: Path) -> Run:
     """Starts `afspm run` of EXPERIMENT, `more` and a second file laid over it, in `where`."""
 
     def start(
-        *options: str, more: str = "", over: str = "", scans: int = 4, speed: float = 120.0, where: Path = tmp_path
+        *options: str,
+        more: str = "",
+        over: str = "",
+        scans: int = 4,
+        speed: float = SPEED,
+        where: Path = tmp_path,
     ) -> AfspmRun:
         (tmp_path / "witness.py").write_text(WITNESS, encoding="utf-8")
         file = tmp_path / "experiment.toml"

@@ -19,6 +19,7 @@ from systems import PATIENCE, freeze, kill
 import afspm
 
 DEADLINE_S = 60.0 * PATIENCE
+SPEED = 120.0 / PATIENCE
 AFSPM = (sys.executable, "-P", "-c", "from afspm.cli import main; main()")
 Run = Callable[..., "AfspmRun"]
 

@@ -25,6 +25,21 @@ print(*told)
 """
 
 
+CLASS_TOLD = """
+import psutil
+from afspm.process.priority import step_back
+step_back()
+print(psutil.Process().nice() == psutil.BELOW_NORMAL_PRIORITY_CLASS)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "win32", reason="only there are classes of priority")
+def test_on_windows_the_whole_process_steps_back() -> None:
+    assert subprocess.run((sys.executable, "-c", CLASS_TOLD), capture_output=True, check=True).stdout.split() == [
+        b"True"
+    ]
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="there are classes of priority there")
 def test_threads_that_come_later_step_back_and_on_linux_those_that_beat_do_not() -> None:
     ours = os.nice(0)

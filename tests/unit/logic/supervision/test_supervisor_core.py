@@ -228,6 +228,7 @@ def test_exits_are_described() -> None:
     assert describe_exit(-signal.SIGTERM) == "killed by SIGTERM"
     assert describe_exit(ExitCode.CONFIG) == "its settings can't work"
     assert describe_exit(3) == "exit code 3"
+    assert describe_exit(0xC0000005) == "killed by Windows: access violation (0xC0000005)"
 
 
 def test_when_the_last_plan_is_done_it_is_said_how_to_end_the_experiment() -> None:
