@@ -7,7 +7,7 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 SETUP := .venv/.made
 
-.PHONY: demo demo-drift test mutants test-samples test-ui test-gateway test-translators test-clients test-windows test-hosts test-nexus test-bluesky check bench bench-drift soak chaos simulate power-cut docs clean
+.PHONY: demo demo-drift test mutants test-samples test-ui test-gateway test-translators test-clients test-windows test-hosts test-nexus test-tiled test-bluesky check bench bench-drift soak chaos simulate power-cut docs clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -88,6 +88,10 @@ test-windows: $(TEST)
 ## the files of runs, with the validator of NeXus
 test-nexus: $(TEST)
 	@$(PYTHON) tools/validate_nexus.py
+
+## the folder of a run, as Tiled serves it
+test-tiled: test-nexus
+	@$(PYTHON) tools/serve_with_tiled.py
 
 ## the microscope in plans of Bluesky, and documents of a run, in an environment of its own (316 MB)
 test-bluesky: $(TEST)

@@ -48,6 +48,22 @@ def _sync(*options: str, folder: Path = VENV) -> None:
         sys.exit("the environment could not be made: see above")
 
 
+def environment_of(name: str, package: str) -> Path:
+    """Return the folder of programs of the environment build/<name>-env, made if it is not there, with one package.
+
+    It is for what is tried with afspm's files, and is not installed beside afspm.
+    """
+    folder = ROOT / "build" / f"{name}-env"
+    programs = folder / ("Scripts" if os.name == "nt" else "bin")
+    if not (folder / package).exists():
+        sys.stdout.write(f"Setting up {folder} with {package} …\n")
+        uv = find_uv()
+        subprocess.run([uv, "venv", "--quiet", "--clear", "--python", sys.executable, folder], check=True)
+        subprocess.run([uv, "pip", "install", "--quiet", "--python", programs / "python", package], check=True)
+        (folder / package).touch()  # so that one that was not finished is made anew
+    return programs
+
+
 def _has_browser() -> bool:
     """Return whether there is a browser for the tests of the page: what drives it is a sixth of all."""
     names = ("chromium", "chromium-browser", "google-chrome")

@@ -13,7 +13,7 @@ from pathlib import Path
 import bootstrap
 
 ROOT = Path(__file__).resolve().parents[1]
-ENVIRONMENT, RUNS = ROOT / "build" / "nexus-env", ROOT / "build" / "nexus-runs"
+RUNS = ROOT / "build" / "nexus-runs"
 VALIDATOR = "pynxtools==0.14.1"
 PROGRAMS = "Scripts" if os.name == "nt" else "bin"
 METADATA = '[metadata]\nsample = "Au(111)"\nperson = "A. Student"\norcid = "0000-0002-1825-0097"\nproject = "steps"\n'
@@ -52,23 +52,12 @@ end_when_done = true
 
 
 def main() -> None:
-    validator = _validator()
+    validator = bootstrap.environment_of("nexus", VALIDATOR) / "pynx"
     RUNS.mkdir(parents=True, exist_ok=True)
     parts = {"scans": SCANS, "bias": SPECTRA.format(kind="IV"), "force": SPECTRA.format(kind="force")}
     wrong = [name for name, part in parts.items() if not _is_valid(name, METADATA + MICROSCOPE + part, validator)]
     if wrong:
         sys.exit(f"not valid: {', '.join(wrong)}")
-
-
-def _validator() -> Path:
-    program = ENVIRONMENT / PROGRAMS / "pynx"
-    if not program.exists():
-        sys.stdout.write(f"Setting up {ENVIRONMENT}: 770 MB …\n")
-        uv = bootstrap.find_uv()
-        subprocess.run([uv, "venv", "--quiet", "--clear", "--python", sys.executable, ENVIRONMENT], check=True)
-        python = ENVIRONMENT / PROGRAMS / "python"
-        subprocess.run([uv, "pip", "install", "--quiet", "--python", python, VALIDATOR], check=True)
-    return program
 
 
 def _is_valid(name: str, experiment: str, validator: Path) -> bool:

@@ -252,5 +252,5 @@ def write_synced(path: Path, data: bytes) -> None:
 
 
 def _stamp(time_ns: int) -> str:
-    """Return a time as it may stand in the name of a file."""
-    return iso_utc(time_ns).replace("-", "").replace(":", "")
+    """Return a time as it may stand in the name of a file; programs that cut names at a dot get the whole."""
+    return iso_utc(time_ns).replace("-", "").replace(":", "").replace(".", "_")

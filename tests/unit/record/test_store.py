@@ -43,7 +43,7 @@ def test_a_scan_is_one_file_with_all_channels_and_the_circumstances(
     assert (row.holder, row.mode, row.problems) == ("series", "automated", ("tip-shape-changed",))
     assert (row.channels, row.shape) == ((("Height", "m"), ("Height Retrace", "m")), (6, 8))
     assert row.began_ns == given[2][0].time_ns
-    assert row.file == "scans/20260314T200000.003000Z-00001.h5"
+    assert row.file == "scans/20260314T200000_003000Z-00001.h5"
     for packet, _ in given[3:5]:
         scan = wire.decode("Scan2d", packet.payload)
         assert np.array_equal(run.scan(0)[scan.channel].values, scan.values)
@@ -247,7 +247,7 @@ def test_a_file_that_was_written_right_before_a_kill_is_not_there_twice(night: N
     store = RecordStore(tmp_path, ABOUT)
     store.take([night.state(ScopeState.SCANNING), night.state(ScopeState.INTERRUPTED)])  # it gets number 1
     store.close()
-    stamp = "20260314T200000.001000Z"
+    stamp = "20260314T200000_001000Z"
     (tmp_path / "scans").mkdir()
     (tmp_path / "scans" / f"{stamp}-00001.h5").write_bytes(b"of a transaction that was not committed")
     (tmp_path / "scans" / f"{stamp}-00002.h5.part").write_bytes(b"half")
