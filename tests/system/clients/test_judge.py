@@ -88,4 +88,4 @@ def test_a_program_that_is_not_there_is_said_so(tmp_path: Path) -> None:
 def test_a_program_that_says_nothing_fails(tmp_path: Path) -> None:
     report = judge([sys.executable, "-c", "pass"], tmp_path, ["launch/heartbeats"])
     assert [result.outcome for result in report.results] == [CheckOutcome.FAILED]
-    assert "the end of the program (exit code 0)" in report.results[0].line
+    assert "the step ready; came the end of the program (exit code 0)" in report.results[0].line

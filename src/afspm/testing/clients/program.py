@@ -64,6 +64,7 @@ class ClientProgram:
         self._answers: dict[int, Answer] = {}
         self._garbage: deque[str] = deque(maxlen=_LAST_WORDS)
         self._said: deque[str] = deque(maxlen=_LAST_WORDS)
+        self._begun: dict[int, str] = {}
         self._next = 0
         self._log = log
         try:
@@ -92,6 +93,7 @@ class ClientProgram:
     def begin(self, do: str, **arguments: Any) -> int:
         """Give it a step, and return the step's id."""
         self._next += 1
+        self._begun[self._next] = do
         self._write(json.dumps({"id": self._next, "do": do, **arguments}))
         return self._next
 
@@ -106,7 +108,7 @@ class ClientProgram:
         if step in self._answers:
             return self._answers.pop(step)
         came = f"nothing in {within_s:.0f} s" if self.is_running else f"the end of the program ({self.ending})"
-        raise Failed("an answer to the step", f"{came}{self.last_words}")
+        raise Failed(f"an answer to the step {self._begun[step]}", f"{came}{self.last_words}")
 
     def is_answered(self, step: int) -> bool:
         return step in self._answers

@@ -77,7 +77,7 @@ def problem(bench: ClientBench) -> None:
         try:
             flagged = experiment.pump(lambda: _PROBLEM in scope.control_state.problems, KNOWN_S)
             expect(flagged, f"the problem {_PROBLEM} to be flagged", str(scope.control_state))
-            refused = program.do("request_control", problem=0, timeout_s=0.5)
+            refused = program.do("request_control", problem=0, timeout_s=3.0)
             expect(refused.get("response") == "REP_WRONG_EXP_PROBLEM", "REP_WRONG_EXP_PROBLEM", str(refused))
             program.succeed("request_control", problem=_PROBLEM, timeout_s=10.0)
             _require_state(experiment, program, in_control=True, problems=[_PROBLEM])
