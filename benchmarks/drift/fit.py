@@ -136,7 +136,7 @@ def drawn(outcomes: Mapping[Half, Sequence[Outcome]], path: Path) -> None:
     axes.plot([0, 1], [0, 1], color="0.7", linewidth=1, label="as told")
     for half, marker, color in zip(HALVES, "os", ("tab:blue", "tab:orange"), strict=True):
         pairs = [(found.wrong, one.failed) for one in outcomes[half] if (found := evidence(one)) is not None]
-        told, wrong = (np.array(column, dtype=np.float64) for column in zip(*pairs, strict=True))
+        told, wrong = np.array(pairs, dtype=np.float64).T
         number = np.digitize(told, BINS[1:-1])
         for k in np.unique(number):
             here = number == k
