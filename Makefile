@@ -85,6 +85,10 @@ test-windows: $(TEST)
 	@$(PYTHON) tools/windows/python.py
 	@$(PYTHON) tools/windows/run_tests.py $(TESTS)
 
+## an experiment on four hosts (network namespaces: on Linux, as root) over links that are slow, lossy, cut and gone
+test-hosts: $(TEST)
+	@$(BIN)/pytest -n 2 tests/system/hosts
+
 ## the files of runs, with the validator of NeXus
 test-nexus: $(TEST)
 	@$(PYTHON) tools/validate_nexus.py

@@ -12,6 +12,7 @@ from afspm.cli import (
     clients,
     dashboard,
     demo,
+    doctor,
     drift,
     drivers,
     experiment_file,
@@ -59,6 +60,7 @@ app.command("demo")(demo.demo)
 app.command("run")(run.run)
 app.add_typer(new.app, name="new", rich_help_panel=BEFORE)
 app.command("check", rich_help_panel=BEFORE)(experiment_file.check)
+app.command("doctor", rich_help_panel=BEFORE)(doctor.doctor)
 app.command("graph", rich_help_panel=BEFORE)(experiment_file.graph)
 app.command("keys", rich_help_panel=BEFORE)(experiment_file.keys)
 app.command("notify", rich_help_panel=BEFORE)(notify.notify)

@@ -186,7 +186,7 @@ def _tell_time(draft: StateDraft, event: RequestIn) -> None:
     """Tell what all parts of an experiment have in common: the run, what time it is, and how it passes."""
     settings = draft.env.settings
     common = {"run": settings.run, "simulated": settings.simulated, "now_ns": draft.now_ns}
-    told = json.dumps({**settings.clock, **common}).encode()
+    told = json.dumps({**settings.clock, **common, "versions": dict(settings.versions)}).encode()
     response = Response(int(ControlResponse.SUCCESS), told, "", event.request.id)
     draft.effects.append(Reply(event.connection, event.name, response, CLOCK_REQUEST))
 

@@ -31,6 +31,7 @@ class SchedulerSettings:
         clock: `ExperimentClock.as_dict()`, to be told to those who ask; empty: real time.
         run: the identity of the run, which is told with it; empty: it has none.
         simulated: whether the microscope is, which is told with it.
+        versions: of the programs on this computer, which are told with it, too.
     """
 
     rules: Rules = field(default_factory=Rules)
@@ -51,3 +52,4 @@ class SchedulerSettings:
     clock: Mapping[str, float] = field(default_factory=dict)
     run: str = ""
     simulated: bool = False
+    versions: Mapping[str, str] = field(default_factory=dict)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from afspm.scheduler.state_file import StateFile
 from afspm.scheduler.wire_codec import WireCodec
 from afspm.scheduler.write_ahead import WriteAhead
 from afspm.storage.packet_log import PacketLog, cached_packets, log_folder
+from afspm.transport.probe import versions_here
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.scheduler_sockets import SchedulerSockets
 
@@ -85,7 +86,10 @@ class Scheduler:
             self._control, self._limits, self._cache, context.problems, context.launch.request_timeout_s
         )
         launch = context.launch
-        return replace(settings, clock=dict(launch.clock), run=launch.run, simulated=launch.simulated)
+        versions = asdict(versions_here())
+        return replace(
+            settings, clock=dict(launch.clock), run=launch.run, simulated=launch.simulated, versions=versions
+        )
 
     def _core(self, context: ProcessContext) -> SchedulerCore:
         return SchedulerCore(self._settings(context), WireCodec())

@@ -278,7 +278,7 @@ def reporter_of(
         keys: that were made for it; None: the file says where they are, or there are none.
     """
     scheduler = next((start for start in starts if start.role is Role.SCHEDULER), None)
-    here = re.sub(r"[^\w.-]+", "-", platform.node())[:_LONGEST_COMPUTER_NAME] or "computer"
+    here = computer_name()
     if scheduler is None:
         launch = experiment.asking([start.launch.name for start in starts])
         launch = launch and replace(launch, run=run)
@@ -288,6 +288,11 @@ def reporter_of(
     if launch is None:
         return None
     return Reporter(replace(launch, name=f"{SUPERVISOR}:{here}", keys=keys or launch.keys), clock, here)
+
+
+def computer_name() -> str:
+    """Return the name of this computer, as supervisors tell it."""
+    return re.sub(r"[^\w.-]+", "-", platform.node())[:_LONGEST_COMPUTER_NAME] or "computer"
 
 
 def _local(scheduler: ProcessStart) -> Launch | None:

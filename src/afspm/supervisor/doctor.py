@@ -1,0 +1,262 @@
+"""Examines an experiment from one of its computers, whether it runs, does not yet, or runs in part."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from afspm import wire
+from afspm.addresses import connectable
+from afspm.client.connect import find_run, guest_of
+from afspm.clock import NS_PER_S, ExperimentClock
+from afspm.errors import AfspmError
+from afspm.experiment import Experiment, Role
+from afspm.launch import Launch, Sockets
+from afspm.logic import diagnosis
+from afspm.logic.diagnosis import Diagnosis, Handshake, Heard, Reach, Severity, Versions
+from afspm.logic.supervisor_registry import SUPERVISOR
+from afspm.model import CLOCK_REQUEST, ProcessCondition, ProcessStates, Request
+from afspm.process.message_types import register_all
+from afspm.record.run_lock import goes_on
+from afspm.supervisor.reporter import computer_name
+from afspm.transport import keys, probe
+from afspm.transport.network import Network
+from afspm.transport.port import CaughtUp, ControlConnected, PacketReceived, ReplyReceived
+from afspm.transport.zmq_port import open_port
+
+_PROBE_BYTES = 16 << 20
+_ASKED_AS = (SUPERVISOR, "terminal")
+_ILL = (ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.GIVEN_UP)
+
+
+@dataclass
+class Examination:
+    """What was found, what was heard from whom how often, and the experiment's processes on this computer."""
+
+    found: list[Diagnosis] = field(default_factory=list)
+    heard: list[Heard] = field(default_factory=list)
+    pids: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def is_well(self) -> bool:
+        return diagnosis.is_well(self.found)
+
+
+def examine(experiment: Experiment, runs: Path, listen_s: float) -> Examination:
+    """Look at everything that can be seen from here, and listen to the scheduler for so long."""
+    found = Examination([*_file(experiment)])
+    if diagnosis.is_well(found.found):
+        found.found += _keys(experiment)
+        _Connections(experiment, found).examine(listen_s)
+    found.found += _disk(runs)
+    found.found.append(diagnosis.of_memory(psutil.virtual_memory().available, _sizes(found.pids)))
+    return found
+
+
+def _file(experiment: Experiment) -> Iterator[Diagnosis]:
+    """Yield the errors that `afspm check` tells."""
+    errors = [one for one in experiment.check() if one.is_error]
+    for one in errors:
+        yield Diagnosis("file", Severity.ERROR, str(one.place), one.what, one.hint)
+    if not errors:
+        yield diagnosis.fine("file", str(experiment.files[0]), "nothing wrong")
+
+
+def _keys(experiment: Experiment) -> Iterator[Diagnosis]:
+    """Yield what is wrong with the key files of this computer."""
+    if (folder := experiment.keys_folder) is None:
+        return
+    here = sorted(file.stem for file in (folder / "private").glob("*.key_secret"))
+    wrong = False
+    for name in here:
+        try:
+            own = keys.load(folder, name)
+            if name in own.peers.values() and own.public not in own.peers:
+                what, hint = "is not the public part of the secret key here", "make both anew, or copy the right one"
+                yield Diagnosis("key-pair", Severity.ERROR, str(folder / "public" / f"{name}.key"), what, hint)
+                wrong = True
+        except AfspmError as error:
+            wrong = True
+            yield Diagnosis("key-file", Severity.ERROR, error.where, error.what, error.hint)
+    needed = {SUPERVISOR, *experiment.component_names}
+    for name in sorted(needed - {file.stem for file in (folder / "public").glob("*.key")}):
+        wrong = True
+        what, hint = f"there is no public key of {name}", "`afspm keys` makes it; copy keys/public to every computer"
+        yield Diagnosis("key-missing", Severity.ERROR, str(folder / "public"), what, hint)
+    if SUPERVISOR not in here:
+        wrong = True
+        what, hint = "the key of supervisor is not on this computer", "copy private/supervisor.key_secret here"
+        yield Diagnosis("key-missing", Severity.ERROR, str(folder / "private"), what, hint)
+    if not wrong:
+        yield diagnosis.fine("keys", str(folder), f"secret keys here: {', '.join(here)}")
+
+
+def _disk(runs: Path) -> Iterator[Diagnosis]:
+    """Yield space and speed of the disk of the run folders."""
+    folder = next(one for one in (runs.resolve(), *runs.resolve().parents) if one.is_dir())
+    clock, file = ExperimentClock.real(), folder / f".afspm-doctor-{os.getpid()}"
+    try:
+        began_s = clock.monotonic_s()
+        with file.open("wb") as stream:
+            stream.write(bytes(_PROBE_BYTES))
+            stream.flush()
+            os.fsync(stream.fileno())
+        speed = _PROBE_BYTES / max(clock.monotonic_s() - began_s, 1e-6)
+        yield from diagnosis.of_disk(str(folder), shutil.disk_usage(folder).free, speed)
+    except OSError as error:
+        what = f"can't be written: {error.strerror or error}"
+        yield Diagnosis("disk", Severity.ERROR, str(folder), what, "choose another folder with --runs")
+    finally:
+        file.unlink(missing_ok=True)
+
+
+def _sizes(pids: Mapping[str, int]) -> dict[str, int]:
+    """Return what processes of this computer take, bytes."""
+    sizes: dict[str, int] = {}
+    for name, pid in pids.items():
+        with suppress(psutil.Error):
+            sizes[name] = int(psutil.Process(pid).memory_info().rss)
+    return sizes
+
+
+class _Connections:
+    """Looks at the addresses of an experiment, then speaks with its scheduler."""
+
+    def __init__(self, experiment: Experiment, into: Examination) -> None:
+        self._experiment, self._into = experiment, into
+        self._scheduler = next((part.name for part in experiment.resolved.with_role(Role.SCHEDULER)), "scheduler")
+
+    def examine(self, listen_s: float) -> None:
+        """Look at addresses, keys, clock, versions, and at what is published."""
+        reached = self._addresses()
+        launch = self._launch()
+        if launch is None or not launch.sockets.control:
+            what, hint = "nothing runs here, and the file has no addresses", "`afspm run` starts it"
+            self._into.found.append(Diagnosis("not-running", Severity.WARNING, "scheduler", what, hint))
+        elif reached.get(launch.sockets.control, probe.reach(launch.sockets.control)) is Reach.OPEN:
+            self._speak(launch, listen_s)
+        if not any(one.code == "versions" for one in self._into.found):
+            self._into.found.append(diagnosis.of_versions(probe.versions_here(), None))
+
+    def _addresses(self) -> dict[str, Reach]:
+        """Look at every address that the file holds."""
+        slots = [slot for slot in self._experiment.resolved.net.slots.values() if slot.address]
+        reached = {
+            slot.address: (slot, probe.reach(connectable(slot.address)))
+            for slot in slots
+            if slot.address is not None and slot.address.startswith("tcp://")
+        }
+        runs = any(slot.owner == self._scheduler and one is Reach.OPEN for slot, one in reached.values())
+        for address, (slot, one) in reached.items():
+            is_here = probe.is_of_this_computer(address)
+            found = diagnosis.of_address(slot.owner, address, one, is_here=is_here, expected=runs or not is_here)
+            self._into.found.append(found)
+        return {connectable(address): one for address, (_, one) in reached.items()}
+
+    def _launch(self) -> Launch | None:
+        """Return how the scheduler is asked: as the file says, or as the run that goes on here does."""
+        experiment = self._experiment
+        asking = experiment.asking([part.name for part in experiment.resolved.with_role(Role.COMPONENT)])
+        publish = experiment.resolved.net.slots.get(f"{self._scheduler}/publish")
+        written = None if publish is None or publish.address is None else connectable(publish.address)
+        guest = None if experiment.keys_folder else self._guest()  # keys that are made for a run are in its folder
+        if guest is not None or asking is None or written is None:
+            return guest
+        told = None if asking.keys is None else {**asking.keys, written: self._scheduler}
+        sockets = Sockets(subscribe=(written,), control=asking.sockets.control)
+        name, messages = f"{self._owner_of_key()}:doctor-{os.getpid()}", experiment.resolved.messages
+        return replace(asking, name=name, sockets=sockets, keys=told, messages=messages)
+
+    def _guest(self) -> Launch | None:
+        """Return how a guest joins the newest run here; None: nothing goes on."""
+        try:
+            folder = find_run(self._experiment.files[0])
+            return guest_of(folder, f"guest:doctor-{os.getpid()}") if goes_on(folder) else None
+        except AfspmError:
+            return None
+
+    def _owner_of_key(self) -> str:
+        """Return whose key the doctor uses: that of the supervisor, or another that is here."""
+        folder = self._experiment.keys_folder
+        here = [] if folder is None else [file.stem for file in sorted((folder / "private").glob("*.key_secret"))]
+        return next((name for name in (*_ASKED_AS, *here) if name in here), SUPERVISOR)
+
+    def _speak(self, launch: Launch, listen_s: float) -> None:
+        """Exchange keys with the scheduler; then ask for its time, and listen."""
+        address, owner = str(launch.sockets.control), launch.name.partition(":")[0]
+        try:
+            network = Network.from_launch(launch.name, launch.keys)
+            try:
+                shaken = probe.handshake(network, address)
+            finally:
+                network.close()
+            self._into.found.append(diagnosis.of_handshake(address, shaken, owner, self._scheduler))
+            if shaken is Handshake.DONE:
+                register_all(launch.messages)
+                self._listen(launch, listen_s)
+        except AfspmError as error:
+            self._into.found.append(Diagnosis("key-file", Severity.ERROR, error.where, error.what, error.hint))
+
+    def _listen(self, launch: Launch, listen_s: float) -> None:
+        """Ask what time it is, and count what is published."""
+        wall = ExperimentClock.real()
+        port = open_port(launch, wall)
+        until_s, asked_s, caught_up_s = wall.monotonic_s() + listen_s + probe.WITHIN_S, 0.0, None
+        counts, sizes = Counter[str](), Counter[str]()
+        try:
+            while (left_s := until_s - wall.monotonic_s()) > 0.0:
+                for incoming in port.poll(left_s):
+                    if isinstance(incoming, ControlConnected):
+                        asked_s = wall.now_s()
+                        port.send(wire.encode_request(Request(CLOCK_REQUEST, id=f"{launch.name}/doctor/1")))
+                    elif isinstance(incoming, ReplyReceived) and incoming.response.ok:
+                        self._compare(json.loads(incoming.response.payload), asked_s, wall.now_s())
+                    elif isinstance(incoming, CaughtUp):
+                        caught_up_s = wall.monotonic_s()
+                        until_s = caught_up_s + listen_s
+                    elif isinstance(incoming, PacketReceived):
+                        packet = incoming.packet
+                        if packet.envelope.startswith(ProcessStates.__name__):
+                            self._processes(wire.decode(ProcessStates.__name__, packet.payload))
+                        if caught_up_s is not None:
+                            counts[packet.envelope] += 1
+                            sizes[packet.envelope] += len(packet.payload)
+        finally:
+            port.close()
+        self._into.heard = [Heard(name, counts[name], sizes[name], listen_s) for name in sorted(counts)]
+        told = diagnosis.of_publisher(launch.sockets.subscribe[0], self._into.heard, caught_up=caught_up_s is not None)
+        self._into.found.append(told)
+
+    def _compare(self, told: dict[str, Any], asked_s: float, answered_s: float) -> None:
+        """Compare clocks and versions with those of the scheduler."""
+        if not told.get("waits"):  # a simulated time that slows down does not tell real time
+            now_s, start_s, origin_s, speed = (float(told[name]) for name in ("now_ns", "start_s", "origin_s", "speed"))
+            real_s = origin_s + (now_s / NS_PER_S - start_s) / speed
+            ahead_s, uncertain_s = (asked_s + answered_s) / 2 - real_s, (answered_s - asked_s) / 2
+            self._into.found.append(diagnosis.of_clock(ahead_s, uncertain_s))
+        versions = told.get("versions")
+        theirs = Versions(**versions) if isinstance(versions, dict) else None
+        self._into.found.append(diagnosis.of_versions(probe.versions_here(), theirs))
+
+    def _processes(self, states: object) -> None:
+        """Note which processes are not well, as their supervisors tell."""
+        if not isinstance(states, ProcessStates):
+            return
+        if states.supervisor.startswith(computer_name()):
+            self._into.pids |= {one.name: one.pid for one in states.processes if one.pid}
+        known = {one.where for one in self._into.found if one.code == "process"}
+        for process in states.processes:
+            where = f"{process.name} on {states.supervisor}"
+            if process.condition in _ILL and where not in known:
+                what = process.condition.name.lower().replace("_", " ")
+                hint = f"its log says why; `afspm restart {process.name}` starts it again"
+                self._into.found.append(Diagnosis("process", Severity.ERROR, where, what, hint))

@@ -1,0 +1,77 @@
+"""Attempts to reach an address, step by step: its name, the connection, the greeting of ZeroMQ, the keys."""
+
+from __future__ import annotations
+
+import errno
+import platform
+import socket
+from importlib.metadata import version
+
+import zmq
+
+from afspm.clock import ExperimentClock
+from afspm.logic.diagnosis import Handshake, Reach, Versions
+from afspm.transport.network import CONNECTED, REFUSED, Monitor, Network
+
+WITHIN_S = 3.0
+_ZMTP = b"\xff"
+_NO_ROUTE = (errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN)
+
+
+def versions_here() -> Versions:
+    """Return what this computer runs."""
+    return Versions(version("afspm"), platform.python_version(), zmq.zmq_version())
+
+
+def reach(address: str, within_s: float = WITHIN_S) -> Reach:
+    """Return what becomes of a connection to a `tcp://` address."""
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=within_s) as peer:
+            return _greeting(peer)
+    except socket.gaierror:
+        return Reach.UNKNOWN_NAME
+    except ConnectionRefusedError:
+        return Reach.REFUSED
+    except ConnectionError:
+        return Reach.OTHER_PROGRAM
+    except TimeoutError:
+        return Reach.SILENT
+    except OSError as error:
+        return Reach.NO_ROUTE if error.errno in _NO_ROUTE else Reach.SILENT
+
+
+def _greeting(peer: socket.socket) -> Reach:
+    try:
+        return Reach.OPEN if peer.recv(1) == _ZMTP else Reach.OTHER_PROGRAM
+    except TimeoutError:
+        return Reach.NO_GREETING
+
+
+def handshake(network: Network, address: str, within_s: float = WITHIN_S) -> Handshake:
+    """Return what becomes of the exchange of keys at an address that can be reached."""
+    client = network.socket(zmq.DEALER)
+    monitor = Monitor(network, client, CONNECTED | REFUSED)
+    network.connect(client, address)
+    clock = ExperimentClock.real()
+    until_s, found = clock.monotonic_s() + within_s, Handshake.SILENT
+    # a peer that refuses may hang up before its reason has come: it is asked again, until time is up
+    while found in (Handshake.SILENT, Handshake.FAILED) and (left_s := until_s - clock.monotonic_s()) > 0.0:
+        monitor.socket.poll(round(left_s * 1000))
+        for kind, _ in monitor.drain():
+            found = {CONNECTED: Handshake.DONE, int(zmq.EVENT_HANDSHAKE_FAILED_AUTH): Handshake.KEY_REFUSED}.get(
+                kind, Handshake.FAILED
+            )
+    return found
+
+
+def is_of_this_computer(address: str) -> bool:
+    """Return whether an address is one of this computer's own."""
+    host = address.removeprefix("tcp://").rpartition(":")[0].strip("[]")
+    try:
+        found = {entry[4][0] for entry in socket.getaddrinfo("0.0.0.0" if host == "*" else host, None, socket.AF_INET)}
+        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+            probe.bind((str(found.pop()), 0))
+    except OSError:
+        return False
+    return True
