@@ -13,7 +13,7 @@ from afspm.clock import ExperimentClock
 from afspm.logic.diagnosis import Handshake, Reach, Versions
 from afspm.transport.network import CONNECTED, REFUSED, Monitor, Network
 
-WITHIN_S = 3.0
+WITHIN_S = 5.0
 _ZMTP = b"\xff"
 _NO_ROUTE = (errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN)
 

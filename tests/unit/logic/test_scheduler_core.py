@@ -596,4 +596,4 @@ def test_whoever_asks_is_told_the_time_of_the_experiment_and_how_it_passes() -> 
     answer = replies(lab.ask("elsewhere", CLOCK_REQUEST, id_="elsewhere/a/1"))[0].response
     assert (answer.code, answer.id) == (OK, "elsewhere/a/1")
     clock = {"origin_s": 5.0, "start_s": 7.0, "speed": 600.0, "now_ns": lab.now_ns}
-    assert json.loads(answer.payload) == {**clock, "run": "", "simulated": False}
+    assert json.loads(answer.payload) == {**clock, "run": "", "simulated": False, "versions": {}}
