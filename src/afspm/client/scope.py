@@ -16,6 +16,7 @@ from afspm.client.keyed_results import KeyedResults, check_key
 from afspm.client.measurement import MeasurementRunner
 from afspm.client.measurement_setup import MeasurementSetup
 from afspm.client.parameter_values import Value, to_parameter, value_in
+from afspm.client.problem_flags import ProblemFlags
 from afspm.client.targets import ScanTarget, SpectrumTarget, xy_of
 from afspm.errors import ExperimentEnded, InvalidValue
 from afspm.model import (
@@ -74,7 +75,7 @@ class Scope(ExperimentView):
         super().__init__(link, problems or ProblemNames(), between)
         self._frame = frame
         self._begun: tuple[int, int] | None = None  # what was done when progress was first told, and when
-        self._flagged: dict[int, int] = {}  # by us, and how many control states had been published before
+        self._problem_flags = ProblemFlags(link, self._tell, self.is_flagged)
         self._control = ControlHold(link, self.problems)
         self._commands = CommandRetry(link, self._control)
         self._setup = MeasurementSetup(link.view, self._commands)
@@ -249,26 +250,11 @@ class Scope(ExperimentView):
         Raises:
             ExperimentEnded: it is over; the record says nevertheless that the problem was seen.
         """
-        number, states = self.problems.number(problem), self._link.view.count("ControlState")
-        try:
-            self._tell(ControlRequest.ADD_EXP_PRBLM, number)
-        except ExperimentEnded:
-            self._link.send_only(ControlRequest.ADD_EXP_PRBLM, number)
-            raise
-        self._flagged[number] = states
+        self._problem_flags.flag(self.problems.number(problem))
 
     def clear(self, problem: int | str) -> None:
         """Remove the flag of a problem; that it was not flagged is no error."""
-        number = self.problems.number(problem)
-        if self._link.version is wire.Version.OURS or self._is_seen_flagged(number):
-            self._tell(ControlRequest.RMV_EXP_PRBLM, number)
-
-    def _is_seen_flagged(self, problem: int) -> bool:
-        """A scheduler of version 1 ends over clearing a problem that is not flagged."""
-        link, states = self._link, self._flagged.get(problem)
-        if states == link.view.count("ControlState"):  # that we have flagged it ourselves is to be published yet
-            link.wait(lambda: link.view.count("ControlState") != states, link.until(SETTLED_WITHIN_S))
-        return self.is_flagged(problem)
+        self._problem_flags.clear(self.problems.number(problem))
 
     def clear_all(self) -> tuple[str, ...]:
         """Remove the flag of every problem that is flagged, and return their names."""
