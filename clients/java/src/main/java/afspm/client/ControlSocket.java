@@ -50,8 +50,8 @@ final class ControlSocket {
     }
 
     void follow() {
-        for (int event = monitor.next(); event != 0; event = monitor.next()) {
-            onConnected.accept(event == Sockets.Monitor.CONNECTED);
+        for (Boolean isThere = monitor.next(); isThere != null; isThere = monitor.next()) {
+            onConnected.accept(isThere);
         }
     }
 

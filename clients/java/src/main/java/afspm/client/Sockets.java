@@ -4,7 +4,9 @@ import java.util.ArrayList;
 import java.util.List;
 import org.zeromq.SocketType;
 import org.zeromq.ZContext;
+import org.zeromq.ZEvent;
 import org.zeromq.ZMQ;
+import org.zeromq.ZMonitor;
 
 /** Makes sockets with our options: a lost peer is found within seconds, and looked for again at once. */
 final class Sockets {
@@ -62,22 +64,21 @@ final class Sockets {
     /** The connection events of one socket, in the order in which they happened. */
     static final class Monitor {
         /** JeroMQ 0.6 has no event for the end of the handshake; what is sent from its begin on waits for the end. */
-        static final int CONNECTED = zmq.ZMQ.ZMQ_EVENT_HANDSHAKE_PROTOCOL;
-        static final int DISCONNECTED = zmq.ZMQ.ZMQ_EVENT_DISCONNECTED;
+        private static final ZMonitor.Event BEGUN = ZMonitor.Event.HANDSHAKE_PROTOCOL;
         final ZMQ.Socket socket;
 
         Monitor(ZContext context, ZMQ.Socket watched) {
             String address = "inproc://monitor-" + System.identityHashCode(watched);
-            watched.monitor(address, CONNECTED | DISCONNECTED);
+            watched.monitor(address, zmq.ZMQ.ZMQ_EVENT_HANDSHAKE_PROTOCOL | zmq.ZMQ.ZMQ_EVENT_DISCONNECTED);
             socket = context.createSocket(SocketType.PAIR);
             socket.setLinger(0);
             socket.connect(address);
         }
 
-        /** Return the next event; 0 if there is none. */
-        int next() {
-            ZMQ.Event event = ZMQ.Event.recv(socket, ZMQ.DONTWAIT);
-            return event == null ? 0 : event.getEvent();
+        /** Return whether the connection was made (else lost) by the next event; null if there is none. */
+        Boolean next() {
+            ZEvent event = ZEvent.recv(socket, ZMQ.DONTWAIT);
+            return event == null ? null : (Boolean) (event.getEvent() == BEGUN);
         }
     }
 }

@@ -63,8 +63,8 @@ final class Subscription {
 
     /** After each connection, the first or another: ask for what is newer than the newest that has come. */
     void follow() {
-        for (int event = monitor.next(); event != 0; event = monitor.next()) {
-            if (event == Sockets.Monitor.CONNECTED) {
+        for (Boolean isThere = monitor.next(); isThere != null; isThere = monitor.next()) {
+            if (isThere) {
                 forgetMarker();
                 topic = utf8("\0replay/" + name + "/" + connections++);
                 marker = utf8("\0replay/" + name + "/" + (connections - 1) + "\0" + newestNs + "\0" + String.join("\0", prefixes));
