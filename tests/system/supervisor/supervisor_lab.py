@@ -24,7 +24,7 @@ DEADLINE_S = 20.0 * PATIENCE
 BEAT_S = 0.1
 PEER = Path(__file__).with_name("peer.py")
 QUICK = ChildPolicy(
-    liveness=LivenessPolicy(beat_period_s=0.2, missed_beats=5, start_s=15.0, longest_step_s=10.0),
+    liveness=LivenessPolicy(beat_period_s=0.2, missed_beats=5, start_s=15.0 * PATIENCE, longest_step_s=10.0),
     restart=RestartPolicy(budget=2, first_delay_s=0.05),
 )
 
