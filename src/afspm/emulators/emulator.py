@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import math
+import sys
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,8 +30,10 @@ if TYPE_CHECKING:
 LOOPBACK = "127.0.0.1"
 LONGEST_WAIT_S = 60.0
 _AGAIN_S = 1.0
-_TAKEN = {errno.EADDRINUSE, getattr(errno, "WSAEADDRINUSE", errno.EADDRINUSE)}
 """After an error that nobody foresaw, `tick` is called again after so long, experiment time."""
+_TAKEN = {100, 10013, 10048} if sys.platform == "win32" else {errno.EADDRINUSE}
+"""The errors of a port that another program has. On Windows those of its C library, which ZeroMQ hands on, and of its
+sockets: WSAEACCES, where the other has it for itself alone, and WSAEADDRINUSE."""
 FAREWELL_S = 0.5
 """So long, real time, a controller stays there when the experiment has ended: the translator stops the tip first."""
 
@@ -190,7 +193,7 @@ class Emulator(ABC):
         try:
             return self.open()
         except Exception as error:
-            if getattr(error, "errno", None) not in _TAKEN:
+            if _TAKEN.isdisjoint((getattr(error, "errno", None), getattr(error, "winerror", None))):
                 raise
             hint = "end that program or choose another port; without --port and --usual a free port is chosen"
             raise TransportError(
