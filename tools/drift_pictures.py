@@ -206,7 +206,7 @@ def trackers() -> Figure:
             how: dict[str, Any] = {"color": colour, "markersize": 2.5, "linewidth": 0.8, "label": name}
             above.semilogy(time_h[1:], NM * done.misplaced_m[1:], "o-", **how)
             below.semilogy(time_h[1:], NM * np.hypot(*done.unknown_m[1:].T), "o-", **how)
-        above.set_ylabel("scan off its place / nm")
+        above.set_ylabel("position error of the scan / nm")
         below.set_ylabel("error of what is known / nm")
         above.axhline(2e-6 / 127 * NM, color=GREY, linestyle="--", linewidth=0.8)
         above.text(hours, 2e-6 / 127 * NM * 1.1, "a pixel", color=GREY, ha="right")

@@ -38,7 +38,7 @@ class PublishedBrief:
         shift = found.transform.shift
         center = overlap_center_m(reference.region, scan.region, shift)
         if center is None:
-            return Registration.refused("what agrees lies outside of what both scans have seen")
+            return Registration.refused("the matches that agree lie outside the overlap of the scans")
         score = float(np.hypot(*(b - a - shift)[found.inlier].T).mean()) / diagonal_m
         return Registration(
             accepted=score <= THRESHOLD,

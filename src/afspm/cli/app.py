@@ -47,7 +47,7 @@ def _version(asked: bool) -> None:
 @app.callback()
 def _afspm(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which this is, and end.")
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
     """Automate scanning probe microscopes: run experiments of several components that share one microscope."""

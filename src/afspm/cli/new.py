@@ -10,7 +10,9 @@ import typer
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Of it and of its folder, e.g. my_idea.")]
 Into = Annotated[Path, typer.Option("--into", metavar="DIR", help="Where to make its folder.")]
 
-app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Make something to begin with.")
+app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode="markdown", help="Make an experiment, component or driver to begin with."
+)
 
 
 @app.command("experiment")

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def notify(
     files: Files, test: Annotated[bool, typer.Option("--test", help="Send a test message by each of them.")] = False
 ) -> None:
-    """Say which calls the [notify] of an experiment file makes, and try them.
+    """List the calls that the [notify] of an experiment file makes, and try them.
 
     Ends with 1 if there are none, or if a test message does not arrive.
     """

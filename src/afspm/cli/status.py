@@ -27,7 +27,7 @@ def status(
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
     log: Annotated[int, typer.Option("--log", "-n", min=0, metavar="LINES", help="The last lines of the log.")] = 8,
 ) -> None:
-    """Say how a running experiment is: who is in control, what the microscope does, how long it will still take.
+    """Show the state of a running experiment: control, microscope, problems, notes and the time left.
 
     Ends with 3 where nothing runs.
     """

@@ -87,7 +87,7 @@ class PlannedScans(Component):
                 self._take(step)
         left_out = (self.plan.total or 0) - (self._total or 0)
         taken = "the scan is" if self._total == 1 else f"all {self._total} scans are"
-        self.log.info("%s taken%s", taken, f", {left_out} were left out" if left_out else "")
+        self.log.info("%s taken%s", taken, f", {left_out} left out" if left_out else "")
         if self.end_when_done:
             self.scope.end_experiment()
 

@@ -31,7 +31,7 @@ def named(
     settings = {"class": spec} if isinstance(spec, str) else dict(spec)
     name = settings.pop("class", default)
     if not isinstance(name, str):
-        raise ConfigError(f"{_a(what)} is named by a text, not {name!r}", where="class")
+        raise ConfigError(f"{_a(what)} must be a text, not {name!r}", where="class")
     found = _imported(what, name) if "." in name else _ready_made(what, name, ready_made)
     require(found)
     _check_settings(what, name, found, settings, len(arguments))
@@ -62,7 +62,7 @@ def _ready_made(what: str, name: str, ready_made: Mapping[str, str]) -> type[Any
         if isinstance(plugin := plugins.load(f"afspm.{what}s", name), type):
             return plugin
         known = ", ".join(ready_made)
-        hint = _near(name.casefold(), ready_made) or f"there are {known}; write one of your own as module.Name"
+        hint = _near(name.casefold(), ready_made) or f"known: {known}; name one of your own as module.Name"
         raise ConfigError(f"there is no {what} {name!r}", hint=hint)
     return _imported(what, ready_made[name])
 

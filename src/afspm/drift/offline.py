@@ -148,7 +148,7 @@ def common_area(scans: Sequence[DriftScan], drift_m: Array) -> tuple[Region, tup
     """
     angle = scans[0].region.angle_rad
     if any(abs(math.remainder(scan.region.angle_rad - angle, math.tau)) > 1e-6 for scan in scans):
-        raise InvalidValue("scans of different angles have no common rectangle", hint="choose those of one angle")
+        raise InvalidValue("scans of different angles have no common rectangle", hint="choose scans of one angle")
     cos, sin = math.cos(angle), math.sin(angle)
     turn = np.array([[cos, sin], [-sin, cos]])  # into the axes of the frames
     centers = (np.array([scan.region.center_m for scan in scans]) - drift_m) @ turn.T
@@ -157,7 +157,7 @@ def common_area(scans: Sequence[DriftScan], drift_m: Array) -> tuple[Region, tup
     pixel = np.asarray(scans[0].pixel_m)
     counts = np.floor((high - low) / pixel + 1e-9).astype(int) + 1
     if counts.min() < 2:
-        raise InvalidValue("the scans have no common area", hint="leave out those that are far away")
+        raise InvalidValue("the scans have no common area", hint="leave out scans that are far away")
     size = (counts - 1) * pixel
     center = ((low + high) / 2) @ turn
     region = Region((center[0], center[1]), (size[0], size[1]), angle, Frame.SAMPLE)

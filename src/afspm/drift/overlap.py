@@ -140,7 +140,7 @@ def too_little_shared(asked: Region, scanned: Region, f_rescan: float = F_RESCAN
     shared = intersection_ratio(asked, scanned)
     if shared >= f_rescan:
         return ""
-    return f"it shows {shared:.0%} of the region that was asked for, less than {f_rescan:.0%}"
+    return f"it shows {shared:.0%} of the requested region, less than {f_rescan:.0%}"
 
 
 def too_far_off(asked: Region, scanned: Region, sd_m: float, tolerance_m: float) -> str:
@@ -168,4 +168,7 @@ def too_far_off(asked: Region, scanned: Region, sd_m: float, tolerance_m: float)
 def _in_sample(*regions: Region) -> None:
     for region in regions:
         if region.frame is not Frame.SAMPLE:
-            raise InvalidValue(f"a region in {region.frame.value} coordinates can't be judged", hint="map it first")
+            raise InvalidValue(
+                f"a region in {region.frame.value} coordinates can't be compared",
+                hint="map it to sample coordinates first",
+            )

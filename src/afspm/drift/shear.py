@@ -123,7 +123,7 @@ def velocity_from_up_down(up: DriftScan, down: DriftScan, estimator: Estimator) 
     first, second = sorted((up, down), key=lambda scan: scan.mid_s)
     time_s = (first.mid_s + second.mid_s) / 2
     if first.upwards is None or second.upwards is None or first.upwards == second.upwards:
-        return DriftVelocity.refused("they need to be scanned in opposite directions", time_s)
+        return DriftVelocity.refused("the scans must have opposite slow-scan directions", time_s)
     free = estimator.register(first, second)
     result = _combined(first, second, free, np.zeros(2))
     if result.accepted:
@@ -172,7 +172,7 @@ def _combined(first: DriftScan, second: DriftScan, found: Registration, freed_m_
     time_s = (first.mid_s + second.mid_s) / 2
     sheared = velocity_by_shear(first, second, found)
     if not found.accepted or sheared is None:
-        return DriftVelocity.refused(found.reason or "there is no shear to be found between them", time_s, found)
+        return DriftVelocity.refused(found.reason or "no shear between the scans can be found", time_s, found)
     by_shear, shear_covariance = sheared[0] + freed_m_s, sheared[1]
     between_s, middles_s = _between_s(first, second, found), second.mid_s - first.mid_s
     # rows that are freed are all as they were at the middle, but for what the guess was wrong by
@@ -180,7 +180,7 @@ def _combined(first: DriftScan, second: DriftScan, found: Registration, freed_m_
     covariance = found.covariance_m2 / between_s**2
     difference, both = by_displacement - by_shear, covariance + shear_covariance
     if float(difference @ np.linalg.solve(both, difference)) > _CONTRADICTION:
-        return DriftVelocity.refused("the displacement between them contradicts their shear", time_s, found)
+        return DriftVelocity.refused("the displacement between the scans contradicts their shear", time_s, found)
     share = np.linalg.solve(both, covariance).T  # of the shear
     together = covariance - share @ covariance
     return DriftVelocity(

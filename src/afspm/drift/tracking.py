@@ -89,7 +89,7 @@ def require_newer(scan: DriftScan, newest_s: float | None) -> None:
     """
     if newest_s is not None and scan.mid_s < newest_s:
         late = f"the middle of scan {scan.key!r} is at {scan.mid_s:g} s, and {newest_s:g} s was reached already"
-        raise InvalidValue(late, hint="a tracker takes scans in the order of time")
+        raise InvalidValue(late, hint="give a tracker its scans in the order of time")
 
 
 class Tracker(Protocol):

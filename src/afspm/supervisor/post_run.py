@@ -128,6 +128,7 @@ def report(folder: Path, log: RunLog) -> None:
     up for long."""
     if not (folder / JOURNAL_FILE).is_file():
         return  # nothing was recorded
+    log.write(LOGGED_AS, logging.INFO, "writing the report …")
     command = [*python_command("afspm.record.report"), str(folder)]
     environment = {**os.environ, **python_environment(), "MPLBACKEND": "agg"}
     try:

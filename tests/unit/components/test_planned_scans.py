@@ -116,7 +116,7 @@ def test_a_series_for_a_time_ends_then_however_long_a_scan_takes(caplog: pytest.
         assert run(lasting(600.0, every_s=60.0), lab) == ExitCode.ENDED  # each takes longer than that
     assert len(lab.finished) == 6  # at 0, 120, 240 … 600 s
     assert lab.clock.passed_s < 600.0 + 2 * SCAN_S
-    assert "all 6 scans are taken, 5 were left out" in caplog.messages
+    assert "all 6 scans are taken, 5 left out" in caplog.messages
     assert caplog.messages.count("a round takes 101 s, longer than its period of 60 s") == 1
 
 

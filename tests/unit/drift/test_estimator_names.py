@@ -71,12 +71,12 @@ def test_what_is_right_passes_untouched() -> None:
         (replace(FOUND, linear=np.diag([-2.0, 0.0])), "mirrored"),
         (replace(FOUND, linear=np.diag([-1.0, 0.0])), "mirrored or flat"),
         (replace(FOUND, linear=np.diag([0.0, 1.5])), "stretched by 2.5"),
-        (replace(FOUND, linear_seen=np.zeros((2, 2))), "no LinearSeen"),
+        (replace(FOUND, linear_seen=np.zeros((2, 2))), "instead of a LinearSeen"),
         (replace(FOUND, linear_seen=LinearSeen(np.zeros((2, 2)), np.eye(2))), "shapes (2, 2) and (4, 4)"),
         (replace(FOUND, linear_seen=LinearSeen(np.full((2, 2), np.nan), np.eye(4))), "finite"),
-        (replace(FOUND, linear_seen=LinearSeen(np.zeros((2, 2)), -np.eye(4))), "covariance that can't be"),
+        (replace(FOUND, linear_seen=LinearSeen(np.zeros((2, 2)), -np.eye(4))), "invalid covariance"),
         (replace(FOUND, linear_seen=LinearSeen(np.diag([0.0, 1.5]), np.eye(4))), "stretched by 2.5"),
-        (replace(FOUND, displacement_m=np.array([-1.1e-6, 0.0])), "share nothing"),
+        (replace(FOUND, displacement_m=np.array([-1.1e-6, 0.0])), "do not overlap"),
     ],
 )
 def test_what_an_estimator_gets_wrong_is_refused_with_the_reason(answer: Any, reason: str) -> None:

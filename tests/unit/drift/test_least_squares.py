@@ -225,7 +225,7 @@ def test_an_overlap_too_small_for_an_uncertainty_is_refused() -> None:
     first, second = (scanned(REGION, (12, 12), start_s=start_s) for start_s in (0.0, 900.0))
     found = registered(second, first)
     assert not found.accepted
-    assert found.reason == "the overlap of 10 x 10 pixels is too small to tell how certain a displacement is"
+    assert found.reason == "the overlap of 10 x 10 pixels is too small to estimate the uncertainty of a displacement"
 
 
 def test_a_small_overlap_is_registered_where_a_displacement_is_expected() -> None:

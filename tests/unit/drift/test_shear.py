@@ -90,7 +90,7 @@ def test_scans_in_one_direction_do_not_tell_it() -> None:
     assert velocity_by_shear(first, second, Lattice(VELOCITY).register(first, second)) is None
     refused = velocity_from_up_down(first, second, Lattice(VELOCITY))
     assert not refused.accepted
-    assert "opposite directions" in refused.reason
+    assert "opposite slow-scan directions" in refused.reason
 
 
 @pytest.mark.parametrize("up_first", [True, False])

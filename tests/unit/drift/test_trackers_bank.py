@@ -184,7 +184,7 @@ def test_scans_that_could_not_match_anything_do_not_make_it_lost_soon() -> None:
         update = following.add(scan_at(time_s, ((k + 1) * 3 * SIZE_M, 0.0), key=f"far {k}"))
         assert not update.matched
         assert not update.lost
-        assert update.reason == "no earlier scan of this part of the sample is kept"
+        assert update.reason == "no earlier scan of this part of the sample is stored"
 
 
 def test_it_is_lost_when_positions_are_too_uncertain() -> None:
@@ -221,7 +221,7 @@ def test_scans_that_match_only_each_other_do_not_count_as_found(frames: float) -
     assert not any(update.matched for update in updates[11:])
     assert [update.lost for update in updates[10:13]] == [False, False, False]
     assert all(update.lost for update in updates[13:])
-    assert updates[12].reason == "it matches only scans that matched nothing older"
+    assert updates[12].reason == "it matches only scans that themselves matched no older scan"
     assert updates[12].registrations["scan 11"].accepted
     assert updates[29].after.sd_m > 500.0 * NM
     assert "scan 0" in updates[29].registrations

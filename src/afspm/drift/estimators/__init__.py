@@ -49,6 +49,6 @@ def _guarded(made: object, name: str) -> Estimator:
     if not callable(getattr(made, "register", None)):
         raise ConfigError(
             f"{name} is not an estimator",
-            hint="it needs register(reference, scan, prior), see afspm.drift.registration",
+            hint="give it a method register(reference, scan, prior), see afspm.drift.registration",
         )
     return Guarded(made, name)  # type: ignore[arg-type]

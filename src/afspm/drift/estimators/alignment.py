@@ -170,7 +170,7 @@ def covariance(fit: Fit, believed: Believed) -> Array:
     try:
         change = np.linalg.solve(whole - fit.curvature[used], fit.slope[used][:, :, None])[:, :, 0]
     except np.linalg.LinAlgError:
-        raise Unusable("too small to tell how certain a displacement is") from None
+        raise Unusable("too small to estimate the uncertainty of a displacement") from None
     varied = change.T @ change * (n - 1) / n + inverse @ believed.precision @ inverse.T
     size = float(np.trace(np.linalg.solve(model[:2, :2], varied[:2, :2]))) / 2
     total: Array = SPREAD * max(size, 1.0) * (model + model.T) / 2

@@ -45,9 +45,9 @@ class Correlation:
     def __post_init__(self) -> None:
         for name in ("coefficient", "rival", "overlap"):
             if not 0.0 < getattr(self, name) <= 1.0:
-                raise ConfigError(f"{getattr(self, name)!r} is not above 0 and at most 1", where=name)
+                raise ConfigError(f"{getattr(self, name)!r} must be above 0 and at most 1", where=name)
         if not self.height > 0.0:
-            raise ConfigError(f"{self.height!r} is not above 0", where="height")
+            raise ConfigError(f"{self.height!r} must be above 0", where="height")
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         """See `Estimator`."""
@@ -60,11 +60,11 @@ class Correlation:
         grid, first, second = onto_common_grid(reference, images[0], scan, images[1])
         found = self._peak(first, second, grid, prior)
         if found is None:
-            return Registration.refused("no shift leaves enough in common")
+            return Registration.refused("no shift leaves enough overlap")
         displacement = grid.displacement_m(found.shift_px)
         center = overlap_center_m(reference.region, scan.region, displacement)
         if center is None:
-            return Registration.refused("the best shift leaves nothing in common", found.quality)
+            return Registration.refused("at the best shift the scans have no features in common", found.quality)
         reason = self._objection(found.quality)
         covariance = grid.to_m @ _covariance_px2(first, found) @ grid.to_m.T
         return Registration(

@@ -105,13 +105,13 @@ def _objection(
     figures: dict[str, float], matches: int, standards: Standards, has_prior: bool, covariance: Array, deviations: float
 ) -> str:
     if figures["log10_false_alarms"] > math.log10(standards.false_alarms):
-        return f"that {figures['inliers']:.0f} of {matches} matches agree can be chance"
+        return f"that {figures['inliers']:.0f} of {matches} matches agree may be chance"
     if figures["share"] < standards.inlier_share:
         return f"only {figures['inliers']:.0f} of {matches} matches agree"
     if figures["second"] > standards.ambiguity:
         return f"ambiguous: {figures['second']:.0%} as many matches agree on another displacement"
     if figures["blocks"] < _BLOCKS_MIN or not np.isfinite(covariance).all():
-        return "the matches that agree lie all in one place"
+        return "the matches that agree all lie in one place"
     if figures["overlap"] < (_OVERLAP_MIN_WITH_PRIOR if has_prior else _OVERLAP_MIN):
         return f"the scans share only {figures['overlap']:.0%}"
     if deviations > _DEVIATIONS_MAX:

@@ -69,7 +69,7 @@ class Features:
             raise ConfigError(f"no transform {self.transform!r}", where="transform", hint=hint)
         for name in ("residual_threshold", "false_alarms", "inlier_share", "ambiguity", "bend_max"):
             if not 0.0 < getattr(self, name) <= 1.0:
-                raise ConfigError(f"{getattr(self, name)!r} is not above 0 and at most 1", where=name)
+                raise ConfigError(f"{getattr(self, name)!r} must be above 0 and at most 1", where=name)
         for name in ("iterations", "max_keypoints"):
             if not (isinstance(getattr(self, name), int) and getattr(self, name) >= 1):
                 raise ConfigError(f"{getattr(self, name)!r} is not a number from 1", where=name)
@@ -120,7 +120,7 @@ class Features:
         transform = evidence.consensus.transform
         center = overlap_center_m(reference.region, scan.region, transform.shift)
         if center is None:
-            return Registration.refused("what agrees lies outside of what both scans have seen", quality)
+            return Registration.refused("the matches that agree lie outside the overlap of the scans", quality)
         displacement = transform.shift_at(center)
         standards = Standards(self.false_alarms, self.inlier_share, self.ambiguity, self.iterations, self.seed)
         covariance = covariance_m2(evidence, reference.region, scan.region, center)

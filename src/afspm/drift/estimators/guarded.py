@@ -43,7 +43,7 @@ def _copied(scan: DriftScan) -> DriftScan:
 def _wrong(found: object) -> str:
     """Return what makes a result unusable; empty for nothing."""
     if not isinstance(found, Registration):
-        return f"its result is a {type(found).__name__} and no Registration"
+        return f"its result is a {type(found).__name__} instead of a Registration"
     arrays = {
         "displacement_m": (found.displacement_m, (2,)),
         "covariance_m2": (found.covariance_m2, (2, 2)),
@@ -60,7 +60,7 @@ def _wrong(found: object) -> str:
     covariance = found.covariance_m2
     largest = np.abs(covariance).max()
     if np.abs(covariance - covariance.T).max() > 1e-6 * largest or np.linalg.eigvalsh(covariance)[0] <= 0.0:
-        return f"accepted with a covariance that can't be: {covariance.tolist()}"
+        return f"accepted with an invalid covariance: {covariance.tolist()}"
     return _wrong_linear(found.linear_seen)
 
 
@@ -69,14 +69,14 @@ def _wrong_linear(seen: object) -> str:
     if seen is None:
         return ""
     if not isinstance(seen, LinearSeen):
-        return f"linear_seen is a {type(seen).__name__} and no LinearSeen"
+        return f"linear_seen is a {type(seen).__name__} instead of a LinearSeen"
     linear, covariance = np.asarray(seen.linear), np.asarray(seen.covariance)
     if (linear.shape, covariance.shape) != ((2, 2), (4, 4)) or not (
         np.isfinite(linear).all() and np.isfinite(covariance).all()
     ):
         return "linear_seen has no finite matrices of shapes (2, 2) and (4, 4)"
     if np.linalg.eigvalsh((covariance + covariance.T) / 2)[0] < 0.0:
-        return f"linear_seen has a covariance that can't be: {covariance.tolist()}"
+        return f"linear_seen has an invalid covariance: {covariance.tolist()}"
     return unlike_drift(np.eye(2) + linear)
 
 
@@ -88,5 +88,5 @@ def _impossible(found: Registration, reference: DriftScan, scan: DriftScan) -> s
         return f"accepted with a sample {unlike}"
     if overlap_ratio(reference.region, scan.region, found.displacement_m) == 0.0:
         far_m = float(np.hypot(*found.displacement_m))
-        return f"accepted with a displacement of {far_m:.3g} m, with which the scans share nothing"
+        return f"accepted with a displacement of {far_m:.3g} m, at which the scans do not overlap"
     return ""

@@ -46,23 +46,23 @@ def prepare(values: Array) -> Image:
     rows = known.mean(axis=1) > 0.5
     known &= rows[:, None]
     if rows.mean() < LEAST_ROWS:
-        raise Unusable(f"only {rows.sum()} of {rows.size} rows hold something")
+        raise Unusable(f"only {rows.sum()} of {rows.size} rows hold values")
     measured = values[known]
     lowest, highest = measured.min(), measured.max()
     if highest - lowest <= 1e-12 * max(abs(lowest), abs(highest)):
-        raise Unusable("it is constant")
+        raise Unusable("all values are equal")
     if max(np.mean(measured == lowest), np.mean(measured == highest)) > MOST_SATURATED:
-        raise Unusable("most of it is saturated at one value: has the tip crashed?")
+        raise Unusable("most pixels have the same value (saturated): check whether the tip crashed")
     scaled = (_filled(values, known) - lowest) / (highest - lowest)
     flat = flatten_rows(scaled, known)
     low, high = np.percentile(flat[known], (0.1, 99.9))
     flat = np.clip(flat, low - 0.25 * (high - low), high + 0.25 * (high - low))
     spread = flat[known].std()
     if spread < 1e-9:
-        raise Unusable("but for an offset and a tilt of each row it is constant")
+        raise Unusable("the rows hold nothing but an offset and a tilt")
     flat /= spread
     if _topography(flat, rows) < LEAST_TOPOGRAPHY:
-        raise Unusable("no row looks like its neighbours (noise or streaks alone): has the tip crashed?")
+        raise Unusable("no row resembles its neighbours (only noise or streaks): check whether the tip crashed")
     return Image(flat, known)
 
 

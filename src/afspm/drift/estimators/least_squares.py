@@ -78,7 +78,7 @@ class LeastSquares:
             rows, columns = box.shape
             return Registration.refused(f"the overlap of {columns} x {rows} pixels is {reason}")
         if not (np.isfinite(total).all() and np.hypot(*(theta - start[0])[:2]) < FARTHEST_PX):
-            return Registration.refused("no displacement fits: the scans hold nothing in common")
+            return Registration.refused("no displacement fits: the scans have no features in common")
         found = _evidence(scene, box, theta, total, start[1:], expected)
         registration = self._registration(theta, total, box, grid, found)
         return replace(registration, linear_seen=_in_m(seen, grid))

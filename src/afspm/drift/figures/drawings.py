@@ -221,7 +221,7 @@ def draw_features(reference: DriftScan, scan: DriftScan, matches: Matches | None
         InvalidValue: an estimator that matches no features.
     """
     if matches is None:
-        raise InvalidValue("this estimate does not rest on features", hint='e.g. estimator "brief"')
+        raise InvalidValue("this estimator uses no features", hint='e.g. estimator "brief"')
     with styled():
         made = figure(2 * _INCHES, 2 * _INCHES + 0.3)
         rows = made.subplots(2, 2)
@@ -299,7 +299,7 @@ def _misplaced(ax: Axes, off_m: Array, hours: Array) -> None:
     distance_m = np.hypot(*off_m.T)
     distance_m[distance_m == 0.0] = np.nan  # that of the first scan has no place on a logarithmic axis
     ax.semilogy(hours, distance_m * 1e9, "o-", color="black", markersize=2.5, linewidth=0.6)
-    ax.set_ylabel("scan off its place / nm")
+    ax.set_ylabel("position error of the scan / nm")
 
 
 def _known(ax: Axes, record: DriftRecord, truth_m: Array, hours: Array) -> None:
@@ -310,5 +310,5 @@ def _known(ax: Axes, record: DriftRecord, truth_m: Array, hours: Array) -> None:
         ax.fill_between(hours, -2 * sd, 2 * sd, color=colour, alpha=0.15, linewidth=0, label=f"± 2 sd, {name}")
         ax.plot(hours, error_m[:, axis] * factor, color=colour, linewidth=0.9, label=f"{name}, believed - true")
     ax.axhline(0.0, color=GREY, linewidth=0.4)
-    ax.set_ylabel(f"error of what is known / {unit}")
+    ax.set_ylabel(f"error of the estimate / {unit}")
     ax.legend(ncols=2, loc="best")

@@ -45,7 +45,9 @@ def tracker(spec: str | Table[str, Any] = DEFAULT, estimator: Estimator | None =
     """
     made, name = named("tracker", spec, READY_MADE, DEFAULT, default_estimator() if estimator is None else estimator)
     if not all(callable(getattr(made, method, None)) for method in ("add", "state", "restore")):
-        raise ConfigError(f"{name} is not a tracker", hint="it needs add, state and restore, see afspm.drift.tracking")
+        raise ConfigError(
+            f"{name} is not a tracker", hint="give it the methods add, state and restore, see afspm.drift.tracking"
+        )
     return made  # type: ignore[return-value]
 
 

@@ -155,7 +155,7 @@ class BankTracker:
         """
         state = self._state
         if state.filters is None:
-            raise InvalidValue("a velocity was given before the first scan", hint="positions are counted from that")
+            raise InvalidValue("a velocity was set before the first scan", hint="positions are counted from that")
         velocity = np.asarray(velocity_m_s, dtype=np.float64) + state.compensation.velocity_m_s(time_s)
         noise = np.asarray(covariance, dtype=np.float64)
         state.filters = self._with_velocity(state.filters, time_s, velocity, noise)
@@ -170,7 +170,7 @@ class BankTracker:
         if state.newest_s is not None and time_s < state.newest_s:
             raise InvalidValue(
                 f"compensation since {time_s:g} s is told after a scan of {state.newest_s:g} s",
-                hint="tell it before the next scan",
+                hint="report it before the next scan",
             )
         velocity = np.asarray(velocity_m_s, dtype=np.float64)
         needed_s = time_s if state.newest_s is None else state.newest_s
@@ -373,10 +373,10 @@ def _drifts(filters: Filters) -> tuple[Array, Array]:
 
 def _why_not(tried: Table[int, Registration], found: Comparison | None, *, adrift: bool) -> str:
     if adrift:
-        return "it matches only scans that matched nothing older"
+        return "it matches only scans that themselves matched no older scan"
     if found is not None:
         far = f"found {found.surprise**0.5:.1f} standard deviations from where it was expected"
         return f"{far}; believed if the next one is too"
     if tried:
         return next(iter(tried.values())).reason
-    return "no earlier scan of this part of the sample is kept"
+    return "no earlier scan of this part of the sample is stored"

@@ -232,7 +232,7 @@ class PaperTracker:
                 return old.mapping @ transform_between(found, self._transform).inverse, tried, ""
         if tried:
             return None, tried, next(reversed(tried.values())).reason
-        return None, tried, "no scan of the queue shares enough with it"
+        return None, tried, "no scan of the queue overlaps enough with it"
 
     def _averaged(self, predicted: Mapping, estimated: Mapping) -> Mapping:
         """M'_k dM~_k, with dM~_k shortened to the share that is believed."""

@@ -65,13 +65,13 @@ class BankSettings:
                 hint=f"one of {', '.join(TRANSFORMS)}",
             )
         if not (self.densities_m2_s3 and self.fadings_s):
-            raise ConfigError("a bank without filters", where="densities_m2_s3, fadings_s")
+            raise ConfigError("the bank has no filters", where="densities_m2_s3, fadings_s")
         if not min(*numbers, self.linear_walk_per_s, *self.densities_m2_s3, *self.fadings_s) > 0.0:
-            raise ConfigError("all settings of the bank are above zero")
+            raise ConfigError("all settings of the bank must be above 0")
         if not (0.0 < self.forget <= 1.0 and self.rarest < 1.0):
             raise ConfigError("weights: forget up to 1, rarest below it", where="forget, rarest")
         if not (self.inflation > 1.0 and self.widening >= 1.0 and self.lost_after >= 1):
-            raise ConfigError("inflation above 1, widening and lost_after at least 1", where="inflation")
+            raise ConfigError("inflation must be above 1, widening and lost_after at least 1", where="inflation")
 
     @classmethod
     def split(cls, settings: dict[str, Any]) -> tuple[BankSettings, Choice]:
