@@ -133,7 +133,7 @@ def drawn(outcomes: Mapping[Half, Sequence[Outcome]], path: Path) -> None:
 
     figure = Figure(figsize=(4.2, 4.0), layout="constrained")
     axes = figure.subplots()
-    axes.plot([0, 1], [0, 1], color="0.7", linewidth=1, label="as told")
+    axes.plot(exact := np.geomspace(3e-4, 1.0, 200), exact, color="0.7", linewidth=1, label="exactly right")
     for half, marker, color in zip(HALVES, "os", ("tab:blue", "tab:orange"), strict=True):
         pairs = [(found.wrong, one.failed) for one in outcomes[half] if (found := evidence(one)) is not None]
         told, wrong = np.array(pairs, dtype=np.float64).T
@@ -146,9 +146,9 @@ def drawn(outcomes: Mapping[Half, Sequence[Outcome]], path: Path) -> None:
             at, label = told[here].mean(), half if k == number.min() else None
             axes.plot([at, at], [low, high], color=color, linewidth=1)
             axes.plot(at, bad / n, marker, color=color, markersize=5, label=label)
-    axes.set_xscale("logit")
+    axes.set_xscale("log")
     axes.set_yscale("symlog", linthresh=0.01)
-    axes.set(xlabel="probability told that a match is wrong", ylabel="share that was wrong", ylim=(-0.001, 1.3))
+    axes.set(xlabel="probability that a match is wrong", ylabel="share that was wrong", ylim=(-0.001, 1.3))
     axes.legend(frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)

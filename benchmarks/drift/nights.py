@@ -17,7 +17,8 @@ from afspm.drift.registration import DriftScan, Prior, Registration
 from afspm.drift.shear import row_delay_s
 from afspm.drift.tracking import Tracker, Update
 from afspm.model import Region
-from benchmarks.drift.conditions import CONDITIONS, Array, measured
+from benchmarks.drift.conditions import CONDITIONS, Array, Condition, measured
+from benchmarks.drift.families import Half, drawn_condition, drawn_surface, source
 from benchmarks.drift.pairs import HEIGHT_M, PIXEL_M, ROW_S, View
 from benchmarks.drift.surfaces import SURFACES, Grid, imaged
 
@@ -66,19 +67,29 @@ class Drift:
 
 @dataclass
 class Night:
-    """A sample of one kind, and its drift."""
+    """A sample of one kind, and its drift; of a half of the families if one is named."""
 
     surface: str
     seed: int
     scans: int
+    half: Half | None = None
     drift: Drift = field(init=False)
     _view: View = field(init=False)
+    _how: Condition = field(init=False)
 
     def __post_init__(self) -> None:
         self.drift = Drift(self.seed, self.scans)
         grid = Grid(PIXELS / 2 + STRAY_PX)
-        random = [np.random.default_rng([self.seed, list(SURFACES).index(self.surface), k]) for k in (1, 2)]
-        image = imaged(_unit(SURFACES[self.surface](grid, *random)))
+        number = list(SURFACES).index(self.surface)
+        random = [np.random.default_rng([self.seed, number, k]) for k in (1, 2)]
+        self._how, relief = CONDITIONS["real"], SURFACES[self.surface]
+        if self.half is not None:
+            drawn, random = (
+                source(self.half, self.seed, number, 0),
+                [source(self.half, self.seed, number, k) for k in (1, 2)],
+            )
+            self._how, relief = drawn_condition("real", drawn), drawn_surface(self.surface, drawn)
+        image = imaged(_unit(relief(grid, *random)), blunt=self._how.blunt)
         self._view = View.of(grid, image / image[_middle(grid)].std())
 
     def scan(self, number: int, start_s: float, center_m: Array, *, upwards: bool = True) -> DriftScan:
@@ -86,9 +97,11 @@ class Night:
         q = np.stack(np.meshgrid(*[np.arange(PIXELS) - (PIXELS - 1) / 2] * 2))
         order = np.arange(PIXELS) if upwards else np.arange(PIXELS)[::-1]
         sample_m = np.asarray(center_m - self.drift.at(np.asarray(start_s + order * ROW_S, dtype=np.float64)))
+        along = np.arange(PIXELS) / self._how.creep_length_px
+        q[0] += self._how.creep_px * np.exp(-along)
         heights = self._view.at(q + (sample_m / PIXEL_M).T[:, :, None])
         noise = np.random.default_rng([self.seed, 4, number])
-        values = HEIGHT_M * measured(heights, CONDITIONS["real"], noise)
+        values = HEIGHT_M * measured(heights, self._how, noise)
         region = Region((float(center_m[0]), float(center_m[1])), (SIZE_M, SIZE_M))
         return DriftScan(values, region, start_s, start_s + FRAME_S, upwards, f"{number}")
 

@@ -17,9 +17,11 @@ from rich.table import Table
 from afspm.drift.estimators import estimator
 from afspm.drift.trackers import tracker
 from afspm.drift.tracking import Tracker
+from benchmarks.drift.families import Half
 from benchmarks.drift.nights import Night, Oracle
 from benchmarks.drift.pairs import PIXEL_M
 from benchmarks.drift.parts import Plan, Report
+from benchmarks.drift.surfaces import SURFACES
 from benchmarks.rows import Row
 
 SCANS = 32
@@ -29,6 +31,8 @@ NIGHTS = {"rough": 3, "particles": 1, "steps": 1, "stamper": 1}
 LONG_SCANS = 200
 LONG_REFERENCES = 2
 STARTS = {"rough": 6, "stamper": 4}
+# Of the unseen half of the families: nights of each surface, and scans of a night.
+UNSEEN, UNSEEN_SCANS = 4, 24
 
 OURS, ORACLE, PAPER, FEATURES = "bank", "oracle, bank", "paper's scheme", "paper's scheme, brief"
 FIRST_ORDER, STARTED, LONG = "oracle, paper's scheme", "bank, up and down", "bank, long"
@@ -42,6 +46,8 @@ class Followed:
         misplaced: predicted less true position of each scan.
         mistaken: believed less true position after it.
         unmatched, lost: how many scans were so.
+        half: of the families; None: a sample and a microscope like all others.
+        lost_at_end: the sample was never found again.
     """
 
     scheme: str
@@ -50,6 +56,8 @@ class Followed:
     mistaken: tuple[float, ...]
     unmatched: int
     lost: int
+    half: Half | None = None
+    lost_at_end: bool = False
 
     @property
     def misplaced_m(self) -> NDArray[np.float64]:
@@ -69,16 +77,19 @@ class Track:
     seed: int
     scans: int
     estimator: str
+    half: Half | None = None
 
     def run(self) -> list[Followed]:
-        night = Night(self.surface, self.seed, self.scans)
-        misplaced, mistaken, unmatched, lost = [], [], 0, 0
+        night = Night(self.surface, self.seed, self.scans, self.half)
+        misplaced, mistaken, unmatched, lost, last = [], [], 0, 0, False
         for drift_m, update in night.followed(self._tracker(night), up_and_down=self.scheme == STARTED):
             misplaced += list(-update.before.mapping.translation_m - drift_m)
             mistaken += list(-update.after.mapping.translation_m - drift_m)
             unmatched += not update.matched
             lost += update.lost
-        return [Followed(self.scheme, self.surface, tuple(misplaced), tuple(mistaken), unmatched, lost)]
+            last = update.lost
+        found = tuple(misplaced), tuple(mistaken)
+        return [Followed(self.scheme, self.surface, *found, unmatched, lost, self.half, last)]
 
     def _tracker(self, night: Night) -> Tracker:
         kind = "paper" if self.scheme in (PAPER, FEATURES, FIRST_ORDER) else "bank"
@@ -97,6 +108,9 @@ def jobs(plan: Plan) -> list[Track]:
     for surface, count in NIGHTS.items():
         for seed in range(plan.seed, plan.seed + (1 if plan.quick else count)):
             found += [Track(scheme, surface, seed, scans, name) for scheme, name in schemes]
+    for surface in SURFACES:
+        for seed in range(plan.seed, plan.seed + (1 if plan.quick else UNSEEN)):
+            found += [Track(scheme, surface, seed, UNSEEN_SCANS, name, "unseen") for scheme, name in schemes[:2]]
     for surface, count in STARTS.items():
         for seed in plan.seeds(count):
             found += [Track(scheme, surface, seed + 500, 2, plan.ours) for scheme in (OURS, STARTED)]
@@ -104,6 +118,8 @@ def jobs(plan: Plan) -> list[Track]:
 
 
 def report(plan: Plan, results: Sequence[Followed]) -> Report:
+    unseen = [one for one in results if one.half is not None]
+    results = [one for one in results if one.half is None]
     nights = [one for one in results if one.scheme != LONG and len(one.misplaced) > 4]
     starts = [one for one in results if one.scheme != LONG and len(one.misplaced) == 4]
     long = next(one for one in results if one.scheme == LONG)
@@ -118,7 +134,33 @@ def report(plan: Plan, results: Sequence[Followed]) -> Report:
     for scheme in (OURS, STARTED):
         first = [one for one in starts if one.scheme == scheme]
         table.add_row(f"{scheme}: first jump", "rough, stamper", str(len(first)), f"{_jump_m(first) * 1e9:.1f}")
-    return Report([table], list(_rows(nights, starts, long)))
+    return Report([table, _unseen_table(unseen)], [*_rows(nights, starts, long), *_unseen_rows(unseen)])
+
+
+def _unseen_table(nights: Sequence[Followed]) -> Table:
+    table = Table(title="unseen half of the families: nm", title_justify="left", box=None, pad_edge=False)
+    for head in ("scheme", "surface", "nights", "late RMS", "max", "known RMS", "unmatched", "lost"):
+        table.add_column(head)
+    for surface in SURFACES:
+        for scheme in (OURS, ORACLE):
+            here = [one for one in nights if (one.scheme, one.surface) == (scheme, surface)]
+            table.add_row(scheme, surface, str(len(here)), *_figures(here))
+    return table
+
+
+def _unseen_rows(nights: Sequence[Followed]) -> Iterator[Row]:
+    """Late misplacement over that of the oracle."""
+    ratios = []
+    for surface in SURFACES:
+        own, oracle = (
+            _late_m([one for one in nights if (one.scheme, one.surface) == (scheme, surface)])
+            for scheme in (OURS, ORACLE)
+        )
+        ratios.append(own / oracle)
+    yield Row("unseen nights: late misplacement over the oracle's, mean", "1", float(np.mean(ratios)), None, 1.15)
+    yield Row("unseen nights: the same, worst surface", "1", max(ratios), None, 1.4)
+    lost = sum(one.lost_at_end for one in nights if one.scheme == OURS)
+    yield Row("unseen nights: lost for good", "nights", lost, None, 0)
 
 
 def _figures(here: Sequence[Followed]) -> list[str]:
