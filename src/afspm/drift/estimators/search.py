@@ -76,7 +76,7 @@ def candidates(scene: Scene, prior: ExpectedShift | None) -> list[Array]:
     """Shifts (x, y) px worth a closer look, the best first, and the one that is expected."""
     correlation = MaskedCorrelation(scene.first.known, scene.second.known)
     peaks: list[tuple[float, Array]] = []
-    for one, two in (scene.smooth, scene.slope, scene.band):
+    for one, two in (scene.smooth, scene.band):
         peaks += correlation.peaks(one, two, prior)
     peaks.sort(key=lambda peak: -peak[0])
     shifts = [shift for _, shift in peaks]

@@ -249,11 +249,6 @@ class Scene:
         return self._filtered(1.0)
 
     @cached_property
-    def slope(self) -> Both:
-        """Along the rows: their offsets don't touch it."""
-        return self._filtered(1.5, order=(0, 1))
-
-    @cached_property
     def band(self) -> Both:
         """Edges rather than areas."""
         fine, coarse = self._filtered(0.8), self._filtered(3.0)
@@ -280,12 +275,10 @@ class Scene:
         """Pixels of that of which less is known."""
         return min(int(self.first.known.sum()), int(self.second.known.sum()))
 
-    def _filtered(self, sigma_px: float, order: tuple[int, int] = (0, 0)) -> Both:
+    def _filtered(self, sigma_px: float) -> Both:
         from scipy.ndimage import gaussian_filter
 
-        one, two = (
-            gaussian_filter(image.values, sigma_px, order=order, mode="nearest") for image in (self.first, self.second)
-        )
+        one, two = (gaussian_filter(image.values, sigma_px, mode="nearest") for image in (self.first, self.second))
         return one, two
 
     def smaller(self) -> tuple[Scene, int, Array]:
