@@ -141,8 +141,8 @@ def drawn(outcomes: Mapping[Half, Sequence[Outcome]], path: Path) -> None:
         for k in np.unique(number):
             here = number == k
             n, bad = int(here.sum()), int(wrong[here].sum())
-            bounds = beta.ppf((0.025, 0.975), (max(bad, 1e-9), bad + 1), (n - bad + 1, max(n - bad, 1e-9)))
-            low, high = np.asarray(bounds, dtype=np.float64)
+            low = float(beta.ppf(0.025, max(bad, 1e-9), n - bad + 1))
+            high = float(beta.ppf(0.975, bad + 1, max(n - bad, 1e-9)))
             at, label = told[here].mean(), half if k == number.min() else None
             axes.plot([at, at], [low, high], color=color, linewidth=1)
             axes.plot(at, bad / n, marker, color=color, markersize=5, label=label)

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from benchmarks.drift import fit
-from benchmarks.drift.trials import Outcome
+from benchmarks.drift.trials import ELLIPSE_95, Outcome
 
 from afspm.drift.estimators.acceptance import MatchEvidence
+from afspm.drift.estimators.coefficients import SPREAD
 
 GOOD = MatchEvidence(
     overlap=0.8, sd_px=0.02, gap=300.0, rival=0.05,
@@ -57,7 +58,7 @@ def test_the_fit_tells_probabilities_that_are_right() -> None:
     exec(fit.fitted(outcomes), module)
     assert module["WEIGHTS"]["agreement"] == pytest.approx(-10.0, rel=0.1)
     assert abs(module["WEIGHTS"]["gap"]) < 0.2
-    assert module["SPREAD"] == pytest.approx(fit.SPREAD * 3.0 / fit.ELLIPSE_95, rel=0.01)
+    assert module["SPREAD"] == pytest.approx(SPREAD * 3.0 / ELLIPSE_95, rel=0.01)
 
 
 def _outcome(seed: int, found: MatchEvidence, *, wrong: bool) -> Outcome:
