@@ -44,7 +44,7 @@ __all__ = ["Microscope"]
 T = TypeVar("T")
 
 
-class _Session:
+class _PlanSession:
     """The handle to the experiment, used in a thread of its own: its calls block."""
 
     def __init__(self, where: str | Path, name: str) -> None:
@@ -80,7 +80,7 @@ class _Session:
 class _ParameterBackend(SignalBackend[float]):
     """A parameter by its generic name, in SI units."""
 
-    def __init__(self, session: _Session, parameter: str) -> None:
+    def __init__(self, session: _PlanSession, parameter: str) -> None:
         super().__init__(float)
         self._session = session
         self._parameter = parameter
@@ -126,7 +126,7 @@ class _ParameterBackend(SignalBackend[float]):
 class _Measurement(StandardReadable, Triggerable):
     """Something that is measured where its signals say, with an array for each channel or variable."""
 
-    def __init__(self, session: _Session, name: str = "") -> None:
+    def __init__(self, session: _PlanSession, name: str = "") -> None:
         self._session = session
         self._keys: dict[str, DataKey] = {}
         self._readings: dict[str, Reading[Any]] = {}
@@ -169,7 +169,7 @@ class ScanDevice(_Measurement):
     Signals `center_x`, `center_y`, `size_x`, `size_y` (m) and `angle` (rad) say where, `rows` and `columns` how fine.
     """
 
-    def __init__(self, session: _Session, name: str = "") -> None:
+    def __init__(self, session: _PlanSession, name: str = "") -> None:
         with self.add_children_as_readables(StandardReadableFormat.UNCACHED_SIGNAL):
             self.center_x = soft_signal_rw(float, units="m")
             self.center_y = soft_signal_rw(float, units="m")
@@ -198,7 +198,7 @@ class ScanDevice(_Measurement):
 class SpectrumDevice(_Measurement):
     """A spectrum: `trigger` takes it at `x`, `y` (m), and reading it gives all variables over the points."""
 
-    def __init__(self, session: _Session, name: str = "") -> None:
+    def __init__(self, session: _PlanSession, name: str = "") -> None:
         with self.add_children_as_readables(StandardReadableFormat.UNCACHED_SIGNAL):
             self.x = soft_signal_rw(float, units="m")
             self.y = soft_signal_rw(float, units="m")
@@ -231,7 +231,7 @@ class Microscope(StandardReadable):
     def __init__(
         self, where: str | Path = "runs", parameters: Sequence[str] = (), client: str = "bluesky", name: str = ""
     ) -> None:
-        self._session = session = _Session(where, client)
+        self._session = session = _PlanSession(where, client)
         self._held = ExitStack()
         with self.add_children_as_readables(StandardReadableFormat.CONFIG_SIGNAL):
             for parameter in parameters:
