@@ -77,6 +77,8 @@ class Component:
     told of processes, requests and logs; `("",)`: that too."""
     operates: ClassVar[bool] = False
     """A person commands the microscope by it in MANUAL mode, where the experiment file names nobody else."""
+    has_people: ClassVar[bool] = False
+    """It acts for persons, whose passwords are in its setting `people`."""
     requires: ClassVar[tuple[str, ...]] = ()
     """Packages that it needs beside a plain install of afspm, as for `pip install`: `("scikit-learn>=1.4",)`."""
     needs_actions: tuple[str, ...] = ()

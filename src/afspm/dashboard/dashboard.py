@@ -44,6 +44,7 @@ class Dashboard(Component):
     """
 
     operates = True
+    has_people = True
     requires = ("afspm[dashboard]",)
     listens = ("",)
     longest_step_s = 60.0  # the first import of everything, on a busy computer

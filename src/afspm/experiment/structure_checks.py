@@ -308,10 +308,10 @@ def check_names_of_people(resolved: ResolvedExperiment) -> None:
 
 
 def _has_password(resolved: ResolvedExperiment, member: str) -> bool:
-    """False for a person of a dashboard that does not know the password of this person."""
+    """False for a person of a dashboard or gateway that does not know the password of this person."""
     name, _, person = member.partition(PERSON)
     process = resolved.processes.get(name)
-    if not person or process is None or not process.says("operates"):
+    if not person or process is None or not process.says("has_people"):
         return True
     return person in (process.settings.get("people") or {})
 

@@ -45,6 +45,7 @@ class Gateway(Component):
         ConfigError: others could come in without a token, or listen in; the port is taken …
     """
 
+    has_people = True
     requires = ("afspm[gateway]",)
     listens = ("",)
     longest_step_s = 60.0  # the first import of everything, on a busy computer

@@ -317,8 +317,9 @@ def test_roles_without_keys_are_a_warning(write: Write) -> None:
         assert any("without keys" in f.what for f in experiment.check()) is told
 
 
-def test_a_role_of_a_person_without_a_password_is_told(write: Write) -> None:
-    roles = '[dashboard]\ncomponent = true\nclass = "Dashboard"\n{}[control.roles]\nset_mode = ["dashboard:Ada"]\n'
+@pytest.mark.parametrize("class_", ["Dashboard", "Gateway"])
+def test_a_role_of_a_person_without_a_password_is_told(write: Write, class_: str) -> None:
+    roles = f'[web]\ncomponent = true\nclass = "{class_}"\n{{}}[control.roles]\nset_mode = ["web:Ada"]\n'
     people = f'people.Ada = "scrypt:{"A" * 24}:{"A" * 44}"\n'
     for more, told in (("", True), (people, False), (people.replace("Ada", "Max"), True)):
         found = write(CORRECTOR + roles.format(more)).check()
