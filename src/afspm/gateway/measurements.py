@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -145,8 +146,14 @@ class Measurements:
         if refusal is not None:
             raise refused(refusal)
         one = known or Measurement(who, key, plan)
-        response = commands.act_when_free(target.action, lambda: self._next_attempt(one))
+        response = commands.act_when_free(target.action, partial(next, self._attempts(one)))
         return self._begun(one, response)
+
+    def _attempts(self, one: Measurement) -> Iterator[str]:
+        """Yield an id for each attempt; asked for another, the one before was refused."""
+        while True:
+            yield self._next_attempt(one)
+            one.is_certain = True
 
     def _next_attempt(self, one: Measurement) -> str:
         """Write the next attempt down, and return its id; one of unknown outcome is asked for again by its own."""
