@@ -34,7 +34,9 @@ CHUNK_BYTES = 3 << 16  # a multiple of three, so that pieces of base64 fit toget
 
 def region_model(region: Region) -> RegionModel:
     """Return a region; what the microscope says is not judged."""
-    return RegionModel.model_construct(center_m=region.center_m, size_m=region.size_m, angle_rad=region.angle_rad)
+    return RegionModel.model_construct(
+        center_m=list(region.center_m), size_m=list(region.size_m), angle_rad=region.angle_rad
+    )
 
 
 def microscope(overview: Overview) -> MicroscopeModel:
@@ -45,8 +47,8 @@ def microscope(overview: Overview) -> MicroscopeModel:
     return MicroscopeModel.model_construct(
         state="UNDEFINED" if overview.status is None else overview.status.state.name,
         region=None if region is None else region_model(region),
-        shape=shape,
-        probe_m=None if probe is None else probe.xy_m,
+        shape=None if shape is None else list(shape),
+        probe_m=None if probe is None else list(probe.xy_m),
         feedback_on=None if feedback is None else feedback.on,
         setpoint=None if feedback is None or feedback.setpoint is None else number_or_none(feedback.setpoint),
     )
@@ -71,7 +73,7 @@ def scan_model(channels: Sequence[ScanSummary]) -> ScanModel:
         began=None if first.began_ns is None else iso_utc(first.began_ns),
         finished=iso_utc(channels[-1].time_ns),
         region=region_model(first.region),
-        shape=first.shape,
+        shape=list(first.shape),
         channels=[ChannelModel(name=one.channel, unit=one.unit) for one in channels],
         holder=first.holder,
         interrupted=first.interrupted,
@@ -85,7 +87,7 @@ def spectrum_model(spectrum: SpectrumSummary) -> SpectrumModel:
         id=str(spectrum.time_ns),
         finished=iso_utc(spectrum.time_ns),
         kind=spectrum.kind,
-        position_m=spectrum.position_m,
+        position_m=None if spectrum.position_m is None else list(spectrum.position_m),
         variables=[
             ChannelModel(name=name, unit=unit) for name, unit in zip(spectrum.names, spectrum.units, strict=True)
         ],
