@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Query
@@ -33,11 +34,12 @@ from afspm.gateway.problems import RefusalCode, RefusedRequest, refused
 from afspm.gateway.reading_routes import Parameter
 from afspm.gateway.services import GatewayServices
 from afspm.gateway.views import parameter_model
-from afspm.model import WAIT_FOR_CONTROL, ControlMode, Region, Response, names
+from afspm.model import WAIT_FOR_CONTROL, ControlMode, ControlState, Region, Response, names
 from afspm.web.person_commands import PersonCommands
 
 LONGEST_WAIT_S = 25.0
 """What is in between often cuts off what waits for 30 s."""
+PUBLISHED_WITHIN_S = 1.0
 Wait = Annotated[float, Query(ge=0.0, le=LONGEST_WAIT_S, description="for so many seconds at most")]
 Name = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
 _SECURITY = (Depends(HTTPBasic(auto_error=False)), Depends(HTTPBearer(auto_error=False)))
@@ -87,6 +89,7 @@ class CommandRoutes:
             response = await self._services.do(asked, take)
             left_s = until_s - asyncio.get_running_loop().time()
             if response.ok:
+                await self._published(lambda control: control.holder == self._services.who(asked))
                 return ControlModel(holder=self._services.who(asked), lease_s=wanted.lease_s)
             if response.code not in WAIT_FOR_CONTROL or left_s <= 0.0 or await asked.is_disconnected():
                 raise refused(response)
@@ -100,6 +103,7 @@ class CommandRoutes:
     async def release_control(self, asked: Request) -> DoneModel:
         """Give control back."""
         await self._services.command(asked, lambda commands: commands.release_control())
+        await self._published(lambda control: control.holder != self._services.who(asked))
         return DoneModel()
 
     # --- measurements ---
@@ -152,17 +156,21 @@ class CommandRoutes:
         """Flag a problem."""
         number = self._problem(name)
         await self._services.command(asked, lambda commands: commands.flag(number))
+        await self._published(lambda control: number in control.problems)
         return ProblemModel(name=name, flagged=True)
 
     async def clear_problem(self, asked: Request, name: Name) -> ProblemModel:
         """Remove the flag of a problem."""
         number = self._problem(name)
         await self._services.command(asked, lambda commands: commands.clear(number))
+        await self._published(lambda control: number not in control.problems)
         return ProblemModel(name=name, flagged=False)
 
     async def set_mode(self, asked: Request, wanted: ModeModel) -> ModeModel:
         """Set MANUAL, in which no component is in control, or AUTOMATED."""
-        await self._services.command(asked, lambda commands: commands.set_mode(ControlMode[wanted.mode]))
+        mode = ControlMode[wanted.mode]
+        await self._services.command(asked, lambda commands: commands.set_mode(mode))
+        await self._published(lambda control: control.mode is mode)
         return wanted
 
     async def write_note(self, asked: Request, wanted: NoteAsked) -> DoneModel:
@@ -193,6 +201,15 @@ class CommandRoutes:
             return self._services.watch.problems.number(name)
         except AfspmError as error:
             raise RefusedRequest(RefusalCode.NOT_FOUND, str(error)) from error
+
+    async def _published(self, holds: Callable[[ControlState], bool]) -> None:
+        """Wait until what was answered is published, so that a client reads what it has done; not for long."""
+        loop, watch = asyncio.get_running_loop(), self._services.watch
+        until_s = loop.time() + PUBLISHED_WITHIN_S
+        while (left_s := until_s - loop.time()) > 0.0:
+            if watch.overview.control is not None and holds(watch.overview.control):
+                return
+            await self._bell.wait(left_s)
 
     async def _control_changed(self, within_s: float) -> None:
         """Wait until who is in control has changed; not for ever, should that not reach us."""
