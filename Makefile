@@ -77,9 +77,10 @@ CLIENTS ?=
 test-clients: $(TEST)
 	@$(BIN)/python tools/test_clients.py $(CLIENTS)
 
-## tests with a Windows Python under Wine, on Debian, two folders at a time: make test-windows TESTS="tests/unit/wire"
+## tests with a Windows Python under Wine, on Debian, two folders at a time (an hour and more): make test-windows TESTS="tests/unit/wire"
 # (those of whole experiments take longest: they come first; tip_repair is in components, the Nanonis sample in microscopes)
-TESTS ?= $(addprefix tests/system/,experiment supervisor microscopes components process record emulators) \
+TESTS ?= $(wildcard tests/system/experiment/test_*.py) \
+	$(addprefix tests/system/,supervisor microscopes components process record emulators) \
 	$(filter-out %__/,$(wildcard tests/unit/*/)) $(wildcard tests/unit/test_*.py)
 test-windows: $(TEST)
 	@$(PYTHON) tools/windows/python.py
