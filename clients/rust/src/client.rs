@@ -115,6 +115,7 @@ impl Client {
         let (waits, wakes) = sockets::waker(&context)?;
         let shared = Arc::new(Shared::new(launch, session, wakes));
         let memory = crate::measure::Memory::of_earlier_life(&shared)?;
+        shared.lock().gives_back = !memory.resumes();
         let heartbeat = Mutex::new(Heartbeat::start(&shared.launch, &shared.activity)?);
         let sockets = Mutex::new(Some(sockets::start(&context, waits, &shared)?));
         let threads = Arc::new(Threads { shared: shared.clone(), sockets, heartbeat });

@@ -68,6 +68,11 @@ impl Memory {
         Ok(memory)
     }
 
+    /// Return whether an earlier life has left a measurement to be taken up.
+    pub fn resumes(&self) -> bool {
+        self.unfinished.is_some()
+    }
+
     fn watch(&mut self, shared: &Shared, cycle: Cycle) -> u64 {
         self.cycles += 1;
         shared.lock().cycles.insert(self.cycles, cycle);
@@ -201,6 +206,9 @@ impl Client {
         if let Some(watch) = task.watch {
             self.wait_if_begun(watch, task.until)?;
             if self.outcome(watch) == Some(Outcome::Completed) {
+                if self.shared.lock().inherits_control(self.name()) {
+                    self.request(ControlRequest::ReqReleaseCtrl as u8, b"")?; // others wait for it
+                }
                 return Ok(self.results(watch));
             }
         }

@@ -120,6 +120,8 @@ pub struct State {
     pub lines: VecDeque<String>,
     pub over: Option<Error>,
     pub closing: bool,
+    /// Control that an earlier life of the component died with is to be given back: nothing is resumed with it.
+    pub gives_back: bool,
     backlog: VecDeque<Arc<Packet>>,
     backlog_bytes: usize,
     dropped: u64,
@@ -155,6 +157,12 @@ impl State {
             let why = self.obstacle(self.hold.solving(), "");
             self.hold.lost(if why.is_empty() { "it was revoked" } else { &why });
         }
+    }
+
+    /// Return whether the scheduler still counts an earlier life of ours, which wanted control, as its holder.
+    pub fn inherits_control(&self, name: &str) -> bool {
+        let is_holder = self.view.control.as_ref().is_some_and(|control| control.holder.as_deref() == Some(name));
+        is_holder && !self.hold.held && !self.hold.is_wanted()
     }
 
     /// Return the oldest packet that waits whose envelope begins with `prefix`.

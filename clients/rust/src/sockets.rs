@@ -140,6 +140,9 @@ impl Sockets {
             for subscriber in &mut self.subscribers {
                 subscriber.serve(&self.shared);
             }
+            if let Some(control) = &mut self.control {
+                control.give_back_inherited();
+            }
         }
         if let Some(control) = &mut self.control {
             control.send_all();
@@ -214,6 +217,24 @@ impl Control {
         for frames in outbox {
             self.ask(frames);
         }
+    }
+
+    /// Give back, once, what an earlier life had: others wait for it.
+    fn give_back_inherited(&mut self) {
+        let name = &self.shared.launch.name;
+        let mut state = self.shared.lock();
+        if !(self.known
+            && self.connected
+            && state.gives_back
+            && state.hold.tenures == 0
+            && state.inherits_control(name))
+        {
+            return;
+        }
+        state.gives_back = false;
+        drop(state);
+        let id = format!("{name}/{}/{}", self.shared.session, u32::MAX - 1);
+        self.ask(wire::request(crate::proto::ControlRequest::ReqReleaseCtrl as u8, b"", &id));
     }
 
     /// Follow the scheduler's coming and going; say by a request's id of which run we are.
