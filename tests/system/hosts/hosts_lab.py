@@ -37,7 +37,7 @@ PARTS = {
     "right": "right,right_witness",
 }
 TILERS = ("left", "right")
-PEOPLE = ("supervisor", "terminal")
+PEOPLE = ("supervisor", "terminal", "dashboard")
 
 EXPERIMENT = """
 name = "hosts"
@@ -88,6 +88,13 @@ budget = 1000
 
 [security]
 keys = "keys"
+"""
+
+PAGE = """
+[dashboard]
+component = true
+class = "Dashboard"
+port = 8080
 """
 
 APPARATUS = '''
@@ -185,6 +192,7 @@ class HostsLab:
     Args:
         folder: a folder for each host is made there.
         clocks_ahead_s: by how much the clocks of hosts are ahead.
+        page: a dashboard runs on `right`.
     """
 
     def __init__(
@@ -196,14 +204,16 @@ class HostsLab:
         speed: str = "100 um/s",
         kept: int = 200,
         clocks_ahead_s: dict[str, float] | None = None,
+        page: bool = False,
     ) -> None:
         self.scans, self.folder = scans, folder
         self.network = FaultyNetwork()
         self.parts: dict[str, Part] = {}
         self.hosts: dict[str, Host] = {}
         self.known = dict(HOSTS)
+        self._only = {**PARTS, "right": f"{PARTS['right']},dashboard"} if page else PARTS
         _make_keys(folder / "keys")
-        text = EXPERIMENT.format(scans=scans, pixels=pixels, speed=speed, kept=kept)
+        text = EXPERIMENT.format(scans=scans, pixels=pixels, speed=speed, kept=kept) + (PAGE if page else "")
         for name in HOSTS:
             ahead_s = (clocks_ahead_s or {}).get(name, 0.0)
             self.hosts[name] = Host(self.network, name, folder / name, self.known, clock_ahead_s=ahead_s)
@@ -214,7 +224,7 @@ class HostsLab:
     def start(self, *names: str) -> None:
         """Start the parts of these hosts; of all, where none is named."""
         for name in names or HOSTS:
-            self.parts[name] = Part(self.hosts[name], PARTS[name])
+            self.parts[name] = Part(self.hosts[name], self._only[name])
 
     def wait(self, condition: Callable[[], bool], what: str, within_s: float = DEADLINE_S) -> float:
         """Wait until something holds; returns how long that took, s."""
@@ -230,6 +240,11 @@ class HostsLab:
         began_s = time.monotonic()
         self.wait(lambda: time.monotonic() - began_s >= seconds, "time", seconds + 1.0)
         assert all(part.process.poll() is None for part in self.parts.values()), self.output
+
+    def page(self) -> str:
+        """Return what the dashboard serves on its host; empty while it does not."""
+        program = "import urllib.request as r; print(r.urlopen('http://127.0.0.1:8080/').read().decode())"
+        return self.hosts["right"].run("python3", "-c", program).stdout
 
     def tiles(self, name: str) -> int:
         """Return how many scans a component has got, as it says itself."""

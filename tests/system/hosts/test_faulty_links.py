@@ -25,8 +25,9 @@ PARTITIONS: dict[str, Directions] = {
 
 
 def test_an_experiment_on_four_hosts_ends_complete(lab: Lab) -> None:
-    hosts = lab()
+    hosts = lab(page=True)
     hosts.start()
+    hosts.wait(lambda: "<title>" in hosts.page(), "the page of the dashboard")
     hosts.finish()
     assert not (wrong := list(hosts.wrong())), "\n".join([*wrong, hosts.output])
 
