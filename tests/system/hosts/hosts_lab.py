@@ -50,6 +50,7 @@ class = "apparatus.Recorded"
 publisher = "tcp://micro:29003"
 control_server = "tcp://micro:29004"
 surface = "flat"
+live_lines_s = "{lines}"
 initial = {{ scan-speed = "{speed}", move-speed = "100 um/s" }}
 
 [scheduler]
@@ -193,6 +194,8 @@ class HostsLab:
         folder: a folder for each host is made there.
         clocks_ahead_s: by how much the clocks of hosts are ahead.
         page: a dashboard runs on `right`.
+        left: what runs on `left`.
+        lines: how often rows of a running scan are published; "0 s": they are not.
     """
 
     def __init__(
@@ -205,15 +208,19 @@ class HostsLab:
         kept: int = 200,
         clocks_ahead_s: dict[str, float] | None = None,
         page: bool = False,
+        left: str = PARTS["left"],
+        lines: str = "0.5 s",
     ) -> None:
         self.scans, self.folder = scans, folder
         self.network = FaultyNetwork()
         self.parts: dict[str, Part] = {}
         self.hosts: dict[str, Host] = {}
         self.known = dict(HOSTS)
-        self._only = {**PARTS, "right": f"{PARTS['right']},dashboard"} if page else PARTS
+        self._only = {**PARTS, "left": left, "right": PARTS["right"] + (",dashboard" if page else "")}
         _make_keys(folder / "keys")
-        text = EXPERIMENT.format(scans=scans, pixels=pixels, speed=speed, kept=kept) + (PAGE if page else "")
+        text = EXPERIMENT.format(scans=scans, pixels=pixels, speed=speed, kept=kept, lines=lines) + (
+            PAGE if page else ""
+        )
         for name in HOSTS:
             ahead_s = (clocks_ahead_s or {}).get(name, 0.0)
             self.hosts[name] = Host(self.network, name, folder / name, self.known, clock_ahead_s=ahead_s)
@@ -269,7 +276,9 @@ class HostsLab:
     def all_done(self) -> bool:
         """True once both components have all their scans, and both witnesses have heard of each."""
         taken = sum(map(self.tiles, TILERS))
-        return all(map(self.is_done, TILERS)) and all(self.witnessed(name) == taken for name in TILERS)
+        return all(map(self.is_done, TILERS)) and all(
+            self.witnessed(name) == taken for name in TILERS if f"{name}_witness" in self._only[name]
+        )
 
     def witnessed(self, host: str) -> int:
         """Return how many scans, interrupted ones left out, the witness of a host has heard of."""
