@@ -31,7 +31,8 @@ export class Conditions {
     const left = deadline - performance.now();
     if (left <= 0) return false;
     return await new Promise<boolean>((resolve, reject) => {
-      const timer = left < 2 ** 31 ? setTimeout(() => waiting.settle(false), left) : undefined;
+      // a timer may fire a moment early: then the deadline would not have come
+      const timer = left < 2 ** 31 ? setTimeout(() => waiting.settle(false), Math.ceil(left) + 1) : undefined;
       const done = (finish: () => void) => {
         clearTimeout(timer);
         this.waiting.delete(waiting);

@@ -1,7 +1,7 @@
 /** Having control: asking for it, waiting for it, noticing that it is gone, giving it back. */
 
 import { type Deadline, deadlineIn, earlier } from "./conditions.js";
-import { ControlLost, InvalidValue, Refused } from "./errors.js";
+import { ControlLost, InvalidValue, NoResponse, Refused } from "./errors.js";
 import type { Response } from "./frames.js";
 import { ControlRequest, ControlResponse } from "./generated/control_pb.js";
 import type { Link, Published } from "./link.js";
@@ -87,11 +87,16 @@ export class ControlHold {
   async regain(deadline: Deadline): Promise<void> {
     const { link } = this;
     let reported = "";
+    let refusal: Response | undefined;
     while (!this.held) {
       const count = link.count("ControlState");
       const { connections } = link.requests;
-      const response = await this.ask(deadline);
+      const response = await this.ask(deadline).catch((error: unknown) => {
+        if (refusal && error instanceof NoResponse && performance.now() >= deadline) return refusal; // the last that was heard
+        throw error;
+      });
       if (!response) break;
+      refusal = response;
       const obstacle = response.reason || this.obstacle();
       if (obstacle !== reported) link.log("INFO", `${link.launch.name} waits for control: ${obstacle}`);
       reported = obstacle;
