@@ -49,7 +49,7 @@ def checked(folder: Path, name: str, *only: str, speed: float = SPEED) -> CheckR
             "scan/time",
             r"the time at which the scan .* ended, .* s from its beginning; came .* s from its beginning",
         ),
-        ("WrongUnit", "scan/duration", "as scan-speed says .is its unit right"),
+        ("WrongUnit", "scan/duration", "from scan-speed .check its unit"),
         ("FreeBeforeTheScan", "scan/order", "SS_SCANNING, Scan2d …, SS_FREE; came SS_SCANNING, SS_FREE, Scan2d"),
         ("CancelIgnored", "scan/cancel", "expected .*SS_FREE.*; came "),
         ("CancelledSpectrumUntold", "spectrum/cancel", "expected SS_INTERRUPTED.*; came SS_SPEC, SS_FREE"),

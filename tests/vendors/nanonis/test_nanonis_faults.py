@@ -96,7 +96,7 @@ def test_fields_of_another_release_than_it_says_are_named(bench: Make) -> None:
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.NO_RESPONSE
     assert "the reply to Scan.PropsGet is malformed" in response.reason
-    assert "it was read as of release 14573" in response.reason
+    assert "it was read as release 14573" in response.reason
 
 
 def test_a_release_can_be_set_where_it_is_told_wrong(bench: Make) -> None:
