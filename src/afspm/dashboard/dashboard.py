@@ -132,7 +132,7 @@ class Dashboard(Component):
         url = url_of(self._host, port, encrypted=self._certificate is not None)
         self.memory.update({"port": port, "url": url})
         self.memory.save()
-        self.log.info("the dashboard listens at %s", url)
+        self.log.info("the dashboard is at %s", url)
         if self._certificate is None and not is_loopback(self._host):
             self.log.warning(
                 "other computers can reach the dashboard without encryption: set certificate and certificate_key"

@@ -55,7 +55,7 @@ def test_it_stays_in_a_terminal_until_ctrl_c(tmp_path: Path) -> None:
     os.close(terminal)
     said = b""
     try:
-        while not (found := re.search(rb"the dashboard stays at (\S+); Ctrl-C to close", said)):
+        while not (found := re.search(rb"the dashboard is at (\S+); press Ctrl-C to close", said)):
             said += os.read(ours, 4096)
         with urllib.request.urlopen(f"{found[1].decode()}/night/scans", timeout=DEADLINE_S) as answer:
             assert b'"number":1' in answer.read()

@@ -272,7 +272,7 @@ def test_what_can_not_be_checked_is_refused_before_anything_starts(text: str, sa
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=said):
         run(CheckOptions([file], runs=tmp_path / "runs"))
-    with pytest.raises(ConfigError, match="there is no check no-such-check"):
+    with pytest.raises(ConfigError, match="no check is called no-such-check"):
         run(CheckOptions([file], runs=tmp_path / "runs", only=["no-such-check"]))
     assert not (tmp_path / "runs").exists()
 

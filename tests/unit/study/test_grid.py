@@ -58,7 +58,7 @@ def test_settings_that_are_not_there_or_make_no_sense_are_told(tmp_path: Path) -
         NightSettings.of({"pixel": 3})
     with pytest.raises(InvalidValue, match="does not fit"):
         NightSettings.of({"pixels": 1024})
-    with pytest.raises(ConfigError, match="no setting"):
+    with pytest.raises(ConfigError, match="not a setting"):
         SettingsGrid.of(["tracker"])
     with pytest.raises(FileError, match="can't be read"):
         SettingsGrid.of([str(tmp_path / "missing.toml")])
