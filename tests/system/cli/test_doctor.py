@@ -44,9 +44,9 @@ def ports(tmp_path: Path) -> dict[str, int]:
     return ports
 
 
-def doctor(folder: Path, *more: str) -> tuple[int, dict[str, Any]]:
+def doctor(folder: Path, *more: str, listen_s: float = 1.0) -> tuple[int, dict[str, Any]]:
     """Return the exit code, and what was said."""
-    command = [*AFSPM, "doctor", "experiment.toml", *more, "--json", "--listen", "1"]
+    command = [*AFSPM, "doctor", "experiment.toml", *more, "--json", "--listen", str(listen_s)]
     told = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60)
     assert told.stdout, told.stderr
     return told.returncode, json.loads(told.stdout)
@@ -65,7 +65,7 @@ def test_before_and_while_it_runs_all_is_fine(ports: dict[str, int], tmp_path: P
         assert run.stdout is not None
         try:
             next(line for line in run.stdout if "series is in control" in line)
-            code, told = doctor(tmp_path)
+            code, told = doctor(tmp_path, listen_s=4.0)  # a supervisor tells every two seconds
         finally:
             run.terminate()
             run.stdout.read()
