@@ -37,7 +37,7 @@ def main() -> None:
         *(ROOT / "docs").rglob("*.md"),
         *(ROOT / "experiments").rglob("*.md"),
     ]
-    for page in [*pages, *(ROOT / "src").rglob("README.md")]:
+    for page in [*pages, *(ROOT / "src").rglob("README.md"), *(ROOT / "clients").glob("*/README.md")]:
         _write(page.relative_to(ROOT).as_posix(), _for_site(page))
     shutil.copytree(ROOT / "docs" / "pictures", SOURCE / "docs" / "pictures")
     config = (ROOT / "zensical.toml").read_text(encoding="utf-8")
