@@ -7,7 +7,8 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 SETUP := .venv/.made
 
-.PHONY: demo demo-drift test mutants test-samples test-ui test-gateway test-translators test-clients test-windows test-hosts test-nexus test-tiled test-bluesky check bench bench-drift soak chaos simulate power-cut docs clean
+.PHONY: demo demo-drift test mutants test-samples test-ui test-gateway test-translators test-clients test-windows test-hosts
+.PHONY: test-nexus test-tiled test-bluesky check bench bench-drift soak chaos simulate power-cut docs clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
