@@ -39,6 +39,6 @@ def test_a_keyed_scan_of_a_client_is_taken_once(afspm_run: Run, tmp_path: Path, 
     wait_until_it_scans(run.folder)
     run.kill(killed)
     assert run.end() == 0, run.output
-    run.wait_for("scanned the flattest place")
+    run.wait_for("the flattest place")
     with afspm.open_run(run.folder) as record:
         assert len(record.scans.where(lambda row: not row.interrupted)) == 2, run.output
