@@ -133,19 +133,18 @@ def _midnight_ns(day: date) -> int:
 def _up_to_date(root: Path) -> list[RunSummary]:
     with closing(_opened(root)) as index:
         known = {folder: (stamp, about) for folder, stamp, about in index.execute("SELECT * FROM runs")}
-        summaries: list[RunSummary] = []
+        read: list[tuple[RunSummary, str]] = []
         for path in _folders(root):
+            # looked at before it is read: what is recorded meanwhile is then read the next time
             folder, stamp = path.relative_to(root).as_posix(), _stamp(path)
-            if known.get(folder, ("", ""))[0] == stamp:
-                summaries.append(_from_json(known[folder][1]))
-            else:
-                summaries.append(replace(_summary(path), folder=folder))
+            known_stamp, about = known.get(folder, ("", ""))
+            is_known = known_stamp == stamp
+            read.append((_from_json(about) if is_known else replace(_summary(path), folder=folder), stamp))
         with suppress(sqlite3.OperationalError), index:  # a disk that is full or can't be written to costs time alone
             index.execute("DELETE FROM runs")
-            stamps = [_stamp(root / run.folder) for run in summaries]
-            rows = [(run.folder, stamp, json.dumps(asdict(run))) for run, stamp in zip(summaries, stamps, strict=True)]
+            rows = [(run.folder, stamp, json.dumps(asdict(run))) for run, stamp in read]
             index.executemany("INSERT INTO runs VALUES (?, ?, ?)", rows)
-    return summaries
+    return [run for run, _ in read]
 
 
 def _opened(root: Path) -> sqlite3.Connection:
@@ -188,7 +187,8 @@ def _stamp(folder: Path) -> str:
     for name in _WATCHED:
         with suppress(OSError):
             stat = (folder / name).stat()
-            stamps.append(f"{stat.st_mtime_ns}/{stat.st_size}")
+            if stat.st_size:  # one that is empty is left by whoever reads
+                stamps.append(f"{name} {stat.st_mtime_ns}/{stat.st_size}")
     return " ".join(stamps)
 
 
