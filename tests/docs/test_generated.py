@@ -13,5 +13,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.mark.parametrize("tool", ["tools/docs.py", "tools/drawings.py"])
 def test_nothing_in_the_docs_is_stale(tool: str) -> None:
-    done = subprocess.run([sys.executable, tool, "--check"], cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, tool, "--check"], cwd=ROOT, capture_output=True, encoding="utf-8", check=False
+    )
     assert done.returncode == 0, f"run `python {tool}`: stale are\n{done.stdout}{done.stderr}"

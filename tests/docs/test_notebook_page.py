@@ -23,7 +23,9 @@ def test_the_script_of_the_page_measures_and_ends_the_experiment(tmp_path: Path)
         if name := FILE_NAME.match(snippet.text):
             (tmp_path / name[1]).write_text(snippet.text, encoding="utf-8")
     command = (*AFSPM, "run", "--verbose", "--no-report", "experiment.toml")
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as run:
+    with subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8"
+    ) as run:
         try:
             assert run.stdout is not None
             assert any(" scheduler " in line and "is up" in line for line in run.stdout), "it never started"
@@ -33,7 +35,7 @@ def test_the_script_of_the_page_measures_and_ends_the_experiment(tmp_path: Path)
                 [sys.executable, "look.py"],
                 cwd=tmp_path,
                 capture_output=True,
-                text=True,
+                encoding="utf-8",
                 timeout=DEADLINE_S,
                 check=False,
             )

@@ -76,7 +76,14 @@ def run_console(text: str, folder: Path, where: str) -> None:
         if not (folder / "experiments").exists() and "experiments/" in command:
             shutil.copytree(ROOT / "experiments", folder / "experiments")
         done = subprocess.run(
-            command, shell=True, cwd=folder, env=environment, capture_output=True, text=True, timeout=200, check=False
+            command,
+            shell=True,
+            cwd=folder,
+            env=environment,
+            capture_output=True,
+            encoding="utf-8",
+            timeout=200,
+            check=False,
         )
         output = done.stdout + done.stderr
         assert done.returncode == 0, f"{where}: {command} failed:\n{output}"

@@ -61,7 +61,7 @@ def packet(thing: Any, time_ns: int) -> tuple[Packet, str]:
 def url(browser: Any, drifted: Path) -> Iterator[str]:
     """The page of that night."""
     command = (*AFSPM, "dashboard", str(drifted), "--port", "0")
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, encoding="utf-8") as process:
         assert process.stdout is not None
         found = re.search(r"stays at (\S+);", process.stdout.readline())
         assert found

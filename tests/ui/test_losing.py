@@ -57,7 +57,9 @@ def test_a_page_that_has_joined_a_run_says_that_it_was_cut_off(opened: Opened, t
 
         def start(*words: object) -> subprocess.Popen[str]:
             command = (*AFSPM, *map(str, words))
-            process = started.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path))
+            process = started.enter_context(
+                subprocess.Popen(command, stdout=subprocess.PIPE, encoding="utf-8", cwd=tmp_path)
+            )
             started.callback(process.terminate)
             return process
 

@@ -79,7 +79,7 @@ class Night:
             (*AFSPM, "run", str(file), "--runs", str(folder / "runs"), *options),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            text=True,
+            encoding="utf-8",
             start_new_session=True,
             cwd=folder,
         )

@@ -60,7 +60,9 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def afspm(site: Path, *arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(site)}
     command = [sys.executable, "-m", "afspm", *arguments]
-    return subprocess.run(command, env=environment, cwd=cwd, capture_output=True, text=True, timeout=60 * PATIENCE)
+    return subprocess.run(
+        command, env=environment, cwd=cwd, capture_output=True, encoding="utf-8", timeout=60 * PATIENCE
+    )
 
 
 def test_an_experiment_file_names_drivers_and_components_of_a_plug_in(site: Path, tmp_path: Path) -> None:

@@ -17,6 +17,8 @@ from afspm.transport.port import ControlConnected, ReplyReceived
 from afspm.transport.zmq_port import open_port
 
 AGAIN_S = 1.0
+REFUSED_S = 10.0
+"""Real time for which a refusal may pass: the scheduler still holds the connection of a host that lost its power."""
 _SAME_S = 1e-3  # two processes of one computer agree on real time to that
 
 
@@ -49,6 +51,7 @@ def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
     port = open_port(launch, wall)
     session, sent, asked, asked_s, again_s = os.urandom(4).hex(), 0, "", wall.now_s(), -math.inf
     connected = waiting = False
+    refused_s = math.inf
     try:
         while True:
             if connected and wall.monotonic_s() >= again_s:
@@ -58,11 +61,17 @@ def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
             found = port.poll(AGAIN_S)
             for incoming in found:
                 connected = connected or isinstance(incoming, ControlConnected)
-                if isinstance(incoming, ReplyReceived) and incoming.response.id == asked:
-                    if incoming.response.code == ControlResponse.CMD_NOT_SUPPORTED:
-                        tell(f"{incoming.response.reason}: the experiment goes by real time")
-                        return RunIdentity(wall, "", simulated=False)
-                    return _read(incoming.response, asked_s, wall.now_s(), str(launch.sockets.control))
+                if not isinstance(incoming, ReplyReceived) or incoming.response.id != asked:
+                    continue
+                response, now_s = incoming.response, wall.monotonic_s()
+                if response.code == ControlResponse.CMD_NOT_SUPPORTED:
+                    tell(f"{response.reason}: the experiment goes by real time")
+                    return RunIdentity(wall, "", simulated=False)
+                if response.ok or now_s >= refused_s + REFUSED_S:
+                    return _read(response, asked_s, wall.now_s(), str(launch.sockets.control))
+                if refused_s == math.inf:
+                    refused_s = now_s
+                    tell(f"the scheduler refuses: {response.reason}; asking again for {REFUSED_S:.0f} s")
             if not found and not waiting:
                 waiting = True
                 tell(f"waiting for the scheduler at {launch.sockets.control}, whose run and clock this part joins")

@@ -56,7 +56,9 @@ def runs(tmp_path: Path) -> Iterator[Path]:
     """A running experiment, whose scheduler is up."""
     (tmp_path / "night.toml").write_text(EXPERIMENT, encoding="utf-8")
     command = [*AFSPM, "run", "--verbose", "--no-report", "night.toml"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as run:
+    with subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8"
+    ) as run:
         try:
             assert run.stdout is not None
             assert any(" scheduler " in line and "is up" in line for line in run.stdout), "it never started"
@@ -120,7 +122,9 @@ def _pause_when_scanning(engine: RunEngine, watcher: afspm.Scope) -> None:
 
 def test_the_plan_of_the_page_runs_and_the_documents_of_the_run_are_valid(runs: Path, tmp_path: Path) -> None:
     (code,) = re.findall(r"```python\n# plan\.py\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, encoding="utf-8", check=False
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("(32, 32)") == 3
     subprocess.run([*AFSPM, "end", "runs", "--yes"], cwd=tmp_path, check=True)

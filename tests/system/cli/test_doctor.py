@@ -47,7 +47,7 @@ def ports(tmp_path: Path) -> dict[str, int]:
 def doctor(folder: Path, *more: str, listen_s: float = 1.0) -> tuple[int, dict[str, Any]]:
     """Return the exit code, and what was said."""
     command = [*AFSPM, "doctor", "experiment.toml", *more, "--json", "--listen", str(listen_s)]
-    told = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60)
+    told = subprocess.run(command, cwd=folder, capture_output=True, encoding="utf-8", timeout=60)
     assert told.stdout, told.stderr
     return told.returncode, json.loads(told.stdout)
 
@@ -61,7 +61,9 @@ def test_before_and_while_it_runs_all_is_fine(ports: dict[str, int], tmp_path: P
     code, told = doctor(tmp_path)
     assert (code, codes(told)) == (0, set()), told
     command = [*AFSPM, "run", "experiment.toml"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as run:
+    with subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8"
+    ) as run:
         assert run.stdout is not None
         try:
             next(line for line in run.stdout if "series is in control" in line)

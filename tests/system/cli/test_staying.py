@@ -68,6 +68,6 @@ def test_it_stays_in_a_terminal_until_ctrl_c(tmp_path: Path) -> None:
 
 def test_elsewhere_the_run_ends(tmp_path: Path) -> None:
     pytest.importorskip("nicegui")
-    done = subprocess.run(command(tmp_path), capture_output=True, text=True, timeout=DEADLINE_S, check=True)
+    done = subprocess.run(command(tmp_path), capture_output=True, encoding="utf-8", timeout=DEADLINE_S, check=True)
     assert "the dashboard is at" in done.stdout
     assert "stays" not in done.stdout

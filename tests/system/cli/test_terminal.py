@@ -53,9 +53,7 @@ scans = 1000
 def afspm(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [*AFSPM, *map(str, arguments)]
     environment = {**os.environ, "COLUMNS": "200", "PYTHONIOENCODING": "utf-8"}
-    return subprocess.run(
-        command, capture_output=True, text=True, encoding="utf-8", timeout=DEADLINE_S, env=environment
-    )
+    return subprocess.run(command, capture_output=True, encoding="utf-8", timeout=DEADLINE_S, env=environment)
 
 
 def afspm_here(*arguments: object, answer: str = "") -> Any:
@@ -73,7 +71,7 @@ class Running:
         self.output: list[str] = []
         self.process = subprocess.Popen(
             [*AFSPM, "run", str(file), "--runs", str(self.runs), "--verbose", "--no-report"],
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, encoding="utf-8", start_new_session=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8", start_new_session=True,
         )  # fmt: skip
 
     def wait_for(self, pattern: str) -> None:
@@ -157,7 +155,7 @@ def test_a_misspelt_problem_is_an_error_with_the_nearest(night: Running) -> None
 
 
 def test_watch_without_a_terminal_writes_a_line_whenever_something_changes(night: Running) -> None:
-    watching = subprocess.Popen([*AFSPM, "watch", str(night.runs)], stdout=subprocess.PIPE, text=True, encoding="utf-8")
+    watching = subprocess.Popen([*AFSPM, "watch", str(night.runs)], stdout=subprocess.PIPE, encoding="utf-8")
     try:
         assert watching.stdout is not None
         assert "AUTOMATED" in watching.stdout.readline()
@@ -181,7 +179,7 @@ def test_a_run_whose_supervisor_is_killed_is_told_as_cut_off_everywhere(tmp_path
     run.wait_for(r"scan 1 of")
     folder = str(latest_run(run.runs))
     watching = subprocess.Popen(
-        [*AFSPM, "watch", folder], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8"
+        [*AFSPM, "watch", folder], stdout=subprocess.PIPE, stderr=subprocess.PIPE, encoding="utf-8"
     )
     assert watching.stdout is not None
     assert "AUTOMATED" in watching.stdout.readline()

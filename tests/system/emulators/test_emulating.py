@@ -28,7 +28,13 @@ WORDS = " listens at "
 def started(*arguments: str, cwd: Path) -> Iterator[subprocess.Popen[str]]:
     pipe = subprocess.PIPE
     with subprocess.Popen(
-        [sys.executable, "-m", *arguments], stdin=pipe, stdout=pipe, stderr=pipe, text=True, cwd=cwd, env=ENVIRONMENT
+        [sys.executable, "-m", *arguments],
+        stdin=pipe,
+        stdout=pipe,
+        stderr=pipe,
+        encoding="utf-8",
+        cwd=cwd,
+        env=ENVIRONMENT,
     ) as process:
         try:
             yield process

@@ -54,7 +54,7 @@ def test_the_scan_is_stopped_and_the_next_call_works(
     command = [sys.executable, "-c", SCRIPT, str(run.folder)]
     with (
         afspm.connect(run.folder, "watcher") as watcher,
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as script,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, encoding="utf-8") as script,
     ):
         assert watcher.wait_until(lambda: watcher.state is ScopeState.SCANNING, timeout_s=DEADLINE_S)
         for _ in range(times):

@@ -111,7 +111,9 @@ def test_the_script_of_the_tutorial_does_the_same_in_under_thirty_lines(afspm_ru
     one = afspm_run(str(SAMPLE), overlay(tmp_path, SLOWER), "--without", "survey", "--runs", str(tmp_path / "runs"))
     one.wait_up("microscope", 1)
     one.wait_up("scheduler", 1)
-    done = subprocess.run([sys.executable, "by_hand.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "by_hand.py"], cwd=tmp_path, capture_output=True, encoding="utf-8", check=False
+    )
     assert done.returncode == 0, done.stderr + one.output
     assert one.end() == 0, one.output
     assert outcomes(tmp_path) == ["measured"] * 2

@@ -145,7 +145,12 @@ class GatewayRun:
             file.write_text(EXPERIMENT.format(speed=speed, settings=settings) + more, encoding="utf-8")
         command = (*AFSPM, "run", "--verbose", "--no-report", str(file), "--runs", str(folder / "runs"))
         self.process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, cwd=folder, text=True
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            cwd=folder,
+            encoding="utf-8",
         )
         self.lines: list[str] = []
         self._changed = threading.Condition()

@@ -55,7 +55,7 @@ def test_requests_made_from_the_description_are_answered_as_it_says(started: Sta
         "--request-timeout", "40", "--generation-database", "none",
         *(option for path in LEFT_OUT for option in ("--exclude-path", path)),
     )  # fmt: skip
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=380.0, check=False)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, encoding="utf-8", timeout=380.0, check=False)
     assert done.returncode == 0, done.stdout[-8000:] + done.stderr[-2000:]
     assert " generated" in done.stdout
     assert not run.said(" ERROR "), run.said(" ERROR ")

@@ -36,7 +36,7 @@ def test_a_script_of_the_sample_takes_its_scan(language: str, night: GatewayRun,
         pytest.skip(f"there is no {language}: install it to have this script tested")
     arguments = [str(SAMPLE / one) if one.startswith("scan") else one for one in arguments]
     done = subprocess.run(
-        (program, *arguments, night.url, language), cwd=tmp_path, capture_output=True, text=True, timeout=60.0,
+        (program, *arguments, night.url, language), cwd=tmp_path, capture_output=True, encoding="utf-8", timeout=60.0,
         check=False, env={**os.environ, "QT_QPA_PLATFORM": "offscreen"},
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr

@@ -108,7 +108,12 @@ class Host:
     def run(self, *command: str, check: bool = False) -> subprocess.CompletedProcess[str]:
         """Run a program on it to its end."""
         return subprocess.run(
-            self.command(*command), check=check, capture_output=True, text=True, env=self.environment(), timeout=90
+            self.command(*command),
+            check=check,
+            capture_output=True,
+            encoding="utf-8",
+            env=self.environment(),
+            timeout=90,
         )
 
 

@@ -43,14 +43,14 @@ class Installed:
     def add(self, *requirements: str) -> None:
         """Install more. Skips the test where that can't be had."""
         command = (self._uv, "pip", "install", "-q", "--python", str(self.folder), *requirements)
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = subprocess.run(command, capture_output=True, encoding="utf-8", check=False)
         if done.returncode != 0:
             pytest.skip(f"packages can't be had here: {done.stderr}")
 
     def run(self, *command: str, cwd: Path, code: int = 0) -> str:
         """Run a command of the environment, and return its output."""
         done = subprocess.run(
-            command, cwd=cwd, env=self.environment, capture_output=True, text=True, timeout=200, check=False
+            command, cwd=cwd, env=self.environment, capture_output=True, encoding="utf-8", timeout=200, check=False
         )
         output = done.stdout + done.stderr
         assert done.returncode == code, output
@@ -58,7 +58,7 @@ class Installed:
 
     def start(self, *command: str, cwd: Path) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            command, cwd=cwd, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            command, cwd=cwd, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8"
         )
 
 
@@ -73,7 +73,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     subprocess.run([uv, "venv", "-q", "--python", sys.executable, folder / "venv"], check=True)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     probe = [uv, "pip", "install", "--dry-run", "-q", "--python", folder / "venv", *project["build-system"]["requires"]]
-    if (probed := subprocess.run(probe, capture_output=True, text=True, check=False)).returncode != 0:
+    if (probed := subprocess.run(probe, capture_output=True, encoding="utf-8", check=False)).returncode != 0:
         pytest.skip(f"packages can't be had here: {probed.stderr}")
     clone = folder / "clone"  # a build writes into the clone, in which other tests run
     for name in BUILT_FROM:

@@ -45,7 +45,7 @@ def scans_on(microscope: str, folder: Path, more: str = "") -> Kept:
     done = subprocess.run(
         [*AFSPM, "run", *files, "--runs", str(folder / "runs"), "--no-report", "--without", "metadata,recorder"],
         capture_output=True,
-        text=True,
+        encoding="utf-8",
         timeout=DEADLINE_S,
         check=False,
     )

@@ -16,7 +16,7 @@ STARTS = """
 import os, subprocess, sys
 from afspm.interpreter import python_command, python_environment
 environment = {**os.environ, **python_environment()}
-child = subprocess.Popen(python_command("tells"), env=environment, stdout=subprocess.PIPE, text=True)
+child = subprocess.Popen(python_command("tells"), env=environment, stdout=subprocess.PIPE, encoding="utf-8")
 print(child.pid, sys.prefix)
 print(child.communicate()[0])
 """
@@ -34,7 +34,11 @@ def test_a_process_that_is_started_is_the_one_that_runs_in_the_same_environment(
     (tmp_path / "tells.py").write_text(TELLS, encoding="utf-8")
     path = os.pathsep.join([str(tmp_path), str(Path(afspm.__file__).parents[1])])
     told = subprocess.run(
-        [python, "-c", STARTS], env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=True
+        [python, "-c", STARTS],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        encoding="utf-8",
+        check=True,
     )
     started, itself = told.stdout.split("\n")[:2]
     assert started == itself

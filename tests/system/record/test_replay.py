@@ -55,7 +55,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def replaying(recorded: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """A replay that has said where it is: a scan a tenth of a second."""
     command = [sys.executable, "-m", "afspm", "replay", str(recorded), "--stay"]
-    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    process = subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8"
+    )
     assert process.stdout is not None
     line = process.stdout.readline()
     assert "at 600 experiment seconds a second" in line

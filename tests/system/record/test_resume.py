@@ -61,7 +61,7 @@ def afspm_run(folder: Path, *arguments: str) -> subprocess.Popen[str]:
         cwd=folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
-        text=True,
+        encoding="utf-8",
     )
 
 

@@ -97,6 +97,7 @@ class Rig:
             "afspm.scheduler.Scheduler",
             self.settings,
             Sockets(self.publish, (self.source[0],), self.serve, self.source[1]),
+            clock=self.clock.as_dict(),
             state_dir=str(self._folder / "state"),
             request_timeout_s=self.request_timeout_s,
             keys=None

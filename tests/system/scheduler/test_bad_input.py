@@ -13,7 +13,7 @@ def test_twenty_thousand_malformed_messages_change_nothing() -> None:
         [sys.executable, "-m", "benchmarks.soak", "20000"],
         cwd=Path(__file__).parents[3],
         capture_output=True,
-        text=True,
+        encoding="utf-8",
         timeout=100,
         check=False,
     )

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from afspm import wire
+from afspm.launch import Sockets
 from afspm.model import (
     ControlMode,
     ControlRequest,
@@ -21,6 +24,7 @@ from afspm.model import (
 )
 from afspm.storage.packet_log import log_folder, logged_packets
 from afspm.storage.segment import path_of, segments
+from afspm.supervisor import run_identity
 from afspm.transport.port import CaughtUp, ControlConnected, Killed, PacketReceived
 
 REQUEST, RELEASE = ControlRequest.REQUEST_CTRL, ControlRequest.RELEASE_CTRL
@@ -49,6 +53,21 @@ def test_a_request_reaches_the_translator_only_from_who_is_in_control(rig: Any) 
     assert (refused.code, "One" in refused.reason) == (ControlResponse.NOT_IN_CONTROL, True)
     assert one.ask(ACTION, START).ok
     assert [(request.kind, request.subject) for request in rig.asked] == [(ACTION, START)]
+
+
+def test_a_part_that_is_back_while_its_old_connection_stands_asks_for_its_run_until_that_is_gone(rig: Any) -> None:
+    rig.start()
+    former = rig.component("left")
+    rig.until(lambda: former.ask(ControlRequest.ACTION_SUPPORT, START).ok)
+    told: list[str] = []
+    launch = replace(rig.launch(), name="left", sockets=Sockets(control=rig.serve))
+    with ThreadPoolExecutor(1) as pool:
+        asking = pool.submit(run_identity.ask_scheduler, launch, told.append)
+        rig.until(lambda: any("asking again" in text for text in told))
+        rig.components.remove(former)
+        former.port.close()
+        rig.until(asking.done)
+        assert asking.result().clock == rig.clock
 
 
 def test_a_packet_passes_as_it_is_under_its_envelope_with_times_that_increase(rig: Any) -> None:
@@ -174,7 +193,7 @@ def test_a_packet_at_the_end_of_the_log_that_is_damaged_is_left_out(rig: Any, tm
     def scans_on_disk() -> int:
         return sum(entry.packet.envelope.startswith("Scan2d") for entry in logged_packets(log))
 
-    rig.until(lambda: scans_on_disk() == 3)
+    rig.until(lambda: scans_on_disk() == 3 == len(component.packets("Scan2d")))
     rig.kill()
     rig.translator.close()
     rig.translator = rig.make_translator(*rig.source)  # which has forgotten them

@@ -37,7 +37,7 @@ class Listener:
         self.process = subprocess.Popen(
             [sys.executable, str(Path(__file__).with_name("listener.py")), address, name],
             stdout=subprocess.PIPE,
-            text=True,
+            encoding="utf-8",
         )
         self._thread = threading.Thread(target=self._read)
         self._thread.start()

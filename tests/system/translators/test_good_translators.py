@@ -163,7 +163,7 @@ def test_a_translator_of_version_1_made_without_afspm_is_checked_just_the_same(t
 @contextmanager
 def started(*arguments: str, cwd: Path) -> Iterator[subprocess.Popen[str]]:
     with subprocess.Popen(
-        [*AFSPM, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=cwd,
+        [*AFSPM, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8", cwd=cwd,
         start_new_session=True,
     ) as process:  # fmt: skip
         try:
@@ -252,7 +252,7 @@ def test_a_real_microscope_is_not_touched_before_somebody_says_that_the_tip_is_w
     file.write_text('[microscope]\ncomponent = true\nclass = "Nanonis"\n', encoding="utf-8")
     command = [*AFSPM, "test-translator", "experiment.toml"]
     done = subprocess.run(
-        command, cwd=tmp_path, input="n\n", capture_output=True, text=True, timeout=DEADLINE_S, check=False
+        command, cwd=tmp_path, input="n\n", capture_output=True, encoding="utf-8", timeout=DEADLINE_S, check=False
     )
     assert done.returncode == 1
     assert "Is the tip so far from the sample that it can't reach it" in done.stdout
@@ -283,7 +283,9 @@ def test_as_a_pytest_plugin_each_check_is_a_test(file: Path) -> None:
         "-k", "unknown or free", "experiment.toml",
     ]  # fmt: skip
     (file.parent / "pytest.ini").touch()
-    done = subprocess.run(command, cwd=file.parent, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    done = subprocess.run(
+        command, cwd=file.parent, capture_output=True, encoding="utf-8", timeout=DEADLINE_S, check=False
+    )
     assert done.returncode == 0, done.stdout
     assert "refused/unknown-action PASSED" in done.stdout
     assert "3 passed" in done.stdout
@@ -293,6 +295,8 @@ def test_as_a_pytest_plugin_each_check_is_a_test(file: Path) -> None:
 def test_a_plain_pytest_does_not_look_at_experiment_files(file: Path) -> None:
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--trace-config", "experiment.toml"]
     (file.parent / "pytest.ini").touch()
-    done = subprocess.run(command, cwd=file.parent, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    done = subprocess.run(
+        command, cwd=file.parent, capture_output=True, encoding="utf-8", timeout=DEADLINE_S, check=False
+    )
     assert "afspm" not in done.stdout.replace(str(file.parent), "")
     assert done.returncode != 0

@@ -34,7 +34,7 @@ def checked(folder: Path, *files: Path) -> dict[str, Any]:
     ]
     report = folder / "report.json"
     done = subprocess.run(
-        [*command, "--report", str(report)], capture_output=True, text=True, timeout=DEADLINE_S, check=False
+        [*command, "--report", str(report)], capture_output=True, encoding="utf-8", timeout=DEADLINE_S, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
     found: dict[str, Any] = json.loads(report.read_text(encoding="utf-8"))

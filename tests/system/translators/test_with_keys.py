@@ -41,7 +41,7 @@ keys = "keys"
 
 def afspm(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [*AFSPM, *arguments], cwd=cwd, capture_output=True, text=True, timeout=DEADLINE_S, check=False
+        [*AFSPM, *arguments], cwd=cwd, capture_output=True, encoding="utf-8", timeout=DEADLINE_S, check=False
     )
 
 

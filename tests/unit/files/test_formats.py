@@ -208,6 +208,6 @@ def test_nothing_is_loaded_that_a_file_does_not_need(tmp_path: Path) -> None:
         "print([m for m in ('scipy', 'h5py', 'igor2', 'skimage', 'pint') if m in sys.modules])"
     )
     out = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / "a.sxm")], capture_output=True, text=True, check=True
+        [sys.executable, "-c", code, str(tmp_path / "a.sxm")], capture_output=True, encoding="utf-8", check=True
     )
     assert out.stdout.strip() == "[]"

@@ -106,7 +106,7 @@ while failed < 3:
     assert load_checkpoint(path, int) == (10**20 + saved - 1, "")
 print(saved)
 """
-    done = subprocess.run([sys.executable, "-c", script, str(tmp_path / "x")], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", script, str(tmp_path / "x")], capture_output=True, encoding="utf-8")
     assert (done.stdout.strip(), done.stderr) == ("270", ""), "after each failure it is tried to begin the file anew"
 
 

@@ -132,7 +132,7 @@ def test_the_lock_of_another_user_holds_too(tmp_path: Path, folder: Path) -> Non
     code += "from afspm.translator.controller_lock import commanding\nimport fcntl; os.setuid(65534)\n"
     code += "with commanding('lab:1', 'runs/of-nobody'): print('has it', flush=True); input()"
     other = subprocess.Popen(
-        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8"
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, encoding="utf-8"
     )
     assert other.stdin is not None
     assert other.stdout is not None
