@@ -118,6 +118,18 @@ def test_requests(entry: Any) -> None:
     assert str(again.subject) == str(request.subject)
 
 
+@each("our_requests")
+def test_requests_that_version_1_does_not_know(entry: Any) -> None:
+    frames = [bytes.fromhex(frame) for frame in entry["frames"]]
+    request = wire.decode_request(frames)
+    assert (request.kind, request.id) == (entry["request"], "exp/1/7")
+    if isinstance(request.subject, model.RelayedMessage):
+        assert [request.subject.message, bytes(request.subject.payload).hex()] == entry["object"]
+    else:
+        assert request.subject == entry["object"]
+    assert wire.encode_request(model.Request(request.kind, request.subject, id=request.id)) == frames
+
+
 @each("responses")
 def test_responses(entry: Any) -> None:
     frames = [bytes.fromhex(frame) for frame in entry["frames"]]
