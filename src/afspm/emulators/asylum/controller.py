@@ -12,6 +12,7 @@ from typing import Final
 from afspm.emulators.asylum import files
 from afspm.emulators.asylum.values import IgorValues
 from afspm.emulators.faults import Faults
+from afspm.emulators.pending_writes import PendingWrites
 from afspm.emulators.rig import Rig
 from afspm.errors import AfspmError, InvalidValue
 from afspm.model import Region
@@ -78,7 +79,7 @@ class AsylumController:
         self._folder = folder
         self._settings = settings
         self._log = log
-        self._disk = files.PendingWrites()
+        self._disk = PendingWrites()
         self._starts_at_s = math.inf
         self._bias_since_s = -math.inf
         self._curve_running = self._engages = False

@@ -13,9 +13,9 @@ from afspm.emulators.emulator import LOOPBACK, Crashed, Emulator
 from afspm.emulators.nanonis import logger, wire
 from afspm.emulators.nanonis.dispatch import DeferredResult, FunctionRefused, Results
 from afspm.emulators.nanonis.faults import FAULT_KINDS, senseless_value
-from afspm.emulators.nanonis.server import ClientConnection, NanonisServer
 from afspm.emulators.nanonis.software import NanonisSoftware
 from afspm.emulators.rig import RigBusy
+from afspm.emulators.tcp_server import ClientConnection, TcpServer
 from afspm.errors import ConfigError, InvalidValue
 from afspm.units import Length
 
@@ -109,7 +109,7 @@ class NanonisEmulator(Emulator):
     def open(self) -> str:
         """Listen on all ports."""
         ports = [self.port + i if self.port else 0 for i in range(self._ports)]
-        self._server = NanonisServer(
+        self._server = TcpServer(
             LOOPBACK,
             ports,
             stream_port=self.logger_port,

@@ -31,7 +31,7 @@ class ClientConnection:
     memory: dict[str, Any] = field(default_factory=dict)
 
 
-class NanonisServer:
+class TcpServer:
     """Ports and connections, without a thread: everything happens in `poll`.
 
     Args:

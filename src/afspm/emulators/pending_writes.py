@@ -1,0 +1,41 @@
+"""The files that a controller still has to write: late, and in two parts."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class FilePart:
+    """A part of a file, to be written at a time (experiment s)."""
+
+    at_s: float
+    path: Path
+    content: bytes
+    begins: bool = True
+
+
+class PendingWrites:
+    """The file parts that are still to be written."""
+
+    def __init__(self) -> None:
+        self._writes: list[FilePart] = []
+
+    def save(self, path: Path, content: bytes, at_s: float, rest_at_s: float) -> None:
+        """Half of a file at one time, the other half at another."""
+        half = len(content) // 2
+        self._writes += [FilePart(at_s, path, content[:half]), FilePart(rest_at_s, path, content[half:], begins=False)]
+        self._writes.sort(key=lambda write: write.at_s)
+
+    def advance(self, now_s: float, *, there: bool) -> float | None:
+        """Write what is due, if the drive is `there`; returns when there is more."""
+        while self._writes and self._writes[0].at_s <= now_s:
+            write = self._writes.pop(0)
+            with contextlib.suppress(OSError):
+                if there:
+                    write.path.parent.mkdir(parents=True, exist_ok=True)
+                    with write.path.open("wb" if write.begins else "ab") as file:
+                        file.write(write.content)
+        return self._writes[0].at_s if self._writes else None
