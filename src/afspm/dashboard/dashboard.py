@@ -5,29 +5,23 @@ from __future__ import annotations
 import secrets
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from afspm.addresses import Listens
-from afspm.client.component import Component
 from afspm.clock import ExperimentClock
 from afspm.dashboard.access import Access
 from afspm.dashboard.sessions import Sessions
-from afspm.errors import ConfigError
-from afspm.process.priority import step_back
 from afspm.record.run_json import experiment_name
-from afspm.record.run_lock import cut_off_message
-from afspm.web.archive import Archive, adjustable_parameters, allowed_region
+from afspm.web.archive import adjustable_parameters, allowed_region
+from afspm.web.component import WebComponent
 from afspm.web.passwords import is_loopback
-from afspm.web.server import USUAL_PORT, WebServer, listening, url_of
-from afspm.web.watch import Audience, Watch
-
-if TYPE_CHECKING:
-    from afspm.process.context import ProcessContext
+from afspm.web.server import USUAL_PORT
+from afspm.web.watch import Audience
 
 TOLD_WITHIN_S = 1.5  # how long the pages may take to be told of the end
 
 
-class Dashboard(Component):
+class Dashboard(WebComponent):
     """Serves one page. It only subscribes, and asks through the scheduler in the names of persons; all others have the
     processor first.
 
@@ -43,11 +37,10 @@ class Dashboard(Component):
         ConfigError: others could come in without a password, the port is taken …
     """
 
+    served = "dashboard"
+    usual_port = USUAL_PORT
     operates = True
-    has_people = True
     requires = ("afspm[dashboard]",)
-    listens = ("",)
-    longest_step_s = 60.0  # the first import of everything, on a busy computer
 
     def __init__(
         self,
@@ -58,18 +51,8 @@ class Dashboard(Component):
         certificate: Path | None = None,
         certificate_key: Path | None = None,
     ) -> None:
-        if (certificate is None) != (certificate_key is None):
-            raise ConfigError("certificate and certificate_key belong together", where="dashboard")
-        self._host, self._port = host, port
+        super().__init__(host, port, certificate, certificate_key)
         self._people, self._password_hash = dict(people or {}), password_hash
-        self._certificate = None if certificate is None else Path(certificate)
-        self._certificate_key = None if certificate_key is None else Path(certificate_key)
-        self._server: WebServer | None = None
-
-    def run_process(self, context: ProcessContext) -> int:
-        step_back()
-        self._context = context
-        return super().run_process(context)
 
     def on_start(self) -> None:
         from afspm.dashboard.actions import Steering
@@ -79,16 +62,13 @@ class Dashboard(Component):
         from afspm.dashboard.page import Services
         from afspm.web.persons import Persons
 
-        launch = self._context.launch
-        state_dir = Path(launch.state_dir) if launch.state_dir else None
         now_s = ExperimentClock.real().now_s
-        sessions = Sessions(state_dir / f"{self.name}.sessions" if state_dir else None, now_s)
-        access = Access(self._host, self._password_hash, self._people, now_s, sessions)
-        bound = listening(self._host, self._port or None, self._usual_ports())
-        archive = Archive(self.run_dir if launch.run_dir else None)
-        problems = self._context.problems
-        self._watch = Watch(self.clock, problems, archive.past(problems), lambda: cut_off_message(self.run_dir))
-        self._steering = Steering(Persons(launch, self.clock, self._watch), self._watch, access)
+        access = Access(
+            self._host, self._password_hash, self._people, now_s, Sessions(self.state_file("sessions"), now_s)
+        )
+        bound = self.open_port()
+        archive, self._watch = self.watch_run()
+        self._steering = Steering(Persons(self._context.launch, self.clock, self._watch), self._watch, access)
         services = Services(
             self._watch,
             Contents(
@@ -104,15 +84,15 @@ class Dashboard(Component):
             self.simulated,
             Conditions(self._watch, self._steering.read),
         )
-        encrypted = self._certificate is not None
-        app, self._wait_told = application(services, archive, host=self._host, encrypted=encrypted)
-        self._server = WebServer(app, bound, self._certificate, self._certificate_key)
-        self._server.start()
-        self._say_where(bound.getsockname()[1])
+        app, self._wait_told = application(services, archive, host=self._host, encrypted=self.encrypted)
+        self.serve(app, bound)
+        if not self.encrypted and not is_loopback(self._host):
+            self.log.warning(
+                "other computers can reach the dashboard without encryption: set certificate and certificate_key"
+            )
 
     def on_message(self, envelope: str, message: object) -> None:
-        time_ns = self.packet.time_ns if self.packet and self.packet.time_ns is not None else self.clock.now_ns()
-        self._watch.take(envelope.partition("_")[0], message, time_ns, envelope)
+        self._watch.take(envelope.partition("_")[0], message, self.packet_time_ns(), envelope)
 
     def on_end(self) -> None:
         if self._server is None:
@@ -121,19 +101,3 @@ class Dashboard(Component):
         self._wait_told(TOLD_WITHIN_S)
         self._steering.close()
         self._server.stop()
-
-    def _usual_ports(self) -> tuple[int, ...]:
-        """Return the port of the last start, where the page in a browser looks for us."""
-        before = self.memory.get("port")
-        earlier = (before,) if isinstance(before, int) else ()
-        return earlier if self._port == 0 else (*earlier, USUAL_PORT)
-
-    def _say_where(self, port: int) -> None:
-        url = url_of(self._host, port, encrypted=self._certificate is not None)
-        self.memory.update({"port": port, "url": url})
-        self.memory.save()
-        self.log.info("the dashboard is at %s", url)
-        if self._certificate is None and not is_loopback(self._host):
-            self.log.warning(
-                "other computers can reach the dashboard without encryption: set certificate and certificate_key"
-            )

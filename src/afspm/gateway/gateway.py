@@ -4,29 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from afspm.addresses import Listens
-from afspm.client.component import Component
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.model import Frame
-from afspm.process.priority import step_back
 from afspm.record.run_json import experiment_name
-from afspm.record.run_lock import cut_off_message
-from afspm.web.archive import Archive
+from afspm.web.component import WebComponent
 from afspm.web.passwords import Passwords, is_loopback
-from afspm.web.server import WebServer, listening, url_of
-from afspm.web.watch import Bell, Watch
+from afspm.web.watch import Bell
 
-if TYPE_CHECKING:
-    from afspm.process.context import ProcessContext
-
-USUAL_PORT = 8090
 MOST_CONNECTIONS = 200
 
 
-class Gateway(Component):
+class Gateway(WebComponent):
     """Serves a JSON API over HTTP: state, parameters, scans, control, measurements, events.
 
     Each name acts as `<gateway>:<name>`, with the roles and limits of that. Control has a lease, which the scheduler
@@ -45,10 +37,9 @@ class Gateway(Component):
         ConfigError: others could come in without a token, or listen in; the port is taken …
     """
 
-    has_people = True
+    served = "gateway"
+    usual_port = 8090
     requires = ("afspm[gateway]",)
-    listens = ("",)
-    longest_step_s = 60.0  # the first import of everything, on a busy computer
 
     def __init__(
         self,
@@ -59,8 +50,7 @@ class Gateway(Component):
         certificate_key: Path | None = None,
         origins: Sequence[str] = (),
     ) -> None:
-        if (certificate is None) != (certificate_key is None):
-            raise ConfigError("certificate and certificate_key belong together", where="gateway")
+        super().__init__(host, port, certificate, certificate_key)
         if not is_loopback(host) and not (people and certificate):
             raise ConfigError(
                 f"at {host} other computers can reach the gateway: it needs people, certificate and certificate_key",
@@ -69,17 +59,8 @@ class Gateway(Component):
             )
         if any(one in ("*", "null") for one in origins):
             raise ConfigError("origins names pages one by one", where="gateway", hint='e.g. ["http://localhost:3000"]')
-        self._host, self._port = host, port
         self._passwords = Passwords(host, "", people or {}, ExperimentClock.real().now_s)
-        self._certificate = None if certificate is None else Path(certificate)
-        self._certificate_key = None if certificate_key is None else Path(certificate_key)
         self._origins = tuple(origins)
-        self._server: WebServer | None = None
-
-    def run_process(self, context: ProcessContext) -> int:
-        step_back()
-        self._context = context
-        return super().run_process(context)
 
     def on_start(self) -> None:
         from afspm.gateway.application import application
@@ -89,16 +70,14 @@ class Gateway(Component):
         from afspm.web.persons import Persons
 
         launch, problems = self._context.launch, self._context.problems
-        state_dir = Path(launch.state_dir) if launch.state_dir else None
-        bound = listening(self._host, self._port or None, self._usual_ports(), what="gateway")
-        archive = Archive(self.run_dir if launch.run_dir else None)
-        watch = self._watch = Watch(self.clock, problems, archive.past(problems), lambda: cut_off_message(self.run_dir))
+        bound = self.open_port()
+        archive, watch = self.watch_run()
+        self._watch = watch
         bell = Bell()
         watch.on_change(bell.ring)
         self._history = EventHistory(problems)
-        fill(self._history, self.run_dir, state_dir, self.clock.now_ns())
-        kept = state_dir / f"{self.name}.measurements.json" if state_dir else None
-        self._measurements = Measurements(kept, watch, self.clock.monotonic_s)
+        fill(self._history, self.run_dir, Path(launch.state_dir) if launch.state_dir else None, self.clock.now_ns())
+        self._measurements = Measurements(self.state_file("measurements.json"), watch, self.clock.monotonic_s)
         self._persons = Persons(launch, self.clock, watch)
         services = GatewayServices(
             watch, bell, archive, self._history, self._measurements, self._persons,
@@ -106,14 +85,10 @@ class Gateway(Component):
             Frame.SAMPLE if launch.sample_coordinates else Frame.TIP,
         )  # fmt: skip
         app = application(services, self._passwords, host=self._host, origins=self._origins)
-        self._server = WebServer(
-            app, bound, self._certificate, self._certificate_key, most_connections=MOST_CONNECTIONS
-        )
-        self._server.start()
-        self._say_where(bound.getsockname()[1])
+        self.serve(app, bound, most_connections=MOST_CONNECTIONS)
 
     def on_message(self, envelope: str, message: object) -> None:
-        time_ns = self.packet.time_ns if self.packet and self.packet.time_ns is not None else self.clock.now_ns()
+        time_ns = self.packet_time_ns()
         name = envelope.partition("_")[0]
         self._measurements.on_packet(message, time_ns)
         self._history.take(name, message, time_ns)
@@ -124,15 +99,3 @@ class Gateway(Component):
             self._watch.end()
             self._persons.close()
             self._server.stop()
-
-    def _usual_ports(self) -> tuple[int, ...]:
-        """Return the port of the last start, where clients look for us."""
-        before = self.memory.get("port")
-        earlier = (before,) if isinstance(before, int) else ()
-        return earlier if self._port == 0 else (*earlier, USUAL_PORT)
-
-    def _say_where(self, port: int) -> None:
-        url = url_of(self._host, port, encrypted=self._certificate is not None)
-        self.memory.update({"port": port, "url": url})
-        self.memory.save()
-        self.log.info("the gateway is at %s", url)
