@@ -42,7 +42,7 @@ def test_a_person_with_the_own_password_takes_over_and_is_gone_after_signing_out
             page.fill("#password", password)
             page.click("button")
             if password != PASSWORD:
-                page.wait_for_selector("text=That is not right")
+                page.wait_for_selector("text=Wrong name or password")
         page.wait_for_selector(".picture[data-time]")
         page.click("button:has-text('Take over: MANUAL')")
         night.until(lambda: night.control().mode is ControlMode.MANUAL)
