@@ -60,13 +60,13 @@ class Listens:
     host: str = ""
     keyed: bool = True
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> object:
         """Makes pydantic refuse what is none. Called by it alone, so that we need not load it here."""
         from pydantic_core import core_schema
 
         return core_schema.no_info_after_validator_function(self.checked, handler(source))
 
-    def checked(self, value: Any) -> Any:
+    def checked(self, value: object) -> object:
         """Raises InvalidValue: neither an address nor a port."""
         if isinstance(value, str) and not is_address(value):
             raise InvalidValue("this is not an address", hint=hint_on(value) or EXAMPLE)
@@ -74,7 +74,7 @@ class Listens:
             raise InvalidValue("this is not a port", hint=f"0 to {HIGHEST_PORT}")
         return value
 
-    def address(self, value: Any, settings: Mapping[str, Any]) -> str | None:
+    def address(self, value: object, settings: Mapping[str, object]) -> str | None:
         """Return where the component listens, as ZeroMQ writes it; None: it decides itself, or this is none.
 
         Args:

@@ -116,7 +116,7 @@ class _ParameterBackend(SignalBackend[float]):
         if callback is not None:
             callback(self._reading)
 
-    def _take(self, told: Reading[Any]) -> Reading[float]:
+    def _take(self, told: Reading[object]) -> Reading[float]:
         self._reading = Reading(value=float(told["value"]), timestamp=told["timestamp"])
         if self._told is not None:
             self._told(self._reading)
@@ -252,5 +252,5 @@ class Microscope(StandardReadable):
         await self._session.call(lambda _: self._held.close())
 
 
-def _timed(value: Any) -> Reading[Any]:
+def _timed(value: object) -> Reading[object]:
     return Reading(value=value, timestamp=time.time())

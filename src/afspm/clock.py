@@ -13,16 +13,17 @@ import threading
 import time
 import weakref
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from afspm.errors import ConfigError
 from afspm.file_lock import locked
+from afspm.plain_data import PlainMapping
 
 NS_PER_S = 1_000_000_000
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -200,7 +201,7 @@ class ExperimentClock:
         return cls(origin_s, origin_s if start_s is None else start_s, speed)
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> ExperimentClock:
+    def from_dict(cls, values: PlainMapping) -> ExperimentClock:
         """Return the clock that `as_dict` told of; of nothing, the one on the wall."""
         if not values:
             return cls.real()
@@ -216,7 +217,7 @@ class ExperimentClock:
             return cls(*told)
         return cls(*told, float(values["wall_at_zero_s"]), _waiting_in(waits))
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """As JSON has it, for the other processes of the run."""
         return {
             "origin_s": self.origin_s,

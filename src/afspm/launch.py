@@ -20,6 +20,7 @@ from types import NoneType
 from typing import Any
 
 from afspm.errors import ConfigError
+from afspm.plain_data import Plain, PlainMapping
 
 
 @dataclass(frozen=True)
@@ -45,12 +46,12 @@ class Launch:
     name: str
     class_: str = ""
     """"package.module.Name" of a Python class; empty for a command of another language."""
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    settings: PlainMapping = field(default_factory=dict)
     """Keyword arguments of the constructor."""
     sockets: Sockets = Sockets()
     envelopes: tuple[str, ...] | None = None
     """Prefixes of the envelopes subscribed to; None: all."""
-    clock: Mapping[str, Any] = field(default_factory=dict)
+    clock: PlainMapping = field(default_factory=dict)
     """`ExperimentClock.as_dict()`; empty: real time."""
     problems: Mapping[str, int] = field(default_factory=dict)
     """Problems named in the experiment file."""
@@ -63,7 +64,7 @@ class Launch:
     request_timeout_s: float = 5.0
     request_retries: int = 3
     log_level: str = "INFO"
-    keys: Mapping[str, Any] | None = None
+    keys: PlainMapping | None = None
     """The own CURVE pair, and whose key to expect where, see `transport.keys.from_launch`; None: no encryption."""
     messages: tuple[str, ...] = ()
     """Python modules, or .proto files, with message types of the user."""
@@ -113,16 +114,16 @@ _JSON_TYPES: Mapping[str, tuple[type, ...]] = {
     "int": (int, float),
     "float": (int, float),
     "bool": (bool,),
-    "Mapping[str, Any]": (dict,),
+    "PlainMapping": (dict,),
     "Mapping[str, int]": (dict,),
-    "Mapping[str, Any] | None": (dict, NoneType),
+    "PlainMapping | None": (dict, NoneType),
     "tuple[str, ...]": (list,),
     "tuple[str, ...] | None": (list, NoneType),
 }
 """By the annotation of a field."""
 
 
-def _fields(cls: type[Any], plain: Any, where: str) -> dict[str, Any]:
+def _fields(cls: type[Any], plain: object, where: str) -> Plain:
     """Return the values of `plain` as arguments of the dataclass `cls`, each of the JSON type that belongs there."""
     if not isinstance(plain, dict):
         raise ConfigError(f"expected a JSON object, got {type(plain).__name__}", where=where)
@@ -135,7 +136,7 @@ def _fields(cls: type[Any], plain: Any, where: str) -> dict[str, Any]:
     return {key: _checked(key, value, kinds[key], where) for key, value in plain.items()}
 
 
-def _checked(key: str, value: Any, kind: str, where: str) -> Any:
+def _checked(key: str, value: object, kind: str, where: str) -> object:
     fits = isinstance(value, _JSON_TYPES[kind]) and (kind == "bool" or not isinstance(value, bool))
     if isinstance(value, int | float):
         fits = fits and value >= 0

@@ -97,13 +97,13 @@ class Unit:
 
     si: str
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+    def __get_pydantic_core_schema__(self, source: object, handler: Any) -> object:
         """Makes pydantic read the text too. Called by it alone, so that we need not load it here."""
         from pydantic_core import core_schema
 
         return core_schema.no_info_before_validator_function(self.read, handler(source))
 
-    def read(self, value: Any) -> float:
+    def read(self, value: object) -> float:
         """Return a quantity of the experiment file in this SI unit; a plain number is in it already.
 
         Raises:

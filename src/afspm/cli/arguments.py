@@ -22,7 +22,7 @@ RecordedRun = Annotated[
 Runs = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Where to make the run's folder.")]
 
 
-def opt(help_text: str, *flags: str, **more: Any) -> Any:
+def opt(help_text: str, *flags: str, **more: Any) -> object:
     """Return an option whose default is said in its help, if at all."""
     return typer.Option(*flags, help=help_text, show_default=False, **more)
 

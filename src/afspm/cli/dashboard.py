@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from afspm.cli.arguments import RUNS, Where, opt
+from afspm.plain_data import Plain, PlainMapping
 
 if TYPE_CHECKING:
     from afspm.dashboard.recorded import RecordedSettings
@@ -46,7 +47,7 @@ def dashboard(
     if make_password:
         _print_password()
         return
-    settings: dict[str, Any] = {
+    settings: dict[str, object] = {
         "host": host, "port": port, "certificate": certificate, "certificate_key": certificate_key,
         "people": None if people is None else _people_in(people),
     }  # fmt: skip
@@ -58,7 +59,7 @@ def dashboard(
     _serve_recorded(folder, settings)
 
 
-def stay(folder: Path, name: str, settings: Mapping[str, Any]) -> None:
+def stay(folder: Path, name: str, settings: PlainMapping) -> None:
     """Show a run that has ended until Ctrl-C.
 
     Args:
@@ -78,7 +79,7 @@ def stay(folder: Path, name: str, settings: Mapping[str, Any]) -> None:
         # leaving closes its standard input, which ends the page if Ctrl-C has not
 
 
-def dashboard_of(experiment: Experiment, started: Sequence[str]) -> tuple[str, Mapping[str, Any]] | None:
+def dashboard_of(experiment: Experiment, started: Sequence[str]) -> tuple[str, PlainMapping] | None:
     """Return name and settings of a dashboard among the processes that were started here; None: there is none."""
     for process in experiment.resolved.processes.values():
         if process.class_path.rpartition(".")[2] == NAME_OF_CLASS and process.name in started:
@@ -151,7 +152,7 @@ def _run_here(where: Path) -> Path | None:
         raise
 
 
-def _join(folder: Path, settings: dict[str, Any]) -> int:
+def _join(folder: Path, settings: Plain) -> int:
     import logging
     import sys
 
@@ -177,7 +178,7 @@ def _join(folder: Path, settings: dict[str, Any]) -> int:
     return 0 if code in (ExitCode.ENDED, ExitCode.DONE, ExitCode.ORPHAN) else 1
 
 
-def _serve_recorded(folder: Path, settings: dict[str, Any]) -> None:
+def _serve_recorded(folder: Path, settings: Plain) -> None:
     from afspm.dashboard import Dashboard
     from afspm.dashboard.recorded import serve
     from afspm.experiment.process_starts import DASHBOARD
@@ -187,10 +188,10 @@ def _serve_recorded(folder: Path, settings: dict[str, Any]) -> None:
     serve(_recorded(folder, DASHBOARD, settings), typer.echo)
 
 
-def _recorded(folder: Path, name: str, settings: Mapping[str, Any]) -> RecordedSettings:
+def _recorded(folder: Path, name: str, settings: PlainMapping) -> RecordedSettings:
     from afspm.dashboard.recorded import RecordedSettings
 
-    given: dict[str, Any] = {k: str(v) if isinstance(v, Path) else v for k, v in settings.items() if v is not None}
+    given: Plain = {k: str(v) if isinstance(v, Path) else v for k, v in settings.items() if v is not None}
     return RecordedSettings(str(folder.resolve()), name, **given)
 
 

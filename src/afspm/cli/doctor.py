@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -39,7 +39,7 @@ def doctor(
         raise typer.Exit(1)
 
 
-def _as_json(examined: Examination) -> dict[str, Any]:
+def _as_json(examined: Examination) -> dict[str, object]:
     found = [{**dataclasses.asdict(one), "severity": one.severity.value} for one in examined.found]
     heard = [{**dataclasses.asdict(one), "rate_hz": one.rate_hz} for one in examined.heard]
     return {"is_well": examined.is_well, "found": found, "heard": heard}

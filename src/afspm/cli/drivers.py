@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -187,7 +187,7 @@ def _described(name: str, class_: type[Emulator]) -> str:
     return f"{name}: {class_.vendor}{faults}"
 
 
-def _settings(given: list[str]) -> dict[str, Any]:
+def _settings(given: list[str]) -> dict[str, object]:
     """`a=1`, `a.b="x"`, `a=word`: as in TOML, but that a word needs no quotes.
 
     Raises:

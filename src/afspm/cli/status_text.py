@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from afspm.clock import NS_PER_S, utc_time
 from afspm.formatting import area_text, day_and_time, duration_text, time_of_day
@@ -208,7 +208,7 @@ class StatusText:
             on = f" on scan {numbers[note.scan_ns]}" if note.scan_ns in numbers else ""
             yield _label("note").append(f"{time_of_day(note.time_ns)} {note.who}{on}: {note.text}")
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """Return the same for programs. Times as ISO 8601 in UTC, durations in experiment seconds."""
         seen, run = self._seen, self._run
         control, running = seen.control, seen.scan_progress(self._now_ns)
@@ -251,7 +251,7 @@ class StatusText:
             ],
         }
 
-    def _process_json(self, state: ProcessState) -> dict[str, Any]:
+    def _process_json(self, state: ProcessState) -> dict[str, object]:
         return {
             **{name: getattr(state, name) for name in _PROCESS},
             "condition": state.condition.name,

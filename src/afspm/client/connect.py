@@ -14,7 +14,7 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError, FileError, NoResponse
 from afspm.launch import Launch, Sockets
 from afspm.model import Frame, ProblemNames
-from afspm.model.snapshot import Plain
+from afspm.plain_data import Plain
 from afspm.process.context import new_session
 from afspm.process.message_types import register_all
 from afspm.record.run_json import RUN_FILE, STATE_DIR, latest_run, read_run_json, run_json_or_empty

@@ -71,7 +71,7 @@ class Cycle:
             without = CycleOutcome.VANISHED if self.other is None else CycleOutcome.ANOTHER
             self.outcome = CycleOutcome.COMPLETED if self.results else without
 
-    def on_result(self, result: Any, time_ns: int | None) -> None:
+    def on_result(self, result: object, time_ns: int | None) -> None:
         """A channel of a scan, or a spectrum, was published."""
         if self.outcome is not None or self._is_old(time_ns):
             return

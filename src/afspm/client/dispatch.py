@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from afspm import wire
 from afspm.errors import WireError
@@ -84,10 +84,10 @@ class MessageDispatcher:
     def _wants_message(self, message: str) -> bool:
         return self._handler(message) is not None or (message == "ControlState" and self._has("on_problem"))
 
-    def _handler(self, message: str) -> Callable[[str, Any], None] | None:
+    def _handler(self, message: str) -> Callable[[str, object], None] | None:
         name = HANDLERS.get(message) or f"on_{snake_case(message)}"
         if self._has(name):
-            handle: Callable[[Any], None] = getattr(self._component, name)
+            handle: Callable[[object], None] = getattr(self._component, name)
             return lambda envelope, thing: handle(thing)
         return self._component.on_message if self._has("on_message") else None
 

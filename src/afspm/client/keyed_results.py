@@ -14,7 +14,7 @@ from typing import Any
 from afspm import wire
 from afspm.errors import FileError, InvalidValue, WireError
 from afspm.model import LoggedPacket, Packet
-from afspm.model.snapshot import Plain
+from afspm.plain_data import Plain
 from afspm.process.memory import Memory
 from afspm.storage.atomic import OutageLog, write_atomic
 from afspm.storage.segment import head_of, read_packet
@@ -114,7 +114,7 @@ def check_key(key: str) -> str:
     return key
 
 
-def _read(path: Path) -> tuple[Plain, list[Any]]:
+def _read(path: Path) -> tuple[Plain, list[object]]:
     try:
         with path.open("rb") as file:
             packets = [entry.packet for entry in iter(lambda: read_packet(file), None)]

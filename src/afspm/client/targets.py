@@ -9,7 +9,8 @@ from typing import Any, ClassVar
 from afspm.errors import InvalidValue, UnitError
 from afspm.formatting import area_text, position_text
 from afspm.model import Frame, Region, Scan, ScanParameters, ScopeState, Spectrum, names
-from afspm.model.snapshot import Plain, from_plain, to_plain
+from afspm.model.snapshot import from_plain, to_plain
+from afspm.plain_data import Plain
 from afspm.units import si_or_text
 
 XY = tuple[float, float]
@@ -89,7 +90,7 @@ class SpectrumTarget:
     message: ClassVar = "Spec1d"
 
     @classmethod
-    def of(cls, at_m: Any, kind: str | None, frame: Frame) -> SpectrumTarget:
+    def of(cls, at_m: object, kind: str | None, frame: Frame) -> SpectrumTarget:
         return cls(None if at_m is None else xy_of(at_m), kind, frame)
 
     def facts(self) -> Plain:

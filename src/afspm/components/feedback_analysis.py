@@ -63,7 +63,7 @@ class FeedbackAnalysis(FeedbackObserver):
         except InvalidValue as wrong:
             self.log.warning("%s: %s", pair.trace.channel, wrong)
             return
-        message: Any = wire.message_type(MESSAGE)(
+        message: object = wire.message_type(MESSAGE)(
             proportionOverThreshold=error.over, proportionUnderThreshold=error.under
         )
         self.publish(message)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from afspm.client.component import Component
 from afspm.clock import iso_utc
@@ -34,7 +34,7 @@ class LogCollector(Component):
     def on_start(self) -> None:
         self._lines = LineFile(Path(self.run_dir) / self.file)
 
-    def on_message(self, envelope: str, message: Any) -> None:
+    def on_message(self, envelope: str, message: object) -> None:
         time_ns = (self.packet and self.packet.time_ns) or 0
         # after a restart the scheduler sends what it has cached again
         if isinstance(message, LogLines) and time_ns > self.memory.get(_WRITTEN_NS, -1):

@@ -12,7 +12,7 @@ from afspm.client.component import Component
 from afspm.components import tip_verdict
 from afspm.components.line_file import LineFile
 from afspm.model import ControlState, Scan, ScopeState, ScopeStatus
-from afspm.model.snapshot import Plain
+from afspm.plain_data import Plain
 from afspm.record.night_record import NightRecord, control_entry, mark_entry, scan_entry
 
 

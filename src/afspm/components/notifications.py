@@ -8,7 +8,7 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 from afspm.clock import utc_time
 from afspm.errors import AfspmError, ConfigError
@@ -161,7 +161,7 @@ def _post(url: str, notice: Notification) -> None:
         raise NotDelivered(f"{host} can't be reached: {_short(error)}") from None
 
 
-def _short(reason: Any) -> str:
+def _short(reason: object) -> str:
     """Why, without what was asked for."""
     if isinstance(reason, OSError):
         return reason.strerror or type(reason).__name__

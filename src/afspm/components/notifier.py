@@ -22,7 +22,7 @@ from afspm.errors import ConfigError
 from afspm.formatting import duration_text
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import ControlState, LogLines, ProcessCondition, ProcessStates
-from afspm.model.snapshot import Plain
+from afspm.plain_data import Plain
 from afspm.record.run_json import experiment_name
 from afspm.units import Duration
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 from afspm.client.component import Component
 from afspm.exit_codes import ExitCode
 from afspm.model import Frame
-from afspm.model.snapshot import Plain
+from afspm.plain_data import Plain
 from afspm.process.priority import step_back
 from afspm.record.run_json import EXPERIMENT_FILE, METADATA, experiment_name, run_json_or_empty
 from afspm.storage.packet_log import log_folder

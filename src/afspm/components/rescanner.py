@@ -116,7 +116,7 @@ class Rescanner(Component):
             self._note_before(_BEFORE, str(self.scope.get(names.SCAN_DIRECTION)))
             self.scope.set(names.SCAN_DIRECTION, names.UP if message.upwards else names.DOWN)
 
-    def _note_before(self, name: str, value: Any) -> None:
+    def _note_before(self, name: str, value: object) -> None:
         """Keep what was set before until it is put back, also by a life after a kill."""
         self.memory.setdefault(name, value)
         self.memory.save()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from afspm.drift.registration import DriftScan
 from afspm.errors import AfspmError, FileError
-from afspm.model.snapshot import Plain
+from afspm.plain_data import Plain
 from afspm.simulation import World
 
 Array = NDArray[np.float64]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
 
 from afspm.client.targets import xy_of
 from afspm.errors import ConfigError
@@ -14,7 +13,7 @@ from afspm.model.geometry import XY
 from afspm.process.loading import find_object
 from afspm.survey.targets import Target, find_particles, nearest
 
-Finder = Callable[[Scan], Iterable[Any]]
+Finder = Callable[[Scan], Iterable[object]]
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ class TargetFinder:
 
     @staticmethod
     def _function(path: str) -> Finder:
-        function: Any = find_object(path, "targets")
+        function: object = find_object(path, "targets")
         if not callable(function):
             raise ConfigError(f"{path} is not a function", where="targets", hint="it is given a Scan")
         found: Finder = function

@@ -6,16 +6,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Any
 
 import numpy as np
 
 from afspm.drawing.curves import Array, thinned
 from afspm.formatting import quantity, scale, time_of_day, typeset_position
 from afspm.model import Spectrum
+from afspm.plain_data import Plain
 from afspm.record.overview import DriftPoint
 
-Options = dict[str, Any]
+Options = Plain
 BEFORE = 6  # spectra that are shown faintly behind the newest
 MOST_DRIFT = 5_000
 _MARGINS = {"left": 8, "right": 16, "top": 30, "bottom": 28, "containLabel": True}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 from datetime import datetime
-from typing import Any
 
 from fastapi import FastAPI, Response
 from fastapi.responses import FileResponse, PlainTextResponse
@@ -19,6 +18,7 @@ from afspm.drawing.palette import DIVERGING
 from afspm.drawing.raster import ValueRange, indices, png, value_range
 from afspm.errors import InvalidValue
 from afspm.formatting import time_of_day, typeset_area
+from afspm.plain_data import Plain
 from afspm.record.report import REPORT_FILE
 from afspm.record.tables import ScanRow
 from afspm.web.archive import Archive
@@ -37,7 +37,7 @@ class NightRequests:
         app.get("/night/difference", response_model=None)(self._difference)
         app.get("/night/report", response_model=None)(self._report)
 
-    async def _scans(self) -> dict[str, Any]:
+    async def _scans(self) -> Plain:
         """Answer with the ends of the night, its scans and notes. Times are texts: JSON has no numbers of 64 bits."""
         night = self._night
         drifted = night.drifted()
@@ -87,7 +87,7 @@ class NightRequests:
         return FileResponse(file, media_type="text/html")
 
 
-def _scan(row: ScanRow) -> dict[str, Any]:
+def _scan(row: ScanRow) -> Plain:
     assert row.region is not None
     cut = ", interrupted" if row.interrupted else ""
     return {

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 from nicegui import ui
 
@@ -13,6 +11,7 @@ from afspm.dashboard.steering_session import ask_in_dialog
 from afspm.errors import InvalidValue, UnitError
 from afspm.formatting import quantity, typeset_position
 from afspm.model import Region
+from afspm.plain_data import PlainMapping
 from afspm.units import convert, parse_quantity
 
 MOST_PIXELS = 8192
@@ -54,7 +53,7 @@ class ScanDialog:
         self._choice = choice
 
     @classmethod
-    def of_place(cls, place: Mapping[str, Any]) -> ScanDialog:
+    def of_place(cls, place: PlainMapping) -> ScanDialog:
         """Return the dialog for what the picture's script tells: x, y, width, height, angle, rows, columns."""
         x, y, width, height, angle = (float(place[name]) for name in ("x", "y", "width", "height", "angle"))
         pixels = max(int(place["rows"]), int(place["columns"]))

@@ -19,6 +19,7 @@ from afspm.emulators.faults import Fault, Faults
 from afspm.emulators.rig import Rig
 from afspm.errors import AfspmError, ErrorCollector, TransportError
 from afspm.exit_codes import ExitCode
+from afspm.plain_data import PlainMapping
 from afspm.translator.emulated_controller import AddressNotice, notice_file
 from afspm.transport.polling import WakeUp
 from afspm.transport.port import Killed
@@ -74,7 +75,7 @@ class Emulator(ABC):
     """
 
     vendor: ClassVar[str]
-    usual: ClassVar[Mapping[str, Any]] = {}
+    usual: ClassVar[PlainMapping] = {}
     """Settings by which it is found where the vendor's own controller is: for `afspm emulate` alone, and on request."""
     fault_kinds: ClassVar[Mapping[str, str]] = {}
     """Every fault that can be had, with what it does."""
@@ -100,7 +101,7 @@ class Emulator(ABC):
         *,
         port: Annotated[int, Listens()] = 0,
         seed: int = 1,
-        faults: Sequence[str | Mapping[str, Any] | Fault] = (),
+        faults: Sequence[str | PlainMapping | Fault] = (),
         **world: Any,
     ) -> None:
         self.port = port

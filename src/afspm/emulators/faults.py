@@ -5,9 +5,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 from afspm.errors import ConfigError
+from afspm.plain_data import PlainMapping
 
 EVERY_TIME = 1_000_000_000
 
@@ -58,7 +58,7 @@ class Fault:
         return fault
 
     @classmethod
-    def of(cls, given: str | Mapping[str, Any] | Fault) -> Fault:
+    def of(cls, given: str | PlainMapping | Fault) -> Fault:
         """Make a fault from a text as on the command line, or from a table of the experiment file."""
         if isinstance(given, Fault):
             return given

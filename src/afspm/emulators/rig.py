@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from afspm.emulators.activities import RETRACE, Move, Occupied, ScanActivity, Sp
 from afspm.emulators.scan_drawing import ScanDrawing
 from afspm.errors import AfspmError, InvalidValue
 from afspm.model import Feedback, Region
+from afspm.plain_data import PlainMapping
 from afspm.simulation import World
 from afspm.simulation.feedback import FeedbackSettings
 
@@ -71,7 +71,7 @@ class Rig:
         world: the physics, with its ground truth (`world.truth`).
     """
 
-    def __init__(self, world_settings: Mapping[str, Any], seed: int, clock: Clock, *, background: bool = True) -> None:
+    def __init__(self, world_settings: PlainMapping, seed: int, clock: Clock, *, background: bool = True) -> None:
         self.clock = clock
         self.seed = seed
         self.world = World.from_settings(world_settings, seed, clock.now_s())

@@ -9,6 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from afspm.plain_data import Plain
+
 READ_AT_ONCE = 1 << 16
 
 
@@ -26,9 +28,9 @@ class ClientConnection:
     socket: socket.socket
     received: bytearray = field(default_factory=bytearray)
     sending: bytearray = field(default_factory=bytearray)
-    waits_for: Any = None
+    waits_for: object = None
     closing: bool = False
-    memory: dict[str, Any] = field(default_factory=dict)
+    memory: Plain = field(default_factory=dict)
 
 
 class TcpServer:

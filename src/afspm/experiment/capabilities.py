@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from afspm.errors import AfspmError
 from afspm.experiment.toml_lines import Table
@@ -44,7 +44,7 @@ def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None
     return MicroscopeCapabilities(frozenset(actions), {name: table[name].si_unit for name in table}, sets)
 
 
-def _set_by(action: Any, table: ParameterTable) -> tuple[Parameter, ...]:
+def _set_by(action: object, table: ParameterTable) -> tuple[Parameter, ...]:
     """Return what an action of the experiment file sets, in SI."""
     given = action.get("set") if isinstance(action, Mapping) else None
     values = table.written(given, where="actions") if isinstance(given, Mapping) else {}

@@ -187,7 +187,7 @@ def _hidden(module: Any) -> str:
     return ""
 
 
-def _import(package: str) -> Any:
+def _import(package: str) -> object:
     try:
         return importlib.import_module(package)
     except ImportError:
@@ -233,7 +233,7 @@ def _where(error: BaseException) -> str:
     return f"{type(error).__name__}: {said}{place}"
 
 
-def _public_classes(module: Any) -> list[str]:
+def _public_classes(module: object) -> list[str]:
     return [n for n, v in vars(module).items() if inspect.isclass(v) and not n.startswith("_")]
 
 
@@ -241,7 +241,7 @@ def _own_classes(module: Any) -> list[str]:
     return [name for name in _public_classes(module) if getattr(module, name).__module__ == module.__name__]
 
 
-def _names(value: Any) -> tuple[str, ...] | None:
+def _names(value: object) -> tuple[str, ...] | None:
     """Return a text or texts as a tuple of texts; enum members by their name. None for what is not declared."""
     if value is None or isinstance(value, property):
         return None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator
-from typing import Any
 
 from afspm import wire
 from afspm.client.component import Component
@@ -33,7 +32,7 @@ def check_handlers(resolved: ResolvedExperiment) -> None:
                 resolved.document.error(f"{shown} can't be called as it will be: {wrong}", *path, hint=hint)
 
 
-def _methods(component: type[Component]) -> Iterator[tuple[str, Callable[..., Any]]]:
+def _methods(component: type[Component]) -> Iterator[tuple[str, Callable[..., object]]]:
     """Methods of the user's that are called, or look so."""
     ours = set(Component.__mro__)
     seen: set[str] = set()
@@ -58,7 +57,7 @@ def _arguments(name: str) -> list[str]:
     return list(inspect.signature(base).parameters) if base is not None else ["self", "message"]
 
 
-def _wrong_signature(method: Callable[..., Any], arguments: list[str]) -> str:
+def _wrong_signature(method: Callable[..., object], arguments: list[str]) -> str:
     if inspect.iscoroutinefunction(method) or inspect.isgeneratorfunction(method):
         return "calling it does nothing yet, since it is async or has a yield"
     try:

@@ -22,7 +22,7 @@ import contextlib
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
-from typing import Annotated, Any, Final, TypeVar
+from typing import Annotated, Final, TypeVar
 
 import pydantic
 from pydantic import Field
@@ -120,7 +120,7 @@ class LimitsReader:
         self._check_sizes(limits)
         return limits
 
-    def _parameter(self, name: str, table: Any) -> Limit | None:
+    def _parameter(self, name: str, table: object) -> Limit | None:
         if name not in self.parameters and (self.certain or not name.startswith("x-")):
             is_action = name in self._known_actions
             near = nearest(name, [*self.parameters, *_OWN])
@@ -144,7 +144,7 @@ class LimitsReader:
                 self.document.warning(f"[limits.{name}] step is larger than the whole range", *path, "step")
         return Limit(low, high, step, rate, read.every, read.only, unit, str(self.document.place(*path)))
 
-    def _action(self, name: str, table: Any) -> Limit | None:
+    def _action(self, name: str, table: object) -> Limit | None:
         path = ("limits", "actions", name)
         if name not in self._known_actions and (self.actions is not None or not name.startswith("x-")):
             hint = nearest(name, self._known_actions)
@@ -154,7 +154,7 @@ class LimitsReader:
             return None
         return Limit(interval_s=read.every, only=read.only, source=str(self.document.place(*path)))
 
-    def _validated(self, model: type[L], table: Any, path: tuple[str, ...]) -> L | None:
+    def _validated(self, model: type[L], table: object, path: tuple[str, ...]) -> L | None:
         try:
             read = model.model_validate(table)
         except pydantic.ValidationError as error:

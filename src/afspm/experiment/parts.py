@@ -231,7 +231,7 @@ class VariableReferences:
         """Return `value`, which stands at `path`, with every reference in it replaced, again and again."""
         return self._expand(value, path, ())
 
-    def _expand(self, value: Any, path: Path, through: tuple[str, ...]) -> Any:
+    def _expand(self, value: object, path: Path, through: tuple[str, ...]) -> object:
         if isinstance(value, dict):
             return {key: self._expand(item, (*path, key), through) for key, item in value.items()}
         if isinstance(value, list):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from afspm.addresses import connectable, reaches
 from afspm.errors import ConfigError
@@ -178,7 +178,7 @@ def _secrets(process: ResolvedProcess) -> set[str]:
     return {*_variable(process.settings.get(SECRET)), *([DASHBOARD_PASSWORD] if process.says("operates") else [])}
 
 
-def _variable(secret: Any) -> list[str]:
+def _variable(secret: object) -> list[str]:
     """The environment variable that is named instead of a secret."""
     return [secret[1:]] if isinstance(secret, str) and secret.startswith("$") else []
 

@@ -19,7 +19,7 @@ GUIDE: Final = "see docs/how-to/from-the-published-implementation.md"
 CHANNEL: Final = "Height"
 """The channel of the simulated microscope that stands for the one that a published picture was given."""
 
-Becomes = Callable[[Any, Table], Settings]
+Becomes = Callable[[object, Table], Settings]
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class PublishedClass:
     why: str = ""
 
 
-def wire_of(table: Any) -> WiringClass | None:
+def wire_of(table: object) -> WiringClass | None:
     """Return the kind of intermediary that a value is, or None."""
     name = table.get("class") if isinstance(table, Mapping) else None
     if not isinstance(name, str):
@@ -53,7 +53,7 @@ def wire_of(table: Any) -> WiringClass | None:
     return WIRE_CLASSES.get(last) if name.startswith(PUBLISHED_WIRES) else SHORT_WIRE_CLASSES.get(name)
 
 
-def evaluated(value: Any, channels: Mapping[str, str]) -> Any:
+def evaluated(value: object, channels: Mapping[str, str]) -> Any:
     """Replace each call of a published function in a value by the envelope that the function would return.
 
     Args:
@@ -79,7 +79,7 @@ def with_channels(table: Table, channels: Mapping[str, str]) -> Settings:
     return renamed
 
 
-def envelope(table: Table) -> Any:
+def envelope(table: Table) -> object:
     """Return the envelope that a published function makes: create_spec_envelope, or create_roi_scan_envelope.
 
     A size without a unit is in nm, as in the envelopes themselves. What makes no envelope is returned as it is.
@@ -123,7 +123,7 @@ def without_counterpart(path: str) -> str:
     return INSTEAD.get(path.rpartition(".")[2], "") if path.startswith(COMPONENTS) else ""
 
 
-def put(settings: Settings, name: str, value: Any) -> None:
+def put(settings: Settings, name: str, value: object) -> None:
     """Set a setting that may be within tables: put({}, "drift.channel", "Height").
 
     Raises:
@@ -154,7 +154,7 @@ def _gone(why: str, *names: str) -> dict[str, PublishedSetting]:
 def _paper(ours: str) -> PublishedSetting:
     """Return a setting of the paper's tracker, whose queue is what the published scheduler caches."""
 
-    def becomes(value: Any, table: Table) -> Settings:
+    def becomes(value: object, table: Table) -> Settings:
         settings = {"drift.tracker.class": "paper", f"drift.tracker.{ours}": value}
         count = _within(table, "pubsubcache", "update_cache_kwargs", "cache_logic", "default_scan_history")
         return settings if count is None else {**settings, "drift.tracker.queue": count}
@@ -184,7 +184,7 @@ def _estimator(value: Any, table: Table) -> Settings:
     }
 
 
-def _oldest(value: Any, table: Table) -> Settings:
+def _oldest(value: object, table: Table) -> Settings:
     if value is not True:
         raise InvalidValue("the paper's tracker compares with the oldest scan that fits", hint="leave the line out")
     return {}
@@ -193,7 +193,7 @@ def _oldest(value: Any, table: Table) -> Settings:
 def _client(address: Callable[[Table], str]) -> Becomes:
     """The table of a client that the published translator was given: where the controller is, and its timeout."""
 
-    def becomes(value: Any, table: Table) -> Settings:
+    def becomes(value: object, table: Table) -> Settings:
         if not isinstance(value, Mapping):
             raise InvalidValue(
                 f"{value!r} is not a table of a client", hint='address = "…" says where the controller is'

@@ -6,7 +6,6 @@ import re
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from afspm.client.component import Component
 from afspm.errors import AfspmError, InvalidValue, individual_errors
@@ -325,7 +324,7 @@ def _written_role(part: ExperimentPart, resolved: ResolvedExperiment) -> Role:
     return Role.SCHEDULER if {"router", "pubsubcache"} & part.own.keys() else Role.COMPONENT
 
 
-def _messages(given: Any, document: Document) -> tuple[str, ...]:
+def _messages(given: object, document: Document) -> tuple[str, ...]:
     """`messages`: .proto files, absolute, and modules with messages of the user."""
     if not isinstance(given, list) or not all(isinstance(one, str) for one in given):
         document.error("`messages` is not a list of texts", "messages", hint='messages = ["my.proto"]')

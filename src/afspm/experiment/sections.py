@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from datetime import datetime
 from functools import partial
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Literal, TypeVar, get_args
 
 import pydantic
 from pydantic import Field
@@ -176,7 +176,7 @@ def _fields_at(model: type[pydantic.BaseModel], location: tuple[str | int, ...])
     return tuple(here.model_fields)
 
 
-def _sections_in(annotation: Any) -> Iterator[type[pydantic.BaseModel]]:
+def _sections_in(annotation: object) -> Iterator[type[pydantic.BaseModel]]:
     """Return the sections that an annotation speaks of: itself, or within a union or a tuple."""
     if isinstance(annotation, type) and issubclass(annotation, pydantic.BaseModel):
         yield annotation

@@ -115,7 +115,7 @@ def jsonable(value: Any, folder: Path) -> Any:
     return value
 
 
-def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Document) -> Any:
+def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Document) -> object:
     folder = document.folder_of(*path)
     if _is_object(value):
         return _object(value, path, document)
@@ -146,7 +146,7 @@ def _object(value: Settings, path: tuple[str, ...], document: Document) -> Setti
     return {"class": value["class"], **check(wanted, settings, path, document)}
 
 
-def _is_quantity(value: Any) -> bool:
+def _is_quantity(value: object) -> bool:
     """Return whether a text is a number with a unit for which there is an annotation."""
     if not isinstance(value, str):
         return False
@@ -157,11 +157,11 @@ def _is_quantity(value: Any) -> bool:
     return False
 
 
-def _is_object(value: Any) -> bool:
+def _is_object(value: object) -> bool:
     return isinstance(value, dict) and isinstance(value.get("class"), str)
 
 
-def _has_own_config(annotation: Any) -> bool:
+def _has_own_config(annotation: object) -> bool:
     inner = typing.get_origin(annotation) or annotation
     return isinstance(inner, type) and (
         is_dataclass(inner) or issubclass(inner, pydantic.BaseModel) or typing.is_typeddict(inner)
@@ -180,9 +180,9 @@ def _parameters(component: type) -> Mapping[str, inspect.Parameter]:
 
 
 @cache
-def _constructors(component: type) -> Sequence[Callable[..., Any]]:
+def _constructors(component: type) -> Sequence[Callable[..., object]]:
     """`__init__` of the class, and of its bases for as long as each passes **keywords on."""
-    chain: list[Callable[..., Any]] = []
+    chain: list[Callable[..., object]] = []
     for base in component.__mro__:
         init = vars(base).get("__init__")
         if base is object or not inspect.isfunction(init):

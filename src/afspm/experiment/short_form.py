@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from afspm import units
 from afspm.addresses import is_address
@@ -82,7 +82,7 @@ def _addresses(resolved: ResolvedExperiment) -> set[str]:
     return {address for address in found if address is not None}
 
 
-def _variable(name: str, value: Any, addresses: Collection[str]) -> str:
+def _variable(name: str, value: object, addresses: Collection[str]) -> str:
     if name in _VARIABLES:
         return "as it is"
     if isinstance(value, str) and value in addresses:

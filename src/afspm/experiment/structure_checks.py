@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Callable, Collection, Iterator
-from typing import Any, Final
+from typing import Final
 
 from afspm.addresses import EXAMPLE, hint_on, is_address, reaches
 from afspm.errors import InvalidValue
@@ -327,7 +327,7 @@ def check_likely_typos(resolved: ResolvedExperiment) -> None:
                 resolved.document.warning(what, *path, hint=f"did you mean {near!r}?")
 
 
-def _texts(value: Any, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], str]]:
+def _texts(value: object, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], str]]:
     if isinstance(value, str):
         yield path, value
     elif isinstance(value, dict | list):

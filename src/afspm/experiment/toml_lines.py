@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from itertools import count
-from typing import Any, TypeAlias
+from typing import TypeAlias
+
+from afspm.plain_data import Plain, PlainMapping
 
 Path: TypeAlias = tuple[str | int, ...]
 """A way into the parsed document: keys, and indices into arrays."""
-Table: TypeAlias = Mapping[str, Any]
+Table: TypeAlias = PlainMapping
 """A table of a TOML file, to read."""
-Settings: TypeAlias = dict[str, Any]
+Settings: TypeAlias = Plain
 """What a table has become: settings of a component, in types of TOML or JSON."""
 
 _TOKEN = re.compile(

@@ -36,7 +36,7 @@ def to_toml(experiment: Experiment, *, secrets: bool = True) -> str:
     return dumps(tables if secrets else _without(_secrets_in(tables), tables))
 
 
-def _secrets_in(value: Any) -> list[str]:
+def _secrets_in(value: object) -> list[str]:
     """Return the secrets in a document, each once, wherever they are."""
     if isinstance(value, list | tuple):
         return list(dict.fromkeys(secret for one in value for secret in _secrets_in(one)))
@@ -47,7 +47,7 @@ def _secrets_in(value: Any) -> list[str]:
     return list(dict.fromkeys([*here, *_secrets_in(list(value.values()))]))
 
 
-def _without(secrets: list[str], value: Any) -> Any:
+def _without(secrets: list[str], value: object) -> Any:
     """Return a document with names of environment variables instead of secrets, which a variable may hold, too."""
     if isinstance(value, Mapping):
         return {key: _without(secrets, one) for key, one in value.items()}
@@ -75,7 +75,7 @@ def _key(key: str) -> str:
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key, ensure_ascii=False)
 
 
-def value(of: Any) -> str:
+def value(of: object) -> str:
     """Return a value as TOML writes it."""
     if isinstance(of, bool):
         return "true" if of else "false"

@@ -42,7 +42,7 @@ _WANTED: Final = {
 
 def report(
     error: pydantic.ValidationError,
-    given: Any,
+    given: object,
     path: SettingPath,
     document: Document,
     known: Callable[[SettingPath], Iterable[str]] = lambda place: (),
@@ -52,7 +52,7 @@ def report(
     Args:
         known: returns the names that are valid beside an unknown one.
     """
-    by_place: dict[SettingPath, list[Any]] = {}
+    by_place: dict[SettingPath, list[object]] = {}
     for one in error.errors(include_url=False):
         by_place.setdefault(_place(one, given), []).append(one)
     for place, errors in by_place.items():

@@ -8,7 +8,6 @@ since 1904, of saving; the units of a wave are those of its first channel alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import Any
@@ -21,8 +20,9 @@ from afspm.errors import FileError
 from afspm.files import igor
 from afspm.files.content import FileContent, clock_ns
 from afspm.model import Region, Scan, Spectrum
+from afspm.plain_data import PlainMapping
 
-Note = Mapping[str, Any]
+Note = PlainMapping
 
 CONTROLLER = "Asylum"
 _IGOR_EPOCH = datetime(1904, 1, 1)  # noqa: DTZ001  (local time of the controller)

@@ -12,7 +12,6 @@ import re
 from dataclasses import dataclass
 from datetime import tzinfo
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,7 +105,7 @@ def _content(raw: _Raw, path: Path) -> FileContent:
         )
         for k, layer in enumerate(layers)
     )
-    header: dict[str, Any] = {**raw.about, **raw.numbers, **raw.texts}
+    header: dict[str, object] = {**raw.about, **raw.numbers, **raw.texts}
     return FileContent(CONTROLLER, scans, header=header, start_ns=start, end_ns=end, upwards=upwards)
 
 

@@ -68,7 +68,7 @@ def texts(attributes: Any) -> dict[str, str]:
     return {key: text(value) for key, value in attributes.items() if isinstance(value, bytes | str)}
 
 
-def text(value: Any) -> str:
+def text(value: object) -> str:
     """An attribute, or a dataset of characters, as text."""
     if isinstance(value, np.ndarray):
         value = value.tobytes()

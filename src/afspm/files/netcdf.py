@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.errors import FileError
+from afspm.plain_data import Plain, PlainMapping
 
 Attributes = Mapping[str, str | float]
 
@@ -93,11 +94,11 @@ def _netcdf_file(content: io.BytesIO, mode: Literal["r", "w"]) -> Any:
     return netcdf_file(content, mode, mmap=False, version=2)
 
 
-def _as_bytes(attributes: Attributes) -> dict[str, Any]:
+def _as_bytes(attributes: Attributes) -> Plain:
     return {name: value.encode() if isinstance(value, str) else np.float64(value) for name, value in attributes.items()}
 
 
-def _told(attributes: Mapping[str, Any]) -> dict[str, str | float]:
+def _told(attributes: PlainMapping) -> dict[str, str | float]:
     """Return text as it is, of numbers the first."""
     return {
         name: _text(value) if isinstance(value, bytes) else float(np.ravel(value)[0])

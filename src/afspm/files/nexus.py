@@ -13,6 +13,7 @@ from afspm.errors import FileError
 from afspm.files import hdf5, nsid
 from afspm.files.content import FileContent
 from afspm.model import Frame, Region, Scan, Spectrum
+from afspm.plain_data import Plain
 
 DEFINITION = "NXspm"
 BIAS_SPECTRUM = "NXsts"
@@ -37,21 +38,21 @@ def read_hdf5(path: Path, zone: tzinfo | None) -> FileContent:
         )  # fmt: skip
 
 
-def about_of(file: Any) -> dict[str, Any]:
+def about_of(file: Any) -> Plain:
     """Return what the record noted beside the values: holder of control, problems … Raises FileError: it is damaged."""
     try:
-        about: dict[str, Any] = json.loads(hdf5.text(file["entry"][ABOUT]["about"][()]))
+        about: Plain = json.loads(hdf5.text(file["entry"][ABOUT]["about"][()]))
     except (KeyError, ValueError) as error:
         raise FileError(f"is damaged: {error}") from error
     return about
 
 
-def vendor_header(file: Any) -> dict[str, Any]:
+def vendor_header(file: Any) -> dict[str, object]:
     """The header of the controller's own file, as that said it; empty if it was not there to be read."""
     group = file["entry"].get(VENDOR)
     if group is None or "header" not in group:
         return {}
-    header: dict[str, Any] = json.loads(hdf5.text(group["header"][()]))
+    header: dict[str, object] = json.loads(hdf5.text(group["header"][()]))
     return header
 
 
@@ -60,7 +61,7 @@ def _is_ours(file: Any) -> bool:
     return entry is not None and ABOUT in entry and hdf5.text(entry["definition"][()]) in (DEFINITION, BIAS_SPECTRUM)
 
 
-def _scans(file: Any, about: dict[str, Any]) -> list[Scan]:
+def _scans(file: Any, about: Plain) -> list[Scan]:
     region = Region(tuple(about["center_m"]), tuple(about["size_m"]), about["angle_rad"], Frame(about["frame"]))
     data = file["entry"]["data"]
     return [
@@ -76,7 +77,7 @@ def _scans(file: Any, about: dict[str, Any]) -> list[Scan]:
     ]
 
 
-def _spectrum(file: Any, about: dict[str, Any]) -> Spectrum:
+def _spectrum(file: Any, about: Plain) -> Spectrum:
     data, variables = file["entry"]["data"], about["variables"]
     columns = [hdf5.array(data[variable["field"]]) for variable in variables]
     place = about["position_m"]

@@ -37,7 +37,7 @@ def read_nsid(path: Path, zone: tzinfo | None) -> FileContent:
     )
 
 
-def _note(image: Any) -> dict[str, Any]:
+def _note(image: Any) -> dict[str, object]:
     """The keys of Asylum's note, which all images of a file share; empty in files of other instruments."""
     metadata = image.parent.get("original_metadata")
     if metadata is None:
@@ -58,7 +58,7 @@ def _axis_m(axis: Any, unit: str) -> NDArray[np.float64]:
     return values
 
 
-def _scan(image: Any, note: dict[str, Any], end_ns: int | None, path: Path) -> Scan:
+def _scan(image: Any, note: dict[str, object], end_ns: int | None, path: Path) -> Scan:
     channel = hdf5.text(image.attrs["quantity"])
     values = hdf5.array(image).T
     # what wrote Asylum's gave the axes the unit of their channel; they are in m

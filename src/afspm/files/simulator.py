@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,7 @@ def is_ours(file: File) -> bool:
 
 def content(file: File, path: Path) -> FileContent:
     """A scan or a spectrum. Raises FileError: something of it is missing."""
-    header: dict[str, Any] = dict(file.attributes)
+    header: dict[str, object] = dict(file.attributes)
     try:
         end_ns = int(str(file.attributes["time_ns"]))
         if header.get("content") == "spectrum":
@@ -45,7 +44,7 @@ def content(file: File, path: Path) -> FileContent:
     )
 
 
-def _start_ns(header: dict[str, Any], scan: Scan, end_ns: int) -> int | None:
+def _start_ns(header: dict[str, object], scan: Scan, end_ns: int) -> int | None:
     """Every line is scanned there and back."""
     speed_m_s = header.get(f"{names.SCAN_SPEED} [m/s]")
     if not isinstance(speed_m_s, float) or not speed_m_s > 0.0:

@@ -7,7 +7,6 @@ import re
 from collections.abc import AsyncIterator, Collection
 from http import HTTPStatus
 from importlib import metadata
-from typing import Any
 
 from fastapi import FastAPI
 from fastapi.exceptions import RequestValidationError
@@ -21,6 +20,7 @@ from afspm.gateway.guard import GatewayGuard, answer
 from afspm.gateway.problems import RefusalCode, RefusalModel, RefusedRequest, of_error
 from afspm.gateway.reading_routes import ReadingRoutes
 from afspm.gateway.services import GatewayServices
+from afspm.plain_data import Plain
 from afspm.web.asgi import AsgiApp
 from afspm.web.passwords import Passwords
 
@@ -28,7 +28,7 @@ PREFIX = "/v1"
 ABOUT = """The experiment over HTTP. Everybody who may look reads; to command, send a name and its token, request
 control, and renew its lease. The scheduler decides about each request as it does for every component: limits hold, and
 what is done is in the record under `<gateway>:<name>`. Everything is in SI units."""
-_REFUSED: dict[int | str, dict[str, Any]] = {
+_REFUSED: dict[int | str, dict[str, object]] = {
     "4XX": {"model": RefusalModel, "description": "It was not done, and why."},
     "5XX": {"model": RefusalModel, "description": "No answer, or a fault."},
     422: {"model": RefusalModel, "description": "The request makes no sense, or a limit refuses it."},
@@ -91,7 +91,7 @@ async def _no_route(asked: Request, error: Exception) -> Response:
     return response
 
 
-def _methods(paths: dict[str, Any], path: str) -> list[str]:
+def _methods(paths: Plain, path: str) -> list[str]:
     """Return the methods of a path, of which each has a route of its own."""
     for template, of_path in paths.items():
         if re.fullmatch(re.sub(r"{\w+}", "[^/]+", template), path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path, Query
 from fastapi.security import HTTPBasic, HTTPBearer
@@ -35,6 +35,7 @@ from afspm.gateway.reading_routes import Parameter
 from afspm.gateway.services import GatewayServices
 from afspm.gateway.views import parameter_model
 from afspm.model import WAIT_FOR_CONTROL, ControlMode, ControlState, Region, Response, names
+from afspm.plain_data import Plain
 from afspm.web.person_commands import PersonCommands
 
 LONGEST_WAIT_S = 25.0
@@ -56,7 +57,7 @@ class CommandRoutes:
     def router(self) -> APIRouter:
         """Return the routes."""
         router = APIRouter(dependencies=[*_SECURITY, Depends(self._services.who)])
-        accepted: dict[str, Any] = {"status_code": 202, "response_model": MeasurementModel}
+        accepted: Plain = {"status_code": 202, "response_model": MeasurementModel}
         router.post("/control", response_model=ControlModel)(self.request_control)
         router.put("/control", response_model=ControlModel)(self.renew_control)
         router.delete("/control", response_model=DoneModel)(self.release_control)

@@ -94,7 +94,7 @@ class EventHistory:
         with self._lock:
             self._complete_since_ns = max(self._complete_since_ns, time_ns)
 
-    def take(self, message: str, thing: Any, time_ns: int) -> None:
+    def take(self, message: str, thing: object, time_ns: int) -> None:
         """Add what was published; what is not newer (a replay) is passed over."""
         kind = KINDS.get(message)
         with self._lock:
@@ -136,7 +136,7 @@ def fill(history: EventHistory, run_dir: Path, state_dir: Path | None, now_ns: i
         history.incomplete_before(now_ns if oldest_ns is None else oldest_ns - 1)
 
 
-def _recorded(run_dir: Path, state_dir: Path | None) -> Iterator[tuple[str, Any, int]]:
+def _recorded(run_dir: Path, state_dir: Path | None) -> Iterator[tuple[str, object, int]]:
     newest_ns = -1
     if (run_dir / JOURNAL_FILE).is_file():
         try:
@@ -156,7 +156,7 @@ def _recorded(run_dir: Path, state_dir: Path | None) -> Iterator[tuple[str, Any,
             continue
 
 
-def _data(thing: Any, time_ns: int, problems: ProblemNames) -> dict[str, Any]:
+def _data(thing: object, time_ns: int, problems: ProblemNames) -> dict[str, object]:
     """Return what was published in JSON's types, without the values of scans and spectra."""
     match thing:
         case ControlState():
@@ -187,11 +187,11 @@ def _data(thing: Any, time_ns: int, problems: ProblemNames) -> dict[str, Any]:
             }
         case JournalEntries():
             return {"entries": [_entry(one, problems) for one in thing.entries]}
-    plain: dict[str, Any] = _without_large_numbers(to_plain(thing, lists=True))
+    plain: dict[str, object] = _without_large_numbers(to_plain(thing, lists=True))
     return plain
 
 
-def _entry(entry: JournalEntry, problems: ProblemNames) -> dict[str, Any]:
+def _entry(entry: JournalEntry, problems: ProblemNames) -> dict[str, object]:
     is_known = entry.response in ControlResponse._value2member_map_
     return {
         "who": entry.who,
@@ -205,7 +205,7 @@ def _entry(entry: JournalEntry, problems: ProblemNames) -> dict[str, Any]:
     }
 
 
-def _without_large_numbers(value: Any) -> Any:
+def _without_large_numbers(value: object) -> Any:
     """Return plain data with times in nanoseconds as texts, and None for what JSON has no number for."""
     if isinstance(value, dict):
         return {key: _without_large_numbers(one) for key, one in value.items()}

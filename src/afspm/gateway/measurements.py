@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from afspm.client.cycle import Cycle, CycleOutcome
 from afspm.client.targets import ScanTarget, Target, target_from
@@ -19,6 +18,7 @@ from afspm.gateway.models import MeasurementModel, MeasurementState
 from afspm.gateway.problems import RefusalCode, RefusalModel, RefusedRequest, refused
 from afspm.logic.sessions import KEYED
 from afspm.model import ControlResponse, Response, Scan, ScopeStatus, Spectrum
+from afspm.plain_data import Plain
 from afspm.process.memory import Memory
 from afspm.web.person_commands import PersonCommands
 from afspm.web.watch import Watch
@@ -47,12 +47,12 @@ class Measurement:
 
     who: str
     key: str
-    plan: dict[str, Any]
+    plan: Plain
     attempt: int = 0
     since_ns: int = -1
     state: str = _RUNNING
     result: str | None = None
-    refusal: dict[str, Any] | None = None
+    refusal: dict[str, object] | None = None
     is_certain: bool = True
 
     @property

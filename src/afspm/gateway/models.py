@@ -6,7 +6,7 @@ Ids are texts: they are times in nanoseconds, and JSON has no numbers of 64 bits
 from __future__ import annotations
 
 from enum import Enum
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
@@ -290,4 +290,4 @@ class EventModel(_Answer):
     """The data of an event: of a `missed` one `after` and `until`, between which events were left out."""
 
     time: TIME | None
-    data: dict[str, Any]
+    data: dict[str, object]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from fastapi import APIRouter, Header, Path, Query
@@ -41,14 +41,14 @@ Which = Annotated[str, Path(pattern=r"^([0-9]{1,20}|newest)$", examples=[NEWEST]
 Parameter = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$", examples=["scan-speed"])]
 Limit = Annotated[int, Query(ge=1, le=500)]
 After = Annotated[str, Query(pattern=r"^[0-9]{1,19}$", description="only those newer than this id")]
-_VALUES: dict[int | str, dict[str, Any]] = {
+_VALUES: dict[int | str, dict[str, object]] = {
     200: {
         "model": ArrayModel,
         "description": "the values in the format asked for",
         "content": {"application/octet-stream": {}, "image/png": {}},
     }
 }
-_EVENTS: dict[int | str, dict[str, Any]] = {
+_EVENTS: dict[int | str, dict[str, object]] = {
     200: {
         "description": "Server-sent events: `id`, `event` (a kind) and `data` (an EventModel) until the end.",
         "content": {"text/event-stream": {"schema": {"type": "string"}}},

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 from afspm.model import Packet, PacketHeader, Parameter, Request, Response
 
@@ -54,10 +54,10 @@ class CoordinateFrame(Protocol):
         """A packet of the microscope's as it is to be published, its time and envelope unchanged."""
         ...
 
-    def snapshot(self) -> dict[str, Any]:
+    def snapshot(self) -> dict[str, object]:
         """Return the part that must survive a kill, as plain JSON."""
         ...
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: dict[str, object]) -> None:
         """Take up what `snapshot` wrote."""
         ...

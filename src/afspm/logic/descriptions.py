@@ -74,7 +74,7 @@ def _control(problem: Any, problems: ProblemNames) -> str:
     return f"asks for control to solve {problems.name(int(problem))}" if problem else "asks for control"
 
 
-def _parameter(subject: Any, problems: ProblemNames) -> str:
+def _parameter(subject: object, problems: ProblemNames) -> str:
     if not isinstance(subject, Parameter):
         return f"parameter {subject}"
     if subject.value is None:
@@ -82,7 +82,7 @@ def _parameter(subject: Any, problems: ProblemNames) -> str:
     return f"{subject.name} = {subject.value}{f' {subject.unit}' if subject.unit else ''}"
 
 
-def _scan_parameters(subject: Any, problems: ProblemNames) -> str:
+def _scan_parameters(subject: object, problems: ProblemNames) -> str:
     if not isinstance(subject, ScanParameters):
         return "scan parameters"
     region, shape = subject.region, subject.shape
@@ -103,7 +103,7 @@ def _scan_parameters(subject: Any, problems: ProblemNames) -> str:
     return f"scan parameters: {', '.join(parts)}" if parts else "scan parameters"
 
 
-def _feedback(subject: Any, problems: ProblemNames) -> str:
+def _feedback(subject: object, problems: ProblemNames) -> str:
     if not isinstance(subject, Feedback):
         return "feedback"
     gains = {"P": subject.proportional_gain, "I": subject.integral_gain, "setpoint": subject.setpoint}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from afspm.model import Packet, PacketHeader, Parameter, Request, Response
 
@@ -256,7 +256,7 @@ Effect = Reply | Forward | Publish | Replay | SaveState | Log | Kill
 class Codec(Protocol):
     """The wire as far as decisions need it, so that they need not know the wire."""
 
-    def encode(self, thing: Any) -> bytes:
+    def encode(self, thing: object) -> bytes:
         """A model object as the payload of a packet."""
 
     def encode_orders(self, restart: Sequence[str]) -> bytes:
@@ -271,5 +271,5 @@ class Codec(Protocol):
     def by_point(self, spectrum: bytes | memoryview) -> bytes:
         """A Spec1d whose values came variable after variable, with its values point by point. Raises AfspmError."""
 
-    def decode_packet(self, message: str, payload: bytes | memoryview) -> Any:
+    def decode_packet(self, message: str, payload: bytes | memoryview) -> object:
         """The object of a small packet (ScopeStatus, Feedback, ProcessStates …); None if malformed."""

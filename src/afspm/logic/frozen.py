@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 T = TypeVar("T")
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from dataclasses import replace as replace  # so that names and types of its arguments are checked
 else:
 
-    def replace(part: T, /, **changes: Any) -> T:
+    def replace(part: T, /, **changes: object) -> T:
         """Return a copy of a dataclass without `__post_init__`, with some fields changed."""
         if not hasattr(part, "__dict__"):
             return dataclasses.replace(part, **changes)

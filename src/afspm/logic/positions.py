@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 from afspm.errors import InvalidValue
 from afspm.model import PositionChange, ProbePosition, Region, RegionChange, ScanParameters, ShapeChange, names
 from afspm.model.geometry import XY
+from afspm.plain_data import Plain
 
 SHAPE_CHANGES: dict[str, Callable[[int], ShapeChange]] = {
     names.SCAN_RESOLUTION_X: lambda value: ShapeChange(columns=value),
@@ -69,7 +69,7 @@ def changes_by(values: Iterable[tuple[str, float]]) -> list[PositionChange | Sca
     Raises:
         InvalidValue: a number of pixels that is none.
     """
-    given: dict[type, dict[str, Any]] = {}
+    given: dict[type, Plain] = {}
     for name, value in values:
         change: PositionChange | RegionChange | ShapeChange
         if name in SHAPE_CHANGES:

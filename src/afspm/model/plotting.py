@@ -40,7 +40,7 @@ def draw(scan: Scan, kind: str = "image", axes: Axes | None = None) -> Axes:
     return cast("Axes", given)
 
 
-def _fill(scan: Scan, kind: str, axes: Any) -> Any:
+def _fill(scan: Scan, kind: str, axes: Any) -> object:
     """Draw the values over the places of their pixels, in m."""
     x, y = scan.region.pixels_m(scan.shape)
     span = value_range(scan.values)
@@ -56,7 +56,7 @@ def _fill(scan: Scan, kind: str, axes: Any) -> Any:
             return axes.pcolormesh(x, y, values, shading="nearest", **look)
 
 
-def _explain(scan: Scan, drawn: Any, axes: Any) -> None:
+def _explain(scan: Scan, drawn: object, axes: Any) -> None:
     """Add what the first scan in axes needs: units, a colour bar, a scale bar. Others lie over it as they are."""
     _, unit = _value_unit(scan)
     label = f"{scan.channel} / {unit}" if unit else scan.channel

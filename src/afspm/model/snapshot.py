@@ -16,12 +16,12 @@ from functools import cache
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from afspm.errors import InvalidValue
+from afspm.plain_data import Plain
 
 T = TypeVar("T")
-Plain = dict[str, Any]
 
 
-def snapshot(state: Any, kind: str, version: int, *, lists: bool = False) -> Plain:
+def snapshot(state: object, kind: str, version: int, *, lists: bool = False) -> Plain:
     """Return a dataclass as plain data.
 
     Args:
@@ -31,7 +31,7 @@ def snapshot(state: Any, kind: str, version: int, *, lists: bool = False) -> Pla
     return {"kind": kind, "version": version, **to_plain(state, lists=lists)}
 
 
-def restored(type_: type[T], plain: Mapping[str, Any], kind: str, version: int) -> T:
+def restored(type_: type[T], plain: Mapping[str, object], kind: str, version: int) -> T:
     """Return the dataclass that `snapshot` was made of.
 
     Raises:
@@ -52,7 +52,7 @@ def _numpy() -> Any:
     return sys.modules.get("numpy")
 
 
-def to_plain(value: Any, *, lists: bool = False) -> Any:
+def to_plain(value: object, *, lists: bool = False) -> Any:
     """Return dataclasses, enums, collections and arrays as plain data."""
     if isinstance(value, Enum):
         return value.value
@@ -101,7 +101,7 @@ def from_plain(type_: Any, plain: Any) -> Any:
     return plain
 
 
-def _from_union(arguments: Sequence[Any], plain: Any) -> Any:
+def _from_union(arguments: Sequence[object], plain: object) -> object:
     """Of `X | None` alone: which of several a value was, plain data do not say."""
     if plain is None and types.NoneType in arguments:
         return None
@@ -109,7 +109,7 @@ def _from_union(arguments: Sequence[Any], plain: Any) -> Any:
     return from_plain(only, plain)
 
 
-def _from_fields(type_: Any, plain: Mapping[str, Any]) -> Any:
+def _from_fields(type_: Any, plain: Mapping[str, object]) -> object:
     hints = _hints(type_)
     known = {field.name: hints[field.name] for field in fields(type_) if field.init}
     if unknown := plain.keys() - known.keys():
@@ -117,7 +117,7 @@ def _from_fields(type_: Any, plain: Mapping[str, Any]) -> Any:
     return type_(**{name: from_plain(known[name], value) for name, value in plain.items()})
 
 
-def _from_collection(origin: Any, arguments: Sequence[Any], plain: Any) -> Any:
+def _from_collection(origin: Any, arguments: Sequence[Any], plain: Any) -> object:
     if issubclass(origin, Mapping):
         key, value = arguments
         return {from_plain(key, one): from_plain(value, other) for one, other in plain}
@@ -128,5 +128,5 @@ def _from_collection(origin: Any, arguments: Sequence[Any], plain: Any) -> Any:
 
 
 @cache
-def _hints(type_: type[Any]) -> dict[str, Any]:
+def _hints(type_: type[object]) -> dict[str, object]:
     return get_type_hints(type_)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from afspm.clock import utc_time
 from afspm.errors import InvalidValue, NoSuchItem
 from afspm.model.geometry import XY, Frame
+from afspm.plain_data import Plain
 
 if TYPE_CHECKING:
     import numpy as np
@@ -67,7 +68,7 @@ class Spectrum:
         import xarray
 
         swept, *rest = self.names
-        columns: dict[str, Any] = {
+        columns: Plain = {
             name: (swept, self[name], {"units": unit}) for name, unit in zip(rest, self.units[1:], strict=True)
         }
         attributes = {

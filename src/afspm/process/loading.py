@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import importlib
 import inspect
-from typing import Any
 
 from afspm.errors import AfspmError, ConfigError
 from afspm.launch import Launch
@@ -37,7 +36,7 @@ def load(launch: Launch) -> ExperimentProcess:
     return made
 
 
-def made_of(value: Any, where: str) -> Any:
+def made_of(value: object, where: str) -> object:
     """Return a setting, each table in it with a `class` as the object that this makes."""
     if isinstance(value, list | tuple):
         return [made_of(item, where) for item in value]
@@ -50,7 +49,7 @@ def made_of(value: Any, where: str) -> Any:
     return inside if path is None else {"class": path, **inside}
 
 
-def find_class(path: str, where: str) -> type[Any]:
+def find_class(path: str, where: str) -> type[object]:
     """Return the class "package.module.Name". Raises ConfigError if there is none."""
     class_ = find_object(path, where, "class")
     if not isinstance(class_, type):
@@ -58,7 +57,7 @@ def find_class(path: str, where: str) -> type[Any]:
     return class_
 
 
-def find_object(path: str, where: str, what: str = "function") -> Any:
+def find_object(path: str, where: str, what: str = "function") -> object:
     """Return the object "package.module.name". Raises ConfigError if there is none.
 
     Args:
@@ -84,7 +83,7 @@ def find_object(path: str, where: str, what: str = "function") -> Any:
     return found
 
 
-def _check_settings(class_: type[Any], launch: Launch) -> None:
+def _check_settings(class_: type[object], launch: Launch) -> None:
     """Report a typo as one, and not as a TypeError from within a constructor."""
     try:
         signature = inspect.signature(class_)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from afspm.errors import InvalidValue
+from afspm.plain_data import Plain
 from afspm.storage.atomic import CheckpointFile, OutageLog, load_checkpoint, write_atomic
 from afspm.storage.disk import DEADLINE_S, DiskThread
 
@@ -37,7 +38,7 @@ class Memory(MutableMapping[str, Any]):
         self._disk = DiskThread(SYNCED_WITHIN_S if synced else DEADLINE_S)
         self._told = OutageLog("a restart would not know what was done until now", _log)
         self.damage = ""
-        self._values: dict[str, Any] = {}
+        self._values: Plain = {}
         if path is not None:
             values, self.damage = load_checkpoint(path, _read)
             self._values = values or {}
@@ -113,7 +114,7 @@ def _number(value: Any) -> Any:
     raise TypeError(f"it is of the type {type(value).__name__}")
 
 
-def _read(content: bytes) -> dict[str, Any]:
+def _read(content: bytes) -> Plain:
     values = json.loads(content)
     if not isinstance(values, dict):
         raise ValueError("it is not what a component remembers")

@@ -11,11 +11,12 @@ from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from afspm.clock import NS_PER_S
 from afspm.errors import FileError, InvalidValue
 from afspm.formatting import counted
+from afspm.plain_data import Plain
 from afspm.record.run import Run, open_run
 from afspm.record.run_json import RUN_FILE
 from afspm.record.run_lock import describe_state
@@ -193,7 +194,7 @@ def _stamp(folder: Path) -> str:
 
 
 def _from_json(text: str) -> RunSummary:
-    about: dict[str, Any] = json.loads(text)
+    about: Plain = json.loads(text)
     lists = {name: tuple(about[name]) for name in ("problems", "notes")}
     return RunSummary(**{one.name: about[one.name] for one in fields(RunSummary)} | lists)
 

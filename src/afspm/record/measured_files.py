@@ -35,7 +35,7 @@ class MeasuredFiles:
     """
 
     def __init__(
-        self, folder: Path, journal: sqlite3.Connection, facts: Mapping[str, Any], problems: ProblemNames
+        self, folder: Path, journal: sqlite3.Connection, facts: Mapping[str, object], problems: ProblemNames
     ) -> None:
         self._folder = folder
         self._journal = journal
@@ -231,7 +231,7 @@ def insert_packet(
     )
 
 
-def header_of(filename: str, folder: Path) -> Mapping[str, Any]:
+def header_of(filename: str, folder: Path) -> Mapping[str, object]:
     """Return the header of the controller's own file; empty if it is on another computer, or can't be read."""
     from afspm.files import read
 

@@ -27,6 +27,7 @@ from afspm.clock import iso_utc
 from afspm.files import hdf5
 from afspm.files.nexus import ABOUT, BIAS_SPECTRUM, DEFINITION, VENDOR, about_of
 from afspm.model import Scan, Spectrum
+from afspm.plain_data import Plain, PlainMapping
 from afspm.record import nxspm
 from afspm.record.nxspm import group, values
 
@@ -48,8 +49,8 @@ class FileProvenance:
 
     time_ns: int
     began_ns: int | None = None
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    header: Mapping[str, Any] = field(default_factory=dict)
+    facts: PlainMapping = field(default_factory=dict)
+    header: Mapping[str, object] = field(default_factory=dict)
 
 
 def encode_scan(scans: Sequence[Scan], circumstances: FileProvenance) -> bytes:
@@ -69,7 +70,7 @@ def encode_scan(scans: Sequence[Scan], circumstances: FileProvenance) -> bytes:
     (left, low), (width, height), (rows, columns) = region.top_left_m, region.size_m, first.shape
     x, y = np.linspace(left, left + width, columns), np.linspace(low, low + height, rows)
 
-    def fill(entry: Any, instrument: Any) -> None:
+    def fill(entry: object, instrument: object) -> None:
         data = group(entry, "data", "NXdata")
         data.attrs.update(signal=fields[0], axes=["y", "x"], x_indices=1, y_indices=0)
         if fields[1:]:
@@ -116,14 +117,14 @@ def encode_spectrum(spectrum: Spectrum, circumstances: FileProvenance) -> bytes:
     return _encoded(definition, about, circumstances, fill)
 
 
-def facts_of(path: Path) -> dict[str, Any]:
+def facts_of(path: Path) -> Plain:
     """Return what a file says beside its values. Raises FileError: it is damaged."""
     with hdf5.opened(path) as file:
         return about_of(file)
 
 
 def _encoded(
-    definition: str, about: dict[str, Any], circumstances: FileProvenance, fill: Callable[[Any, Any], None]
+    definition: str, about: dict[str, object], circumstances: FileProvenance, fill: Callable[[object, object], None]
 ) -> bytes:
     """Made in memory: whatever is wrong with the disk is then found in one place, where the bytes are written."""
     import h5py
@@ -147,7 +148,7 @@ def _encoded(
     return image
 
 
-def _about(content: str, filename: str, circumstances: FileProvenance) -> dict[str, Any]:
+def _about(content: str, filename: str, circumstances: FileProvenance) -> dict[str, object]:
     return {
         **circumstances.facts,
         "content": content,
@@ -180,7 +181,7 @@ def afspm_version() -> str:
     return version("afspm")
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     """Return a value of a vendor's header in JSON's types."""
     if isinstance(value, np.generic):
         return value.item()

@@ -133,7 +133,7 @@ def _sheet(ax: Axes, record: NightRecord, shots: Sequence[Shot], colours: Mappin
         ax.text(x + 2, y + 2, label, size=4.5, color="white", va="top", bbox=_LABEL)
 
 
-_LABEL: dict[str, Any] = {"boxstyle": "square,pad=0.12", "facecolor": "black", "alpha": 0.55, "linewidth": 0}
+_LABEL: dict[str, object] = {"boxstyle": "square,pad=0.12", "facecolor": "black", "alpha": 0.55, "linewidth": 0}
 
 
 def _bands(

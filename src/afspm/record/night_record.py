@@ -6,12 +6,12 @@ import base64
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.model import ControlMode, ControlState, Scan
+from afspm.plain_data import Plain
 from afspm.record.timeline import Span, Timeline
 
 THUMBNAIL_PX = 64
@@ -68,7 +68,7 @@ class NightRecord:
                 continue
         return record
 
-    def add(self, entry: dict[str, Any]) -> bool:
+    def add(self, entry: Plain) -> bool:
         """Take an entry in; False if it is known already (packets are replayed after a restart)."""
         kind, time_ns = entry["kind"], int(entry["time_ns"])
         identity = f"{kind} {time_ns} {entry.get('by', '')}"
@@ -146,7 +146,7 @@ def sorted_by_time(control: list[tuple[int, ControlState]]) -> list[tuple[int, C
     return sorted(control, key=lambda pair: pair[0])
 
 
-def scan_entry(scan: Scan, time_ns: int, start_ns: int | None, holder: str | None) -> dict[str, Any]:
+def scan_entry(scan: Scan, time_ns: int, start_ns: int | None, holder: str | None) -> dict[str, object]:
     """A scan as an entry."""
     picture = thumbnail(scan.values)
     return {
@@ -159,7 +159,7 @@ def scan_entry(scan: Scan, time_ns: int, start_ns: int | None, holder: str | Non
     }
 
 
-def control_entry(state: ControlState, time_ns: int) -> dict[str, Any]:
+def control_entry(state: ControlState, time_ns: int) -> dict[str, object]:
     """A control state as an entry."""
     problems = list(state.problems)
     return {
@@ -173,7 +173,7 @@ def control_entry(state: ControlState, time_ns: int) -> dict[str, Any]:
 
 def mark_entry(
     by: str, what: str, time_ns: int, score: float | None = None, of_ns: int | None = None
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """An action done, or a verdict, as an entry."""
     return {"kind": "mark", "time_ns": time_ns, "by": by, "what": what, "score": score, "of_ns": of_ns}
 

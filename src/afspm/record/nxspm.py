@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from afspm.files.nexus import BIAS_SPECTRUM, DEFINITION
 from afspm.model import Region, Scan, Spectrum
+from afspm.plain_data import PlainMapping
 
 _VERSION: Final = "v2024.02"
 """Of the NeXus definitions."""
@@ -24,7 +25,7 @@ def definition_of(spectrum: Spectrum, metadata: Mapping[str, str]) -> str:
     return BIAS_SPECTRUM if is_over_bias and is_tunnelling else DEFINITION
 
 
-def describe(entry: Any, definition: str, about: Mapping[str, Any], version: str) -> Any:
+def describe(entry: Any, definition: str, about: PlainMapping, version: str) -> object:
     """Write what holds for the whole file, and return the instrument. What is not known is left out."""
     entry["definition"] = definition
     entry["definition"].attrs["version"] = _VERSION
@@ -54,19 +55,19 @@ def describe(entry: Any, definition: str, about: Mapping[str, Any], version: str
     return instrument
 
 
-def write_frame(instrument: Any, scan: Scan) -> None:
+def write_frame(instrument: object, scan: Scan) -> None:
     """Write region and pixels of a scan: start and end are those of the frame before it was turned."""
     rows, columns = scan.shape
     _write_pattern(instrument, scan.region.center_m, scan.region, (columns, rows))
 
 
-def write_point(instrument: Any, spectrum: Spectrum) -> None:
+def write_point(instrument: object, spectrum: Spectrum) -> None:
     """Write where the probe was, as a scan of one point."""
     if spectrum.position_m is not None:
         _write_pattern(instrument, spectrum.position_m, None, (1, 1))
 
 
-def write_bias_sweep(entry: Any, instrument: Any, spectrum: Spectrum) -> None:
+def write_bias_sweep(entry: Any, instrument: object, spectrum: Spectrum) -> None:
     """Write the sweep of a spectrum over the bias."""
     entry["scan_mode"] = "constant height"  # the feedback is held while the bias is swept
     environment = group(instrument, "bias_spectroscopy_environment", "NXenvironment")
@@ -90,7 +91,7 @@ def write_bias_sweep(entry: Any, instrument: Any, spectrum: Spectrum) -> None:
 
 
 def _write_pattern(
-    instrument: Any, center_m: tuple[float, float], region: Region | None, points: tuple[int, int]
+    instrument: object, center_m: tuple[float, float], region: Region | None, points: tuple[int, int]
 ) -> None:
     environment = group(instrument, "scan_environment", "NXenvironment")
     control = group(environment, "scan_control", "NXspm_scan_control")

@@ -83,7 +83,7 @@ def _without_numbers(scan: Scan) -> Scan:
     return replace(scan, values=np.broadcast_to(np.nan, scan.shape))
 
 
-def _placed(thing: Any, frame: Frame) -> Any:
+def _placed(thing: object, frame: Frame) -> object:
     if frame is Frame.TIP:
         return thing
     if isinstance(thing, Scan):
@@ -97,7 +97,7 @@ class _Values:
     def __init__(self, query: Query, folder: Path) -> None:
         self._query = query
         self._folder = folder
-        self._kept: OrderedDict[str, Any] = OrderedDict()
+        self._kept: OrderedDict[str, object] = OrderedDict()
 
     def of(
         self, scan: int | None, spectrum: int | None, channel: str | None, first_row: int | None, rows: int | None

@@ -10,6 +10,7 @@ from typing import Any
 from afspm import wire
 from afspm.errors import WireError
 from afspm.model import ControlState, Feedback, ProblemNames, ScopeState, ScopeStatus
+from afspm.plain_data import Plain
 
 _BACK = 20
 """So many states are looked back through for the one in which a measurement began."""
@@ -23,9 +24,9 @@ class ControlAtStart:
     control: ControlState | None
     feedback: Feedback | None
 
-    def facts(self, problems: ProblemNames) -> dict[str, Any]:
+    def facts(self, problems: ProblemNames) -> Plain:
         """Return it in JSON's types, by names that people know."""
-        facts: dict[str, Any] = {}
+        facts: dict[str, object] = {}
         if self.control is not None:
             facts |= {
                 "in_control": self.control.holder,
@@ -58,9 +59,7 @@ def control_at_start(
     )
 
 
-def drift(
-    journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filenames: Collection[str]
-) -> dict[str, Any] | None:
+def drift(journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filenames: Collection[str]) -> Plain | None:
     """Return the drift mapping that was published just before a scan; None if there was none.
 
     Args:

@@ -27,6 +27,7 @@ from afspm.model import (
     ScanSet,
     Spectrum,
 )
+from afspm.plain_data import Plain
 from afspm.record import journal
 from afspm.record.journal import SCHEDULER
 from afspm.record.measured_tables import (
@@ -104,9 +105,9 @@ class Run:
         row = row if isinstance(row, SpectrumRow) else self._row("spectra", row, spectrum_row)
         return cast(Spectrum, self._content(row.file, f"spectrum {row.number}").spectra[0])
 
-    def about(self, row: ScanRow | SpectrumRow) -> dict[str, Any]:
+    def about(self, row: ScanRow | SpectrumRow) -> Plain:
         """Return what is known beside the values: drift, feedback, the controller's header, notes … See `scan`."""
-        header: dict[str, Any] = dict(self._content(row.file, f"number {row.number}").header)
+        header: Plain = dict(self._content(row.file, f"number {row.number}").header)
         notes = [f"{note.text} ({note.who})" for note in self.notes_on(row)]
         return header | ({"notes": notes} if notes else {}) | ({"key": row.key} if row.key else {})
 
@@ -258,7 +259,7 @@ class Run:
     # --- the run itself ---
 
     @cached_property
-    def experiment(self) -> dict[str, Any]:
+    def experiment(self) -> Plain:
         """The experiment file as it was expanded."""
         try:
             return tomllib.loads((self.folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
@@ -266,7 +267,7 @@ class Run:
             raise FileError(f"can't be read: {error}", where=str(self.folder / EXPERIMENT_FILE)) from error
 
     @property
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Plain:
         """run.json: clock, addresses, how it ended. Empty if it can't be read."""
         return run_json_or_empty(self.folder)
 
@@ -291,7 +292,7 @@ class Run:
         return bool(self._note("simulated"))
 
     @property
-    def seeds(self) -> dict[str, Any]:
+    def seeds(self) -> Plain:
         """Of what was left to chance, by component."""
         return dict(self._note("seeds") or {})
 
@@ -327,7 +328,7 @@ class Run:
         scans, spectra = (self._query(f"SELECT count(*) FROM {kind}")[0][0] for kind in ("scans", "spectra"))
         return f"<Run {self.folder.name}: {counted(scans, 'scan')}, {counted(spectra, 'spectrum', 'spectra')}>"
 
-    def _query(self, sql: str, values: Sequence[Any] = ()) -> list[Any]:
+    def _query(self, sql: str, values: Sequence[object] = ()) -> list[Any]:
         with self._naming_damage():
             return self._journal.execute(sql, values).fetchall()
 
@@ -359,7 +360,7 @@ class Run:
         return read(self.folder / file)
 
     @staticmethod
-    def _decoded(message: str, payload: bytes) -> Any:
+    def _decoded(message: str, payload: bytes) -> object:
         try:
             return wire.decode(message, payload)
         except WireError:

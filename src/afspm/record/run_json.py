@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from afspm.errors import FileError
+from afspm.plain_data import Plain
 
 RUN_FILE: Final = "run.json"
 STATE_DIR: Final = "state"
@@ -27,7 +28,7 @@ LATEST_FILE: Final = "latest.txt"
 """Where no links can be made: a file with the name of the newest."""
 
 
-def read_run_json(folder: Path) -> dict[str, Any]:
+def read_run_json(folder: Path) -> Plain:
     """Return what run.json in the folder of a run says.
 
     Raises:
@@ -43,7 +44,7 @@ def read_run_json(folder: Path) -> dict[str, Any]:
     return facts
 
 
-def run_json_or_empty(folder: Path) -> dict[str, Any]:
+def run_json_or_empty(folder: Path) -> Plain:
     """Return the same; empty where nothing can be read."""
     try:
         return read_run_json(folder)

@@ -58,7 +58,7 @@ class RecordSettings:
         measured: whether scans and spectra are written; else there is the journal alone.
     """
 
-    facts: dict[str, Any] = field(default_factory=dict)
+    facts: dict[str, object] = field(default_factory=dict)
     problems: ProblemNames = field(default_factory=ProblemNames)
     frame: Frame = Frame.TIP
     measured: bool = True
@@ -129,7 +129,7 @@ class RecordStore:
         waits = ((one.time_ns, one.envelope) == (packet.time_ns, packet.envelope) for one in self._gathering.waiting())
         return row.fetchone() is not None or any(waits)
 
-    def note(self, name: str, value: Any) -> None:
+    def note(self, name: str, value: object) -> None:
         """Note something about the whole run, in JSON's types."""
         text = json.dumps(value, ensure_ascii=False)
         self._journal.execute("INSERT OR REPLACE INTO about VALUES (?, ?)", (name, text))
@@ -256,7 +256,7 @@ def _is_start(entry: JournalEntry) -> bool:
     return entry.sent_ns is not None and entry.what in (names.START_SCAN, names.START_SPEC) and may_have_begun
 
 
-def _read(packet: Packet) -> tuple[str, Any]:
+def _read(packet: Packet) -> tuple[str, object]:
     """Return the name of the message and its content; ("", None) if it can't be read."""
     try:
         message = wire.message_of(packet.envelope)

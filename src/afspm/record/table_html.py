@@ -19,7 +19,7 @@ _FIRST: Final = ("number", "key")
 _CELL: Final = 'style="text-align:left;white-space:nowrap;max-width:18em;overflow:hidden;text-overflow:ellipsis"'
 
 
-def table_html(columns: Mapping[str, Sequence[Any]], count: int) -> str:
+def table_html(columns: Mapping[str, Sequence[object]], count: int) -> str:
     """Return columns of `count` rows each; those in which nothing stands are left out."""
     shown = range(count) if count <= MOST_ROWS else [*range(_ENDS), None, *range(count - _ENDS, count)]
     columns = {name: columns[name] for name in sorted(columns, key=lambda name: name not in _FIRST)}
@@ -49,11 +49,11 @@ def _column(name: str, values: Sequence[Any]) -> tuple[str, list[str]]:
     return f"{plain} / {prefixed}", [_text(None if v is None else v * factor) for v in values]
 
 
-def _says(value: Any) -> bool:
+def _says(value: object) -> bool:
     return value is not None and value is not False and value != ""
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     if value is None:
         return ""
     if isinstance(value, bool):

@@ -198,9 +198,9 @@ def _names(kind: type[Any]) -> list[str]:
     return [name for field in fields(kind) for name in _COLUMNS.get(field.name, (field.name,))]
 
 
-def _apart(row: Any) -> dict[str, Any]:
+def _apart(row: Any) -> dict[str, object]:
     """Return a row as numbers and texts."""
-    made: dict[str, Any] = {}
+    made: dict[str, object] = {}
     for field in fields(row):
         name, value = field.name, getattr(row, field.name)
         if name in _COLUMNS:
@@ -216,7 +216,7 @@ def _apart(row: Any) -> dict[str, Any]:
     return made
 
 
-def _parts(value: Any, count: int) -> tuple[Any, ...]:
+def _parts(value: Any, count: int) -> tuple[object, ...]:
     if isinstance(value, Region):
         return (*value.center_m, *value.size_m, value.angle_rad, value.frame.value)
     if isinstance(value, ControlState):
@@ -224,7 +224,7 @@ def _parts(value: Any, count: int) -> tuple[Any, ...]:
     return (None,) * count if value is None else tuple(value)
 
 
-def _array(name: str, values: list[Any]) -> NDArray[Any]:
+def _array(name: str, values: list[object]) -> NDArray[Any]:
     import numpy as np
 
     if name.endswith("_ns"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from afspm.scheduler.scheduler import Scheduler
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 __all__ = ["DriftCompensatedScheduler", "Scheduler"]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name != "DriftCompensatedScheduler":  # loaded only where it is asked for
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from afspm.scheduler.drift.scheduler import DriftCompensatedScheduler

@@ -39,9 +39,9 @@ class Scheduler:
 
     def __init__(
         self,
-        control: Mapping[str, Any] | None = None,
-        limits: Mapping[str, Any] | None = None,
-        cache: Mapping[str, Any] | None = None,
+        control: Mapping[str, object] | None = None,
+        limits: Mapping[str, object] | None = None,
+        cache: Mapping[str, object] | None = None,
     ) -> None:
         self._control = control or {}
         self._limits = limits or {}

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
-from typing import Any
 
 from afspm.errors import ConfigError
 from afspm.logic.arbitration import Cause, RoleTable, Rules
@@ -13,8 +11,9 @@ from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import Parameter, ProblemNames, Region
+from afspm.plain_data import PlainMapping
 
-Table = Mapping[str, Any]
+Table = PlainMapping
 
 
 def scheduler_settings(

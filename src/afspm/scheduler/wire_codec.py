@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from afspm import wire
 from afspm.errors import AfspmError
@@ -22,7 +21,7 @@ class WireCodec:
         except AfspmError:
             return None
 
-    def encode(self, thing: Any) -> bytes:
+    def encode(self, thing: object) -> bytes:
         return wire.encode(thing)[1]
 
     def encode_orders(self, restart: Sequence[str]) -> bytes:
@@ -36,7 +35,7 @@ class WireCodec:
     def by_point(self, spectrum: bytes | memoryview) -> bytes:
         return wire.by_point(spectrum)
 
-    def decode_packet(self, message: str, payload: bytes | memoryview) -> Any:
+    def decode_packet(self, message: str, payload: bytes | memoryview) -> object:
         try:
             return wire.decode(message, payload)
         except AfspmError:

@@ -6,7 +6,6 @@ import cmath
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -93,7 +92,7 @@ class Sample:
         """Leave a mark under a position of the scanner."""
         self.marks.append(SurfaceMark(self.under(position_m, t_s), depth_m, radius_m, t_s, kind))
 
-    def turn(self, t_s: float) -> dict[str, Any]:
+    def turn(self, t_s: float) -> dict[str, object]:
         """Return rotation and scale at a time, JSON-able."""
         turn = complex(self.drift.turn(t_s))
         return {"angle_rad": cmath.phase(turn), "scale": abs(turn), "about_m": list(self._about_m)}

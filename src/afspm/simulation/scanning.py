@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,7 +150,7 @@ class SimulatedScan:
 
     course: Course
     drift_m: Array
-    truth: Mapping[str, Any]
+    truth: Mapping[str, object]
     _channels: Mapping[str, tuple[str, Array]] = field(repr=False)
 
     @property

@@ -118,7 +118,7 @@ def _convert(hint: Any, value: object, where: str) -> object:
     raise ConfigError(f"expected {getattr(hint, '__name__', hint)}, got {value!r}", where=where)
 
 
-def _sequence(arguments: tuple[Any, ...], value: object, where: str) -> tuple[object, ...]:
+def _sequence(arguments: tuple[object, ...], value: object, where: str) -> tuple[object, ...]:
     if not isinstance(value, (list, tuple)):
         raise ConfigError(f"expected a list, got {value!r}", where=where)
     if arguments[-1] is Ellipsis:
@@ -128,7 +128,7 @@ def _sequence(arguments: tuple[Any, ...], value: object, where: str) -> tuple[ob
     return tuple(_gathered(zip(arguments, value, strict=True), where))
 
 
-def _gathered(pairs: Iterable[tuple[Any, object]], where: str) -> list[object]:
+def _gathered(pairs: Iterable[tuple[object, object]], where: str) -> list[object]:
     errors, found = ErrorCollector(), []
     for i, (hint, item) in enumerate(pairs):
         with errors:

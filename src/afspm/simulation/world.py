@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,7 +37,7 @@ from afspm.simulation.tip import (
 )
 
 # What suits a sample better than the general defaults; the user's settings go on top.
-_FITTING: dict[str, dict[str, dict[str, Any]]] = {
+_FITTING: dict[str, dict[str, dict[str, object]]] = {
     # Atoms are seen by the foremost atom of the tip, not by its apex as a whole.
     "lattice": {
         "tip": {"radius_m": 0.12e-9, "half_angle_deg": 35.0},
@@ -70,7 +69,7 @@ class WorldSettings:
     force: spectra.ForceSettings = field(default_factory=spectra.ForceSettings)
 
 
-def read_settings(settings: Mapping[str, Any]) -> tuple[object, WorldSettings]:
+def read_settings(settings: Mapping[str, object]) -> tuple[object, WorldSettings]:
     """The surface's table and the rest, from one table of all.
 
     Raises:
@@ -131,10 +130,10 @@ class World:
         self._calls = 0
         self._place = ScannerPlace(self.settings.scanner.creep, start_s)
         self._held_z_m: float | None = None
-        self._felt_at_rest: tuple[Any, Felt] | None = None
+        self._felt_at_rest: tuple[object, Felt] | None = None
 
     @classmethod
-    def from_settings(cls, settings: Mapping[str, Any], seed: int, start_s: float) -> World:
+    def from_settings(cls, settings: Mapping[str, object], seed: int, start_s: float) -> World:
         """Return the world that tables ask for: `surface`, and the fields of `WorldSettings`.
 
         Raises:
@@ -335,7 +334,7 @@ class World:
         """The tip after all that has been asked for so far."""
         return self._tip.history[-1].tip
 
-    def truth(self, t_s: float) -> dict[str, Any]:
+    def truth(self, t_s: float) -> dict[str, object]:
         """Return what nobody on the wire is told, JSON-able: drift, tip, what happened to it, marks on the sample."""
         return {
             "t_s": t_s,
@@ -351,7 +350,7 @@ class World:
 
     # -- being killed and coming back
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, object]:
         """Return all that `restore` needs to go on as if nothing had happened, JSON-able."""
         state = WorldState(
             seed=self.seed,
@@ -368,7 +367,7 @@ class World:
         )
         return snapshot(state, "world", STATE_VERSION)
 
-    def restore(self, state: Mapping[str, Any]) -> None:
+    def restore(self, state: Mapping[str, object]) -> None:
         """Become the world that `state` was taken from; its settings must be the same.
 
         Raises:
@@ -424,7 +423,7 @@ class World:
         )
 
 
-def _truth_of_scan(sample: Sample, course: Course, tips: TipTimes) -> dict[str, Any]:
+def _truth_of_scan(sample: Sample, course: Course, tips: TipTimes) -> dict[str, object]:
     start_s, end_s = course.start_s, course.end_s
     return {
         "start_s": start_s,

@@ -7,7 +7,6 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from afspm.errors import ConfigError, FileError
 from afspm.study.settings import PARTS, NightSettings
@@ -22,7 +21,7 @@ class SettingsGrid:
             ("paper.queue" for the bank) makes no further combinations.
     """
 
-    values: Mapping[str, tuple[Any, ...]]
+    values: Mapping[str, tuple[object, ...]]
 
     @classmethod
     def of(cls, given: Sequence[str]) -> SettingsGrid:
@@ -31,7 +30,7 @@ class SettingsGrid:
         Raises:
             ConfigError: not such a text, or wrong TOML. FileError: the file can't be read.
         """
-        values: dict[str, tuple[Any, ...]] = {}
+        values: dict[str, tuple[object, ...]] = {}
         for text in given:
             name, equals, listed = text.partition("=")
             if equals:
@@ -72,7 +71,7 @@ class SettingsGrid:
                 told.append(settings)
                 yield label, settings
 
-    def _combinations(self) -> Iterator[dict[str, Any]]:
+    def _combinations(self) -> Iterator[dict[str, object]]:
         lists = [self.values[name] for name in self.varied]
         for combination in itertools.product(*lists) if lists else ():
             yield dict(zip(self.varied, combination, strict=True))
@@ -83,7 +82,7 @@ def _is_in_force(name: str, settings: NightSettings) -> bool:
     return "." not in name or name.startswith(classes)
 
 
-def _value(text: str) -> Any:
+def _value(text: str) -> object:
     """A value of TOML, or else a text as it is."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
@@ -91,7 +90,7 @@ def _value(text: str) -> Any:
         return text
 
 
-def _read(path: Path) -> Mapping[str, Any]:
+def _read(path: Path) -> Mapping[str, object]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
@@ -100,8 +99,8 @@ def _read(path: Path) -> Mapping[str, Any]:
         raise ConfigError(f"is not TOML: {error}", where=str(path)) from error
 
 
-def _flat(table: Mapping[str, Any], before: str = "") -> dict[str, tuple[Any, ...]]:
-    found: dict[str, tuple[Any, ...]] = {}
+def _flat(table: Mapping[str, object], before: str = "") -> dict[str, tuple[object, ...]]:
+    found: dict[str, tuple[object, ...]] = {}
     for name, value in table.items():
         if isinstance(value, Mapping):
             found |= _flat(value, f"{before}{name}.")

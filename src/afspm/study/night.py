@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,7 +119,7 @@ def _again(settings: NightSettings, place: Region, scan: DriftScan, update: Upda
     return ""
 
 
-def _world(settings: NightSettings, seed: int) -> dict[str, Any]:
+def _world(settings: NightSettings, seed: int) -> dict[str, object]:
     """A slow and a fast relaxation, the day, and a random walk, as in section 6 of what was measured."""
     random = np.random.default_rng([seed, 6])
     slow, fast, day = (settings.drift_m * share for share in (1.0, 0.2, 0.1))

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any
 
 from afspm.drift.estimators import DEFAULT as DEFAULT_ESTIMATOR
 from afspm.drift.overlap import F_RESCAN
 from afspm.drift.trackers import DEFAULT as DEFAULT_TRACKER
 from afspm.errors import ConfigError, InvalidValue
+from afspm.plain_data import Plain, PlainMapping
 
-Table = Mapping[str, Any]
+Table = PlainMapping
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ class NightSettings:
         Raises:
             ConfigError: unknown names. InvalidValue: values that don't fit each other.
         """
-        plain: dict[str, Any] = {name: value for name, value in names.items() if "." not in name}
+        plain: Plain = {name: value for name, value in names.items() if "." not in name}
         known = [one.name for one in fields(cls)]
         for name in plain:
             if name not in known:
@@ -89,6 +88,6 @@ RULES = ("tolerance", "paper", "never")
 _DEFAULTS = {"estimator": DEFAULT_ESTIMATOR, "tracker": DEFAULT_TRACKER}
 
 
-def _told(name: str, names: Table) -> dict[str, Any]:
+def _told(name: str, names: Table) -> dict[str, object]:
     before = f"{name}."
     return {key.removeprefix(before): value for key, value in names.items() if key.startswith(before)}

@@ -39,7 +39,9 @@ def processes(asked: int | None, pixels: int) -> int:
     return 1 if pixels <= _FEW_PIXELS else os.cpu_count() or 1
 
 
-def on_cores(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *, jobs: int) -> Iterator[TaskOutcome]:
+def on_cores(
+    function: Callable[..., object], tasks: Sequence[tuple[object, ...]], *, jobs: int
+) -> Iterator[TaskOutcome]:
     """Yield the outcomes of `function(*task)`, as they come, from `jobs` processes (1: in this one)."""
     if jobs <= 1:
         for index, task in enumerate(tasks):
@@ -60,7 +62,7 @@ def on_cores(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *, 
 
 
 def on_cluster(
-    function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *, address: str
+    function: Callable[..., object], tasks: Sequence[tuple[object, ...]], *, address: str
 ) -> Iterator[TaskOutcome]:
     """As `on_cores`, on the workers of a Dask cluster, which need the same afspm installed. What a worker was at when
     it died is done by another.
@@ -83,7 +85,9 @@ def on_cluster(
             future.release()
 
 
-def _until_one_dies(function: Callable[..., Any], left: dict[int, tuple[Any, ...]], jobs: int) -> Iterator[TaskOutcome]:
+def _until_one_dies(
+    function: Callable[..., object], left: dict[int, tuple[object, ...]], jobs: int
+) -> Iterator[TaskOutcome]:
     """All outcomes that come before a worker dies, which ends them all."""
     # spawn: the same on all systems, and none of the threads of numpy are copied half
     with ProcessPoolExecutor(min(jobs, len(left)), mp_context=multiprocessing.get_context("spawn")) as pool:
@@ -106,7 +110,7 @@ def _result(future: Any, index: int) -> TaskOutcome:
     return outcome
 
 
-def _done(function: Callable[..., Any], index: int, task: tuple[Any, ...]) -> TaskOutcome:
+def _done(function: Callable[..., object], index: int, task: tuple[object, ...]) -> TaskOutcome:
     """One task, in whatever process. Errors go back as text: not every exception survives the way."""
     try:
         return TaskOutcome(index, function(*task))

@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import psutil
 
@@ -25,6 +24,7 @@ from afspm.logic import diagnosis
 from afspm.logic.diagnosis import Diagnosis, Handshake, Heard, Reach, Severity, Versions
 from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.model import CLOCK_REQUEST, ProcessCondition, ProcessStates, Request
+from afspm.plain_data import Plain
 from afspm.process.message_types import register_all
 from afspm.record.run_lock import goes_on
 from afspm.supervisor.reporter import computer_name
@@ -236,7 +236,7 @@ class _Connections:
         told = diagnosis.of_publisher(launch.sockets.subscribe[0], self._into.heard, caught_up=caught_up_s is not None)
         self._into.found.append(told)
 
-    def _compare(self, told: dict[str, Any], asked_s: float, answered_s: float) -> None:
+    def _compare(self, told: Plain, asked_s: float, answered_s: float) -> None:
         """Compare clocks and versions with those of the scheduler."""
         if not told.get("waits"):  # a simulated time that slows down does not tell real time
             now_s, start_s, origin_s, speed = (float(told[name]) for name in ("now_ns", "start_s", "origin_s", "speed"))

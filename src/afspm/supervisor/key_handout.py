@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from afspm.addresses import connectable, reaches
 from afspm.client.connect import GUEST_KEYS
@@ -33,8 +32,8 @@ class KeyHandout:
     """
 
     starts: Sequence[ProcessStart]
-    guest: Mapping[str, Any] | None = None
-    supervisor: Mapping[str, Any] | None = None
+    guest: Mapping[str, object] | None = None
+    supervisor: Mapping[str, object] | None = None
 
     @contextmanager
     def laid_down(self, folder: Path) -> Iterator[None]:

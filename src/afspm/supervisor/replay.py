@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 from afspm import wire
 from afspm.addresses import is_address
@@ -148,7 +147,7 @@ def _folder(run: Run, runs: Path, guest: Launch, clock: ExperimentClock, publish
     source = run.folder / EXPERIMENT_FILE
     if source.is_file():
         run_folder.write_experiment(folder, source.read_text(encoding="utf-8"))
-    facts: dict[str, Any] = {
+    facts: dict[str, object] = {
         "name": run.name,
         REPLAY_OF: str(run.folder.resolve()),
         "clock": clock.as_dict(),

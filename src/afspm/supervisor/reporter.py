@@ -14,7 +14,6 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from afspm import wire
 from afspm.addresses import connectable
@@ -270,7 +269,7 @@ def reporter_of(
     starts: Sequence[ProcessStart],
     clock: Clock,
     run: str = "",
-    keys: Mapping[str, Any] | None = None,
+    keys: Mapping[str, object] | None = None,
 ) -> Reporter | None:
     """Return a reporter for what is started here; None where the scheduler can't be asked, or may not be ours.
 

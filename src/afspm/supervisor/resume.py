@@ -12,13 +12,14 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 from afspm.client.connect import find_run
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
 from afspm.experiment import Experiment, load, load_expanded
 from afspm.logic.supervision.run_end import EndReason
+from afspm.plain_data import Plain
 from afspm.record.journal import open_to_read
 from afspm.record.run_json import EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, read_run_json
 from afspm.record.run_lock import lock_run, quoted, resume_command
@@ -50,7 +51,7 @@ class ResumableRun:
     folder: Path
     name: str
     experiment: Experiment
-    facts: dict[str, Any]
+    facts: Plain
     homes: tuple[Path, ...]
     added: tuple[str, ...] = ()
 
@@ -128,7 +129,7 @@ def _own(experiment: Experiment, options: RunOptions, found: ResumableRun) -> Ru
     return RunIdentity(clock, str(facts.get(RUN) or new_identity()), simulated)
 
 
-def _clock_after(facts: dict[str, Any], folder: Path) -> ExperimentClock:
+def _clock_after(facts: Plain, folder: Path) -> ExperimentClock:
     before = ExperimentClock.from_dict(facts["clock"])
     seen_ns = max(last_seen_ns(folder), round(before.start_s * NS_PER_S))
     return ExperimentClock.starting_now((seen_ns + STEP_NS) / NS_PER_S, before.speed)
@@ -156,7 +157,7 @@ def last_seen_ns(folder: Path) -> int:
     return max(seen)
 
 
-def _wait_until_gone(facts: dict[str, Any], folder: Path) -> None:
+def _wait_until_gone(facts: Plain, folder: Path) -> None:
     """Wait until processes that lost their parent have ended: two of one name must not share a folder.
 
     Raises:
@@ -216,13 +217,13 @@ def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> Non
         )
 
 
-def _whole(experiment: Experiment) -> dict[str, Any]:
+def _whole(experiment: Experiment) -> dict[str, object]:
     """Return what is in force, defaults too, whoever wrote it down."""
     experiment.resolved  # noqa: B018  (adds what the file leaves open)
     return tomllib.loads(experiment.expanded(secrets=False))
 
 
-def differing(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+def differing(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
     """Return where two experiments differ: each section with its keys."""
     found = []
     for name in {**before, **now}:

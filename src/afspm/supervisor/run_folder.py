@@ -8,7 +8,6 @@ import re
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from afspm.errors import FileError
 from afspm.record.run_json import EXPERIMENT_FILE, LATEST_FILE, LATEST_LINK, RUN_FILE, STATE_DIR
@@ -42,7 +41,7 @@ def create(runs: Path, experiment: str, started: datetime) -> Path:
     return folder
 
 
-def write_run(folder: Path, facts: Mapping[str, Any]) -> None:
+def write_run(folder: Path, facts: Mapping[str, object]) -> None:
     """Write run.json, which `afspm.connect` reads to find the running experiment."""
     _replace(folder / RUN_FILE, json.dumps(facts, indent=2, ensure_ascii=False) + "\n")
 

@@ -13,6 +13,7 @@ from typing import Any
 from afspm import units
 from afspm.errors import AfspmError, ConfigError, Refused
 from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, request_name
+from afspm.plain_data import PlainMapping
 from afspm.translator.driver import LOST, Action, Driver
 from afspm.translator.parameters import Value
 from afspm.translator.sequence import SequenceStep, StatusSequence
@@ -147,7 +148,7 @@ class Commands:
         if state is not ScopeState.FREE and not allowed:
             raise Refused(ControlResponse.NOT_FREE, f"the microscope is not free: SS_{state.name}")
 
-    def _added_actions(self, given: Mapping[str, Any]) -> dict[str, Action]:
+    def _added_actions(self, given: PlainMapping) -> dict[str, Action]:
         added = {}
         for name, what in given.items():
             where = f"actions.{name}"

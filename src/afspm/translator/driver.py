@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 from afspm.clock import Clock
 from afspm.errors import AfspmError, ConfigError, InvalidValue, Refused
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.plain_data import Plain, PlainMapping
 from afspm.translator.parameters import ParameterTable, Value
 from afspm.translator.polling import EAGER_S
 from afspm.translator.setting_groups import SettingsGroup
@@ -180,13 +181,13 @@ class Driver(ABC):
     controller_at: str = ""
     lacking: Mapping[str, str] = MappingProxyType({})
     groups: Sequence[SettingsGroup] = ()
-    memory: dict[str, Any]
+    memory: Plain
 
     def __init__(
         self,
         *,
-        parameters: Mapping[str, Mapping[str, Any]] | None = None,
-        actions: Mapping[str, Mapping[str, Any]] | None = None,
+        parameters: Mapping[str, Mapping[str, object]] | None = None,
+        actions: Mapping[str, Mapping[str, object]] | None = None,
         poll_period_s: Duration = 0.1,
         result_timeout_s: Duration = 10.0,
         live_lines_s: Duration | None = None,
@@ -210,12 +211,12 @@ class Driver(ABC):
         return max(of_s, self.program_s / self.clock.real_s(1.0))
 
     @classmethod
-    def rows(cls, settings: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
+    def rows(cls, settings: PlainMapping) -> Mapping[str, Mapping[str, object]]:
         """Return the rows that these settings add to the table, or change in it."""
         return settings.get("parameters") or {}
 
     @classmethod
-    def parameter_table(cls, changed: Mapping[str, Mapping[str, Any]]) -> ParameterTable:
+    def parameter_table(cls, changed: Mapping[str, Mapping[str, object]]) -> ParameterTable:
         """The parameters of this kind of microscope, with the rows that the experiment file adds or changes.
 
         Raises:
@@ -225,7 +226,7 @@ class Driver(ABC):
         return table.extended(changed, where="the experiment file", translated=cls.translated)
 
     @classmethod
-    def technique(cls, settings: Mapping[str, Any]) -> str:
+    def technique(cls, settings: Mapping[str, object]) -> str:
         """Return STM or AFM, where the microscope is always the same with these settings; else an empty text."""
         return ""
 

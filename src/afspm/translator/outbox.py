@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from afspm.errors import AfspmError
 from afspm.model import Scan, Spectrum
+from afspm.plain_data import Plain
 from afspm.translator.driver import Driver
 from afspm.wire import encode
 
@@ -39,7 +40,7 @@ class Outbox:
     def __init__(
         self,
         microscope: Driver,
-        kept: dict[str, Any],
+        kept: Plain,
         stamp: Callable[[int], list[int]],
         log: logging.Logger,
     ) -> None:

@@ -17,6 +17,7 @@ from typing import Any, Final
 from afspm import units
 from afspm.errors import AfspmError, ConfigError, ErrorCollector, Refused, UnitError
 from afspm.model import ControlResponse, names
+from afspm.plain_data import PlainMapping
 
 Value = bool | int | float | str
 
@@ -221,7 +222,7 @@ class ParameterTable(Mapping[str, ParameterSpec]):
         return cls({}).extended(content.get("parameters", {}), where=path.name)
 
     def extended(
-        self, rows: Mapping[str, Mapping[str, Any]], *, where: str, translated: Collection[str] = ()
+        self, rows: Mapping[str, Mapping[str, object]], *, where: str, translated: Collection[str] = ()
     ) -> ParameterTable:
         """This table with rows added or changed, attribute by attribute, e.g. by the experiment file.
 
@@ -257,7 +258,7 @@ class ParameterTable(Mapping[str, ParameterSpec]):
             raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, reason)
         return self._rows[name]
 
-    def written(self, given: Mapping[str, Any], *, where: str) -> dict[str, Value]:
+    def written(self, given: PlainMapping, *, where: str) -> dict[str, Value]:
         """Values as the experiment file has them, in SI: "2 um/s", or plain numbers in the row's unit.
 
         Raises:
@@ -301,7 +302,7 @@ _ATTRIBUTES = {field.name for field in fields(ParameterSpec)} - {"name", "where"
 _OF_THE_CONTROLLER = frozenset({"vendor", "sign"})
 
 
-def _row(known: ParameterSpec, given: Mapping[str, Any], where: str, *, translated: bool) -> ParameterSpec:
+def _row(known: ParameterSpec, given: PlainMapping, where: str, *, translated: bool) -> ParameterSpec:
     at = f"{where}, parameters.{known.name}"
     if not isinstance(given, Mapping):
         raise ConfigError(f"expected a table, got {given!r}", where=at)
@@ -332,7 +333,7 @@ def _row(known: ParameterSpec, given: Mapping[str, Any], where: str, *, translat
         raise ConfigError(str(error), where=at) from error
 
 
-def _with_numbers(row: ParameterSpec, values: Mapping[str, Any], where: str) -> ParameterSpec:
+def _with_numbers(row: ParameterSpec, values: PlainMapping, where: str) -> ParameterSpec:
     """The row with its numbers in SI: plain ones are in the row's unit, texts carry their own."""
 
     def number(value: Any) -> float:

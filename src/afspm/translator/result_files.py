@@ -11,12 +11,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from afspm.errors import FileError
 from afspm.model import Region, Scan, Spectrum
+from afspm.plain_data import Plain
 
 SCAN: Final = "scan"
 """The kind of a measurement that is no spectrum; that of a spectrum is its own."""
@@ -25,7 +26,7 @@ _OF_A_RESULT: Final = ("what", "frame", "position", "end_ns")
 
 XY = tuple[float, float]
 Content = Sequence[Scan | Spectrum]
-Entry = dict[str, Any]
+Entry = Plain
 """Of a measurement, in JSON: "what" it is, "frame" or "position" as they were set, "end_ns", and what a driver adds."""
 
 
@@ -82,13 +83,13 @@ class ResultFiles(ABC):
             self._content = {result: self.read(entry)}
         return self._content[result]
 
-    def _begins(self, what: str, facts: Mapping[str, Any]) -> None:
+    def _begins(self, what: str, facts: Mapping[str, object]) -> None:
         self._kept["running"], self._kept["ended"] = {"what": what, **facts}, None
 
-    def _ends(self, facts: Mapping[str, Any]) -> None:
+    def _ends(self, facts: Mapping[str, object]) -> None:
         self._kept["running"], self._kept["ended"] = None, {**self._kept["running"], **facts}
 
-    def _add(self, result: str, measured: Entry, facts: Mapping[str, Any], content: Content) -> None:
+    def _add(self, result: str, measured: Entry, facts: Mapping[str, object], content: Content) -> None:
         """It is a result, by this name."""
         taken = {key: measured[key] for key in _OF_A_RESULT if key in measured}
         self._kept["results"] = [*self._kept["results"], {"result": result, **taken, **facts}][-_LISTED:]

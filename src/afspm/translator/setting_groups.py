@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
-from typing import Any, Final
+from typing import Final
 
 from afspm.errors import InvalidValue, Refused
 from afspm.model import ControlResponse, Feedback, ProbePosition, Region, ScanParameters, names
+from afspm.plain_data import Plain
 from afspm.translator.parameters import FEEDBACK_ON, ParameterTable, Value, refuse_value
 
 Published = ScanParameters | Feedback | ProbePosition
@@ -46,7 +47,7 @@ class SettingsGroup(ABC):
             Refused: PARAM_ERROR: the controller would make something else of it.
         """
 
-    def merged(self, values: Mapping[str, Value]) -> dict[str, Any]:
+    def merged(self, values: Mapping[str, Value]) -> Plain:
         """Return all of the group's values, with these changed."""
         return {**self.read(), **values}
 
@@ -63,7 +64,7 @@ class KeptSettings(SettingsGroup):
         self._at_first = at_first
         self._kept: dict[str, Value] = {}
 
-    def kept_in(self, memory: dict[str, Any]) -> None:
+    def kept_in(self, memory: Plain) -> None:
         """Keep the values in a memory that lasts, from now on."""
         self._kept = memory.setdefault("kept", {})
         for name, value in self._at_first.items():

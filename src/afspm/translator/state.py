@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from afspm.clock import Clock
 from afspm.model import ScopeState, ScopeStatus
+from afspm.plain_data import Plain
 from afspm.process.memory import Memory
 from afspm.translator.sequence import StatusSequence
 
-Kept = dict[str, Any]
+Kept = Plain
 """JSON values by name, kept on disk."""
 
 

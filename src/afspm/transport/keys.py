@@ -16,12 +16,12 @@ import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import zmq
 
 from afspm.errors import ConfigError
 from afspm.model import component_of
+from afspm.plain_data import Plain, PlainMapping
 
 GUEST = "guest"
 """The owner of the key that notebooks and terminal commands use where keys are made for a run; good for other names."""
@@ -89,7 +89,7 @@ class Keys:
         component = component_of(name)
         return component if user == GUEST and component not in self.peers.values() else user
 
-    def as_launch(self) -> dict[str, Any]:
+    def as_launch(self) -> Plain:
         """Return the entries of a launch line, see `from_launch`."""
         return {
             "name": self.name,
@@ -143,7 +143,7 @@ def public_keys(folder: Path, name: str) -> dict[bytes, str]:
     return {_read(file, name)["public-key"]: file.name.removesuffix(".key") for file in files}
 
 
-def from_launch(name: str, entries: Mapping[str, Any] | None) -> Keys | None:
+def from_launch(name: str, entries: PlainMapping | None) -> Keys | None:
     """Return the keys that a launch line hands over (`Keys.as_launch`), or names, for programs that join.
 
     A component that acts for a person ("dashboard:Ada") does so with its own key.

@@ -10,7 +10,7 @@ import struct
 import sys
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import zmq
 
@@ -99,7 +99,7 @@ class Network:
             self._authenticator = Authenticator(self._context, keys)
 
     @classmethod
-    def from_launch(cls, name: str, entries: Mapping[str, Any] | None) -> Network:
+    def from_launch(cls, name: str, entries: Mapping[str, object] | None) -> Network:
         """As the launch line of the process `name` says.
 
         Args:

@@ -66,7 +66,7 @@ class Poller(Generic[S]):
     def __init__(self, wake_up: WakeUp[Any]) -> None:
         self._poller = zmq.Poller()
         self._poller.register(wake_up.fileno(), zmq.POLLIN)
-        self._sources: dict[Any, S] = {}
+        self._sources: dict[object, S] = {}
 
     def register(self, socket: zmq.Socket[bytes], source: S) -> None:
         """Wait for `socket` too; `wait` names it by `source`."""

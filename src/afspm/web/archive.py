@@ -7,10 +7,10 @@ import threading
 import tomllib
 from collections import OrderedDict
 from pathlib import Path
-from typing import Any
 
 from afspm.errors import AfspmError
 from afspm.model import ProblemNames, Region, Scan
+from afspm.plain_data import Plain
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.overview import Overview
 from afspm.record.run import open_run
@@ -87,7 +87,7 @@ def adjustable_parameters(folder: Path) -> tuple[str, ...]:
     return tuple(map(str, offered)) if isinstance(offered, list) else ()
 
 
-def _section(folder: Path, name: str) -> dict[str, Any]:
+def _section(folder: Path, name: str) -> Plain:
     try:
         section = tomllib.loads((folder / EXPERIMENT_FILE).read_text(encoding="utf-8")).get(name)
     except (OSError, ValueError):
@@ -95,7 +95,7 @@ def _section(folder: Path, name: str) -> dict[str, Any]:
     return section if isinstance(section, dict) else {}
 
 
-def _region(box: dict[str, Any]) -> Region:
+def _region(box: Plain) -> Region:
     if "x" in box:
         (left, right), (low, high) = (tuple(si(v, "m") for v in box[axis]) for axis in "xy")
         return Region(((left + right) / 2, (low + high) / 2), (right - left, high - low))

@@ -23,7 +23,7 @@ _DATA_OF_SPECTRUM = 4
 _VALUES_OF_DATA = 5
 
 
-def encode(thing: Any) -> tuple[str, bytes]:
+def encode(thing: object) -> tuple[str, bytes]:
     """Return a model object, or any message, as (name of the message, bytes).
 
     Raises:
@@ -220,7 +220,7 @@ def _serialised(message: Message) -> tuple[str, bytes]:
     return message.DESCRIPTOR.name, message.SerializeToString()
 
 
-def _encode_mapped(mapping: MessageMapping[Any], thing: Any) -> tuple[str, bytes]:
+def _encode_mapped(mapping: MessageMapping[object], thing: object) -> tuple[str, bytes]:
     return _serialised(mapping.to_wire(thing))
 
 
@@ -243,7 +243,7 @@ _ENCODERS: dict[type, Callable[[Any], tuple[str, bytes]]] = {
     **{mapping.kind: partial(_encode_mapped, mapping) for mapping in MAPPINGS},
 }
 
-_DECODERS: dict[str, Callable[[Buffer], Any]] = {
+_DECODERS: dict[str, Callable[[Buffer], object]] = {
     "Scan2d": _decode_scan,
     "ScanLines": _decode_lines,
     "Spec1d": _decode_spectrum,

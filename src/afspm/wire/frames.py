@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any
 
 from google.protobuf.duration_pb2 import Duration
 from google.protobuf.message import DecodeError
@@ -84,7 +83,7 @@ def encode_request(request: Request) -> list[bytes]:
     return [*frames, request.id.encode()] if request.id else as_version_1(frames)
 
 
-def encode_subject(subject: Any) -> bytes:
+def encode_subject(subject: object) -> bytes:
     """Return a request's subject in bytes.
 
     One byte for a whole number, a Duration for seconds, an ActionMsg for text, else the model object's.
@@ -222,7 +221,7 @@ def _seconds(payload: bytes) -> float:
     return seconds
 
 
-_SUBJECTS: dict[int, Callable[[bytes], Any]] = {
+_SUBJECTS: dict[int, Callable[[bytes], object]] = {
     ControlRequest.ACTION: _action,
     ControlRequest.PARAM: PARAMETER.decode,
     ControlRequest.SET_SCAN_PARAMS: lambda p: convert.scan_parameters_from_wire(parse(scan_pb2.ScanParameters2d, p)),

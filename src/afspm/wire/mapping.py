@@ -61,8 +61,8 @@ class FieldMapping(NamedTuple):
     """
 
     name: str
-    to_wire: Callable[[Any], Any] | None = None
-    from_wire: Callable[[Any], Any] | None = None
+    to_wire: Callable[[Any], object] | None = None
+    from_wire: Callable[[Any], object] | None = None
     sparse: bool = False
 
 
@@ -109,7 +109,7 @@ class MessageMapping(Generic[T]):
         return self.from_wire(parse(self._message, payload))
 
 
-def _converted(field: FieldMapping, value: Any) -> Any:
+def _converted(field: FieldMapping, value: object) -> Any:
     return field.from_wire(value) if field.from_wire else value
 
 

@@ -15,6 +15,7 @@ from afspm.emulators.asylum.server import QueuedCall, XopServer
 from afspm.emulators.asylum.values import IgorValues
 from afspm.emulators.emulator import LOOPBACK, Crashed, Emulator
 from afspm.errors import AfspmError, ConfigError
+from afspm.plain_data import Plain
 from afspm.units import Duration
 
 PROCEDURES: Final = ("afspm", "spots", "none")
@@ -47,7 +48,7 @@ class AsylumEmulator(Emulator):
     """
 
     vendor = "Asylum"
-    usual: ClassVar[dict[str, Any]] = {"port": 5555}
+    usual: ClassVar[Plain] = {"port": 5555}
     fault_kinds: ClassVar[dict[str, str]] = {
         "no-reply": "a request is carried out but not answered",
         "late-reply": "a reply is delayed by the duration and may arrive after later ones",

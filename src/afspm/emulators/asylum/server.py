@@ -33,7 +33,7 @@ class XopServer:
         wakes: something with a `fileno` that ends `poll`.
     """
 
-    def __init__(self, port: int, wakes: Any, log: logging.Logger) -> None:
+    def __init__(self, port: int, wakes: object, log: logging.Logger) -> None:
         self._log = log
         self._context: zmq.Context[Any] = zmq.Context()
         self._wakes = wakes

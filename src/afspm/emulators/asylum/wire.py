@@ -13,6 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NoReturn
 
+from afspm.plain_data import Plain
+
 LONGEST_REQUEST: Final = 1024
 
 MESSAGES: Final = {
@@ -39,7 +41,7 @@ _NUMBER: Final = re.compile(
 )
 """A number as C's strtod reads it to the end of the text."""
 
-Value = float | str | Mapping[str, Any] | None
+Value = float | str | Mapping[str, object] | None
 
 
 class CallFailed(Exception):
@@ -78,7 +80,7 @@ class IgorFunction:
         listed: it is declared by Igor's syntax for several results, which it may use for one, too.
     """
 
-    do: Callable[..., Any]
+    do: Callable[..., object]
     takes: str = ""
     gives: str = "v"
     listed: bool = False
@@ -103,7 +105,7 @@ def call(payload: bytes) -> FunctionCall:
     return FunctionCall(*_function_call(wanted), message_id)
 
 
-def _parsed(payload: bytes) -> Any:
+def _parsed(payload: bytes) -> object:
     """The JSON, which may begin with a byte order mark and ends at the first NUL."""
     text = payload.removeprefix(b"\xef\xbb\xbf").partition(b"\0")[0]
     try:
@@ -114,7 +116,7 @@ def _parsed(payload: bytes) -> Any:
     return content
 
 
-def _function_call(wanted: dict[str, Any]) -> tuple[str, tuple[str, ...]]:
+def _function_call(wanted: Plain) -> tuple[str, tuple[str, ...]]:
     """The name of the function, and its parameters."""
     name, given = wanted.get("name"), wanted.get("params", [])
     if len(wanted) > 2 or not isinstance(name, str):
@@ -156,7 +158,7 @@ def success(function: IgorFunction, given_back: Any, message_id: str | None) -> 
     results, passed = given_back if by_reference else (given_back, ())
     several = function.listed or len(function.gives) > 1
     values = [_value(*one) for one in zip(function.gives, results if several else (results,), strict=True)]
-    content: dict[str, Any] = {"errorCode": {"value": 0}, "result": values if several else values[0]}
+    content: dict[str, object] = {"errorCode": {"value": 0}, "result": values if several else values[0]}
     if by_reference and not several:
         content["passByReference"] = [_value(*one) for one in zip(by_reference, passed, strict=True)]
     return _message(content, message_id)
@@ -164,13 +166,13 @@ def success(function: IgorFunction, given_back: Any, message_id: str | None) -> 
 
 def failure(failed: CallFailed, message_id: str | None) -> bytes:
     """The reply with an error."""
-    content: dict[str, Any] = {"errorCode": {"value": failed.number, "msg": str(failed)}}
+    content: dict[str, object] = {"errorCode": {"value": failed.number, "msg": str(failed)}}
     if failed.history:
         content["history"] = failed.history
     return _message(content, message_id)
 
 
-def wave(values: Sequence[float], **more: Any) -> dict[str, Any]:
+def wave(values: Sequence[float], **more: object) -> dict[str, object]:
     """A wave of one dimension as it is replied."""
     raw = [_variable(value) for value in values]
     return {
@@ -182,25 +184,25 @@ def wave(values: Sequence[float], **more: Any) -> dict[str, Any]:
     }
 
 
-def _message(content: dict[str, Any], message_id: str | None) -> bytes:
+def _message(content: dict[str, object], message_id: str | None) -> bytes:
     if message_id is not None:
         content["messageID"] = message_id
     return json.dumps(content, sort_keys=True, indent=4, ensure_ascii=False).encode("utf-8")
 
 
-def _value(kind: str, value: Value) -> dict[str, Any]:
+def _value(kind: str, value: Value) -> dict[str, object]:
     types = {"v": "variable", "s": "string", "d": "dfref", "w": "wave"}
     return {"type": types[kind], "value": _variable(value) if isinstance(value, int | float) else value}
 
 
-def _variable(value: float) -> Any:
+def _variable(value: float) -> object:
     """As "%.15g" prints it: 3.0 is 3."""
     if not math.isfinite(value):
         return "nan" if math.isnan(value) else "inf" if value > 0 else "-inf"
     return json.loads(f"{value:.15g}")
 
 
-def _parameter(given: Any) -> str:
+def _parameter(given: object) -> str:
     if isinstance(given, bool):
         return str(int(given))
     if isinstance(given, int | float):

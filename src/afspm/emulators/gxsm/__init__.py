@@ -18,6 +18,7 @@ from afspm.emulators.gxsm.console import SCRIPT, ScriptCall, ScriptConsole
 from afspm.emulators.gxsm.entries import USER_UNITS
 from afspm.emulators.gxsm.program import GxsmProgram
 from afspm.errors import ConfigError
+from afspm.plain_data import PlainMapping
 from afspm.units import Length
 
 PROCESS: Final = "emulated-gxsm4"
@@ -46,7 +47,7 @@ class GxsmEmulator(Emulator):
     """
 
     vendor = "GXSM"
-    usual: ClassVar[Mapping[str, Any]] = {"port": 65431, "block": "gxsm4_py_shm_data_block", "process": "gxsm4"}
+    usual: ClassVar[PlainMapping] = {"port": 65431, "block": "gxsm4_py_shm_data_block", "process": "gxsm4"}
     fault_kinds: ClassVar[Mapping[str, str]] = {
         "wedge": "nothing is answered for the duration",
         "crash": "GXSM crashes; its shared memory stays",

@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from afspm.emulators.emulator import Crashed
 from afspm.emulators.faults import Faults
@@ -100,7 +100,7 @@ class SharedMemoryBlock:
             return b""
         return self._process.stdout.read(struct.unpack(">I", head)[0])
 
-    def _answer(self, found: Any) -> None:
+    def _answer(self, found: object) -> None:
         now_s = self._now_s()
         status, content = 0, b""
         if isinstance(found, NameError):
@@ -136,5 +136,5 @@ class SharedMemoryBlock:
 class _MaliciousPickle:
     """Makes a folder called `evil` where it is unpickled."""
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         return os.mkdir, ("evil",)

@@ -6,7 +6,7 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 
@@ -31,9 +31,9 @@ _VOLT: Final = 532.0
 """Of the scanner, in ångström."""
 
 
-_Method = TypeVar("_Method", bound=Callable[..., Any])
+_Method = TypeVar("_Method", bound=Callable[..., object])
 _LONGS: Final = range(-(2**63), 2**63)
-_FUNCTIONS: dict[str, tuple[Callable[..., Any], inspect.Signature]] = {}
+_FUNCTIONS: dict[str, tuple[Callable[..., object], inspect.Signature]] = {}
 
 
 def _function(method: _Method) -> _Method:
@@ -51,7 +51,7 @@ def _converts(value: object, kind: str) -> bool:
     return isinstance(value, float) or (isinstance(value, int) and value in _LONGS)
 
 
-def _fits(signature: inspect.Signature, arguments: tuple[Any, ...]) -> bool:
+def _fits(signature: inspect.Signature, arguments: tuple[object, ...]) -> bool:
     """Return whether C takes these arguments."""
     takes = [*signature.parameters.values()][1:]  # without self
     needed = sum(one.default is inspect.Parameter.empty for one in takes)
@@ -79,7 +79,7 @@ class GxsmFunctions:
         self._feedback_actions = feedback_actions
         self._faults = program.faults
 
-    def answer(self, method: str, arguments: tuple[Any, ...]) -> Any:
+    def answer(self, method: str, arguments: tuple[object, ...]) -> object:
         """Call one.
 
         Raises:
@@ -139,7 +139,7 @@ class GxsmFunctions:
         return self._program.entries.gets(ref)
 
     @_function
-    def _action(self, name: str) -> Any:
+    def _action(self, name: str) -> object:
         program = self._program
         kind, _, switch = name.partition("-")
         if kind in ("CHECK", "UNCHECK") and switch == "MainAutoSave":
@@ -276,7 +276,7 @@ class GxsmFunctions:
         return (width / (columns - 1), height / (rows - 1), self._program.channels[channel].dz, 10.0)
 
     @_function
-    def _get_slice(self, channel: int, value: int, time: int, first: int, count: int) -> Any:
+    def _get_slice(self, channel: int, value: int, time: int, first: int, count: int) -> object:
         program = self._program
         if program.last is None or not 0 <= channel < len(program.channels):
             return -1
@@ -287,7 +287,7 @@ class GxsmFunctions:
         return image[first : first + count].astype(np.float64) * one.dz
 
     @_function
-    def _get_probe_event(self, channel: int, nth: int) -> Any:
+    def _get_probe_event(self, channel: int, nth: int) -> object:
         program = self._program
         curve = program.rig.spectrum
         if curve is None or curve is program.curve:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 SCRIPT: Final = Path(__file__).parents[2] / "microscopes" / "gxsm" / "bridge.py"
 """What is run if nothing else is said: the file that a user runs, not a module of ours."""
@@ -28,8 +28,8 @@ class ScriptCall:
     """
 
     method: str
-    arguments: tuple[Any, ...]
-    answered: Callable[[Any], None]
+    arguments: tuple[object, ...]
+    answered: Callable[[object], None]
 
 
 class GxsmModule:
@@ -37,12 +37,12 @@ class GxsmModule:
 
     def __init__(self, post: Callable[[ScriptCall], None]) -> None:
         self._post = post
-        self._waiting: set[Future[Any]] = set()
+        self._waiting: set[Future[object]] = set()
         self._gone = False
 
-    def __getattr__(self, method: str) -> Callable[..., Any]:
-        def call(*arguments: Any) -> Any:
-            answer: Future[Any] = Future()
+    def __getattr__(self, method: str) -> Callable[..., object]:
+        def call(*arguments: object) -> object:
+            answer: Future[object] = Future()
             self._waiting.add(answer)
             if self._gone:
                 raise ConsoleClosed

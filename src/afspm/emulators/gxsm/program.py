@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from afspm.emulators.gxsm.file_writer import GxsmFileWriter
 from afspm.emulators.rig import Rig
 from afspm.errors import InvalidValue
 from afspm.model import Region
+from afspm.plain_data import Plain
 
 CARDS: Final = {"SRanger": "SRangerMK2:SPM", "RPSPMC": "RPSPMC:SPM", "simulator": "SPM-SIM:SPM"}
 FAULT_KINDS: Final[Mapping[str, str]] = {
@@ -116,7 +117,7 @@ class GxsmProgram:
 
         def fed_back(name: str, factor: float = 1.0) -> Callable[[float], None]:
             def told(value: float) -> None:
-                changed: dict[str, Any] = {name: value * factor}
+                changed: Plain = {name: value * factor}
                 rig.setup.feedback = replace(rig.setup.feedback, **changed)
 
             return told

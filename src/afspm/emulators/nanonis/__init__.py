@@ -77,7 +77,7 @@ class NanonisEmulator(Emulator):
     """
 
     vendor = "Nanonis"
-    usual: ClassVar[Mapping[str, Any]] = {"port": 6501, "ports": 4, "logger_port": logger.USUAL_PORT}
+    usual: ClassVar[Mapping[str, object]] = {"port": 6501, "ports": 4, "logger_port": logger.USUAL_PORT}
     fault_kinds: ClassVar[Mapping[str, str]] = FAULT_KINDS
 
     def __init__(

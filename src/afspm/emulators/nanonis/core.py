@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 from afspm.clock import Clock
 from afspm.emulators.faults import Faults
@@ -12,6 +11,7 @@ from afspm.emulators.nanonis.dispatch import Answer, DeferredResult
 from afspm.emulators.nanonis.registers import Registers
 from afspm.emulators.nanonis.session import SessionFolder
 from afspm.emulators.rig import Rig
+from afspm.plain_data import Plain
 
 
 @dataclass
@@ -32,7 +32,7 @@ class NanonisCore:
     range_m: tuple[float, float, float]
     release: int
     registers: Registers = field(default_factory=Registers)
-    client: dict[str, Any] = field(default_factory=dict)
+    client: Plain = field(default_factory=dict)
     opened: set[str] = field(default_factory=set)
 
     @property

@@ -13,7 +13,7 @@ import numpy as np
 
 from afspm.emulators.nanonis.registers import Registers
 
-Results = tuple[Any, ...]
+Results = tuple[object, ...]
 _STORED: Final = (
     "Bias", "BiasSpectr", "Current", "ZCtrl", "SafeTip", "AutoApproach", "ZSpectr", "Piezo", "Scan", "FolMe", "Pattern",
     "TipShaper", "Motor", "AtomTrack", "LockIn", "PLL", "Signals", "UserIn", "UserOut", "TCPLog", "Util",
@@ -71,7 +71,7 @@ class Dispatcher:
                 for name in getattr(marked, "answered_functions", ()):
                     self._handlers[name] = _bound(getattr(module, attribute), name)
 
-    def call(self, name: str, arguments: list[Any]) -> Answer:
+    def call(self, name: str, arguments: list[object]) -> Answer:
         """Execute a function and return its results.
 
         Raises:
@@ -99,14 +99,14 @@ def _bound(handler: Handler, name: str) -> Handler:
     return partial(handler, name) if "name" in inspect.signature(handler).parameters else handler
 
 
-def chosen(number: int, *choices: Any) -> Any:
+def chosen(number: int, *choices: object) -> Any:
     """Return the choice of a number; choice 0 is usually "no change"."""
     if not 0 <= number < len(choices):
         raise FunctionRefused(f"{number} is none of the choices")
     return choices[number]
 
 
-def _refuse_nan(name: str, arguments: Iterable[Any], *, keeps_nan: bool) -> None:
+def _refuse_nan(name: str, arguments: Iterable[object], *, keeps_nan: bool) -> None:
     """The maker's own examples say of some functions that NaN is no change; (!) how others take it is not known."""
     for argument in arguments:
         if not isinstance(argument, str) and np.asarray(argument).dtype.kind == "f":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -53,7 +53,7 @@ _TEXTS: Final = (
 )
 
 
-def senseless_value(code: str, chance: random.Random) -> Any:
+def senseless_value(code: str, chance: random.Random) -> object:
     """A value of the field, by its code."""
     if code in "fd":
         return chance.choice(_NUMBERS)

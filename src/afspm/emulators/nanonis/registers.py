@@ -58,7 +58,7 @@ class Registers:
     def __init__(self) -> None:
         self._kept: dict[tuple[str, Values], Values] = {}
 
-    def set(self, name: str, arguments: Sequence[Any]) -> None:
+    def set(self, name: str, arguments: Sequence[object]) -> None:
         """Store the arguments of the function `name`. Raises ValueError: an argument is none of its choices."""
         register = name.removesuffix("Set")
         fields = wire.functions()[name].arguments
@@ -70,15 +70,15 @@ class Registers:
             now[place] = _set(fields[n].mark, arguments[n], now[place])
         self._kept[key] = tuple(now)
 
-    def put(self, register: str, *values: Any) -> None:
+    def put(self, register: str, *values: object) -> None:
         """Keep the values of a register that belongs to nothing in particular."""
         self._kept[register, ()] = values
 
-    def get(self, register: str, belongs_to: Sequence[Any] = ()) -> Values:
+    def get(self, register: str, belongs_to: Sequence[object] = ()) -> Values:
         """Return the stored values, or the initial ones; empty if there are none."""
         return self._kept.get((register, tuple(belongs_to)), AT_FIRST.get(register, ()))
 
-    def got(self, name: str, arguments: Sequence[Any]) -> Values:
+    def got(self, name: str, arguments: Sequence[object]) -> Values:
         """The results of a function `…Get`: all that its fields have, zero where nothing is known."""
         kept = self.get(_OTHER_NAMES.get(name, name.removesuffix("Get")), arguments)
         codes = [field.code for field in wire.functions()[name].results]
@@ -100,7 +100,7 @@ def _keys_without_getter(register: str) -> int:
     return len(wire.functions()[other].arguments) if other is not None else 0
 
 
-def _set(mark: str, value: Any, before: Any) -> Any:
+def _set(mark: str, value: Any, before: object) -> object:
     """Store a value; NaN is no change."""
     if isinstance(value, float) and math.isnan(value):
         return before

@@ -22,7 +22,7 @@ _LARGEST_SINGLE: Final = float(np.finfo(np.float32).max)
 _NEVER: Final = 1 << 31
 _FIELD: Final = re.compile(r"(?P<code>[^@?=-]+)(?P<mark>\?|-|=-?\d+)?(?:@(?P<since>\d+))?(?:@<(?P<until>\d+))?")
 _SIZES: Final[Mapping[str, int]] = {code: struct.calcsize(f">{code}") for code in "BHIifd"}
-ZEROS: Final[Mapping[str, Any]] = {
+ZEROS: Final[Mapping[str, object]] = {
     **dict.fromkeys("HIin", 0),
     **dict.fromkeys("fd", 0.0),
     "S": "",
@@ -122,7 +122,7 @@ def split(received: bytearray) -> tuple[str, bool, bytes] | None:
     return name, bool(wants_answer), body
 
 
-def arguments(name: str, body: bytes, release: int) -> list[Any]:
+def arguments(name: str, body: bytes, release: int) -> list[object]:
     """The arguments in the body of a request.
 
     Raises:
@@ -181,7 +181,7 @@ def reply(name: str, body: bytes) -> bytes:
     return name.encode("ascii", "replace")[:32].ljust(32, b"\0") + struct.pack(">i", len(body)) + bytes(4) + body
 
 
-def body(name: str, results: Sequence[Any], release: int, encoding: str = "utf-8") -> bytes:
+def body(name: str, results: Sequence[object], release: int, encoding: str = "utf-8") -> bytes:
     """Encode the body of a reply without an error."""
     values = zip(functions()[name].results, results, strict=True)
     packed = (_packed(field.code, value, encoding) for field, value in values if field.is_in(release))

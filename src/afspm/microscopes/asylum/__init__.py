@@ -86,7 +86,7 @@ class Asylum(Driver):
         self.groups = (self._kept, frame_settings, self._place, feedback)
 
     @classmethod
-    def technique(cls, settings: Mapping[str, Any]) -> str:
+    def technique(cls, settings: Mapping[str, object]) -> str:
         return "AFM"
 
     def connect(self) -> None:

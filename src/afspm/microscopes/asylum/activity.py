@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from afspm.clock import Clock
 from afspm.errors import Refused
@@ -120,7 +120,7 @@ class Activity:
         Args:
             position_m: of a force curve, where the tip was sent; None: it is left to the file to know.
         """
-        taken: dict[str, Any] = {"position": position_m and list(position_m)}
+        taken: dict[str, object] = {"position": position_m and list(position_m)}
         if what == SCAN:
             if "led_away" in self._kept:  # it was sent somewhere
                 self._kept["led_away"] = True

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import zmq
 from zmq.utils.monitor import recv_monitor_message
@@ -121,14 +120,14 @@ def _payload(frames: list[bytes]) -> bytes:
     return frames[1]
 
 
-def text(result: Any) -> str:
+def text(result: object) -> str:
     """A result that has to be a text. Raises BadReply."""
     if isinstance(result, str):
         return result
     raise xop.BadReply(f"Igor returned {result!r} instead of a text")
 
 
-def number(result: Any) -> float:
+def number(result: object) -> float:
     """A result that has to be a number, NaN too. Raises BadReply."""
     if isinstance(result, float):
         return result

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
-from typing import Any, Final
+from typing import Final
 
 from afspm.errors import AfspmError, ConfigError, FileError
 from afspm.files import read
@@ -56,7 +56,7 @@ class AsylumFiles(ResultFiles):
         super().__init__(kept, log)
         kept.setdefault("taken", 0)
 
-    def begin(self, what: str, target: Target, taken: Mapping[str, Any]) -> None:
+    def begin(self, what: str, target: Target, taken: Mapping[str, object]) -> None:
         """A measurement begins.
 
         Args:

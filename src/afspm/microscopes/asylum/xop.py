@@ -9,9 +9,10 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from afspm.errors import AfspmError, InvalidValue
+from afspm.plain_data import PlainMapping
 from afspm.translator.driver import ControllerLost
 
 LONGEST_REQUEST: Final = 1024
@@ -122,7 +123,7 @@ def reply(message: bytes) -> Reply:
         raise BadReply(f"ZeroMQ-XOP sent an unreadable reply, {shown!r}: {error}") from error
 
 
-def _reply(content: Mapping[str, Any]) -> Reply:
+def _reply(content: PlainMapping) -> Reply:
     message_id = content.get("messageID")
     number = content["errorCode"]["value"]
     if type(number) is not int or not isinstance(message_id, str | None):
@@ -136,7 +137,7 @@ def _reply(content: Mapping[str, Any]) -> Reply:
     return Reply(message_id, None, tuple(results))
 
 
-def _value(one: Mapping[str, Any]) -> Result:
+def _value(one: Mapping[str, object]) -> Result:
     kind, value = one["type"], one["value"]
     if kind == "variable":
         return _number(value)
@@ -149,7 +150,7 @@ def _value(one: Mapping[str, Any]) -> Result:
     raise ValueError(f"a result of type {kind!r}")
 
 
-def _number(value: Any) -> float:
+def _number(value: object) -> float:
     """NaN and infinities come as texts."""
     if value in ("nan", "inf", "-inf") or (isinstance(value, int | float) and not isinstance(value, bool)):
         return float(value)

@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -43,7 +43,7 @@ class BridgeLink:
         self._is_welcome = False
         self.close = self._tcp.close
 
-    def call(self, method: str, *arguments: str | int | float) -> Any:
+    def call(self, method: str, *arguments: str | int | float) -> object:
         """Call a function of GXSM (see `Link`)."""
         if not self._is_welcome:
             self._introduce()
@@ -78,7 +78,7 @@ class BridgeLink:
         self._is_welcome = True
 
 
-def _read(receiver: Receiver) -> dict[str, Any]:
+def _read(receiver: Receiver) -> dict[str, object]:
     """Return the reply in the one line that is replied."""
     parts = [receiver.some()]
     size = len(parts[0])
@@ -97,7 +97,7 @@ def _message(method: str, *arguments: str | int | float) -> bytes:
     return json.dumps([method, *arguments]).encode() + b"\n"
 
 
-def _reply(line: bytes) -> dict[str, Any]:
+def _reply(line: bytes) -> dict[str, object]:
     try:
         reply = _REPLY.decode(line.decode())
     except (ValueError, RecursionError) as error:
@@ -107,7 +107,7 @@ def _reply(line: bytes) -> dict[str, Any]:
     return reply
 
 
-def _unpacked(found: dict[str, Any]) -> Any:
+def _unpacked(found: dict[str, object]) -> object:
     if found.keys() != {"array", "shape", "bytes"}:
         return found
     kind, shape = found["array"], found["shape"]

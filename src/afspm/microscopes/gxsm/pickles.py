@@ -40,23 +40,23 @@ class _Array:
         self.values = _array(content, kind, shape, "F" if by_columns else "C")
 
 
-def _array(content: Any, kind: Any, shape: Any, order: Any) -> np.ndarray:
+def _array(content: object, kind: object, shape: Any, order: object) -> np.ndarray:
     if not (isinstance(kind, _DType) and isinstance(content, bytes | bytearray) and order in ("C", "F")):
         raise BadReply("a malformed array")
     return np.frombuffer(bytes(content), kind.numpy).reshape(tuple(shape), order=order)
 
 
-def _from_buffer(content: Any, kind: Any, shape: Any, order: Any) -> _Array:
+def _from_buffer(content: object, kind: object, shape: object, order: object) -> _Array:
     made = _Array()
     made.values = _array(content, kind, shape, order)
     return made
 
 
-def _scalar(kind: Any, content: Any) -> object:
+def _scalar(kind: object, content: object) -> object:
     return _array(content, kind, (), "C").item()
 
 
-_ALLOWED: Final[dict[tuple[str, str], Any]] = {("numpy", "dtype"): _DType, ("numpy", "ndarray"): _Array}
+_ALLOWED: Final[dict[tuple[str, str], object]] = {("numpy", "dtype"): _DType, ("numpy", "ndarray"): _Array}
 for _core in ("numpy.core", "numpy._core"):  # before numpy 2, and since
     _ALLOWED[f"{_core}.multiarray", "_reconstruct"] = lambda *_: _Array()
     _ALLOWED[f"{_core}.multiarray", "scalar"] = _scalar
@@ -64,13 +64,13 @@ for _core in ("numpy.core", "numpy._core"):  # before numpy 2, and since
 
 
 class _Unpickler(pickle._Unpickler):  # type: ignore[name-defined, misc, unused-ignore]
-    def find_class(self, module: str, name: str) -> Any:
+    def find_class(self, module: str, name: str) -> object:
         if (module, name) not in _ALLOWED:
             raise BadReply(f"GXSM's reply refers to {f'{module} {name}'[:100]!r}, which afspm does not run")
         return _ALLOWED[module, name]
 
 
-def loads(content: bytes) -> Any:
+def loads(content: bytes) -> object:
     """Return the value of a pickle.
 
     Raises:
@@ -92,7 +92,7 @@ class _Values:
     def __init__(self) -> None:
         self._left = _MOST_PARTS
 
-    def of(self, value: Any) -> Any:
+    def of(self, value: object) -> object:
         self._left -= 1
         if self._left < 0:
             raise BadReply("GXSM's reply has too many parts")

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
-from typing import Any, Final
+from typing import Final
 
 from afspm.errors import ConfigError
 from afspm.microscopes.gxsm import pickles
@@ -85,7 +85,7 @@ class SharedMemoryLink:
             hint = "is Gxsm4 running on this computer, by the same user, and without -s?"
             raise ControllerLost(f"no shared memory: {error}", where=self._where, hint=hint) from error
 
-    def call(self, method: str, *arguments: str | int | float) -> Any:
+    def call(self, method: str, *arguments: str | int | float) -> object:
         """Call a function of GXSM (see `Link`)."""
         if self._closed.is_set():
             raise ControllerLost("the link was closed", where=self._where)
@@ -106,7 +106,7 @@ class SharedMemoryLink:
             self._closed.set()
             self._memory.close()
 
-    def _transaction(self, method: str, arguments: tuple[str | int | float, ...]) -> Any:
+    def _transaction(self, method: str, arguments: tuple[str | int | float, ...]) -> object:
         until_s = self._monotonic_s() + self._timeout_s
         self._see_alive()
         if self._status() == _REQUEST:  # of somebody who has given up waiting: its answer would be taken for ours
@@ -128,7 +128,7 @@ class SharedMemoryLink:
         self._wait(until_s, f"no answer to {method} within {self._timeout_s:g} s")
         return self._answer(method)
 
-    def _answer(self, method: str) -> Any:
+    def _answer(self, method: str) -> object:
         status = self._status()
         if status in _FAILURES:
             raise GxsmError(_FAILURES[status], where=method)

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from afspm.microscopes.simulator import Simulator
+from afspm.plain_data import PlainMapping
 from afspm.units import Length
 
 __all__ = ["ImageMicroscope"]
 
 # An instrument that shows the picture as it is; whoever wants noise, drift or a blunt tip says so.
-_IDEAL: Mapping[str, Mapping[str, Any]] = {
+_IDEAL: Mapping[str, PlainMapping] = {
     "tip": {"radius_m": 1e-12, "half_angle_deg": 1.0, "spread": 0.0},
     "noise": dict.fromkeys(
         ("white_m", "one_over_f_m", "line_offset_m", "scar_probability", "amplitude_v", "phase_deg", "current_a"), 0.0

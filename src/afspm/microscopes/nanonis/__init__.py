@@ -112,7 +112,7 @@ class Nanonis(Driver):
             raise ControllerLost("Nanonis is not connected")
         return self._session
 
-    def _ask(self, name: str, *arguments: Any) -> tuple[Any, ...]:
+    def _ask(self, name: str, *arguments: object) -> tuple[object, ...]:
         return self._there.ask(name, *arguments)
 
     def status(self) -> ScopeStatus:
@@ -253,7 +253,7 @@ class Nanonis(Driver):
             self._ask("Scan.PropsSet", off, off, autosave, series, comment, modules, no_change)
 
 
-def _argument(code: str, word: str) -> Any:
+def _argument(code: str, word: str) -> object:
     if code in "HIi":
         return int(word)
     if code in "fd":

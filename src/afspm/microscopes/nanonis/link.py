@@ -32,7 +32,7 @@ class Link:
         self._tcp = TcpConnection(address, timeout_s, monotonic_s, _HINTS)
         self.close = self._tcp.close
 
-    def ask(self, name: str, *arguments: Any, longer_s: float = 0.0) -> tuple[Any, ...]:
+    def ask(self, name: str, *arguments: object, longer_s: float = 0.0) -> tuple[Any, ...]:
         """Call a function of Nanonis.
 
         Args:
@@ -43,7 +43,7 @@ class Link:
             ControllerLost, BadReply: no answer, or none to be trusted; the connection is closed.
         """
 
-        def read(receiver: Receiver) -> tuple[Any, ...]:
+        def read(receiver: Receiver) -> tuple[object, ...]:
             size = protocol.body_bytes(bytes(receiver.exactly(protocol.HEADER_BYTES)), name)
             return protocol.results(name, receiver.exactly(size), self.release)
 

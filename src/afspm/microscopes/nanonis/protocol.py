@@ -89,7 +89,7 @@ def function(name: str) -> Function:
     return functions()[name]
 
 
-def request(name: str, arguments: Sequence[Any], release: int = NEWEST) -> bytes:
+def request(name: str, arguments: Sequence[object], release: int = NEWEST) -> bytes:
     """The bytes that ask for `name`; arguments that the release does not have are left out.
 
     Raises:
@@ -123,7 +123,7 @@ def body_bytes(header: bytes, asked: str) -> int:
     return int(size)
 
 
-def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[Any, ...]:
+def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[object, ...]:
     """The results in the body of a reply.
 
     After an error the results may be there or not: the specification does not say.
@@ -160,7 +160,7 @@ def _depends_on_release(name: str) -> bool:
     return any(since for _, since in function(name).results)
 
 
-def _parsed(body: bytes | bytearray, codes: Sequence[str]) -> tuple[tuple[Any, ...], int, str]:
+def _parsed(body: bytes | bytearray, codes: Sequence[str]) -> tuple[tuple[object, ...], int, str]:
     reader = _Reader(memoryview(body))
     found = tuple(_READERS[code](reader) for code in codes)
     status, text = reader.number("I"), reader.text()
@@ -204,7 +204,7 @@ class _Reader:
             raise BadReply(f"{count} elements in {self.left} bytes")
         return count
 
-    def numbers(self, code: str) -> list[Any]:
+    def numbers(self, code: str) -> list[object]:
         raw = self.take(4 * self.count(4))
         return list(struct.unpack(f">{len(raw) // 4}{code}", raw))
 
@@ -225,11 +225,11 @@ class _Reader:
         return [[self.text() for _ in range(columns)] for _ in range(rows)]
 
 
-def _reader_of(code: str) -> Callable[[_Reader], Any]:
+def _reader_of(code: str) -> Callable[[_Reader], object]:
     return lambda reader: reader.number(code)
 
 
-_READERS: Final[Mapping[str, Callable[[_Reader], Any]]] = {
+_READERS: Final[Mapping[str, Callable[[_Reader], object]]] = {
     **{code: _reader_of(code) for code in _NUMBERS},
     "S": _Reader.text,
     "A": _Reader.texts,
@@ -240,7 +240,7 @@ _READERS: Final[Mapping[str, Callable[[_Reader], Any]]] = {
 }
 
 
-def _counted(code: str, values: Sequence[Any]) -> bytes:
+def _counted(code: str, values: Sequence[object]) -> bytes:
     return struct.pack(f">i{len(values)}{code}", len(values), *values)
 
 

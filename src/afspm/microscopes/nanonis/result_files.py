@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path, PureWindowsPath
-from typing import Any, Final
+from typing import Final
 
 from afspm.errors import AfspmError, FileError
 from afspm.files import read
@@ -42,7 +42,7 @@ class NanonisFiles(ResultFiles):
         self._patience_s = patience_s
         kept.setdefault("fetched", 0)
 
-    def begin(self, what: str, session: str, taken: Mapping[str, Any]) -> None:
+    def begin(self, what: str, session: str, taken: Mapping[str, object]) -> None:
         """A measurement begins.
 
         Args:

@@ -34,7 +34,7 @@ class Group(SettingsGroup):
     def __init__(self, ask: Ask) -> None:
         self._ask = ask
 
-    def _numbers(self, name: str, *arguments: Any) -> tuple[Any, ...]:
+    def _numbers(self, name: str, *arguments: object) -> tuple[Any, ...]:
         return numbers(self._ask, name, *arguments)
 
 

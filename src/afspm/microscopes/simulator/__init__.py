@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Final, TypeVar
 
 from afspm.errors import AfspmError, ConfigError, ErrorCollector, Refused
 from afspm.files import read
@@ -18,6 +18,7 @@ from afspm.microscopes.simulator.faults import Fault, Faults
 from afspm.microscopes.simulator.instrument import Instrument, PanelEvent
 from afspm.microscopes.simulator.truth import Truth
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.plain_data import PlainMapping
 from afspm.simulation import World
 from afspm.simulation.feedback import FeedbackSettings
 from afspm.simulation.settings import build
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-Table = dict[str, Any]
+Table = dict[str, object]
 """Settings as the experiment file has them."""
 Rows = dict[str, Table]
 
@@ -168,7 +169,7 @@ class Simulator(Driver):
                 self._check_values(loop, initial or {}, errors)
         errors.raise_all()
 
-    def _check_values(self, loop: FeedbackSettings, initial: Mapping[str, Any], errors: ErrorCollector) -> None:
+    def _check_values(self, loop: FeedbackSettings, initial: PlainMapping, errors: ErrorCollector) -> None:
         """Values of parameters that are set by themselves: at the start, and by a person at the panel."""
         in_force = {
             FEEDBACK_ON: loop.on,
@@ -186,12 +187,12 @@ class Simulator(Driver):
                 errors.add(ConfigError(f"there is no action {event.action!r}", where=f"panel[{i}].action"))
 
     @classmethod
-    def technique(cls, settings: Mapping[str, Any]) -> str:
+    def technique(cls, settings: PlainMapping) -> str:
         loop = _loop_of(settings)
         return "" if loop is None else "STM" if loop.mode == "current" else "AFM"
 
     @classmethod
-    def rows(cls, settings: Mapping[str, Any]) -> Rows:
+    def rows(cls, settings: PlainMapping) -> Rows:
         loop = _loop_of(settings)
         return _merged({} if loop is None else _rows_for(loop.mode), settings.get("parameters") or {})
 
@@ -293,7 +294,7 @@ def _rows_for(mode: str) -> Rows:
     return {names.ZCTRL_SETPOINT: _SETPOINTS[mode], names.SPEC_KIND: {"choices": ["IV", "force"]}}
 
 
-def _merged(*tables: Mapping[str, Mapping[str, Any]]) -> Rows:
+def _merged(*tables: Mapping[str, Mapping[str, object]]) -> Rows:
     merged: Rows = {}
     for table in tables:
         for name, row in table.items():
@@ -302,7 +303,7 @@ def _merged(*tables: Mapping[str, Mapping[str, Any]]) -> Rows:
     return merged
 
 
-def _loop_of(settings: Mapping[str, Any]) -> FeedbackSettings | None:
+def _loop_of(settings: Mapping[str, object]) -> FeedbackSettings | None:
     """The feedback at the start, whatever is wrong with the rest of the world; None: it is itself."""
     of_it = {name: settings[name] for name in ("surface", "feedback") if settings.get(name) is not None}
     try:
@@ -311,7 +312,7 @@ def _loop_of(settings: Mapping[str, Any]) -> FeedbackSettings | None:
         return None
 
 
-def _made(kind: type[T], tables: Sequence[Mapping[str, Any]], where: str, errors: ErrorCollector) -> list[T]:
+def _made(kind: type[T], tables: Sequence[Mapping[str, object]], where: str, errors: ErrorCollector) -> list[T]:
     made = []
     for i, table in enumerate(tables):
         with errors:

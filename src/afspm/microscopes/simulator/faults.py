@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from afspm.errors import ConfigError, Refused
 from afspm.model import ControlResponse
+from afspm.plain_data import Plain
 
 KINDS = ("slow", "hang", "refuse", "lose", "crash", "half-file")
 
@@ -45,7 +45,7 @@ class Faults:
         start_s: experiment time that `Fault.at_s` counts from.
     """
 
-    def __init__(self, scheduled: list[Fault], kept: dict[str, Any], start_s: float) -> None:
+    def __init__(self, scheduled: list[Fault], kept: Plain, start_s: float) -> None:
         self._scheduled = sorted(scheduled, key=lambda fault: fault.at_s)
         self._kept = kept
         self._start_s = start_s

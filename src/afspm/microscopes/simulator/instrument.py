@@ -14,7 +14,7 @@ from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -56,7 +56,7 @@ class PanelEvent:
     """
 
     at_s: float
-    set: dict[str, Any] | None = None
+    set: dict[str, object] | None = None
     action: str = ""
 
 

@@ -6,10 +6,10 @@ import contextlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from afspm.plain_data import Plain
 from afspm.storage.disk import DiskThread, DiskTimeout
 
 
@@ -23,12 +23,12 @@ class Truth:
             the same `n`.
     """
 
-    def __init__(self, path: Path, kept: dict[str, Any]) -> None:
+    def __init__(self, path: Path, kept: Plain) -> None:
         self._path = path
         self._kept = kept
         self._disk = DiskThread()
 
-    def note(self, time_s: float, event: str, facts: Mapping[str, Any]) -> None:
+    def note(self, time_s: float, event: str, facts: Mapping[str, object]) -> None:
         """Write down what happened."""
         self._kept["truth_lines"] = number = int(self._kept.get("truth_lines", 0)) + 1
         line = json.dumps({"n": number, "time_s": time_s, "event": event, **facts}, default=_plain)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 from uuid import NAMESPACE_URL, uuid5
 
 from afspm.clock import NS_PER_S
@@ -17,7 +16,7 @@ from afspm.record.nexus import field_names
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 
-Document = tuple[str, dict[str, Any]]
+Document = tuple[str, dict[str, object]]
 """Name and content."""
 DOCUMENTS_FILE = "documents.jsonl"
 _PLACE = {"center_x": "m", "center_y": "m", "width": "m", "height": "m", "angle": "rad"}
@@ -40,7 +39,7 @@ def documents(run: Run, scans: Iterable[ScanRow], spectra: Iterable[SpectrumRow]
     began_ns = rows[0].began_ns or rows[0].time_ns if rows else run.newest_ns
     start = _uid(run, "start")
     yield "start", _start(run, start, began_ns)
-    streams: dict[tuple[Any, ...], _Stream] = {}
+    streams: dict[tuple[object, ...], _Stream] = {}
     for row in rows:
         stream = streams.get(_alike(row))
         if stream is None:
@@ -53,7 +52,7 @@ def documents(run: Run, scans: Iterable[ScanRow], spectra: Iterable[SpectrumRow]
     yield "stop", _stop(run, start, counts)
 
 
-def _start(run: Run, uid: str, began_ns: int) -> dict[str, Any]:
+def _start(run: Run, uid: str, began_ns: int) -> dict[str, object]:
     metadata = run.metadata
     known = {"sample": metadata.get("sample"), "project": metadata.get("project"), "owner": metadata.get("person")}
     return {
@@ -65,7 +64,7 @@ def _start(run: Run, uid: str, began_ns: int) -> dict[str, Any]:
     }
 
 
-def _stop(run: Run, start: str, counts: Mapping[str, int]) -> dict[str, Any]:
+def _stop(run: Run, start: str, counts: Mapping[str, int]) -> dict[str, object]:
     ended = run.facts.get("how") == "experiment_ended"
     return {
         "uid": _uid(run, "stop"),
@@ -77,7 +76,7 @@ def _stop(run: Run, start: str, counts: Mapping[str, int]) -> dict[str, Any]:
     }
 
 
-def _alike(row: ScanRow | SpectrumRow) -> tuple[Any, ...]:
+def _alike(row: ScanRow | SpectrumRow) -> tuple[object, ...]:
     """Return what measurements of one stream have in common: their arrays are of one shape."""
     if isinstance(row, ScanRow):
         return "scan", row.channels, row.shape
@@ -109,9 +108,9 @@ class _Stream:
             for one, name, unit in zip(field_names(row.names), row.names, row.units, strict=True):
                 yield one, name, unit, [row.points]
 
-    def descriptor(self) -> dict[str, Any]:
+    def descriptor(self) -> dict[str, object]:
         source = f"afspm:{self.run.folder.name}"
-        keys: dict[str, Any] = {
+        keys: dict[str, object] = {
             one: {
                 "source": f"{source}/{name}", "dtype": "array", "dtype_numpy": "<f8", "shape": shape, "units": unit,
                 "external": "STREAM:",

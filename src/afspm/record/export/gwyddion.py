@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 
 from afspm.model import Scan, Spectrum
 from afspm.model.spectrum_stack import SpectrumStack, mean_over_repeats
+from afspm.plain_data import PlainMapping
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 
 _MAGIC = b"GWYP"
-Item = tuple[str, str, Any]
+Item = tuple[str, str, object]
 """The name, the type (Gwyddion's letter) and the value of a component."""
 
 
@@ -182,7 +183,7 @@ def _typical(values: NDArray[np.float64]) -> float:
     return float(np.median(known)) if known.size else 0.0
 
 
-def _meta(about: Mapping[str, Any]) -> dict[str, str]:
+def _meta(about: PlainMapping) -> dict[str, str]:
     """Return what is known of a measurement as names and texts, as Gwyddion shows them."""
     said = {}
     for name, value in about.items():

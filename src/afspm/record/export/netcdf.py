@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import numpy as np
 
@@ -27,7 +26,7 @@ def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
         yield ".nc", spectrum_file(run.spectrum(row), about)
 
 
-def scan_file(scans: ScanSet, about: Mapping[str, Any]) -> bytes:
+def scan_file(scans: ScanSet, about: Mapping[str, object]) -> bytes:
     """All channels over (y, x), which are those of the frame before it was turned."""
     (left, low), (width, height), (rows, columns) = scans.region.top_left_m, scans.region.size_m, scans.first.shape
     variables = {
@@ -40,7 +39,7 @@ def scan_file(scans: ScanSet, about: Mapping[str, Any]) -> bytes:
     return encoded(variables, _attributes(about))
 
 
-def spectrum_file(spectrum: Spectrum, about: Mapping[str, Any]) -> bytes:
+def spectrum_file(spectrum: Spectrum, about: Mapping[str, object]) -> bytes:
     """Every variable over (point)."""
     variables = {
         name: Variable(("point",), spectrum.values[:, number], {"long_name": long_name, "units": unit})
@@ -51,7 +50,7 @@ def spectrum_file(spectrum: Spectrum, about: Mapping[str, Any]) -> bytes:
     return encoded(variables, _attributes(about))
 
 
-def _attributes(about: Mapping[str, Any]) -> Attributes:
+def _attributes(about: Mapping[str, object]) -> Attributes:
     """Texts and numbers as they are; whole numbers as texts, since a float64 has no room for all of them."""
     made: dict[str, str | float] = {}
     for name, value in about.items():

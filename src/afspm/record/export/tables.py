@@ -40,14 +40,14 @@ def tables(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow]) -> Iterat
         yield f"{name}.csv", _csv([column.removesuffix("_ns") for column in columns], rows)
 
 
-def _told(column: str, values: list[Any]) -> list[Any]:
+def _told(column: str, values: list[Any]) -> list[object]:
     """Times as ISO 8601 in UTC, what is not known as nothing."""
     if column.endswith("_ns"):
         return ["" if value is None else iso_utc(value) for value in values]
     return ["" if value is None else value for value in values]
 
 
-def _csv(header: list[str], rows: Iterable[Iterable[Any]]) -> bytes:
+def _csv(header: list[str], rows: Iterable[Iterable[object]]) -> bytes:
     text = io.StringIO(newline="")
     writer = csv.writer(text)
     writer.writerow(header)

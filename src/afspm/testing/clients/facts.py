@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm import wire
 from afspm.model import Packet, Scan, ScanLines, Spectrum
+from afspm.plain_data import Plain
 from afspm.testing.verdicts import Failed, near
 
 EXACT = 1e-9
-Facts = dict[str, Any]
+Facts = Plain
 
 
 def facts_of(packet: Packet) -> Facts:

@@ -6,21 +6,22 @@ import json
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+
+from afspm.plain_data import Plain
 
 FILE = "golden.json"
 
 
 @cache
-def golden() -> dict[str, list[dict[str, Any]]]:
+def golden() -> dict[str, list[Plain]]:
     """Return the contents of `proto/golden.json`, by kind."""
     package = Path(str(files("afspm")))
     installed, clone = package / "wire" / "proto" / FILE, package.parents[1] / "proto" / FILE
     text = (installed if installed.exists() else clone).read_text(encoding="utf-8")
-    reference: dict[str, list[dict[str, Any]]] = json.loads(text)
+    reference: dict[str, list[Plain]] = json.loads(text)
     return reference
 
 
-def frames_of(entry: dict[str, Any]) -> list[bytes]:
+def frames_of(entry: Plain) -> list[bytes]:
     """Return the frames of a reference request, response or packet."""
     return [bytes.fromhex(frame) for frame in entry["frames"]]

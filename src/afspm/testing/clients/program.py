@@ -16,6 +16,7 @@ from typing import IO, Any, Protocol
 
 from afspm.errors import ConfigError
 from afspm.launch import Launch
+from afspm.plain_data import Plain
 from afspm.testing.verdicts import Failed, expect
 
 ANSWER_S = 30.0
@@ -31,7 +32,7 @@ class Pump(Protocol):
         ...
 
 
-class Answer(dict[str, Any]):
+class Answer(Plain):
     """The answer to one step."""
 
     @property
@@ -90,7 +91,7 @@ class ClientProgram:
 
     # --- steps ---
 
-    def begin(self, do: str, **arguments: Any) -> int:
+    def begin(self, do: str, **arguments: object) -> int:
         """Give it a step, and return the step's id."""
         self._next += 1
         self._begun[self._next] = do
@@ -113,7 +114,7 @@ class ClientProgram:
     def is_answered(self, step: int) -> bool:
         return step in self._answers
 
-    def do(self, do: str, **arguments: Any) -> Answer:
+    def do(self, do: str, **arguments: object) -> Answer:
         """Give it a step, and return the answer.
 
         Raises:
@@ -127,7 +128,7 @@ class ClientProgram:
         """Give it a step, and return the answer, be it an error. Raises Failed: none comes."""
         return self.answer(self.begin(do, **arguments), ANSWER_S + float(arguments.get("timeout_s", 0.0)))
 
-    def succeed(self, do: str, **arguments: Any) -> Answer:
+    def succeed(self, do: str, **arguments: object) -> Answer:
         """Give it a step, which must succeed. Raises Failed."""
         answer = self.do(do, **arguments)
         expect(answer.ok, f"the step {do} to succeed", str(answer))

@@ -208,7 +208,7 @@ class CheckClient:
 
     # --- asking ---
 
-    def ask(self, kind: ControlRequest, subject: Any = None) -> Response:
+    def ask(self, kind: ControlRequest, subject: object = None) -> Response:
         """The answer, whatever it is.
 
         Raises:
@@ -220,11 +220,11 @@ class CheckClient:
             raise Lost(f"control was lost: {response.reason}")
         return response
 
-    def ask_directly(self, kind: ControlRequest, subject: Any) -> Response:
+    def ask_directly(self, kind: ControlRequest, subject: object) -> Response:
         """As `ask`, past the scheduler: for what the translator has to refuse by itself."""
         return self._asked_by(self._direct, kind, subject)
 
-    def _asked_by(self, link: ExperimentLink, kind: ControlRequest, subject: Any) -> Response:
+    def _asked_by(self, link: ExperimentLink, kind: ControlRequest, subject: object) -> Response:
         self._heed()
         try:
             with self._alive():
@@ -234,7 +234,7 @@ class CheckClient:
         self._stirred |= response.ok and not _only_asks(kind, subject)
         return response
 
-    def asked(self, kind: ControlRequest, subject: Any, what: str) -> Response:
+    def asked(self, kind: ControlRequest, subject: object, what: str) -> Response:
         """As `ask`, where it has to be a success."""
         response = self.ask(kind, subject)
         expect(response.ok, f"REP_SUCCESS to {what}", answer_in_words(response))
@@ -328,7 +328,7 @@ class CheckClient:
             raise Lost(str(ended)) from ended
 
 
-def _only_asks(kind: ControlRequest, subject: Any) -> bool:
+def _only_asks(kind: ControlRequest, subject: object) -> bool:
     return kind is ControlRequest.ACTION_SUPPORT or (isinstance(subject, Parameter) and subject.value is None)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field
-from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -51,7 +50,7 @@ class CheckReport:
 
     def to_json(self) -> str:
         """For programs: `passed`, the checks, and what is supported, with the controller's version."""
-        facts: dict[str, Any] = {
+        facts: dict[str, object] = {
             "passed": self.passed,
             "translator": self.translator,
             "controller": self.support.controller,
@@ -67,7 +66,7 @@ class CheckReport:
         }
         return json.dumps(facts, indent=2, ensure_ascii=False) + "\n"
 
-    def _parameter(self, name: str) -> dict[str, Any]:
+    def _parameter(self, name: str) -> dict[str, object]:
         told = self.support.parameters[name]
         return {
             "name": name,

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
+from afspm.plain_data import Plain
 from afspm.testing.clients.bench import ClientBench
 from afspm.testing.clients.checks.launch import require_beats
 from afspm.testing.clients.experiment import JudgedExperiment
@@ -19,7 +19,7 @@ CHANNELS = 2
 """The least that the simulated microscope records."""
 
 
-def scan_step(shape: Sequence[int] = (16, 32), angle_deg: float = 0.0, timeout_s: float = SCAN_S) -> dict[str, Any]:
+def scan_step(shape: Sequence[int] = (16, 32), angle_deg: float = 0.0, timeout_s: float = SCAN_S) -> Plain:
     """Return the arguments of a small scan."""
     return {
         "center_m": [0.2e-6, -0.1e-6],
@@ -30,7 +30,7 @@ def scan_step(shape: Sequence[int] = (16, 32), angle_deg: float = 0.0, timeout_s
     }
 
 
-def require_scans(experiment: JudgedExperiment, answer: Answer, asked: dict[str, Any]) -> None:
+def require_scans(experiment: JudgedExperiment, answer: Answer, asked: Plain) -> None:
     """Raise Failed unless an answer has what was published of the scan that was asked for."""
     expect(answer.ok, "the scan to be taken", str(answer))
     scans = answer.get("scans")
@@ -47,7 +47,7 @@ def require_scans(experiment: JudgedExperiment, answer: Answer, asked: dict[str,
         expect(near(scan["angle_deg"], asked["angle_deg"], 1e-3, 1e-3), f"{asked['angle_deg']}°", scan["angle_deg"])
 
 
-def _require_published(experiment: JudgedExperiment, message: str, told: dict[str, Any]) -> None:
+def _require_published(experiment: JudgedExperiment, message: str, told: dict[str, object]) -> None:
     """Raise Failed unless exactly this was published. A client need not tell which packet its own measurement was."""
     told = {"message": message, **told}
     wrong: list[Failed] = []

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import base64
 import binascii
-from typing import Any
 
 from google.protobuf import json_format
 
 from afspm.model import ControlRequest, ControlResponse, Packet, ScopeState
+from afspm.plain_data import Plain
 from afspm.testing.clients.bench import ClientBench, ScriptedRun
 from afspm.testing.clients.facts import compare
 from afspm.testing.clients.golden import frames_of, golden
@@ -50,7 +50,7 @@ def decode(bench: ClientBench) -> None:
             expect(again == payload, f"{entry['name']} encoded again as {payload.hex()}", again.hex())
 
 
-def _says(entry: dict[str, Any], answer: Answer) -> None:
+def _says(entry: Plain, answer: Answer) -> None:
     kind = message_type(entry["type"])
     right = kind.FromString(bytes.fromhex(entry["hex"]))
     try:
