@@ -17,7 +17,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import NoneType
-from typing import Any
 
 from afspm.errors import ConfigError
 from afspm.plain_data import Plain, PlainMapping
@@ -123,7 +122,7 @@ _JSON_TYPES: Mapping[str, tuple[type, ...]] = {
 """By the annotation of a field."""
 
 
-def _fields(cls: type[Any], plain: object, where: str) -> Plain:
+def _fields(cls: type[Launch | Sockets], plain: object, where: str) -> Plain:
     """Return the values of `plain` as arguments of the dataclass `cls`, each of the JSON type that belongs there."""
     if not isinstance(plain, dict):
         raise ConfigError(f"expected a JSON object, got {type(plain).__name__}", where=where)

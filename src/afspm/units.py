@@ -11,13 +11,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
-from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final, TypeVar
 
 from afspm.errors import UnitError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+    from pydantic import GetCoreSchemaHandler
 
 Number = TypeVar("Number", float, "NDArray[np.float64]")
 
@@ -97,7 +98,7 @@ class Unit:
 
     si: str
 
-    def __get_pydantic_core_schema__(self, source: object, handler: Any) -> object:
+    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> object:
         """Makes pydantic read the text too. Called by it alone, so that we need not load it here."""
         from pydantic_core import core_schema
 

@@ -286,7 +286,7 @@ class Emulator(ABC):
         self._wake()
         port.close()
 
-    def _survive(self, do: Callable[[float], Any], argument: float) -> Any:
+    def _survive(self, do: Callable[[float], float | None], argument: float) -> float | None:
         """Call it; an error that nobody foresaw ends what goes on, not the emulator: nothing that a client sends may.
 
         Raises:

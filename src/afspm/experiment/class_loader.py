@@ -10,7 +10,9 @@ import sys
 import traceback
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from afspm import plugins
@@ -146,7 +148,7 @@ def load(path: str) -> Any:
     return _attribute(module, name)
 
 
-def find_module(name: str, folders: Sequence[Path]) -> Any:
+def find_module(name: str, folders: Sequence[Path]) -> ModuleSpec | None:
     """Return the spec of a module, also from beside the file; None: there is none."""
     with importing_from(folders):
         try:
@@ -164,7 +166,7 @@ def role_of(component: type) -> Role | None:
     return Role.COMPONENT if hasattr(component, "run_process") else None
 
 
-def _attribute(module: Any, name: str) -> Any:
+def _attribute(module: ModuleType, name: str) -> Any:
     """Return a name of a module, which a package may only import when it is asked for."""
     try:
         return getattr(module, name)
@@ -177,7 +179,7 @@ def _attribute(module: Any, name: str) -> Any:
         raise Unloadable(f"importing {name} fails: {_where(error)}") from error
 
 
-def _hidden(module: Any) -> str:
+def _hidden(module: ModuleType) -> str:
     """Return what to do where a file of the user's has the name of a module of Python's; empty where none has."""
     for folder in sys.path:
         file = Path(folder, f"{module.__name__}.py")
@@ -187,7 +189,7 @@ def _hidden(module: Any) -> str:
     return ""
 
 
-def _import(package: str) -> object:
+def _import(package: str) -> ModuleType | None:
     try:
         return importlib.import_module(package)
     except ImportError:
@@ -233,11 +235,11 @@ def _where(error: BaseException) -> str:
     return f"{type(error).__name__}: {said}{place}"
 
 
-def _public_classes(module: object) -> list[str]:
+def _public_classes(module: ModuleType) -> list[str]:
     return [n for n, v in vars(module).items() if inspect.isclass(v) and not n.startswith("_")]
 
 
-def _own_classes(module: Any) -> list[str]:
+def _own_classes(module: ModuleType) -> list[str]:
     return [name for name in _public_classes(module) if getattr(module, name).__module__ == module.__name__]
 
 

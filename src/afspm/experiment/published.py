@@ -93,7 +93,7 @@ def envelope(table: Table) -> object:
     return default_envelope(PacketHeader("Scan2d", str(table.get("channel", "")), (width_m, height_m)))
 
 
-def length_m(value: Any) -> float:
+def length_m(value: str | float) -> float:
     """Return a length of the cache's settings in m: a text with its unit, or a number in nm."""
     return units.si(value, "m") if isinstance(value, str) else float(value) * 1e-9
 
@@ -162,7 +162,7 @@ def _paper(ours: str) -> PublishedSetting:
     return PublishedSetting(becomes)
 
 
-def _within(value: Any, *keys: str) -> Any:
+def _within(value: object, *keys: str) -> object:
     for key in keys:
         value = value.get(key) if isinstance(value, Mapping) else None
     return value
@@ -209,7 +209,7 @@ def _client(address: Callable[[Table], str]) -> Becomes:
 
 
 def _refused(hint: str) -> PublishedSetting:
-    def becomes(value: Any, table: Table) -> Settings:
+    def becomes(value: object, table: Table) -> Settings:
         raise InvalidValue("this is not taken over", hint=hint)
 
     return PublishedSetting(becomes)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 import pydantic
+from pydantic_core import ErrorDetails
 
 from afspm.errors import AfspmError
 from afspm.experiment.document import Document
@@ -52,7 +53,7 @@ def report(
     Args:
         known: returns the names that are valid beside an unknown one.
     """
-    by_place: dict[SettingPath, list[object]] = {}
+    by_place: dict[SettingPath, list[ErrorDetails]] = {}
     for one in error.errors(include_url=False):
         by_place.setdefault(_place(one, given), []).append(one)
     for place, errors in by_place.items():
@@ -71,7 +72,7 @@ def name_of(path: SettingPath) -> str:
     return f"[{path[0]}] {text}".rstrip()
 
 
-def _place(one: Any, given: Any) -> SettingPath:
+def _place(one: ErrorDetails, given: Any) -> SettingPath:
     """Return where in the given value an error is: its location without the names of alternatives and validators."""
     place: list[str | int] = []
     for number, part in enumerate(one["loc"], 1):
@@ -83,7 +84,7 @@ def _place(one: Any, given: Any) -> SettingPath:
     return tuple(place)
 
 
-def _sentence(errors: Sequence[Any], shown: str, known: Iterable[str]) -> tuple[str, str]:
+def _sentence(errors: Sequence[ErrorDetails], shown: str, known: Iterable[str]) -> tuple[str, str]:
     """Return what is wrong with one value, and the hint."""
     given = errors[0].get("input")
     if len(errors) > 1 and isinstance(given, list | Mapping):  # alternatives: it is not meant as a quantity
@@ -110,6 +111,6 @@ def _sentence(errors: Sequence[Any], shown: str, known: Iterable[str]) -> tuple[
     return f"{shown}: {said[:1].lower()}{said[1:]}, not {given!r}", ""
 
 
-def _cause(one: Any) -> AfspmError | None:
+def _cause(one: ErrorDetails) -> AfspmError | None:
     cause = one.get("ctx", {}).get("error")
     return cause if isinstance(cause, AfspmError) else None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, tzinfo
+from typing import Any
 
 from afspm.model import Scan, Spectrum
 
@@ -27,7 +28,7 @@ class FileContent:
     controller: str
     scans: tuple[Scan, ...] = ()
     spectra: tuple[Spectrum, ...] = ()
-    header: Mapping[str, object] = field(default_factory=dict)
+    header: Mapping[str, Any] = field(default_factory=dict)
     start_ns: int | None = None
     end_ns: int | None = None
     upwards: bool | None = None

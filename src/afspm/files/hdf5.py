@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.errors import FileError
+
+if TYPE_CHECKING:
+    import h5py
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 _HEAP = b"GCOL\x01\0\0\0"
@@ -22,7 +25,7 @@ def is_hdf5(path: Path) -> bool:
         return file.read(len(MAGIC)) == MAGIC
 
 
-def opened(path: Path) -> Any:
+def opened(path: Path) -> h5py.File:
     """The file; to be closed. Raises FileError: it is none."""
     import h5py
 
@@ -55,7 +58,7 @@ def _adds_up(data: bytes, place: int, end: int) -> bool:
     return place <= end
 
 
-def array(dataset: Any) -> NDArray[np.float64]:
+def array(dataset: h5py.Dataset) -> NDArray[np.float64]:
     """All values of a dataset of numbers. Raises FileError: it promises more than the file can hold."""
     most = _VALUES_PER_BYTE * dataset.file.id.get_filesize()
     if dataset.size is None or dataset.size > most:
@@ -63,7 +66,7 @@ def array(dataset: Any) -> NDArray[np.float64]:
     return np.asarray(dataset[()], dtype=np.float64)
 
 
-def texts(attributes: Any) -> dict[str, str]:
+def texts(attributes: h5py.AttributeManager) -> dict[str, str]:
     """The attributes that are texts."""
     return {key: text(value) for key, value in attributes.items() if isinstance(value, bytes | str)}
 

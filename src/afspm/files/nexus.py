@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from datetime import tzinfo
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from afspm.files import hdf5, nsid
 from afspm.files.content import FileContent
 from afspm.model import Frame, Region, Scan, Spectrum
 from afspm.plain_data import Plain
+
+if TYPE_CHECKING:
+    import h5py
 
 DEFINITION = "NXspm"
 BIAS_SPECTRUM = "NXsts"
@@ -38,7 +41,7 @@ def read_hdf5(path: Path, zone: tzinfo | None) -> FileContent:
         )  # fmt: skip
 
 
-def about_of(file: Any) -> Plain:
+def about_of(file: h5py.File) -> Plain:
     """Return what the record noted beside the values: holder of control, problems … Raises FileError: it is damaged."""
     try:
         about: Plain = json.loads(hdf5.text(file["entry"][ABOUT]["about"][()]))
@@ -47,7 +50,7 @@ def about_of(file: Any) -> Plain:
     return about
 
 
-def vendor_header(file: Any) -> dict[str, object]:
+def vendor_header(file: h5py.File) -> dict[str, object]:
     """The header of the controller's own file, as that said it; empty if it was not there to be read."""
     group = file["entry"].get(VENDOR)
     if group is None or "header" not in group:
@@ -56,12 +59,12 @@ def vendor_header(file: Any) -> dict[str, object]:
     return header
 
 
-def _is_ours(file: Any) -> bool:
+def _is_ours(file: h5py.File) -> bool:
     entry = file.get("entry")
     return entry is not None and ABOUT in entry and hdf5.text(entry["definition"][()]) in (DEFINITION, BIAS_SPECTRUM)
 
 
-def _scans(file: Any, about: Plain) -> list[Scan]:
+def _scans(file: h5py.File, about: Plain) -> list[Scan]:
     region = Region(tuple(about["center_m"]), tuple(about["size_m"]), about["angle_rad"], Frame(about["frame"]))
     data = file["entry"]["data"]
     return [
@@ -77,7 +80,7 @@ def _scans(file: Any, about: Plain) -> list[Scan]:
     ]
 
 
-def _spectrum(file: Any, about: Plain) -> Spectrum:
+def _spectrum(file: h5py.File, about: Plain) -> Spectrum:
     data, variables = file["entry"]["data"], about["variables"]
     columns = [hdf5.array(data[variable["field"]]) for variable in variables]
     place = about["position_m"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import tzinfo
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,14 @@ from afspm.files.content import FileContent
 from afspm.model import Region, Scan
 from afspm.units import convert
 
+if TYPE_CHECKING:
+    import h5py
+
 
 def read_nsid(path: Path, zone: tzinfo | None) -> FileContent:
     """All images of a file. Raises FileError: none in it, or broken. UnitError: axes that are no lengths."""
     with hdf5.opened(path) as file:
-        nodes: list[Any] = []
+        nodes: list[h5py.Dataset | h5py.Group] = []
         file.visititems(lambda _, node: nodes.append(node))
         images = [node for node in nodes if "quantity" in node.attrs and len(getattr(node, "shape", ())) == 2]
         if not images:
@@ -37,7 +40,7 @@ def read_nsid(path: Path, zone: tzinfo | None) -> FileContent:
     )
 
 
-def _note(image: Any) -> dict[str, object]:
+def _note(image: h5py.Dataset) -> dict[str, object]:
     """The keys of Asylum's note, which all images of a file share; empty in files of other instruments."""
     metadata = image.parent.get("original_metadata")
     if metadata is None:
@@ -46,19 +49,19 @@ def _note(image: Any) -> dict[str, object]:
     return values if "XOffset" in values else {}
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     if isinstance(value, np.generic):
         value = value.item()
     return hdf5.text(value) if isinstance(value, bytes) else value
 
 
-def _axis_m(axis: Any, unit: str) -> NDArray[np.float64]:
+def _axis_m(axis: h5py.Dataset, unit: str) -> NDArray[np.float64]:
     """Its values in m; `unit`: that it is in, whatever it says."""
     values: NDArray[np.float64] = convert(hdf5.array(axis), unit or hdf5.text(axis.attrs.get("units", "m")), "m")
     return values
 
 
-def _scan(image: Any, note: dict[str, object], end_ns: int | None, path: Path) -> Scan:
+def _scan(image: h5py.Dataset, note: dict[str, object], end_ns: int | None, path: Path) -> Scan:
     channel = hdf5.text(image.attrs["quantity"])
     values = hdf5.array(image).T
     # what wrote Asylum's gave the axes the unit of their channel; they are in m

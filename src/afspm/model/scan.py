@@ -6,7 +6,7 @@ import operator
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from afspm.clock import utc_time
 from afspm.errors import InvalidValue, NoSuchItem
@@ -14,6 +14,7 @@ from afspm.model.geometry import XY, Region, RegionChange
 
 if TYPE_CHECKING:
     import numpy as np
+    import sidpy
     import xarray
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
@@ -203,7 +204,7 @@ class Scan:
 
         return draw(self, kind, axes)
 
-    def to_sidpy(self) -> Any:
+    def to_sidpy(self) -> sidpy.Dataset:
         """Return the scan as a `sidpy.Dataset`, for programs of the pycroscopy ecosystem (needs sidpy).
 
         Its axes are x and y in m, those of the unrotated rectangle; angle, frame, time and file are in
@@ -214,7 +215,7 @@ class Scan:
         return to_sidpy(self)
 
     @staticmethod
-    def from_sidpy(dataset: Any) -> Scan:
+    def from_sidpy(dataset: sidpy.Dataset) -> Scan:
         """Return a two-dimensional `sidpy.Dataset` as a scan; axes in any unit of length.
 
         Raises:

@@ -6,7 +6,7 @@ sidpy's images are [x, y]; here they are [y, x]. Install sidpy yourself: it is a
 from __future__ import annotations
 
 from datetime import datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,12 +14,14 @@ from afspm.errors import InvalidValue
 from afspm.model.geometry import Frame, Region
 
 if TYPE_CHECKING:
+    import sidpy
+
     from afspm.model.scan import Scan
 
 _OURS = "afspm"
 
 
-def to_sidpy(scan: Scan) -> Any:
+def to_sidpy(scan: Scan) -> sidpy.Dataset:
     """Return the scan as a `sidpy.Dataset`; see `Scan.to_sidpy`."""
     import sidpy
 
@@ -39,7 +41,7 @@ def to_sidpy(scan: Scan) -> Any:
     return made
 
 
-def from_sidpy(dataset: Any) -> Scan:
+def from_sidpy(dataset: sidpy.Dataset) -> Scan:
     """Return an image of sidpy's as a scan; see `Scan.from_sidpy`."""
     from afspm import units
     from afspm.model.scan import Scan

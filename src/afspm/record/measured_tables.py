@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from afspm.model.spectrum_stack import Quantity, SpectrumStack
 
 R = TypeVar("R", ScanRow, SpectrumRow)
-Query = Callable[[str], list[Any]]
+Row = tuple[Any, ...]
+"""Of a table in SQLite."""
+Query = Callable[[str], list[Row]]
 
 _PUBLISHED = {
     "scans": "SELECT scan, min(time_ns) FROM packets WHERE message = 'Scan2d' GROUP BY scan",
@@ -133,12 +135,12 @@ def read_spectra(query: Query, read: Callable[[SpectrumRow], Spectrum]) -> Spect
     return SpectrumTable((spectrum_row(row, keys.get(row[0], "")) for row in found), read)
 
 
-def _keys(query: Query, table: str, action: str, rows: Sequence[Any]) -> dict[int, str]:
+def _keys(query: Query, table: str, action: str, rows: Sequence[Row]) -> dict[int, str]:
     """Return the keys by the number of the row: each start belongs to the measurement that was published next."""
     starts = query(f"SELECT sent_ns, key FROM starts WHERE action = '{action}'") if query(_HAS_STARTS) else []
     if not any(key for _, key in starts):
         return {}
-    published = dict(query(_PUBLISHED[table]))
+    published: dict[int, int] = dict(query(_PUBLISHED[table]))
     ends = sorted((published.get(number, time_ns), number) for number, time_ns, *_ in rows)
     keys: dict[int, str] = {}
     waiting = sorted(starts, key=itemgetter(0), reverse=True)
@@ -154,7 +156,7 @@ def _told(keys: Sequence[str]) -> str:
     return f"there are {', '.join(keys[:20])}{' …' if len(keys) > 20 else ''}"
 
 
-def scan_row(row: Any, key: str = "") -> ScanRow:
+def scan_row(row: Row, key: str = "") -> ScanRow:
     """Return a row of the journal as an object."""
     (
         number, time_ns, began_ns, filename, file, interrupted, x, y, width, height, angle, frame, rows, columns,
@@ -178,7 +180,7 @@ def scan_row(row: Any, key: str = "") -> ScanRow:
     )
 
 
-def spectrum_row(row: Any, key: str = "") -> SpectrumRow:
+def spectrum_row(row: Row, key: str = "") -> SpectrumRow:
     """Return a row of the journal as an object."""
     (
         number, time_ns, began_ns, filename, file, kind, x, y, frame, points, names, units, holder, mode, problems,

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,11 @@ from afspm.model import Scan, Spectrum
 from afspm.plain_data import Plain, PlainMapping
 from afspm.record import nxspm
 from afspm.record.nxspm import group, values
+
+if TYPE_CHECKING:
+    import h5py
+
+    _Fill = Callable[[h5py.Group, h5py.Group], None]
 
 Array = NDArray[np.float64]
 
@@ -70,7 +75,7 @@ def encode_scan(scans: Sequence[Scan], circumstances: FileProvenance) -> bytes:
     (left, low), (width, height), (rows, columns) = region.top_left_m, region.size_m, first.shape
     x, y = np.linspace(left, left + width, columns), np.linspace(low, low + height, rows)
 
-    def fill(entry: object, instrument: object) -> None:
+    def fill(entry: h5py.Group, instrument: h5py.Group) -> None:
         data = group(entry, "data", "NXdata")
         data.attrs.update(signal=fields[0], axes=["y", "x"], x_indices=1, y_indices=0)
         if fields[1:]:
@@ -100,7 +105,7 @@ def encode_spectrum(spectrum: Spectrum, circumstances: FileProvenance) -> bytes:
 
     definition = nxspm.definition_of(spectrum, circumstances.facts.get("metadata") or {})
 
-    def fill(entry: Any, instrument: Any) -> None:
+    def fill(entry: h5py.Group, instrument: h5py.Group) -> None:
         data = group(entry, "data", "NXdata")
         if fields[1:]:
             data.attrs.update({"signal": fields[1], "axes": [fields[0]], f"{fields[0]}_indices": 0})
@@ -124,7 +129,10 @@ def facts_of(path: Path) -> Plain:
 
 
 def _encoded(
-    definition: str, about: dict[str, object], circumstances: FileProvenance, fill: Callable[[object, object], None]
+    definition: str,
+    about: dict[str, object],
+    circumstances: FileProvenance,
+    fill: _Fill,
 ) -> bytes:
     """Made in memory: whatever is wrong with the disk is then found in one place, where the bytes are written."""
     import h5py

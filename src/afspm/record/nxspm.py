@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from afspm.files.nexus import BIAS_SPECTRUM, DEFINITION
 from afspm.model import Region, Scan, Spectrum
 from afspm.plain_data import PlainMapping
+
+if TYPE_CHECKING:
+    import h5py
 
 _VERSION: Final = "v2024.02"
 """Of the NeXus definitions."""
@@ -25,7 +28,7 @@ def definition_of(spectrum: Spectrum, metadata: Mapping[str, str]) -> str:
     return BIAS_SPECTRUM if is_over_bias and is_tunnelling else DEFINITION
 
 
-def describe(entry: Any, definition: str, about: PlainMapping, version: str) -> object:
+def describe(entry: h5py.Group, definition: str, about: PlainMapping, version: str) -> h5py.Group:
     """Write what holds for the whole file, and return the instrument. What is not known is left out."""
     entry["definition"] = definition
     entry["definition"].attrs["version"] = _VERSION
@@ -55,19 +58,19 @@ def describe(entry: Any, definition: str, about: PlainMapping, version: str) -> 
     return instrument
 
 
-def write_frame(instrument: object, scan: Scan) -> None:
+def write_frame(instrument: h5py.Group, scan: Scan) -> None:
     """Write region and pixels of a scan: start and end are those of the frame before it was turned."""
     rows, columns = scan.shape
     _write_pattern(instrument, scan.region.center_m, scan.region, (columns, rows))
 
 
-def write_point(instrument: object, spectrum: Spectrum) -> None:
+def write_point(instrument: h5py.Group, spectrum: Spectrum) -> None:
     """Write where the probe was, as a scan of one point."""
     if spectrum.position_m is not None:
         _write_pattern(instrument, spectrum.position_m, None, (1, 1))
 
 
-def write_bias_sweep(entry: Any, instrument: object, spectrum: Spectrum) -> None:
+def write_bias_sweep(entry: h5py.Group, instrument: h5py.Group, spectrum: Spectrum) -> None:
     """Write the sweep of a spectrum over the bias."""
     entry["scan_mode"] = "constant height"  # the feedback is held while the bias is swept
     environment = group(instrument, "bias_spectroscopy_environment", "NXenvironment")
@@ -91,7 +94,7 @@ def write_bias_sweep(entry: Any, instrument: object, spectrum: Spectrum) -> None
 
 
 def _write_pattern(
-    instrument: object, center_m: tuple[float, float], region: Region | None, points: tuple[int, int]
+    instrument: h5py.Group, center_m: tuple[float, float], region: Region | None, points: tuple[int, int]
 ) -> None:
     environment = group(instrument, "scan_environment", "NXenvironment")
     control = group(environment, "scan_control", "NXspm_scan_control")
@@ -108,14 +111,14 @@ def _write_pattern(
     values(area, "scan_angle_x", 0.0 if region is None else math.degrees(region.angle_rad), "deg")
 
 
-def group(parent: Any, name: str, nexus_class: str) -> Any:
+def group(parent: h5py.Group, name: str, nexus_class: str) -> h5py.Group:
     """Create a group of a NeXus class."""
     made = parent.create_group(name)
     made.attrs["NX_class"] = nexus_class
     return made
 
 
-def values(parent: Any, name: str, numbers: NDArray[np.float64] | float, unit: str, long_name: str = "") -> None:
+def values(parent: h5py.Group, name: str, numbers: NDArray[np.float64] | float, unit: str, long_name: str = "") -> None:
     """Create a field of float64 with its unit."""
     dataset = parent.create_dataset(name, data=numbers, dtype="<f8")
     dataset.attrs["units"] = unit
@@ -123,7 +126,7 @@ def values(parent: Any, name: str, numbers: NDArray[np.float64] | float, unit: s
         dataset.attrs["long_name"] = long_name
 
 
-def _write_texts(parent: Any, texts: Mapping[str, str | None]) -> None:
+def _write_texts(parent: h5py.Group, texts: Mapping[str, str | None]) -> None:
     for name, text in texts.items():
         if text:
             parent[name] = str(text)

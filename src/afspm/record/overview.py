@@ -6,7 +6,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -65,6 +65,8 @@ OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
 """Of a process of which nothing more is to be heard."""
 COMPARED = 5  # scans before, by which it is told how long one takes
 NOBODY = None
+K = TypeVar("K")
+V = TypeVar("V")
 
 
 @dataclass(frozen=True, slots=True)
@@ -437,7 +439,7 @@ def _flags(entry: JournalEntry, number: int) -> bool:
     return is_flag and entry.problem == number
 
 
-def _keep(kept: dict[Any, Any], key: object, thing: object) -> None:
+def _keep(kept: dict[K, V], key: K, thing: V) -> None:
     """Add what is not there yet; the oldest goes where there are too many."""
     kept.setdefault(key, thing)
     if len(kept) > MOST_MEASURED:

@@ -12,13 +12,16 @@ from afspm import wire
 from afspm.errors import FileError, WireError
 from afspm.model import Frame, Packet, Scan, Spectrum
 from afspm.record.journal import SCHEDULER
+from afspm.record.measured_tables import Row
 from afspm.wire.values import with_values
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-Query = Callable[[str, Sequence[Any]], list[Any]]
+    from afspm.files.content import FileContent
+
+Query = Callable[[str, Sequence[object]], list[Row]]
 """Asks the journal; raises FileError where it is damaged."""
 
 _AT_ONCE = 500
@@ -66,7 +69,7 @@ def without_reading_files(
         yield Packet(envelope, payload, time_ns), message, _placed(thing, frame)
 
 
-def _rows(query: Query, since_ns: int, messages: Sequence[str] | None) -> Iterator[Any]:
+def _rows(query: Query, since_ns: int, messages: Sequence[str] | None) -> Iterator[Row]:
     """Read some rows at a time, so that a slow reader blocks no writer and sees what is written meanwhile."""
     wanted = "" if messages is None else f" AND message IN ({', '.join('?' * len(messages))})"
     sql = f"SELECT {_COLUMNS} FROM packets WHERE source = ? AND (time_ns, envelope) > (?, ?){wanted}"
@@ -97,24 +100,23 @@ class _Values:
     def __init__(self, query: Query, folder: Path) -> None:
         self._query = query
         self._folder = folder
-        self._kept: OrderedDict[str, object] = OrderedDict()
+        self._kept: OrderedDict[str, FileContent] = OrderedDict()
 
     def of(
         self, scan: int | None, spectrum: int | None, channel: str | None, first_row: int | None, rows: int | None
     ) -> NDArray[np.float64] | None:
         """None: the packet is whole as it is. Raises FileError: the file is missing or damaged."""
         if spectrum is not None:
-            found: NDArray[np.float64] = self._content("spectra", spectrum).spectra[0].values
-            return found
+            return self._content("spectra", spectrum).spectra[0].values
         if scan is None:
             return None
         content = self._content("scans", scan)
-        values: NDArray[np.float64] | None = next((s.values for s in content.scans if s.channel == channel), None)
+        values = next((s.values for s in content.scans if s.channel == channel), None)
         if values is None:
             raise FileError(f"channel {channel!r} is missing", where=f"scan {scan} of {self._folder}")
         return values if first_row is None else values[first_row : first_row + (rows or 0)]
 
-    def _content(self, table: str, number: int) -> Any:
+    def _content(self, table: str, number: int) -> FileContent:
         from afspm.files import read
 
         ((file,),) = self._query(f"SELECT file FROM {table} WHERE number = ?", (number,))

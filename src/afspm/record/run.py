@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from afspm import wire
 from afspm.errors import FileError, InvalidValue, NoSuchItem, WireError
@@ -27,11 +27,12 @@ from afspm.model import (
     ScanSet,
     Spectrum,
 )
-from afspm.plain_data import Plain
 from afspm.record import journal
 from afspm.record.journal import SCHEDULER
 from afspm.record.measured_tables import (
     KeyedTable,
+    R,
+    Row,
     SpectrumTable,
     read_scans,
     read_spectra,
@@ -43,6 +44,7 @@ from afspm.record.run_json import EXPERIMENT_FILE, METADATA, REPLAY_OF, latest_r
 from afspm.record.tables import ControlRow, NoteRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
 
 if TYPE_CHECKING:
+    from afspm.files.content import FileContent
     from afspm.record.overview import DriftPoint, Overview
 
 _SAME_SCAN_NS = 1_000_000_000
@@ -103,11 +105,11 @@ class Run:
         """Return a spectrum: by its place in `spectra` (-1: the last), its key, or its row. Raises as `scan`."""
         row = self.spectra[which] if isinstance(which, str) else which
         row = row if isinstance(row, SpectrumRow) else self._row("spectra", row, spectrum_row)
-        return cast(Spectrum, self._content(row.file, f"spectrum {row.number}").spectra[0])
+        return self._content(row.file, f"spectrum {row.number}").spectra[0]
 
-    def about(self, row: ScanRow | SpectrumRow) -> Plain:
+    def about(self, row: ScanRow | SpectrumRow) -> dict[str, Any]:
         """Return what is known beside the values: drift, feedback, the controller's header, notes … See `scan`."""
-        header: Plain = dict(self._content(row.file, f"number {row.number}").header)
+        header: dict[str, Any] = dict(self._content(row.file, f"number {row.number}").header)
         notes = [f"{note.text} ({note.who})" for note in self.notes_on(row)]
         return header | ({"notes": notes} if notes else {}) | ({"key": row.key} if row.key else {})
 
@@ -259,7 +261,7 @@ class Run:
     # --- the run itself ---
 
     @cached_property
-    def experiment(self) -> Plain:
+    def experiment(self) -> dict[str, Any]:
         """The experiment file as it was expanded."""
         try:
             return tomllib.loads((self.folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
@@ -267,7 +269,7 @@ class Run:
             raise FileError(f"can't be read: {error}", where=str(self.folder / EXPERIMENT_FILE)) from error
 
     @property
-    def facts(self) -> Plain:
+    def facts(self) -> dict[str, Any]:
         """run.json: clock, addresses, how it ended. Empty if it can't be read."""
         return run_json_or_empty(self.folder)
 
@@ -292,7 +294,7 @@ class Run:
         return bool(self._note("simulated"))
 
     @property
-    def seeds(self) -> Plain:
+    def seeds(self) -> dict[str, Any]:
         """Of what was left to chance, by component."""
         return dict(self._note("seeds") or {})
 
@@ -328,7 +330,7 @@ class Run:
         scans, spectra = (self._query(f"SELECT count(*) FROM {kind}")[0][0] for kind in ("scans", "spectra"))
         return f"<Run {self.folder.name}: {counted(scans, 'scan')}, {counted(spectra, 'spectrum', 'spectra')}>"
 
-    def _query(self, sql: str, values: Sequence[object] = ()) -> list[Any]:
+    def _query(self, sql: str, values: Sequence[object] = ()) -> list[Row]:
         with self._naming_damage():
             return self._journal.execute(sql, values).fetchall()
 
@@ -345,14 +347,14 @@ class Run:
         found = self._query("SELECT value FROM about WHERE name = ?", (name,))
         return json.loads(found[0][0]) if found else None
 
-    def _row(self, table: str, index: int, made: Any) -> Any:
+    def _row(self, table: str, index: int, made: Callable[[Row], R]) -> R:
         order, offset = ("ASC", index) if index >= 0 else ("DESC", -index - 1)
         found = self._query(f"SELECT * FROM {table} ORDER BY number {order} LIMIT 1 OFFSET ?", (offset,))
         if not found:
             raise NoSuchItem(f"there is no number {index} among the {table} of {self.folder.name}")
         return made(found[0])
 
-    def _content(self, file: str, what: str) -> Any:
+    def _content(self, file: str, what: str) -> FileContent:
         from afspm.files import read
 
         if not file:

@@ -194,7 +194,7 @@ _COLUMNS = {
 """The columns that some attributes are taken apart into."""
 
 
-def _names(kind: type[Any]) -> list[str]:
+def _names(kind: type) -> list[str]:
     return [name for field in fields(kind) for name in _COLUMNS.get(field.name, (field.name,))]
 
 

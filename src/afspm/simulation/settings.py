@@ -87,7 +87,7 @@ def check(settings: object, *, above_zero: str = "", from_zero: str = "", fracti
     errors.raise_all()
 
 
-def _names(cls: Any) -> list[str]:
+def _names(cls: type) -> list[str]:
     return [field.name for field in dataclasses.fields(cls)]
 
 

@@ -7,9 +7,12 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+
+if TYPE_CHECKING:
+    import h5py
 
 _USER: Final = "Nobody"
 _VERSIONS: Final = {3: ("gxsm3", "3.54.0"), 4: ("gxsm4", "4.4.1")}
@@ -133,7 +136,7 @@ def netcdf3(scan: GxsmScanFile) -> bytes:
     return made.getvalue()
 
 
-def _variable(file: Any, name: str, kind: str, dimensions: tuple[str, ...], values: Any) -> Any:
+def _variable(file: Any, name: str, kind: str, dimensions: tuple[str, ...], values: object) -> Any:
     made = file.createVariable(name, kind, dimensions)
     made[...] = values
     return made
@@ -171,7 +174,7 @@ def netcdf4(scan: GxsmScanFile) -> bytes:
     return made.getvalue()
 
 
-def _describe(node: Any, **attributes: str) -> None:
+def _describe(node: h5py.Dataset, **attributes: str) -> None:
     for name, value in attributes.items():
         node.attrs[name] = np.bytes_(value.encode())
 

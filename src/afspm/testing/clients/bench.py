@@ -145,7 +145,7 @@ class ClientBench:
         )
 
     @contextmanager
-    def _started(self, launch: Launch, pump: Pump, wake: Any) -> Iterator[JudgedClient]:
+    def _started(self, launch: Launch, pump: Pump, wake: Callable[[], None]) -> Iterator[JudgedClient]:
         with ExitStack() as stack:
             beats = BeatRecorder(self.clock, wake)
             stack.callback(beats.close)

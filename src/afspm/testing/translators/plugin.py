@@ -100,7 +100,7 @@ class CheckItem(pytest.Item):
         return self.path, None, f"{self._check.name}: {self._check.title}"
 
 
-def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     """Print what is supported and what is not."""
     from rich.console import Console
 
