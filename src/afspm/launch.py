@@ -80,6 +80,8 @@ class Launch:
     feedback off."""
     adjustable: tuple[str, ...] = ()
     """Of a translator: parameters that are set during a scan, too."""
+    solved: tuple[str, ...] = ()
+    """Of a scheduler: the problems that components of the run solve."""
 
     def to_json(self) -> str:
         """Return one line, without the newline at its end."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any, ClassVar
 
 from afspm import wire
@@ -31,7 +32,7 @@ class Rescanner(Component):
     flags device-malfunction.
 
     Args:
-        attempts: scans for one request.
+        attempts: scans for one request; in the other direction there is one.
         widen: by how much each search is wider than the one before it.
         most_pixels: of a side of a search, whose pixels are those of the scans before as far as this allows.
         problem: what it solves.
@@ -74,12 +75,16 @@ class Rescanner(Component):
             self.scope.flag(self.problem)
             self.scope.wait_until(self._is_flagged, timeout_s=FLAGGED_WITHIN_S)
         with self.scope.control(solving=self.problem):
+            optional = message.kind == RescanKind.OPPOSITE
             try:
                 found = self._take(message, parameters, told)
             except Refused as refused:
-                self.log.error("it can't be scanned again: %s", refused.reason)
+                level = logging.INFO if optional else logging.ERROR
+                self.log.log(level, "it can't be scanned again: %s", refused.reason)
                 found = False
-            if not found and message.kind == RescanKind.SEARCH:
+            if not found and optional:
+                self.log.info("the velocity of drift stays unknown until the second scan")
+            elif not found and message.kind == RescanKind.SEARCH:
                 # before the other flag is gone: nobody is to go on in between
                 self.log.critical(
                     "the sample can't be found again; nothing is scanned until a person clears the problem"
@@ -98,7 +103,7 @@ class Rescanner(Component):
             self._turn(message)
             if message.kind == RescanKind.SEARCH:
                 self._note_before(_FRAME_BEFORE, [*region.center_m, *region.size_m, region.angle_rad, shape])
-            for attempt in range(self.attempts):
+            for attempt in range(1 if message.kind == RescanKind.OPPOSITE else self.attempts):
                 self._forget(told)
                 if message.kind == RescanKind.SEARCH:
                     self._search(region, shape, attempt + 1)

@@ -47,7 +47,11 @@ def starts(
     _require_addresses(resolved, {**resolved.net.links, **links} if only else links, chosen, implied)
     addresses = resolved.net.addresses(take_address)
     processes = [process for role in _ORDER for process in resolved.with_role(role) if process.name in chosen]
-    return [_start(process, resolved, links[process.name], addresses, chosen) for process in processes]
+    made = [_start(process, resolved, links[process.name], addresses, chosen) for process in processes]
+    solved = _solved(resolved, without)
+    return [
+        replace(one, launch=replace(one.launch, solved=solved)) if one.role is Role.SCHEDULER else one for one in made
+    ]
 
 
 def knowing_the_run(resolved: ResolvedExperiment) -> set[str]:
@@ -228,6 +232,12 @@ def _in_sample_coordinates(resolved: ResolvedExperiment) -> bool:
     """Return whether the scheduler maps places, as its class says."""
     schedulers = resolved.with_role(Role.SCHEDULER)
     return any(getattr(scheduler.component, "frame", None) is Frame.SAMPLE for scheduler in schedulers)
+
+
+def _solved(resolved: ResolvedExperiment, without: Collection[str]) -> tuple[str, ...]:
+    """Return the problems that components solve, here or on another computer."""
+    solvers = (process for process in resolved.processes.values() if process.name not in without)
+    return tuple(sorted({problem for process in solvers for problem in process.declared.solves}))
 
 
 def _retracts(resolved: ResolvedExperiment) -> bool:

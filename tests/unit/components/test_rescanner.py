@@ -99,6 +99,12 @@ def test_the_other_direction_is_scanned_and_the_direction_set_back() -> None:
     assert lab.problems == ()
 
 
+def test_the_other_direction_is_tried_once_and_costs_no_night() -> None:
+    lab = asked(RescanKind.OPPOSITE, ["unmatched"] * 3, upwards=False)
+    assert len(lab.finished) == 1
+    assert lab.problems == ()
+
+
 @pytest.mark.parametrize("kind", [RescanKind.OPPOSITE, RescanKind.SEARCH])
 def test_direction_and_region_are_set_back_when_somebody_else_says_that_there_is_no_drift(kind: int) -> None:
     lab = Drifting([])

@@ -12,6 +12,7 @@ from .conftest import Write, errors, only_error
 
 SCHEDULER = '[scheduler]\ncomponent = true\nclass = "{name}"\n'
 MICROSCOPE = '[microscope]\ncomponent = true\nclass = "Simulator"\n'
+BY_HAND = '[control]\nsolved_by_hand = ["thermal-drift", "device-malfunction"]\n'
 RESCANNER = '[rescanner]\ncomponent = true\nclass = "{name}"\n'
 
 
@@ -93,3 +94,16 @@ def test_the_published_names_are_ours(write: Write) -> None:
     )
     assert names["scheduler"].class_.endswith("scheduler.drift.scheduler.DriftCompensatedScheduler")
     assert names["rescanner"].class_.endswith("rescanner.Rescanner")
+
+
+@pytest.mark.parametrize(("rescanner", "solved"), [(True, ("thermal-drift",)), (False, ())])
+def test_the_scheduler_is_told_which_problems_are_solved(
+    write: Write, rescanner: bool, solved: tuple[str, ...]
+) -> None:
+    text = experiment() if rescanner else experiment().replace(RESCANNER.format(name="Rescanner"), BY_HAND)
+    assert launched(write, text)["scheduler"].solved == solved
+
+
+@pytest.mark.parametrize(("solved", "at_start"), [(("thermal-drift",), "up-down"), ((), "nothing")])
+def test_without_a_rescanner_the_first_scan_is_taken_once(solved: tuple[str, ...], at_start: str) -> None:
+    assert DriftCompensatedScheduler().drift.beside(solved).at_start == at_start

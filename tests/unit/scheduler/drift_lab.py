@@ -126,7 +126,11 @@ def position_message(change: PositionChange) -> ProbePositionMessage:
 
 
 class Lab:
-    """A core, what it has done, and short ways to make things happen. Real and experiment time pass alike."""
+    """A core, what it has done, and short ways to make things happen. Real and experiment time pass alike.
+
+    Args:
+        drift: None: the defaults, but that a night begins with one scan.
+    """
 
     def __init__(
         self,
@@ -142,7 +146,11 @@ class Lab:
         self.now_s = now_s
         settings = SchedulerSettings(limits=limits or ExperimentLimits())
         self.core = DriftCore(
-            settings, drift or DriftCompensationSettings(), DriftWireCodec(), self.worker, "scheduler"
+            settings,
+            drift or DriftCompensationSettings(at_start="nothing"),
+            DriftWireCodec(),
+            self.worker,
+            "scheduler",
         )
         if state is not None:
             self.core.restore(state)

@@ -110,7 +110,7 @@ class DriftResponse:
         self._started = True
         if upwards is None:
             why = f"the microscope does not report {names.SCAN_DIRECTION}"
-            return [Log("WARNING", f"{why}: the first scan is not taken in both directions")]
+            return [Log("INFO", f"{why}: the first scan is not taken in both directions")]
         effects = step(ProblemSeen(_DRIFT, flagged=True, name=self._name))
         return effects + self._want(RescanKind.OPPOSITE, _AT_START, step, now_ns, upwards=not upwards)
 

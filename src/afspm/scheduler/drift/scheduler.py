@@ -77,9 +77,12 @@ class DriftCompensatedScheduler(Scheduler):
     def _core(self, context: ProcessContext) -> SchedulerCore:
         launch = context.launch
         file = Path(launch.state_dir) / f"{launch.name}.drift.npz" if launch.state_dir else None
-        self._registrar = DriftWorkerProcess(self.drift, file, context.log)
+        drift = self.drift.beside(launch.solved)
+        if drift != self.drift:
+            context.log.info("no component solves thermal-drift: the first scan is not taken in both directions")
+        self._registrar = DriftWorkerProcess(drift, file, context.log)
         self._registrar.late = context.clock.late
-        return DriftCore(self._settings(context), self.drift, DriftWireCodec(), self._registrar, launch.name)
+        return DriftCore(self._settings(context), drift, DriftWireCodec(), self._registrar, launch.name)
 
     def _shell(self, core: SchedulerCore, sockets: SchedulerSockets, *others: Any) -> SchedulerShell:
         assert isinstance(core, DriftCore)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 from afspm.errors import ConfigError, InvalidValue
@@ -56,7 +57,8 @@ class DriftCompensationSettings:
         correct: whether components are given sample coordinates; else drift is followed and told, and nothing changed.
         correct_after: since the start of the experiment; until then as if `correct` were false.
         rescan: when a scan is taken again.
-        at_start: "up-down": the first scan is followed by one in the other direction, which tells the velocity.
+        at_start: "up-down": the first scan is followed by one in the other direction, which tells the velocity, where
+            a component solves thermal-drift and the microscope reports its direction; "nothing": it is not.
         compensate: hands the velocity over to a controller that compensates by itself.
         longest_registration: for how long (real) what the microscope publishes waits for a scan to be registered.
     """
@@ -67,7 +69,7 @@ class DriftCompensationSettings:
     correct: bool = True
     correct_after: Duration = 0.0
     rescan: RescanRule = field(default_factory=RescanRule)
-    at_start: Literal["up-down", "nothing"] = "nothing"
+    at_start: Literal["up-down", "nothing"] = "up-down"
     compensate: Compensate | None = None
     longest_registration: Duration = 30.0
 
@@ -78,6 +80,11 @@ class DriftCompensationSettings:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise InvalidValue(f"{name} = {value} s is not zero or more", where="drift")
+
+    def beside(self, solved: Collection[str]) -> DriftCompensationSettings:
+        """Return these settings for a run whose components solve these problems: without a component that scans again,
+        the first scan is taken in one direction."""
+        return self if "thermal-drift" in solved else replace(self, at_start="nothing")
 
     @classmethod
     def from_table(cls, table: dict[str, Any]) -> DriftCompensationSettings:
