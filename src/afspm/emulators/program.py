@@ -88,6 +88,11 @@ class MakerProgram(ABC):
         return self._curve is not None
 
     @property
+    def engages(self) -> bool:
+        """True while the tip is about to go to the sample."""
+        return self._engages
+
+    @property
     def engaged(self) -> bool:
         """True while the tip is at the sample or on its way there."""
         return self.rig.engaged or self._engages

@@ -1,0 +1,102 @@
+"""The files that the emulated Studio saves: .nhf of format 2, HDF5 with integers that lie in a range."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any, Final
+
+import numpy as np
+
+from afspm.emulators.activities import RETRACE, ScanActivity, SpectrumActivity
+from afspm.simulation.fields import Array
+
+_MISSING: Final = -(2**31)
+_LARGEST: Final = 2**31 - 1
+SegmentChannels = Mapping[str, tuple[str, Array]]
+_SEGMENTS: Final = ("Forward", "Backward")
+_BLOCKS: Final = "block_size"
+
+
+def image(scan: ScanActivity, now_s: float, mode: str) -> bytes:
+    """The file of a scan; lines that were not scanned hold the number for none."""
+    channels = scan.channels(scan.end_s if scan.stopped_s is not None else None)
+    (rows, columns), region = scan.shape, scan.region
+    width, height = region.size_m
+    facts = {
+        "group_type": "image_line_based",
+        "image_scan_direction": "up" if scan.upwards else "down",
+        "image_line_rate": 1.0 / scan.line_s,
+        "image_points_per_line": np.uint32(columns),
+        "image_number_of_lines": np.uint32(rows),
+        "image_size_x": width,
+        "image_size_y": height,
+        "scanner_offset_x": region.center_m[0],
+        "scanner_offset_y": region.center_m[1],
+        "scanner_rotation": float(np.degrees(region.angle_rad)),
+    }
+    frame = {
+        "rect_axis_size": np.array([rows, columns], np.uint32),
+        "rect_axis_range": np.array([height, width]),
+        "rect_rotation": float(np.degrees(region.angle_rad)),
+    }
+    forward = {name: data for name, data in channels.items() if not name.endswith(RETRACE)}
+    backward = {name.removesuffix(RETRACE): data for name, data in channels.items() if name.endswith(RETRACE)}
+    return _file({**facts, "measurement_mode": mode}, frame, [forward, backward], now_s)
+
+
+def curve(spectrum: SpectrumActivity, now_s: float, mode: str) -> bytes:
+    """The file of a force curve: a segment towards the sample, another back."""
+    table = dict(zip(spectrum.names, zip(spectrum.units, spectrum.values.T, strict=True), strict=True))
+    there = {name: data for name, data in table.items() if not name.endswith(RETRACE)}
+    back = {name: (unit, table.get(f"{name}{RETRACE}", (unit, values))[1]) for name, (unit, values) in there.items()}
+    there = {name: (unit, values[::-1]) for name, (unit, values) in there.items()}
+    return _file({"group_type": "spectroscopy", "measurement_mode": mode}, {}, [there, back], now_s)
+
+
+def _file(
+    facts: Mapping[str, Any], frame: Mapping[str, Any], segments: Sequence[SegmentChannels], now_s: float
+) -> bytes:
+    import h5py
+
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        written = datetime.fromtimestamp(now_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        file.attrs.update(nsf_file_version_major=np.uint32(2), nsf_file_version_minor=np.uint32(0), created=written)
+        group = file.create_group("group_0000")
+        group.attrs.update(facts)
+        group.attrs.update(name="SIMULATED", created=written, modified=written)
+        for number, (name, channels) in enumerate(zip(_SEGMENTS, segments, strict=True)):
+            segment = group.create_group(f"segment_{number:04d}")
+            segment.attrs.update(frame)
+            segment.attrs["segment_name"] = name
+            for index, (signal, (unit, values)) in enumerate(channels.items()):
+                _add(segment, f"dataset_{index:04d}", signal, unit, values)
+            if not frame:
+                _add_blocks(segment, channels)
+    return content.getvalue()
+
+
+def _add(segment: Any, name: str, signal: str, unit: str, values: Array) -> None:
+    """A channel: integers over the range that its values take."""
+    present = values[np.isfinite(values)]
+    low, high = (float(present.min()), float(present.max())) if present.size else (0.0, 1.0)
+    high = high if high > low else low + max(abs(low), 1e-12)
+    scaled = np.rint((values - low) / (high - low) * (2.0 * _LARGEST)) - _LARGEST
+    integers = np.where(np.isfinite(values), scaled, _MISSING).astype(np.int32)
+    dataset = segment.create_dataset(name, data=integers.ravel(), fillvalue=_MISSING)
+    dataset.attrs.update(
+        signal_name=signal,
+        signal_calibration_unit=unit,
+        signal_calibration_min=low,
+        signal_calibration_max=high,
+        dataset_element_type="int32",
+        dataset_block_size_source=_BLOCKS,
+    )
+
+
+def _add_blocks(segment: Any, channels: Mapping[str, tuple[str, Array]]) -> None:
+    sizes = [len(values) for _, values in channels.values()][:1]
+    dataset = segment.create_dataset("dataset_blocks", data=np.array(sizes, np.uint32))
+    dataset.attrs["dataset_block_size_id"] = _BLOCKS

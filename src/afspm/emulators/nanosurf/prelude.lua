@@ -1,0 +1,105 @@
+-- Runs the scripts of clients, each in a coroutine, and writes what they return as Studio does. Called with Python's
+-- functions; returns start(text, environment), step(script) and helpers.
+local fire_limit = 5000000
+
+local function key_text(key)
+  if type(key) == "string" then return string.format("[%q]", key) end
+  return "[" .. tostring(key) .. "]"
+end
+
+local function written(value, depth)
+  local kind = math.type(value)
+  if kind == "integer" then return tostring(value) end
+  if kind == "float" then
+    if value ~= value then return "(0/0)" end
+    if value == math.huge then return "math.huge" elseif value == -math.huge then return "-math.huge" end
+    local text = string.format("%.17g", value)
+    return text:find("[%.eE]") and text or text .. ".0"
+  end
+  kind = type(value)
+  if kind == "string" then return (string.format("%q", value):gsub("\\\n", "\\n")) end
+  if kind == "function" then return "function() end" end
+  if kind ~= "table" then return (kind == "boolean" or kind == "nil") and tostring(value) or "nil" end
+  if depth > 20 then error("a table is too deep") end
+  local parts = {}
+  for key, inner in pairs(value) do parts[#parts + 1] = key_text(key) .. "=" .. written(inner, depth + 1) end
+  return "{" .. table.concat(parts, ",") .. "}"
+end
+
+local safe = {}
+for _, name in ipairs({"pairs", "ipairs", "next", "type", "tostring", "tonumber", "select", "pcall", "error", "rawget",
+                       "math", "string", "table"}) do
+  safe[name] = _G[name]
+end
+
+local function environment(root)
+  local env = setmetatable({root = root}, {__index = safe})
+  return env
+end
+
+local function start(text, env)
+  local chunk, problem = load(text, "=script", "t", env)
+  if not chunk then return nil, "{1,{" .. written(tostring(problem), 0) .. "}}" end
+  local thread = coroutine.create(chunk)
+  debug.sethook(thread, function() error("the script runs too long", 0) end, "", fire_limit)
+  return {thread = thread}
+end
+
+-- Returns nil while the script waits for the instrument, else the reply.
+local function step(script)
+  local thread = script.thread
+  local results = table.pack(coroutine.resume(thread))
+  if not results[1] then return "{1,{" .. written(tostring(results[2]), 0) .. "}}" end
+  if coroutine.status(thread) ~= "dead" then return nil end
+  local parts = {}
+  for i = 2, results.n do parts[#parts + 1] = written(results[i], 0) end
+  return "{0,{" .. table.concat(parts, ",") .. "}}"
+end
+
+local function as_function(call)
+  return function(...) return call(...) end
+end
+
+-- A function that returns when `waiting` is over, with what `outcome` says.
+local function blocking(call, waiting, outcome)
+  return function(...)
+    call(...)
+    while waiting() do coroutine.yield() end
+    return {message = outcome()}
+  end
+end
+
+-- "value", "unit", "min" … can be read and set as fields as well as by value_get() and value_set(v).
+local function property(fields, enum)
+  local node = {enum = enum}
+  for name, access in pairs(fields) do
+    node[name .. "_get"] = as_function(access.get)
+    if access.set then node[name .. "_set"] = as_function(access.set) end
+  end
+  return setmetatable(node, {
+    __index = function(_, key) return fields[key] and fields[key].get() end,
+    __newindex = function(_, key, value)
+      if not (fields[key] and fields[key].set) then error("no such value: " .. tostring(key), 2) end
+      fields[key].set(value)
+    end,
+    __pairs = function()
+      local all = {}
+      for key, inner in next, node do all[key] = inner end
+      for key, access in pairs(fields) do all[key] = access.get() end
+      return next, all
+    end,
+  })
+end
+
+local function signal()
+  local handlers = {}
+  local node = {}
+  function node.connect(handler) handlers[#handlers + 1] = handler end
+  node.connect_extended = node.connect
+  function node.empty() return #handlers == 0 end
+  function node.call(...) for _, handler in ipairs(handlers) do handler(...) end end
+  return node
+end
+
+return {start = start, step = step, environment = environment, as_function = as_function, blocking = blocking,
+        property = property, signal = signal}

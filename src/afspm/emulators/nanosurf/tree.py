@@ -1,0 +1,231 @@
+"""The tree of commands, as Lua sees it: `root` of the application and `root` of a measurement session."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path, PureWindowsPath
+from typing import Any, Final
+
+from afspm.emulators.nanosurf.studio import PANEL, StudioProgram
+from afspm.emulators.scripted import ScriptFailed
+from afspm.errors import ConfigError
+
+SESSION: Final = "91-01-000"
+"""The name of a simulated controller in the maker's client."""
+LAST_WITH_OLD_COMMANDS: Final = 18
+ALL_LEVELS: Final = 5
+_INT32: Final = 2**31 - 1
+_SYNCHRONIZED: Final = 3
+_WRAPPER: Final = Path(__file__).with_name("wrapper.py.in")
+
+Nested = dict[str, Any]
+
+
+class CommandTree:
+    """Both trees, in one Lua, and the scripts that run in them.
+
+    Args:
+        level_chosen: called with a level when a client selects the session, None for the application.
+        release: of Studio: 19 has no `is_scanning` any more.
+        image_buffer: number of the low-level buffer with the running scan.
+
+    Raises:
+        ConfigError: lupa is missing.
+    """
+
+    def __init__(
+        self, program: StudioProgram, release: int, image_buffer: int, level_chosen: Callable[[int | None], None]
+    ) -> None:
+        self._program, self._release, self._image_buffer = program, release, image_buffer
+        self._level_chosen = level_chosen
+        lua_runtime = _lua_runtime()
+        self._lua = lua_runtime(register_eval=False, register_builtins=False, unpack_returned_tuples=True)
+        self._prelude = self._lua.execute(Path(__file__).with_name("prelude.lua").read_text(encoding="utf-8"))
+        self._signals = {name: self._prelude.signal() for name in ("scanning_started", "scanning_finished")}
+        program.on_signal = lambda name: self._signals[name].call()
+        shared = self._shared()
+        self._roots: dict[int | None, Any] = {None: self._prelude.environment(self._table(shared))}
+        workflow = self._workflow()
+        for level in range(1, ALL_LEVELS + 1):
+            self._roots[level] = self._prelude.environment(self._table({**shared, **self._session(workflow, level)}))
+
+    def start(self, script: str, level: int | None) -> tuple[Any, str | None]:
+        """Return a script that is ready to run, or the reply that it can't be."""
+        started = self._prelude.start(script, self._roots[level])
+        return started if isinstance(started, tuple) else (started, None)
+
+    def step(self, thread: Any) -> str | None:
+        """Run a script on; return its reply, or None while it waits for the instrument."""
+        reply: str | None = self._prelude.step(thread)
+        return reply
+
+    # -- inside
+
+    def _function(self, call: Callable[..., Any]) -> Any:
+        return self._prelude.as_function(call)
+
+    def _table(self, nested: Mapping[str, Any]) -> Any:
+        """A Lua table of a nested dictionary; Python's functions become Lua's."""
+        return self._lua.table_from({name: self._in_lua(inner) for name, inner in nested.items()})
+
+    def _in_lua(self, inner: Any) -> Any:
+        if isinstance(inner, dict):
+            return self._table(inner)
+        return self._function(inner) if _is_python(inner) else inner
+
+    def _shared(self) -> Nested:
+        version = {"major": lambda: self._release, "minor": lambda: 0, "name": lambda: "Nanosurf Studio SIMULATED"}
+        session = {
+            "list": lambda: self._lua.table_from([SESSION]),
+            "select": self._select,
+            "select_main": lambda *_: self._level_chosen(None),
+        }
+        python = {"create_python_wrapper": self._write_wrapper}
+        return {
+            "session": session,
+            "version": {**version, "full": lambda: f"{self._release}.0.0"},
+            "scripting": {"wrapper": {"python": python}},
+            "util": {"fill_environments": lambda: None},
+        }
+
+    def _select(self, session: str, level: float = 1) -> None:
+        if session != SESSION or not 1 <= level <= ALL_LEVELS:
+            raise ScriptFailed(f"there is no session {session!r} with level {level}")
+        self._level_chosen(int(level))
+
+    def _session(self, workflow: Nested, level: int) -> Nested:
+        """What a licence of a level adds to the application's own commands."""
+        imaging = workflow["imaging"]
+        if level == ALL_LEVELS and self._release <= LAST_WITH_OLD_COMMANDS:
+            imaging = {**imaging, "is_scanning": lambda: self._program.scanning}
+        found: Nested = {"workflow": {**workflow, "imaging": imaging}}
+        if level > 1:
+            found["core"] = {"acquisition": self._buffers()}
+        return found
+
+    def _workflow(self) -> Nested:
+        workflow: Nested = {}
+        for path in PANEL:
+            *parents, name = path.split(".")
+            node = workflow
+            for parent in parents:
+                node = node.setdefault(parent, {})
+            node[name] = self._property(path)
+        program = self._program
+        busy = program.rig.busy
+        workflow["imaging"] |= {
+            **self._signals,
+            "start": lambda: program.start_scan(self._now_s),
+            "stop": lambda: program.stop_scan(self._now_s),
+            "pause": lambda: program.pause(self._now_s),
+            "resume": lambda: program.resume(self._now_s),
+            "acquire": self._blocking(lambda: program.start_scan(self._now_s), lambda: program.scanning),
+        }
+        workflow["approach"] |= {
+            "approach": self._blocking(program.engage, lambda: program.engages or busy(self._now_s)),
+            "approach_async": program.engage,
+            "withdraw": self._blocking(lambda: program.withdraw(self._now_s), lambda: busy(self._now_s)),
+            "stop_approach": program.stop_engaging,
+        }
+        workflow["spectroscopy"] = {
+            "start": lambda: program.start_curve("force", self._now_s),
+            "stop": program.stop_curve,
+            "acquire": self._blocking(
+                lambda: program.start_curve("force", self._now_s), lambda: program.measuring_curve
+            ),
+        }
+        workflow["scanner"]["move_to_target_offsets"] = program.move
+        return workflow
+
+    @property
+    def _now_s(self) -> float:
+        return self._program.rig.clock.now_s()
+
+    def _blocking(self, call: Callable[[], None], waiting: Callable[[], bool]) -> Any:
+        return self._prelude.blocking(call, waiting, lambda: "")
+
+    def _property(self, path: str) -> Any:
+        row, program = PANEL[path], self._program
+        field = "value_raw" if row.enum else "value"
+        fields = {field: {"get": lambda: program.get(path), "set": lambda value: program.put(path, value)}}
+        told: dict[str, Any] = {"unit": row.unit} if row.unit else {}
+        if row.unit and row.low > -1e300:
+            told |= {"min": row.low, "max": row.high}
+        for name, value in told.items():
+            fields[name] = {"get": lambda value=value: value}
+        table = {name: self._lua.table_from(access) for name, access in fields.items()}
+        enum = self._lua.table_from(dict(row.enum)) if row.enum else None
+        return self._prelude.property(self._lua.table_from(table), enum)
+
+    def _buffers(self) -> Nested:
+        """The low-level buffers of measured values, as far as the running scan is in one."""
+
+        def numbers(buffer: float, channel: float) -> Any:
+            values = self._channel(buffer, channel)[2]
+            span = self._span(values)
+            return self._lua.table_from([round(value / span * _INT32) for value in values])
+
+        def known(buffer: float) -> bool:
+            return buffer == self._image_buffer
+
+        return {
+            "reserve_lu_data_buffer": lambda buffer: None,
+            "synchronize_lu_data_buffer": lambda buffer: None,
+            "lu_data_buffer_state": lambda buffer: _SYNCHRONIZED if known(buffer) else 0,
+            "lu_data_buffer_channel_count": lambda buffer: len(self._program.rig.channels) if known(buffer) else 0,
+            "lu_data_buffer_channel_name": lambda buffer, channel: self._channel(buffer, channel)[0],
+            "lu_data_buffer_channel_unit": lambda buffer, channel: self._channel(buffer, channel)[1],
+            "lu_data_buffer_channel_range": lambda buffer, channel: self._span(self._channel(buffer, channel)[2]),
+            "lu_data_buffer_channel_data": numbers,
+        }
+
+    def _channel(self, buffer: float, channel: float) -> tuple[str, str, list[float]]:
+        if buffer != self._image_buffer or not 0 <= channel < len(self._program.rig.channels):
+            raise ScriptFailed(f"there is no channel {channel} in the buffer {buffer}")
+        return self._program.lines(int(channel))
+
+    @staticmethod
+    def _span(values: list[float]) -> float:
+        return max(map(abs, values), default=1.0) or 1.0
+
+    def _write_wrapper(self, root: Any, name: str, path: str) -> None:
+        """Write Python classes for the tree, for the maker's client, which asks for it by the path of its own file."""
+        file = Path(path)
+        if not (PureWindowsPath(path).name.startswith("cmd_tree_") and file.suffix == ".py" and file.parent.is_dir()):
+            raise ScriptFailed(f"{path!r} is not the file of a wrapper")
+        tree = json.dumps(_described(root))
+        text = _WRAPPER.read_text(encoding="utf-8").replace("@TREE@", repr(tree)).replace("@ROOT@", repr(name))
+        file.write_text(text, encoding="utf-8")
+
+
+def _is_python(value: Any) -> bool:
+    return callable(value) and type(value).__module__ != "lupa" and not type(value).__module__.startswith("lupa.")
+
+
+def _described(table: Any) -> Nested:
+    """A tree: of each table its tables, of each property its fields, of each function True."""
+    import lupa
+
+    found: Nested = {}
+    for name, inner in table.items():
+        kind = lupa.lua_type(inner)
+        if kind == "table":
+            choices = inner["enum"]
+            is_property = inner["value_get"] is not None or inner["value_raw_get"] is not None
+            if is_property:
+                found[str(name)] = {"property": dict(choices.items()) if choices is not None else None}
+            else:
+                found[str(name)] = {"node": _described(inner)}
+        elif kind == "function":
+            found[str(name)] = "function"
+    return found
+
+
+def _lua_runtime() -> Any:
+    try:
+        from lupa import lua54
+    except ImportError as error:
+        hint = "pip install afspm[nanosurf]"
+        raise ConfigError("the emulated Nanosurf Studio runs scripts in Lua, and lupa is missing", hint=hint) from error
+    return lua54.LuaRuntime

@@ -1,0 +1,126 @@
+"""Files of Nanosurf's programs: the maker's examples, where they are installed, and what the emulator writes."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import afspm
+from afspm.clock import ExperimentClock
+from afspm.emulators.activities import SpectrumActivity
+from afspm.emulators.nanosurf import files
+from afspm.emulators.rig import Rig
+from afspm.errors import FileError
+from afspm.model import Region
+
+pytest.importorskip("h5py")
+NSFOPEN = importlib.util.find_spec("NSFopen")
+EXAMPLES = Path(NSFOPEN.origin).parent / "example" if NSFOPEN is not None and NSFOPEN.origin else Path("/nowhere")
+
+
+def example(name: str) -> Path:
+    path = EXAMPLES / name
+    if not path.is_file():
+        pytest.skip("NSFopen, with the maker's examples, is not installed")
+    return path
+
+
+def scanned(folder: Path, *, upwards: bool = True) -> tuple[Path, Rig]:
+    """A file of the emulator, and the instrument that it was scanned with."""
+    rig = Rig({"surface": "steps"}, 3, ExperimentClock.starting_now(speed=1e4), background=False)
+    rig.setup.region, rig.setup.shape = Region((40e-9, -25e-9), (300e-9, 100e-9), np.deg2rad(30)), (6, 10)
+    rig.setup.upwards = upwards
+    path = folder / "scan.nhf"
+    path.write_bytes(files.image(rig.start_scan(), 1.7e9, "dynamic_mode"))
+    return path, rig
+
+
+@pytest.mark.parametrize("upwards", [True, False])
+def test_an_image_comes_back_as_it_was_scanned(tmp_path: Path, *, upwards: bool) -> None:
+    path, rig = scanned(tmp_path, upwards=upwards)
+    content = afspm.read(path)
+    assert rig.scan is not None
+    heights = rig.scan.channels()["Height"][1]
+    (found,) = [scan for scan in content.scans if scan.channel == "Height Forward"]
+    np.testing.assert_allclose(found.values, heights, atol=1e-9 * np.ptp(heights))
+    np.testing.assert_allclose(found.region.center_m, rig.scan.region.center_m)
+    assert (found.unit, found.region.angle_rad) == ("m", pytest.approx(rig.scan.region.angle_rad))
+    assert content.upwards is upwards
+    assert content.end_ns == 1_700_000_000_000_000_000
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_the_makers_reader_finds_the_same(tmp_path: Path) -> None:
+    reading = pytest.importorskip("NSFopen.read")
+    path, _ = scanned(tmp_path)
+    data = reading.read(str(path)).data["Image"]
+    for scan in afspm.read(path).scans:
+        channel, way = scan.channel.rsplit(" ", 1)
+        theirs = np.asarray(data[way][channel], dtype=float)
+        # NSFopen leaves the middle of the range out
+        ours = scan.values - np.nanmean(scan.values)
+        np.testing.assert_allclose(theirs - theirs.mean(), ours, atol=1e-6 * np.ptp(scan.values))
+
+
+def test_lines_that_were_not_scanned_are_missing(tmp_path: Path) -> None:
+    rig = Rig({"surface": "steps"}, 3, ExperimentClock.starting_now(), background=False)
+    rig.setup.shape = (6, 10)
+    scan = rig.start_scan()
+    scan.stopped_s = scan.start_s + 2.5 * scan.line_s
+    path = tmp_path / "partial.nhf"
+    path.write_bytes(files.image(scan, scan.stopped_s, "dynamic_mode"))
+    assert {one.lines_missing for one in afspm.read(path).scans} == {4}
+
+
+def test_a_curve_goes_there_and_back(tmp_path: Path) -> None:
+    rig = Rig({"surface": "steps"}, 3, ExperimentClock.starting_now())
+    taken: SpectrumActivity = rig.start_spectrum("force")
+    path = tmp_path / "curve.nhf"
+    path.write_bytes(files.curve(taken, 1.7e9, "dynamic_mode"))
+    (curve,) = afspm.read(path).spectra
+    z = taken.values[:, taken.names.index("Z")]
+    np.testing.assert_allclose(curve["Z"], np.concatenate([z[::-1], z]), atol=1e-15)
+    back = taken.values[:, taken.names.index("Deflection Retrace")]
+    np.testing.assert_allclose(curve["Deflection"][len(z) :], back, atol=1e-9 * np.ptp(back))
+
+
+def test_the_makers_image() -> None:
+    content = afspm.read(example("Calculate_Roughness/sapphire.nid"))
+    assert content.controller == "Nanosurf 3.8.3.5"
+    assert [scan.channel for scan in content.scans][:2] == ["Z-Axis forward", "Amplitude forward"]
+    heights = content.scans[0]
+    assert (heights.values.shape, heights.unit, heights.region.size_m) == ((256, 256), "m", (2.5e-6, 2.5e-6))
+    # as Gwyddion 2.66 shows it, where the first row is the upper one
+    assert heights.values.min() == pytest.approx(-3.4497025077044964e-06)
+    assert heights.values.max() == pytest.approx(-3.3933982e-06, rel=1e-4)
+    assert content.upwards is True
+
+
+def test_the_makers_image_that_is_turned_and_off_the_middle() -> None:
+    region = afspm.read(example("Plane_Removal/grid.nid")).scans[0].region
+    assert region.center_m == (1.2982e-06, -1.65728e-07)
+    assert np.degrees(region.angle_rad) == pytest.approx(45.0)
+
+
+@pytest.mark.filterwarnings("ignore")  # of the maker's reader, about pandas
+def test_the_makers_force_curves_are_what_the_makers_reader_finds() -> None:
+    reading = pytest.importorskip("NSFopen.read")
+    path = example("Force_Spectroscopy/spectroscopy.nid")
+    theirs = reading.read(str(path)).data["Spec"]
+    spectra = afspm.read(path).spectra
+    assert len(spectra) == 100
+    for number in (0, 1, 57):
+        both = np.concatenate([theirs[way]["Deflection"][number] for way in ("Forward", "Backward")])
+        np.testing.assert_allclose(spectra[number]["Deflection"], both)
+    assert spectra[0].units[:2] == ("m", "N")
+
+
+def test_a_file_that_ends_early_is_refused(tmp_path: Path) -> None:
+    whole = example("Plane_Removal/circles.nid").read_bytes()
+    path = tmp_path / "half.nid"
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(FileError, match="ends within DataSet-"):
+        afspm.read(path)
