@@ -31,9 +31,11 @@ SHORT_NAME_PACKAGES = (
     "afspm.microscopes.nanonis",
     "afspm.microscopes.asylum",
     "afspm.microscopes.gxsm",
+    "afspm.microscopes.nanosurf",
     "afspm.emulators.nanonis",
     "afspm.emulators.asylum",
     "afspm.emulators.gxsm",
+    "afspm.emulators.nanosurf",
     "afspm.dashboard",
     "afspm.gateway",
 )

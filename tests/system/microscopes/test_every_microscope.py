@@ -17,8 +17,19 @@ ROOT = Path(__file__).parents[3]
 FILES = ROOT / "experiments" / "every_microscope"
 AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
 DEADLINE_S = 90.0 * PATIENCE
-HEIGHTS = {"simulator": "Height", "nanonis": "Z Forward", "asylum": "HeightTrace", "gxsm": "ZS-Topo"}
-ADDRESSES = {"nanonis": "127.0.0.1:{port}", "asylum": "tcp://127.0.0.1:{port}", "gxsm": "127.0.0.1:{port}"}
+HEIGHTS = {
+    "simulator": "Height",
+    "nanonis": "Z Forward",
+    "asylum": "HeightTrace",
+    "gxsm": "ZS-Topo",
+    "nanosurf": "Height Forward",
+}
+ADDRESSES = {
+    "nanonis": "127.0.0.1:{port}",
+    "asylum": "tcp://127.0.0.1:{port}",
+    "gxsm": "127.0.0.1:{port}",
+    "nanosurf": "127.0.0.1:{port}",
+}
 NOISE_M = 0.8e-9
 """The rms between two scans of the same place whose lines are not taken at the same moments."""
 OVERLAY = """

@@ -97,7 +97,7 @@ local function signal()
   function node.connect(handler) handlers[#handlers + 1] = handler end
   node.connect_extended = node.connect
   function node.empty() return #handlers == 0 end
-  function node.call(...) for _, handler in ipairs(handlers) do handler(...) end end
+  function node.call(...) for _, handler in ipairs(handlers) do pcall(handler, ...) end end
   return node
 end
 

@@ -1,0 +1,99 @@
+"""The results of a controller that saves each measurement to a new file in a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from afspm.errors import AfspmError, FileError
+from afspm.files import read
+from afspm.model import Scan, Spectrum
+from afspm.translator.result_files import (
+    SCAN,
+    Content,
+    Entry,
+    FilePrecision,
+    ResultFiles,
+    lines_missing,
+    modified_ns,
+    newest,
+)
+
+
+class FolderFiles(ResultFiles):
+    """The measurement that is running or has just ended, and the results.
+
+    Attributes:
+        pattern: of the names of its files, as of `Path.glob`.
+        precision: of its files.
+    """
+
+    pattern: str
+    precision: FilePrecision
+
+    def begin(self, what: str, folder: Path, taken: Mapping[str, Any]) -> None:
+        """A measurement begins.
+
+        Args:
+            taken: "frame" of a scan, "position" of a spectrum.
+        """
+        self._begins(what, {"folder": str(folder), "newest_ns": newest(self._files(folder))[0], **taken})
+
+    def end(self, now_ns: int) -> None:
+        """It has ended."""
+        if self._kept["running"] is not None:
+            self._ends({"end_ns": now_ns})
+
+    def has_file(self) -> bool:
+        """Return True if the file of what is running has appeared."""
+        running = self._kept["running"]
+        return running is not None and self._file(running) is not None
+
+    def results(self, now_ns: int) -> list[str]:
+        """Return the last results, oldest first."""
+        self.broken_off = False
+        ended, running = self._kept["ended"], self._kept["running"]
+        if ended is not None and self._take(ended) is not None:
+            self._kept["ended"] = None
+        elif running is not None and running["what"] == SCAN:  # it may go on with the next image
+            taken_ns = self._take({**running, "end_ns": now_ns})
+            running["newest_ns"] = running["newest_ns"] if taken_ns is None else taken_ns
+        return self._listed()
+
+    def read(self, entry: Entry) -> Content:
+        path = Path(entry["result"])
+        if modified_ns(path) != entry["modified_ns"]:
+            raise FileError("was overwritten or deleted", where=str(path))
+        return self._content_of(path, entry)
+
+    def _take(self, measured: Entry) -> int | None:
+        """Take the file as a result, if it is whole, or note that it was broken off; return when it was written."""
+        path = self._file(measured)
+        if path is None:
+            return None
+        written_ns = modified_ns(path)
+        try:
+            content = self._content_of(path, measured)
+        except (AfspmError, OSError):
+            return None  # not yet whole
+        if modified_ns(path) != written_ns:
+            return None
+        if lines_missing(content):  # it was saved when the scan was broken off
+            self.broken_off = True
+        else:
+            self._add(str(path), measured, {"modified_ns": written_ns}, content)
+        return written_ns
+
+    def _file(self, measured: Entry) -> Path | None:
+        return newest(self._files(Path(measured["folder"])), measured["newest_ns"])[1]
+
+    def _files(self, folder: Path) -> list[Path]:
+        return list(folder.glob(self.pattern)) if folder.is_dir() else []
+
+    def _content_of(self, path: Path, measured: Entry) -> Content:
+        found = read(path)
+        content: Sequence[Scan | Spectrum] = found.scans if measured["what"] == SCAN else found.spectra
+        if not content:
+            raise FileError(f"holds no {measured['what']}", where=str(path))
+        return [self.precision.as_set(one, measured) for one in content]
