@@ -22,9 +22,22 @@ fn compile_messages() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// `libsodium-sys-stable` has built libsodium, and tells where; the `zmq` crate's libzmq has no CURVE.
+/// `libsodium-sys-stable` has built libsodium and tells where, or was told by `SODIUM_LIB_DIR`; the `zmq` crate's libzmq
+/// has no CURVE.
 fn compile_libzmq() -> Result<(), Box<dyn Error>> {
-    let sodium = zeromq_src::LibLocation::new(env::var("DEP_SODIUM_LIB")?, env::var("DEP_SODIUM_INCLUDE")?);
-    zeromq_src::Build::new().with_libsodium(Some(sodium)).build();
+    let (library, include) = match env::var("SODIUM_LIB_DIR") {
+        Ok(library) => (PathBuf::from(&library), PathBuf::from(&library).join("../include")),
+        Err(_) => (env::var("DEP_SODIUM_LIB")?.into(), env::var("DEP_SODIUM_INCLUDE")?.into()),
+    };
+    zeromq_src::Build::new().with_libsodium(Some(zeromq_src::LibLocation::new(library, include))).build();
+    let target = env::var("TARGET")?;
+    if target.contains("windows") {
+        println!("cargo:rustc-link-lib=ws2_32\ncargo:rustc-link-lib=advapi32");
+    }
+    if target.ends_with("windows-gnu") {
+        // what libzmq polls by on Windows, which that crate compiles for MSVC alone
+        let wepoll = PathBuf::from(env::var("OUT_DIR")?).join("source/external/wepoll/wepoll.c");
+        cc::Build::new().warnings(false).file(wepoll).compile("wepoll");
+    }
     Ok(())
 }
