@@ -71,7 +71,7 @@ class Dimension:
 
     @property
     def hint(self) -> str:
-        """What to write, for an error."""
+        """Return an example to write, for an error."""
         return f'{self.name}, for example "{self.example}"'
 
 

@@ -99,7 +99,7 @@ class RecordWriter:
             self._changed.notify()
 
     def wants_replay(self) -> bool:
-        """Whether publishers should be asked again for what they keep: something was missed, and there is room now."""
+        """Return whether to ask publishers again for what they keep: something was missed, and there is room now."""
         with self._changed:
             wanted, self._wants_replay = self._wants_replay, False
         return wanted
@@ -261,7 +261,7 @@ class RecordWriter:
 
 
 class LogProgress:
-    """How far a log is read, and how far it is recorded.
+    """The progress of reading a log, and of recording it.
 
     Args:
         log: folder of the packet log; it need not be there.

@@ -1,4 +1,4 @@
-"""What a person can do to a recorded night: write notes."""
+"""The one action on a recorded night: to write notes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What one viewer may do now, and how it is carried out: all panels of the page share it."""
+"""The actions that one viewer may do now; all panels of the page share them."""
 
 from __future__ import annotations
 

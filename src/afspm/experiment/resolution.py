@@ -62,7 +62,7 @@ class ResolvedProcess:
 
     @property
     def acts(self) -> bool:
-        """Whether it follows a plan of its own: a script, but for one that solves problems; of a command: unknown."""
+        """Return whether it follows a plan of its own: a script, unless it solves problems. A command: unknown."""
         if self.component is None or not issubclass(self.component, Component):
             return self.component is None
         return self.component.run is not Component.run and not self.declared.solves

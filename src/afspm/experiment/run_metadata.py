@@ -1,4 +1,4 @@
-"""What is written into every file of a run about its sample, people and microscope."""
+"""The metadata in every file of a run: its sample, people and microscope."""
 
 from __future__ import annotations
 

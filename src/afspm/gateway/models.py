@@ -60,7 +60,7 @@ class RegionModel(_Asked):
 
 
 class MicroscopeModel(_Answer):
-    """What the microscope does. None: it has not said."""
+    """The activity of the microscope. None: it has not told."""
 
     state: str = Field(examples=["FREE"])
     region: RegionModel | None = Field(default=None, description="of the next scan")

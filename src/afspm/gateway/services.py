@@ -1,4 +1,4 @@
-"""What the routes of the gateway share."""
+"""The services that the routes of the gateway share."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ READER = ".reader"
 
 @dataclass
 class GatewayServices:
-    """What the routes share, and the ways in which they ask."""
+    """The parts that the routes share, and the ways in which they ask."""
 
     watch: Watch
     bell: Bell

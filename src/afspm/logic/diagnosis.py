@@ -60,7 +60,7 @@ class Diagnosis:
 
 @dataclass(frozen=True)
 class Versions:
-    """What a computer runs."""
+    """The programs of one computer."""
 
     afspm: str
     python: str
@@ -193,7 +193,7 @@ def of_memory(available: int, used: Mapping[str, int]) -> Diagnosis:
 
 @dataclass(frozen=True)
 class Heard:
-    """What was heard under an envelope while listening."""
+    """The packets received under one envelope while listening."""
 
     envelope: str
     count: int

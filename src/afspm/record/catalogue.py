@@ -59,7 +59,7 @@ class RunSummary:
 
     @property
     def measured(self) -> str:
-        """How many scans and spectra there are, in words."""
+        """Return the numbers of scans and spectra, in words."""
         scans, spectra = counted(self.scans, "scan"), counted(self.spectra, "spectrum", "spectra")
         return f"{scans}, {spectra}" if self.spectra else scans
 

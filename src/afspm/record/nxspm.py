@@ -1,4 +1,4 @@
-"""What NXspm, and NXsts of a spectrum over the bias, have beside the values: technique, instrument, sample, person."""
+"""The parts of NXspm, and of NXsts for spectra over the bias, beside the values: technique, instrument, sample …"""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ _ILL = (ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.G
 
 @dataclass
 class Examination:
-    """What was found, what was heard from whom how often, and the experiment's processes on this computer."""
+    """The findings, the packets counted by sender, and the experiment's processes on this computer."""
 
     found: list[Diagnosis] = field(default_factory=list)
     heard: list[Heard] = field(default_factory=list)

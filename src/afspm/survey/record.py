@@ -16,7 +16,7 @@ from afspm.survey.targets import Target
 
 
 class Outcome(Enum):
-    """What became of a target."""
+    """The fate of a target."""
 
     MEASURED = "measured"
     REFUSED = "refused"

@@ -13,7 +13,7 @@ NAME_WIDTH = 29
 
 
 class Failed(AssertionError):
-    """What is checked does not do what the wire format says.
+    """The program under test does not do what the wire format says.
 
     Args:
         expected, came: in words of a physicist, without a full stop.

@@ -1,1 +1,1 @@
-"""What the dashboard and the gateway share: who may come in, the server, what was published, and acting for persons."""
+"""The parts that dashboard and gateway share: passwords, the server, what was published, requests for persons."""

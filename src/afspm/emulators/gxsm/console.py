@@ -56,7 +56,7 @@ class GxsmModule:
         return call
 
     def end(self) -> None:
-        """Whoever waits for an answer, or asks again, ends."""
+        """End every thread that waits for an answer, or asks again."""
         self._gone = True
         for answer in list(self._waiting):
             if not answer.done():

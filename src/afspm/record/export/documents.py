@@ -85,7 +85,7 @@ def _alike(row: ScanRow | SpectrumRow) -> tuple[object, ...]:
 
 @dataclass
 class _Stream:
-    """What was measured alike: one descriptor, and an event for each."""
+    """Measurements of one kind: one descriptor, and an event for each."""
 
     run: Run
     start: str

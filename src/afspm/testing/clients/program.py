@@ -142,7 +142,7 @@ class ClientProgram:
 
     @property
     def ending(self) -> str:
-        """How it has ended, for a person."""
+        """Return how it has ended, for a person."""
         code = self._popen.poll()
         return "still running" if code is None else f"exit code {code}" if code >= 0 else f"signal {-code}"
 
@@ -152,7 +152,7 @@ class ClientProgram:
 
     @property
     def last_words(self) -> str:
-        """What it said last on standard error, and on standard output beside answers; empty if nothing."""
+        """Return its last lines on standard error, and on standard output beside answers; empty if there are none."""
         said = [*self._garbage, *self._said]
         return f"; it said: {' / '.join(said)}" if said else ""
 

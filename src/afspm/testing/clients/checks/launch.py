@@ -1,4 +1,4 @@
-"""How the program begins, shows that it is alive, and ends."""
+"""Checks of how the program begins, shows that it is alive, and ends."""
 
 from __future__ import annotations
 
