@@ -13,7 +13,7 @@ from typing import Any
 
 from afspm import wire
 from afspm.errors import FileError, InvalidValue, WireError
-from afspm.model import LoggedPacket, Packet
+from afspm.model import LoggedPacket, Packet, ScanSet, Spectrum
 from afspm.plain_data import Plain
 from afspm.process.memory import Memory
 from afspm.storage.atomic import OutageLog, write_atomic
@@ -30,6 +30,15 @@ class MeasurementResult:
 
     things: list[Any]
     interruptions: list[str]
+
+    @property
+    def scans(self) -> ScanSet:
+        return ScanSet(self.things, self.interruptions)
+
+    @property
+    def spectrum(self) -> Spectrum:
+        spectrum: Spectrum = self.things[0]
+        return spectrum
 
 
 class KeyedResults:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from afspm.client.command_retry import CommandRetry
 from afspm.client.published_state import PublishedState
 from afspm.client.targets import FITS, SAME, XY, ScanTarget, Target, is_set
-from afspm.model import ControlRequest, Frame, Parameter, ProbePosition, Region, ScanParameters, names
+from afspm.model import ControlRequest, Feedback, Frame, Parameter, ProbePosition, Region, ScanParameters, names
 
 
 class MeasurementSetup:
@@ -49,3 +49,11 @@ class MeasurementSetup:
         # a controller may round: then this is what our wish looks like when it is set; what lies elsewhere is another's
         now = self._view.scan_parameters
         self._rounded = (wanted, now) if is_set(wanted, now, FITS) else None
+
+    def set_feedback(self, wanted: Feedback, until_s: float | None) -> None:
+        """Set what is given of the feedback; where that changes anything, wait until it is published."""
+        now = self._view.feedback
+        if now and all(value in (None, getattr(now, name)) for name, value in vars(wanted).items()):
+            self._commands.ask(ControlRequest.SET_ZCTRL_PARAMS, wanted, until_s=until_s)
+        else:
+            self._commands.set(ControlRequest.SET_ZCTRL_PARAMS, wanted, "ZCtrlParameters", until_s)

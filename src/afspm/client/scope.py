@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from afspm import wire
-from afspm.client.command_retry import SETTLED_WITHIN_S, CommandRetry, refused
+from afspm.client.command_retry import CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.events import Events, PublishedEvent
 from afspm.client.experiment_link import ExperimentLink
@@ -106,8 +106,7 @@ class Scope(ExperimentView):
         """
         with self._call():
             target = ScanTarget.of(region, shape, self._frame)
-            result = self._runner.take(target, key, self._link.until(timeout_s))
-            return ScanSet(result.things, result.interruptions)
+            return self._runner.take(target, key, self._link.until(timeout_s)).scans
 
     def spectrum(
         self,
@@ -125,8 +124,7 @@ class Scope(ExperimentView):
         """
         with self._call():
             target = SpectrumTarget.of(at, kind, self._frame)
-            spectrum: Spectrum = self._runner.take(target, key, self._link.until(timeout_s)).things[0]
-            return spectrum
+            return self._runner.take(target, key, self._link.until(timeout_s)).spectrum
 
     def forget(self, key: str) -> None:
         """Remove what is kept of a keyed measurement that will not be asked for again, which a long series needs."""
@@ -172,11 +170,9 @@ class Scope(ExperimentView):
         """
         with self._call():
             feedback = Feedback(on, proportional_gain, integral_gain, setpoint)
-            view, count = self._link.view, self._link.view.count("ZCtrlParameters")
-            changes = _changes(view.feedback, feedback)
-            self._commands.in_control(ControlRequest.SET_ZCTRL_PARAMS, feedback, self._link.until(timeout_s))
-            if changes:  # so that `feedback` then tells it
-                self._link.wait(lambda: view.count("ZCtrlParameters") != count, self._link.until(SETTLED_WITHIN_S))
+            until_s = self._link.until(timeout_s)
+            with self._control.hold(until_s=until_s):
+                self._setup.set_feedback(feedback, until_s)
 
     def move_probe(self, xy_m: Place, *, timeout_s: float | None = None) -> None:
         """Move the probe to (x, y), in m or as text, ("1 um", "0 nm"); returns when it stands there."""
@@ -348,7 +344,3 @@ class Scope(ExperimentView):
             response = self._link.request(kind, subject)
             if not response.ok:
                 raise refused(kind, response, self._link.name)
-
-
-def _changes(now: Feedback | None, wanted: Feedback) -> bool:
-    return now is None or any(value is not None and value != getattr(now, name) for name, value in vars(wanted).items())

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from afspm.simulation import chance
 from afspm.simulation.settings import check, one_of
+
+if TYPE_CHECKING:
+    from afspm.simulation.feedback import Loop
+    from afspm.simulation.scanning import Course
 
 FLAWS = ("blunt", "double", "contaminated")
 CONDITIONS = ("sharp", *FLAWS)
@@ -286,20 +291,23 @@ class SimulatedTip:
                 self._change(t_s, "schedule", condition, chance.generator(self._seed, 6, number))
         self.scheduled_until_s = max(self.scheduled_until_s, until_s)
 
-    def foresee(self, start_s: float, end_s: float, speed_m_s: float, hardness: float, call: int) -> None:
+    def foresee(self, course: Course, loop: Loop, call: int) -> None:
         """Add the changes that will come during a scan: scheduled ones, and by chance."""
-        s = self._settings
-        rate = (s.per_hour / 3600.0 + s.per_metre * speed_m_s) * hardness
+        s, start_s, end_s = self._settings, course.start_s, course.end_s
+        hardness = loop.force**s.hardness_exponent if loop.on and loop.engages else float(not loop.on)
+        rate = (s.per_hour / 3600.0 + s.per_metre * course.length_m / (end_s - start_s)) * hardness
         seed = chance.subseed(self._seed, "tip changes")
         for number, (t_s, flaw) in enumerate(chance_changes(s, start_s, end_s, rate, seed, call)):
             self.advance(t_s)
             self._change(t_s, "chance", flaw, chance.generator(seed, call, number))
         self.advance(end_s)
 
-    def wear(self, t_s: float, worn_m: float) -> None:
-        """Let the apex grow by what it has been rubbed off."""
-        tip = self.history[-1].tip
-        self._add(TipChange(t_s, "wear", replace(tip, radius_m=tip.radius_m + worn_m)))
+    def wear(self, course: Course, loop: Loop) -> None:
+        """Let the apex grow by what a scan has rubbed off."""
+        s, tip = self._settings, self.history[-1].tip
+        if s.wear_m_per_m and loop.engages:
+            worn_m = s.wear_m_per_m * course.length_m * loop.force**s.hardness_exponent
+            self._add(TipChange(course.end_s, "wear", replace(tip, radius_m=tip.radius_m + worn_m)))
 
     def pulse(self, voltage_v: float, duration_s: float, t_s: float, random: np.random.Generator) -> str:
         """Return what a bias pulse did; see `_treat`. It depends on the voltage above all."""

@@ -174,7 +174,7 @@ class World:
         if not all(map(math.isfinite, (bias_v, *slope))):
             raise InvalidValue(f"bias {bias_v} V and slope {slope} must be finite")
         call = self._begin(start_s, region.center_m)
-        self._foresee(course, loop, call)
+        self._tip.foresee(course, loop, call)
         tips = [(start_s, self._tip.at(start_s))]
         tips += [(change.t_s, change.tip) for change in self._tip.between(start_s, course.end_s)]
         setup = self._setup(loop, bias_v, slope, start_s)
@@ -184,7 +184,7 @@ class World:
             anew = measure(course, tips, setup, chance.generator(self.seed, 2, call))
             measured = measured.continued(anew, course.row_times_s(0.0) >= one.t_s)
         self._held_z_m = measured.last_z_m
-        self._wear(course, loop)
+        self._tip.wear(course, loop)
         drift = self.sample.drift.at(course.row_times_s(0.25))
         truth = {**_truth_of_scan(self.sample, course, tips), "pressed_m": measured.pressed_m}
         return SimulatedScan(course, drift, truth, measured.channels)
@@ -394,17 +394,6 @@ class World:
         self._place.move_to(position_m, t_s)
         self._calls += 1
         return self._calls
-
-    def _foresee(self, course: Course, loop: Loop, call: int) -> None:
-        exponent = self.settings.tip_changes.hardness_exponent
-        hardness = loop.force**exponent if loop.on and loop.engages else float(not loop.on)
-        speed = course.length_m / (course.end_s - course.start_s)
-        self._tip.foresee(course.start_s, course.end_s, speed, hardness, call)
-
-    def _wear(self, course: Course, loop: Loop) -> None:
-        s = self.settings.tip_changes
-        if s.wear_m_per_m and loop.engages:
-            self._tip.wear(course.end_s, s.wear_m_per_m * course.length_m * loop.force**s.hardness_exponent)
 
     def _setup(self, loop: Loop, bias_v: float, slope: tuple[float, float], start_s: float) -> Setup:
         return Setup(

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum, auto
+
+from afspm.logic.supervision.liveness import LivenessPolicy
+from afspm.logic.supervision.supervised_child import SupervisedChild
+from afspm.model import Role
 
 OWN_PACE_S = 1.5  # after the end of the experiment: everybody has heard it, and may finish a file
 AGAIN_S = 0.25  # somebody is busy with a step that it may take: ask later
@@ -113,3 +118,19 @@ class RunEnd:
                 return replace(seen, kill_s=kill_s), None
         do = {None: EndStep.ASK, EndStep.ASK: EndStep.KILL, EndStep.KILL: EndStep.LEAVE}[self.last]
         return replace(self, last=do), do
+
+
+def unfinished(
+    ending: RunEnd, children: Mapping[str, SupervisedChild], now_s: float, liveness: LivenessPolicy
+) -> list[str]:
+    """Return which processes have something to finish; a translator may have it after it was asked to end: the tip."""
+    is_asked, has_ended = ending.last is not None, ending.why is EndReason.EXPERIMENT_ENDED
+    # a scheduler on another computer may be there
+    can_hear = all(child.life for child in children.values() if child.spec.role is Role.SCHEDULER)
+    found = []
+    for name, child in children.items():
+        is_busy = child.life is not None and child.life.is_busy(now_s, liveness)
+        may_finish = has_ended and child.may_still_finish(now_s, liveness, can_hear=can_hear)
+        if (is_busy or may_finish) if not is_asked else (is_busy and child.spec.role is Role.TRANSLATOR):
+            found.append(name)
+    return found

@@ -17,7 +17,7 @@ from afspm.logic.supervision.child import (
     KillChild,
     StartChild,
 )
-from afspm.logic.supervision.run_end import EndReason, EndStep, RunEnd
+from afspm.logic.supervision.run_end import EndReason, EndStep, RunEnd, unfinished
 from afspm.logic.supervision.supervised_child import ChildLife, ChildSpec, ProcessReport, SupervisedChild
 from afspm.logic.supervision.supervisor_events import (
     ActivitySeen,
@@ -281,7 +281,7 @@ class SupervisorCore:
     def _continue_ending(self, ending: RunEnd) -> None:
         if self._has_just_ended:
             self._release_scheduler()
-        busy = self._unfinished(ending)
+        busy = unfinished(ending, self.children, self._now_s, self._liveness)
         self.ending, step = ending.step(self._now_s, busy=bool(busy))
         postponed = step is None and self.ending.deadline_s() != ending.deadline_s()
         if busy and postponed and not self._has_told_waiting:
@@ -317,20 +317,6 @@ class SupervisorCore:
                     self._command(ProcessAction.CLOSE_INPUT, child)
             elif self._may_be_rescued(child) and child.life and child.life.is_silent(self._now_s, self._liveness):
                 self._command(ProcessAction.KILL, child)
-
-    def _unfinished(self, ending: RunEnd) -> list[str]:
-        """Return who has something to finish; a translator may have it after it was asked to end: the tip."""
-        now_s, is_asked = self._now_s, ending.last is not None
-        has_ended = ending.why is EndReason.EXPERIMENT_ENDED
-        # a scheduler on another computer may be there
-        can_hear = all(child.life for child in self._with_role(Role.SCHEDULER))
-        found = []
-        for name, child in self.children.items():
-            is_busy = child.life is not None and child.life.is_busy(now_s, self._liveness)
-            may_finish = has_ended and child.may_still_finish(now_s, self._liveness, can_hear=can_hear)
-            if (is_busy or may_finish) if not is_asked else (is_busy and child.spec.role is Role.TRANSLATOR):
-                found.append(name)
-        return found
 
     # --- effects ---
 

@@ -10,20 +10,18 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Thread
 from typing import Final
 
 import numpy as np
 
 from afspm.errors import AfspmError, FileError, Refused
 from afspm.microscopes.simulator.faults import Faults
+from afspm.microscopes.simulator.scan_drawing import ScanDrawing, in_si, line_s
 from afspm.microscopes.simulator.truth import Truth
 from afspm.model import ControlResponse, ScanLines, ScopeState, Spectrum, names
 from afspm.simulation import SimulatedScan, World
-from afspm.simulation.measuring import Adjustment
 from afspm.storage.atomic import write_atomic
 from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 from afspm.translator.parameters import ParameterTable, Value
@@ -93,12 +91,11 @@ class Instrument:
         self._log = log
         self._panel = sorted(panel, key=lambda event: event.at_s)
         self._approach_s = approach_s
-        self._wake = wake
-        self._scan: Future[SimulatedScan] | None = None
+        self._drawing = ScanDrawing(world, table, wake)
         if "world" in kept:
             world.restore(kept["world"])
         if kept["doing"] is not None and kept["doing"]["what"] == "scan":
-            self._scan = self._drawn_meanwhile(kept["doing"])
+            self._drawing.begin(kept["doing"])
         self._actions: dict[str, Callable[[float], None]] = {
             names.START_SCAN: self.start_scan,
             names.STOP_SCAN: self.stop,
@@ -121,7 +118,7 @@ class Instrument:
     def next_change_s(self) -> float | None:
         """When the next thing happens by itself; None if nothing will, or `wake` will tell."""
         times = [self._panel_s(), self._files.whole_s()]
-        if self._kept["doing"] is not None and not self._drawing():
+        if self._kept["doing"] is not None and not self._drawing.is_going_on:
             times.append(self._kept["doing"]["end_s"])
         return min((at_s for at_s in times if at_s is not None), default=None)
 
@@ -132,9 +129,8 @@ class Instrument:
     def lines(self, start: int, now_s: float) -> list[ScanLines]:
         """The lines of the running scan beyond the first `start`, as far as they are complete."""
         doing = self._kept["doing"]
-        if doing is None or self._scan is None or not self._scan.done():
+        if doing is None or self._drawing.is_going_on or (scan := self._drawing.wait()) is None:
             return []
-        scan = self._scan.result()
         course = scan.course
         rows = np.sort(course.order[start : int(course.rows_taken(now_s).sum())])
         if not rows.size:
@@ -160,8 +156,8 @@ class Instrument:
     def _end(self, end_s: float) -> None:
         doing, self._kept["doing"] = self._kept["doing"], None
         try:
-            if doing["what"] == "scan" and self._scan is not None:
-                self._save_scan(self._scan.result(), doing)
+            if doing["what"] == "scan" and (scan := self._drawing.wait()) is not None:
+                self._save_scan(scan, doing)
             elif doing["what"] == "spectrum":
                 self._save_spectrum(doing)
         except AfspmError as error:
@@ -170,15 +166,9 @@ class Instrument:
         if doing["what"] in ("scan", "spectrum"):
             self._settle()
 
-    def _drawing(self) -> bool:
-        """Return True if a scan is still being worked out: it then lasts until that is done, however fast time is."""
-        return self._scan is not None and not self._scan.done()
-
     def _settle(self) -> None:
         """Nothing works on the world any more, and its state is kept."""
-        if self._scan is not None:
-            wait([self._scan])
-        self._scan = None
+        self._drawing.end()
         self._kept["world"] = self._world.state()
 
     # --- what it can be told to do ---
@@ -206,12 +196,12 @@ class Instrument:
     def _adjust(self, values: dict[str, Value], now_s: float) -> None:
         """Draw the rest of a running scan with new values; as before a restart, from the world before the scan."""
         doing = self._kept["doing"]
-        if doing is None or doing["what"] != "scan" or self._scan is None:
+        if doing is None or doing["what"] != "scan":
             return
-        wait([self._scan])
+        self._drawing.end()
         doing["adjusted"] = [*doing.get("adjusted", ()), {"t_s": now_s, "values": values}]
         self._world.restore(self._kept["world"])
-        self._scan = self._drawn_meanwhile(doing)
+        self._drawing.begin(doing)
 
     def start_scan(self, now_s: float) -> None:
         """Scan the frame: every line there and back at the scan speed."""
@@ -219,9 +209,9 @@ class Instrument:
         values = self._si(self._kept["values"])
         region, (rows, _) = frame(values)
         self._kept["scans"] += 1
-        self._begin("scan", now_s, rows * _line_s(values, region.size_m[0]))
+        self._begin("scan", now_s, rows * line_s(values, region.size_m[0]))
         self._note(now_s, "scan starts", {"number": self._kept["scans"]})
-        self._scan = self._drawn_meanwhile(self._kept["doing"])
+        self._drawing.begin(self._kept["doing"])
 
     def start_spectrum(self, now_s: float) -> None:
         """Take a curve of the kind that is set, where the probe is."""
@@ -236,7 +226,7 @@ class Instrument:
         doing = self._kept["doing"]
         if doing is not None and doing["what"] in ("scan", "spectrum"):
             self._kept["doing"] = None
-            if not self._drawing():
+            if not self._drawing.is_going_on:
                 self._settle()
             self._note(now_s, f"{doing['what']} stopped", {})
 
@@ -287,44 +277,6 @@ class Instrument:
 
     # --- what comes of it ---
 
-    def _drawn_meanwhile(self, doing: Kept) -> Future[SimulatedScan]:
-        """The picture is worked out while the scan lasts and beside everything else, so that nobody waits for it."""
-        future: Future[SimulatedScan] = Future()
-
-        def work() -> None:
-            try:
-                future.set_result(self._draw(doing))
-            except BaseException as error:
-                future.set_exception(error)
-            self._wake()
-
-        # not an executor's thread: those are waited for when the process ends
-        Thread(target=work, daemon=True, name="simulated scan").start()
-        return future
-
-    def _draw(self, doing: Kept) -> SimulatedScan:
-        values = self._si(doing["values"])
-        region, shape = frame(values)
-        return self._world.scan(
-            region,
-            shape,
-            _line_s(values, region.size_m[0]),
-            doing["start_s"],
-            feedback(values),
-            float(values[names.TIP_BIAS_VOLTAGE]),
-            direction=str(values[names.SCAN_DIRECTION]),
-            slope=(float(values[names.SAMPLE_SLOPE_X]), float(values[names.SAMPLE_SLOPE_Y])),
-            adjusted=self._adjustments(doing),
-        )
-
-    def _adjustments(self, doing: Kept) -> list[Adjustment]:
-        values, found = dict(doing["values"]), []
-        for change in doing.get("adjusted", ()):
-            values.update(change["values"])
-            now = self._si(values)
-            found.append(Adjustment(change["t_s"], feedback(now), float(now[names.TIP_BIAS_VOLTAGE])))
-        return found
-
     def _save_scan(self, scan: SimulatedScan, doing: Kept) -> None:
         content = encode_scan(scan.course.region, scan.channels(), self._facts(doing))
         name = f"scan-{self._kept['scans']:04d}.nc"
@@ -368,17 +320,12 @@ class Instrument:
                 self._log.warning("a scripted action at the panel was refused: %s", refused)
 
     def _note(self, time_s: float, event: str, facts: Kept) -> None:
-        if not self._drawing():
+        if not self._drawing.is_going_on:
             facts = {**facts, "truth": self._world.truth(time_s)}
         self._truth.note(time_s, event, facts)
 
     def _si(self, values: dict[str, Value]) -> dict[str, Value]:
-        return {name: self._table[name].from_vendor(value) for name, value in values.items() if name in self._table}
-
-
-def _line_s(values: dict[str, Value], width_m: float) -> float:
-    """There and back."""
-    return 2.0 * width_m / float(values[names.SCAN_SPEED])
+        return in_si(values, self._table)
 
 
 def _distance(before: dict[str, Value], after: dict[str, Value], *axes: str) -> float:
