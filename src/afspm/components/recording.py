@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import sqlite3
 import threading
-from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
@@ -69,13 +68,7 @@ class RecordWriter:
         self._step = step
         self._wake = wake
         self._progress = LogProgress(log)
-        self._changed = threading.Condition()
-        self._queue: deque[SourcedPacket] = deque()
-        self._bytes = 0
-        self._missed = False
-        self._wants_replay = False
-        self._ending: bool | None = None
-        self._until_s = 0.0
+        self._inbox = RecordInbox()
         self._error: BaseException | None = None
         self._told_full = self._told_behind = False
         self._heard_s = self._committed_s = clock.monotonic_s()
@@ -90,19 +83,11 @@ class RecordWriter:
         """Have a packet recorded that is not in the log."""
         if packet.time_ns is None:  # of a publisher of version 1
             packet = Packet(packet.envelope, packet.payload, self._clock.now_ns())
-        with self._changed:
-            self._queue.append(SourcedPacket(packet, source))
-            self._bytes += len(packet.payload)
-            if self._bytes > MOST_BYTES and self._told_full:
-                self._queue.clear()
-                self._bytes, self._missed = 0, True
-            self._changed.notify()
+        self._inbox.put(SourcedPacket(packet, source), is_disk_full=self._told_full)
 
     def wants_replay(self) -> bool:
         """Return whether to ask publishers again for what they keep: something was missed, and there is room now."""
-        with self._changed:
-            wanted, self._wants_replay = self._wants_replay, False
-        return wanted
+        return self._inbox.wants_replay()
 
     def check(self) -> None:
         """Raise what has ended the writing, if anything."""
@@ -116,9 +101,7 @@ class RecordWriter:
             ended: the experiment has ended; else it may go on another time.
         """
         within_s = LAST_WORDS_S if ended else STOPPING_S
-        with self._changed:
-            self._ending, self._until_s = ended, self._clock.monotonic_s() + within_s
-            self._changed.notify()
+        self._inbox.end(self._clock.monotonic_s() + within_s, ended=ended)
         self._thread.join(within_s + AGAIN_S)
         self.check()
 
@@ -166,8 +149,7 @@ class RecordWriter:
                 file.replace(self._folder / f"{JOURNAL_FILE}.damaged-{number}{suffix}")
         self._logger.critical("%s; moved it aside, and began a new one", error)
         self._progress.begin_again()
-        with self._changed:
-            self._wants_replay = True
+        self._inbox.want_replay()
         self._wake()
 
     def _go_on(self, store: RecordStore) -> bool:
@@ -190,11 +172,7 @@ class RecordWriter:
 
     def _next(self) -> tuple[list[SourcedPacket], bool | None]:
         """Return the next packets; none if nothing has come for a while, or it is ending."""
-        with self._changed:
-            if not self._told_behind:
-                self._changed.wait_for(lambda: self._bytes > AT_ONCE_BYTES or self._ending is not None, LOOK_S)
-            queued, self._queue, self._bytes = list(self._queue), deque(), 0
-            ending = self._ending
+        queued, ending = self._inbox.take(within_s=0.0 if self._told_behind else LOOK_S)
         logged: list[SourcedPacket] = []
         try:
             logged = self._progress.read()
@@ -224,10 +202,7 @@ class RecordWriter:
             if self._told_full:
                 self._told_full = False
                 self._logger.info("there is room on the disk again")
-            with self._changed:
-                missed, self._missed = self._missed, False
-                self._wants_replay = self._wants_replay or missed
-            if missed:
+            if self._inbox.has_room_for_missed():
                 self._wake()
             return True
 
@@ -236,9 +211,8 @@ class RecordWriter:
         if not self._told_full:
             self._told_full = True
             self._logger.critical("nothing can be recorded, the experiment goes on: %s", error)
-        with self._changed:
-            self._changed.wait_for(lambda: False, AGAIN_S if self._ending is None else AGAIN_S / 10)
-            return self._ending is None or self._clock.monotonic_s() < self._until_s
+        until_s = self._inbox.pause()
+        return until_s is None or self._clock.monotonic_s() < until_s
 
     def _end(self, store: RecordStore, *, ended: bool) -> None:
         if not self._safely(store.finish if ended else store.flush):
@@ -258,6 +232,66 @@ class RecordWriter:
                 self._progress.commit(store.sync)
         except OSError as error:
             self._logger.debug("the progress of the record can't be saved: %s", error)
+
+
+class RecordInbox:
+    """Packets that wait to be recorded, and how it is going to end: what listener and writing thread share."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._queue: list[SourcedPacket] = []
+        self._bytes = 0
+        self._missed = False
+        self._wants_replay = False
+        self._ending: bool | None = None
+        self._until_s = 0.0
+
+    def put(self, packet: SourcedPacket, *, is_disk_full: bool) -> None:
+        """Add a packet; of too many that find no room on the disk none is kept, and publishers are asked for them."""
+        with self._changed:
+            self._queue.append(packet)
+            self._bytes += len(packet.packet.payload)
+            if self._bytes > MOST_BYTES and is_disk_full:
+                self._queue.clear()
+                self._bytes, self._missed = 0, True
+            self._changed.notify()
+
+    def take(self, *, within_s: float) -> tuple[list[SourcedPacket], bool | None]:
+        """Return what has come, and how it ends if it does; waits for much at once, or for the end."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._bytes > AT_ONCE_BYTES or self._ending is not None, within_s)
+            queued, self._queue, self._bytes = self._queue, [], 0
+            return queued, self._ending
+
+    def end(self, until_s: float, *, ended: bool) -> None:
+        """Let the writing end until then; `ended`: so has the experiment."""
+        with self._changed:
+            self._ending, self._until_s = ended, until_s
+            self._changed.notify()
+
+    def pause(self) -> float | None:
+        """Wait a while for room on the disk; return until when that is possible, None: for ever."""
+        with self._changed:
+            self._changed.wait_for(lambda: False, AGAIN_S if self._ending is None else AGAIN_S / 10)
+            return None if self._ending is None else self._until_s
+
+    def want_replay(self) -> None:
+        """Have publishers asked again for what they keep."""
+        with self._changed:
+            self._wants_replay = True
+
+    def has_room_for_missed(self) -> bool:
+        """Have publishers asked again if something was missed; return whether it was."""
+        with self._changed:
+            missed, self._missed = self._missed, False
+            self._wants_replay = self._wants_replay or missed
+            return missed
+
+    def wants_replay(self) -> bool:
+        """Return whether publishers are to be asked again, once."""
+        with self._changed:
+            wanted, self._wants_replay = self._wants_replay, False
+            return wanted
 
 
 class LogProgress:
