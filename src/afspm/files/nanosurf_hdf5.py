@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from datetime import datetime, tzinfo
 from pathlib import Path
 from typing import Any, Final
@@ -36,8 +37,9 @@ def read_nhf(path: Path, zone: tzinfo | None) -> FileContent:
         if version not in (1, 2):
             raise FileError(f"is of Nanosurf's format {version}, not 1 or 2")
         groups = [group for group in file.values() if any(hasattr(inner, "keys") for inner in group.values())]
-        scans = [scan for group in groups for scan in _scans(group)]
-        spectra = [one for group in groups if _kind(group) in _SPECTROSCOPY for one in _curves(group)]
+        scans = [replace(scan, filename=str(path)) for group in groups for scan in _scans(group)]
+        curves = [one for group in groups if _kind(group) in _SPECTROSCOPY for one in _curves(group)]
+        spectra = [replace(one, filename=str(path)) for one in curves]
         if not (scans or spectra):
             raise FileError("holds neither images nor curves")
         header = {key: _plain(value) for group in groups for key, value in group.attrs.items()}

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from datetime import tzinfo
 from pathlib import Path
 from typing import Final
@@ -38,8 +39,10 @@ def read_nid(path: Path, zone: tzinfo | None) -> FileContent:
     channels = list(_channels(sections, data))
     info = sections.get("DataSet-Info", {})
     region = _frame(sections)
-    scans = tuple(_scan(channel, values, region) for channel, values in channels if _is_image(channel))
-    spectra = tuple(_curves([one for one in channels if _CURVE.match(one[0]["Frame"])]))
+    images = (_scan(channel, values, region) for channel, values in channels if _is_image(channel))
+    scans = tuple(replace(one, filename=str(path)) for one in images)
+    curves = _curves([one for one in channels if _CURVE.match(one[0]["Frame"])])
+    spectra = tuple(replace(one, filename=str(path)) for one in curves)
     if not (scans or spectra):
         raise FileError("holds neither images nor curves")
     date = f"{info.get('Date', '')} {info.get('Time', '')}".strip()

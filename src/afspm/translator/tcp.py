@@ -76,10 +76,26 @@ class TcpConnection:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def ask(self, what: str, message: bytes, read: Callable[[Receiver], T], *, longer_s: float = 0.0) -> T:
-        """Send a question, and return what `read` makes of the bytes of its answer.
+        """Send a question, and return what `read` makes of the bytes of its answer. See `send` and `receive`."""
+        self.send(what, message)
+        return self.receive(what, read, longer_s=longer_s)
+
+    def send(self, what: str, message: bytes) -> None:
+        """Send a question, whose answer is to be received before the next is sent.
 
         Args:
             what: is asked for, for messages.
+
+        Raises:
+            ControllerLost: it could not be sent; the connection is closed.
+        """
+        self._socket.settimeout(self._timeout_s)
+        self._guarded(what, self._timeout_s, lambda: self._socket.sendall(message))
+
+    def receive(self, what: str, read: Callable[[Receiver], T], *, longer_s: float = 0.0) -> T:
+        """Return what `read` makes of the bytes of the answer.
+
+        Args:
             longer_s: so much longer than usual may the answer take.
 
         Raises:
@@ -87,10 +103,11 @@ class TcpConnection:
         """
         timeout_s = self._timeout_s + longer_s
         receiver = Receiver(self._socket, self._monotonic_s, self._monotonic_s() + timeout_s, what)
+        return self._guarded(what, timeout_s, lambda: read(receiver))
+
+    def _guarded(self, what: str, timeout_s: float, do: Callable[[], T]) -> T:
         try:
-            self._socket.settimeout(timeout_s)
-            self._socket.sendall(message)
-            return read(receiver)
+            return do()
         except TimeoutError as error:
             self.close()
             told = f"no answer to {what} within {timeout_s:g} s"

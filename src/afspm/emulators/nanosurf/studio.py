@@ -188,11 +188,17 @@ class StudioProgram(MakerProgram):
         values = self.values
         if not values["data.storage.nhf_backend_enabled"] or values["data.storage.nhf_auto_store_mode"] == 0:
             return None
-        index = values["data.storage.next_file_index"]
-        values["data.storage.next_file_index"] = index + 1
-        base = re.sub(r"[^A-Za-z0-9_\[\]-]", "_", values["data.storage.file_basename"])
-        name = base.replace("[INDEX]", f"{index:05d}").replace("[DATE]", f"{int(now_s)}")
-        return f"{name}.nhf", made()
+        while (self.folder / (name := self._next_name(now_s))).exists():
+            pass
+        return name, made()
+
+    def _next_name(self, now_s: float) -> str:
+        """Return the name of the next file, and count on; a file never leaves its folder."""
+        index = self.values["data.storage.next_file_index"]
+        self.values["data.storage.next_file_index"] = index + 1
+        base = re.sub(r"[^A-Za-z0-9_\[\]-]", "_", self.values["data.storage.file_basename"])[:100]
+        marked = base if "[INDEX]" in base else f"{base}_[INDEX]"
+        return f"{marked.replace('[INDEX]', f'{index:05d}').replace('[DATE]', f'{int(now_s)}')}.nhf"
 
 
 def _named(channels: Channels) -> Channels:

@@ -205,11 +205,11 @@ def _is_python(value: Any) -> bool:
 
 def _described(table: Any) -> Nested:
     """A tree: of each table its tables, of each property its fields, of each function True."""
-    import lupa
+    from lupa import lua54
 
     found: Nested = {}
     for name, inner in table.items():
-        kind = lupa.lua_type(inner)
+        kind = lua54.lua_type(inner)
         if kind == "table":
             choices = inner["enum"]
             is_property = inner["value_get"] is not None or inner["value_raw_get"] is not None

@@ -16,6 +16,7 @@ from afspm.translator.tcp import Receiver, TcpConnection
 _LENGTH: Final = struct.Struct("<I")
 _LONGEST_REPLY: Final = 1 << 28
 _HOURS_S: Final = 24 * 3600.0
+_SHOWN: Final = 60
 _HINTS: Final = (
     "does Nanosurf Studio run, with its scripting interface licensed and switched on?",
     "a dialog may wait on its screen",
@@ -34,18 +35,26 @@ class Link:
     def __init__(self, address: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
         self._connection = TcpConnection(_host_and_port(address), timeout_s, monotonic_s, _HINTS)
 
-    def run(self, script: str, *, longer_s: float = 0.0) -> list[Any]:
+    def run(self, script: str) -> list[Any]:
         """Run a script, and return the values that it returns.
 
         Raises:
             StudioError: it failed. ControllerLost: no reply, or none to be trusted; the connection is closed.
         """
+        self.send(script)
+        return self.receive(script)
+
+    def send(self, script: str) -> None:
+        """Send a script, whose values are to be received before the next is sent. Raises ControllerLost."""
         raw = script.encode()
-        reply = self._connection.ask(script[:60], _LENGTH.pack(len(raw)) + raw, _read, longer_s=longer_s)
-        status, content = reply
+        self._connection.send(_shown(script), _LENGTH.pack(len(raw)) + raw)
+
+    def receive(self, script: str, *, longer_s: float = 0.0) -> list[Any]:
+        """Return the values of a script that was sent. Raises as `run` does."""
+        status, content = self._connection.receive(_shown(script), _read, longer_s=longer_s)
         if status != 0:
             raise StudioError(str(content.get(1, "no reason given")))
-        return [content.get(number) for number in range(1, max((one for one in content), default=0) + 1)]
+        return [content.get(number) for number in range(1, max(content, default=0) + 1)]
 
     def close(self) -> None:
         self._connection.close()
@@ -66,6 +75,7 @@ class LongCall:
         self.what = what
         self._result: Future[list[Any]] = Future()
         self._link, self._script, self._done = link, script, done
+        link.send(script)  # before anything else can happen to this process
         Thread(target=self._work, name=f"nanosurf {what}", daemon=True).start()
 
     @property
@@ -82,7 +92,7 @@ class LongCall:
 
     def _work(self) -> None:
         try:
-            self._result.set_result(self._link.run(self._script, longer_s=_HOURS_S))
+            self._result.set_result(self._link.receive(self._script, longer_s=_HOURS_S))
         except Exception as error:
             self._result.set_exception(error)
         finally:
@@ -103,6 +113,12 @@ def _read(receiver: Receiver) -> tuple[Any, dict[Any, Any]]:
     if not (isinstance(reply, dict) and reply.get(1) in (0, 1) and isinstance(reply.get(2), dict)):
         raise ControllerLost(f"a reply without a status: {text[:60]!r}")
     return reply[1], reply[2]
+
+
+def _shown(script: str) -> str:
+    """Return the beginning of a script, for messages."""
+    first = " ".join(script.split())
+    return first if len(first) <= _SHOWN else f"{first[:_SHOWN]}…"
 
 
 def _host_and_port(address: str) -> tuple[str, int]:

@@ -1,0 +1,17 @@
+"""Fixtures for the tests of Nanosurf."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from nanosurf_bench import Bench
+from vendor_bench import benches
+
+pytest.importorskip("lupa", reason="the emulated Studio runs scripts in lupa's Lua: pip install afspm[nanosurf]")
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
+    yield from benches(Bench, tmp_path)

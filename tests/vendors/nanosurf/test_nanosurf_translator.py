@@ -1,0 +1,200 @@
+"""The Nanosurf translator against an emulated Studio: what is asked happens, where it should, and is published."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from nanosurf_bench import Bench
+from vendor_bench import FLAT, TURNED, moved, ready, scanned, scans, small, states
+
+from afspm.exit_codes import ExitCode
+from afspm.model import Region, Scan, ScanLines, ScopeState, Spectrum, names
+
+Make = Callable[..., Bench]
+Settings = dict[str, Any]
+FREE = ScopeState.FREE
+
+
+@pytest.mark.parametrize("release", [17, 19])
+@pytest.mark.parametrize("direction", ["up", "down"])
+def test_a_scan_shows_the_sample_as_it_lies(bench: Make, release: int, direction: str) -> None:
+    made = bench(release=release, tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
+    peer = made.start(release=release)
+    region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
+    ready(peer, region, (48, 32))
+    assert peer.set(names.SCAN_DIRECTION, direction).ok
+    found = scanned(peer)
+    x, y = region.pixels_m((48, 32))
+    truth = made.emulator.rig.world.sample.surface_m(x, y)
+
+    def likeness(values: np.ndarray) -> float:
+        return float(np.corrcoef(values.ravel(), truth.ravel())[0, 1])
+
+    for channel in ("Height Forward", "Height Backward"):
+        scan = found[channel]
+        assert scan.region == region
+        assert likeness(scan.values) > 0.95
+        for mirrored in (scan.values[::-1], scan.values[:, ::-1], scan.values[::-1, ::-1]):
+            assert likeness(mirrored) < likeness(scan.values) - 0.1
+    assert made.emulator.rig.scan is not None
+    assert made.emulator.rig.scan.upwards is (direction == "up")
+
+
+def test_one_scan_after_the_other_each_its_own(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    files = [scanned(peer)["Height Forward"].filename[-9:] for _ in range(3)]
+    assert files == ["00001.nhf", "00002.nhf", "00003.nhf"]
+
+
+def test_a_scan_that_is_stopped_gives_none(bench: Make) -> None:
+    made = bench(speed=10.0)
+    peer = made.start()
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    assert states(peer.until(ScopeState.SCANNING)) == ["SCANNING"]
+    assert peer.act(names.STOP_SCAN).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"]
+    assert not any(isinstance(one, Scan) for one in heard)
+
+
+@pytest.mark.parametrize("release", [18, 19])
+def test_a_scan_that_begins_at_the_panel_is_published(bench: Make, release: int) -> None:
+    made = bench(speed=20.0, release=release)
+    peer = made.start(release=release)
+    ready(peer, shape=(32, 32))
+    made.at_panel(lambda emulator: emulator.program.start_scan(made.clock.now_s()))
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "FREE"]
+    assert {scan.region for scan in scans(heard)} == {TURNED}
+
+
+@pytest.mark.parametrize("direction", ["up", "down"])
+def test_lines_come_while_it_scans(bench: Make, direction: str) -> None:
+    made = bench(speed=5.0)
+    peer = made.start(live_lines_s=1.0, image_buffer=4410)
+    ready(peer, shape=(40, 32))
+    assert peer.set(names.SCAN_DIRECTION, direction).ok
+    assert peer.act(names.START_SCAN).ok
+    heard = peer.until(FREE)
+    lines = [one for one in heard if isinstance(one, ScanLines) and one.channel == "Height Forward"]
+    whole = next(one for one in heard if isinstance(one, Scan) and one.channel == "Height Forward")
+    assert len(lines) >= 2
+    for part in lines:
+        rows = whole.values[part.first_row : part.first_row + len(part.values)]
+        np.testing.assert_allclose(part.values, rows, atol=1e-6 * np.ptp(whole.values))
+    assert (lines[0].first_row == 0) is (direction == "up")
+
+
+def test_a_force_curve_is_taken_where_the_tip_was_sent(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    moved(peer, 120e-9, -40e-9)
+    scanned(peer)
+    assert peer.act(names.START_SPEC).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SPEC", "FREE"]
+    (curve,) = [one for one in heard if isinstance(one, Spectrum)]
+    assert curve.position_m == (120e-9, -40e-9)
+    assert curve.kind == "force"
+    taken = made.emulator.rig.spectrum
+    assert taken is not None
+    assert taken.position_m == pytest.approx((120e-9, -40e-9))
+    assert len(curve["Deflection"]) == 2 * len(taken.values)
+
+
+def test_a_force_curve_can_be_stopped(bench: Make) -> None:
+    made = bench(speed=1.0, force={"duration_s": 20.0})
+    peer = small(made)
+    assert peer.act(names.START_SPEC).ok
+    peer.until(ScopeState.SPEC)
+    made.at_panel(lambda emulator: None)
+    assert peer.act(names.STOP_SPEC).ok
+    heard = peer.until(FREE)
+    assert not any(isinstance(one, Spectrum) for one in heard)
+
+
+def test_the_tip_is_withdrawn_at_any_time_and_brought_back(bench: Make) -> None:
+    made = bench(speed=10.0)
+    peer = made.start()
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    assert peer.act(names.RETRACT).ok
+    peer.until(FREE)
+    assert not made.emulator.rig.engaged
+    assert peer.act(names.ENGAGE).ok
+    assert "COARSE_MOTOR" in states(peer.until(FREE))
+    assert made.emulator.rig.engaged
+
+
+def test_a_run_that_is_stopped_stops_the_scan(bench: Make) -> None:
+    made = bench(speed=10.0)
+    peer = made.start(retracts=True)
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    assert made.let_go() == ExitCode.ORPHAN
+    assert not made.emulator.program.scanning
+    assert made.emulator.rig.engaged, "the tip stays as it is"
+
+
+def test_settings_reach_the_instrument(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    assert peer.set(names.ZCTRL_SETPOINT, 0.65, "V").ok
+    assert peer.set(names.ZCTRL_IGAIN, 2500).ok
+    assert peer.set(names.SCAN_SPEED, 4e-6, "m/s").ok
+    scanned(peer)
+    setup = made.emulator.rig.setup
+    assert setup.feedback.setpoint == 0.65
+    assert setup.feedback.integral_gain == pytest.approx(1250.0)
+    assert setup.line_s == pytest.approx(2 * setup.region.size_m[0] / 4e-6)
+    assert math.isclose(float(peer.get(names.ZCTRL_IGAIN)), 2500)
+
+
+def test_a_translator_that_is_started_again_finds_the_scan(bench: Make) -> None:
+    made = bench(speed=5.0)
+    peer = made.start()
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.kill()
+    peer = made.start()
+    heard = peer.until(FREE)
+    assert "SCANNING" in states(heard)
+    assert {scan.region for scan in scans(heard)} == {TURNED}
+
+
+@pytest.mark.parametrize(
+    ("emulator", "settings", "told"),
+    [
+        ({"release": 19}, {"release": 18}, "Studio is of release 19, not 18"),
+        ({}, {"session": "91-99-999"}, "Studio has no single measurement session 91-99-999"),
+        ({}, {"parameters": {"zctrl-setpoint": {"unit": "nm"}}}, "Studio has z_control.setpoint in V, not in nm"),
+        ({}, {"gallery_dir": "/nowhere/at/all"}, "does not exist on this computer"),
+    ],
+)
+def test_what_does_not_fit_is_told(
+    bench: Make, emulator: dict[str, int], settings: dict[str, object], told: str
+) -> None:
+    made = bench(**emulator)
+    made.start(**settings)
+    made.until_said(told)
+
+
+def test_no_command_is_called_that_the_release_does_not_have(bench: Make) -> None:
+    made = bench(release=19)
+    asked: list[bytes] = []
+    answer = made.emulator.answer
+    made.emulator.answer = lambda client, request: asked.append(request) or answer(client, request)  # type: ignore[method-assign,func-returns-value]
+    scanned(small(made))
+    assert asked
+    assert not any(b"is_scanning" in script for script in asked)
