@@ -167,7 +167,7 @@ def _add_complex_functions() -> None:
     """Build the functions of complex numbers that Wine lacks, and lead the packages that call them there."""
     names: set[str] = set()
     for package in [*PACKAGES.rglob("*.pyd"), *PACKAGES.rglob("*.dll")]:
-        imported = _imported(package, MATH)
+        imported = _imported(package, MATH) | _imported(package, OUR_MATH)  # led there by an earlier set-up
         if any(map(_COMPLEX.fullmatch, imported)):
             names |= imported
             package.write_bytes(package.read_bytes().replace(MATH.encode(), OUR_MATH.encode()))
