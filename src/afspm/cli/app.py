@@ -10,6 +10,7 @@ import typer
 from afspm import plugins
 from afspm.cli import (
     clients,
+    commission,
     dashboard,
     demo,
     doctor,
@@ -23,6 +24,7 @@ from afspm.cli import (
     runs,
     status,
     steer,
+    trace,
 )
 from afspm.errors import ConfigError
 
@@ -80,6 +82,8 @@ app.command("replay", rich_help_panel=AFTERWARDS)(recorded.replay)
 app.add_typer(drift.app, name="drift", rich_help_panel=AFTERWARDS)
 app.command("test-client", rich_help_panel=MICROSCOPES)(clients.check_client)
 app.command("test-translator", rich_help_panel=MICROSCOPES)(drivers.check_translator)
+app.command("commission", rich_help_panel=MICROSCOPES)(commission.commission)
+app.command("trace", rich_help_panel=MICROSCOPES)(trace.trace)
 app.command("emulate", rich_help_panel=MICROSCOPES)(drivers.emulate)
 
 

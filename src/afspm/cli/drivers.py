@@ -140,14 +140,21 @@ def emulate(
     folder: Annotated[
         Path | None, opt("For its files. Default: emulated-NAME", "--folder", "-o", metavar="DIR")
     ] = None,
+    replay: Annotated[
+        Path | None, opt("Answer as a recorded controller did: a trace of `afspm trace`.", metavar="TRACE")
+    ] = None,
 ) -> None:
     """Emulate a vendor's controller: its own protocol, simulated physics behind it.
 
     Runs until Ctrl-C. It listens on this computer only, at a free port unless it is told another: whoever connects
-    to the vendor's usual port may expect a real controller there.
+    to the vendor's usual port may expect a real controller there. A replay ends with 1 if something else was asked
+    than what was recorded.
     """
     from afspm.emulators.registry import emulator, names
 
+    if replay is not None:
+        _replay(replay, port, folder)
+        return
     if not name:
         for known in names():
             typer.echo(_described(known, emulator(known)))
@@ -157,6 +164,16 @@ def emulate(
     made = class_(seed=seed, faults=fault or [], **given)
     made.check()
     _emulate(made, speed, folder or Path(f"emulated-{class_.vendor.lower()}"))
+
+
+def _replay(trace: Path, port: int, folder: Path | None) -> None:
+    from afspm.emulators.replay import TraceReplay
+
+    made = TraceReplay(trace=str(trace), port=port)
+    made.check()
+    _emulate(made, 1.0, folder or Path("emulated-replay"))
+    if made.deviation:
+        raise typer.Exit(1)
 
 
 def _emulate(emulator: Emulator, speed: float, folder: Path) -> None:

@@ -36,6 +36,7 @@ SHORT_NAME_PACKAGES = (
     "afspm.emulators.asylum",
     "afspm.emulators.gxsm",
     "afspm.emulators.nanosurf",
+    "afspm.emulators.replay",
     "afspm.dashboard",
     "afspm.gateway",
 )

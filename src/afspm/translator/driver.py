@@ -134,6 +134,7 @@ class Driver(ABC):
             `patience_s`).
         live_lines_s: how often the lines of a running scan are published, in experiment seconds; 0: not at all; None:
             as often as `live_real_s` says.
+        trace: keep all that is said to and by the controller, in `controller.trace.jsonl` of the run's folder.
 
     Attributes:
         clock, log: of the experiment; given before `connect`.
@@ -191,6 +192,7 @@ class Driver(ABC):
         poll_period_s: Duration = 0.1,
         result_timeout_s: Duration = 10.0,
         live_lines_s: Duration | None = None,
+        trace: bool = False,
     ) -> None:
         if live_lines_s is not None and type(self).lines is Driver.lines:
             raise ConfigError(f"{type(self).__name__} does not publish lines of a running scan", where="live_lines_s")
@@ -199,6 +201,7 @@ class Driver(ABC):
         self.poll_period_s = poll_period_s
         self.result_timeout_s = result_timeout_s
         self.live_lines_s = live_lines_s
+        self.trace = trace
         self.adjustable: frozenset[str] = frozenset()
         self.prove: Callable[[], None] = _nothing_to_prove
         self._told: dict[str, Value] = {}

@@ -12,7 +12,16 @@ from afspm import wire
 from afspm.errors import WireError
 from afspm.logic.fencing import Epoch, SchedulerFence
 from afspm.logic.sessions import run_of
-from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ResponseDetail, names
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Parameter,
+    Request,
+    Response,
+    ResponseDetail,
+    names,
+    request_name,
+)
 from afspm.translator.commands import Commands
 from afspm.translator.connection import Connection
 from afspm.translator.driver import LOST, Driver
@@ -20,6 +29,7 @@ from afspm.translator.observer import Observer
 from afspm.translator.safe_exit import FeedbackWatch
 from afspm.translator.state import TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
+from afspm.translator.trace import TRACE
 from afspm.transport.port import RequestReceived
 
 Reply = Callable[[Response, int], None]
@@ -111,7 +121,10 @@ class RequestHandler:
             connection.reach()  # the way out is always open: a controller that is there will do, whatever else it says
         else:
             connection.require()
-        done = self.commands.do(request)
+        try:
+            done = self.commands.do(request)
+        finally:
+            TRACE.command("")
         if request.kind == ControlRequest.ACTION and done.response.ok and not done.steps:
             connection.guarded(observer.observe)  # first, so that the answered peer knows what its action has set
         self._finish(request, done.response)
@@ -123,6 +136,7 @@ class RequestHandler:
         """Write down that a request is going to be carried out."""
         self._driver.prove()
         self._acting = request
+        TRACE.command(f"{request_name(request.kind)} {request.subject}")
         in_doubt = self._feedback.may_switch(request)
         self._outcomes.begin(request)
         # what a kill leaves half set may be set again; an action may not be done again

@@ -16,8 +16,10 @@ from typing import Final
 import numpy as np
 
 from afspm.errors import FileError
+from afspm.files import FileContent, read
 from afspm.model import Region, Scan, Spectrum
 from afspm.plain_data import Plain
+from afspm.translator.trace import TRACE
 
 SCAN: Final = "scan"
 """The kind of a measurement that is no spectrum; that of a spectrum is its own."""
@@ -140,6 +142,13 @@ class FilePrecision:
         slack_m = 10 * self.part * max(abs(x), abs(y)) + 1e-12
         elsewhere = self.positions and told is not None and math.dist(told, (x, y)) > slack_m
         return told if elsewhere else (x, y)
+
+
+def read_result(path: Path | str) -> FileContent:
+    """Read a file of the controller; a trace has it, too. Raises FileError."""
+    content = read(path)
+    TRACE.file(Path(path))
+    return content
 
 
 def as_list(region: Region) -> list[float]:

@@ -8,6 +8,7 @@ from contextlib import suppress
 from typing import Final, TypeVar
 
 from afspm.translator.driver import ControllerLost
+from afspm.translator.trace import TCP, TRACE, TracedAnswer
 
 _AT_ONCE: Final = 1 << 20
 _SLOWEST_BYTES_PER_S: Final = 1e6
@@ -18,8 +19,16 @@ T = TypeVar("T")
 class Receiver:
     """The bytes that come in reply to one question, until its deadline."""
 
-    def __init__(self, connected: socket.socket, monotonic_s: Callable[[], float], until_s: float, what: str) -> None:
+    def __init__(
+        self,
+        connected: socket.socket,
+        monotonic_s: Callable[[], float],
+        until_s: float,
+        what: str,
+        traced: TracedAnswer,
+    ) -> None:
         self._socket = connected
+        self._traced = traced
         self._monotonic_s = monotonic_s
         self._until_s = until_s
         self._what = what
@@ -37,6 +46,7 @@ class Receiver:
         part = self._socket.recv(min(most, _AT_ONCE))
         if not part:
             raise ControllerLost(f"the connection was closed after {after} bytes of the reply to {self._what}")
+        self._traced.add(part)
         return part
 
     def exactly(self, size: int) -> bytearray:
@@ -74,23 +84,35 @@ class TcpConnection:
         except OSError as error:
             raise ControllerLost(f"no connection: {error}", where=self.where, hint=hints[0]) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._trace = TRACE.connection(TCP)
 
-    def ask(self, what: str, message: bytes, read: Callable[[Receiver], T], *, longer_s: float = 0.0) -> T:
+    def ask(
+        self,
+        what: str,
+        message: bytes,
+        read: Callable[[Receiver], T],
+        *,
+        longer_s: float = 0.0,
+        is_secret: bool = False,
+    ) -> T:
         """Send a question, and return what `read` makes of the bytes of its answer. See `send` and `receive`."""
-        self.send(what, message)
+        self.send(what, message, is_secret=is_secret)
         return self.receive(what, read, longer_s=longer_s)
 
-    def send(self, what: str, message: bytes) -> None:
+    def send(self, what: str, message: bytes, *, is_secret: bool = False) -> None:
         """Send a question, whose answer is to be received before the next is sent.
 
         Args:
             what: is asked for, for messages.
+            is_secret: the question is not to be written into a trace.
 
         Raises:
             ControllerLost: it could not be sent; the connection is closed.
         """
+        self._trace.asked(what, None if is_secret else message)
         self._socket.settimeout(self._timeout_s)
-        self._guarded(what, self._timeout_s, lambda: self._socket.sendall(message))
+        with self._trace.failing():
+            self._guarded(what, self._timeout_s, lambda: self._socket.sendall(message))
 
     def receive(self, what: str, read: Callable[[Receiver], T], *, longer_s: float = 0.0) -> T:
         """Return what `read` makes of the bytes of the answer.
@@ -102,8 +124,11 @@ class TcpConnection:
             ControllerLost: no answer, or none to be trusted; the connection is closed.
         """
         timeout_s = self._timeout_s + longer_s
-        receiver = Receiver(self._socket, self._monotonic_s, self._monotonic_s() + timeout_s, what)
-        return self._guarded(what, timeout_s, lambda: read(receiver))
+        with self._trace.answering() as traced:
+            receiver = Receiver(self._socket, self._monotonic_s, self._monotonic_s() + timeout_s, what, traced)
+            found = self._guarded(what, timeout_s, lambda: read(receiver))
+            traced.is_whole = True
+            return found
 
     def _guarded(self, what: str, timeout_s: float, do: Callable[[], T]) -> T:
         try:

@@ -7,10 +7,13 @@ work: `Connection`, `Observer`, `RequestHandler` and `SafeExit`.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from datetime import UTC, datetime
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +31,7 @@ from afspm.translator.requests import RequestHandler
 from afspm.translator.safe_exit import FeedbackWatch, SafeExit
 from afspm.translator.state import TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
+from afspm.translator.trace import FILE, TRACE, TraceHeader
 from afspm.transport.port import ParentGone, RequestReceived, ServerPort, SubscriberJoined
 
 if TYPE_CHECKING:
@@ -171,7 +175,18 @@ def run_translator(driver: Driver, context: ProcessContext, make: Callable[..., 
         except ControllerTaken as error:
             context.log.error("%s", error)
             return ExitCode.CRASHED  # to be tried again a few times: that run may be just ending
+        if driver.trace:
+            _begin_trace(driver, context)
+            stack.callback(TRACE.end)
         return _run_alone(driver, context, partial(make, controller=controller))
+
+
+def _begin_trace(driver: Driver, context: ProcessContext) -> None:
+    """Keep what is said to the controller; a process that is started again keeps it in a file of its own."""
+    folder = Path(context.launch.run_dir or ".")
+    file = next(one for i in itertools.count() if not (one := folder / (f"{i}-{FILE}" if i else FILE)).exists())
+    began = datetime.fromtimestamp(context.clock.now_s(), UTC).isoformat(timespec="seconds")
+    TRACE.begin(file, TraceHeader(type(driver).__name__, version("afspm"), began), context.clock)
 
 
 def _run_alone(driver: Driver, context: ProcessContext, make: Callable[..., Translator]) -> int:

@@ -12,6 +12,7 @@ from zmq.utils.monitor import recv_monitor_message
 from afspm.errors import ConfigError
 from afspm.microscopes.asylum import xop
 from afspm.translator.driver import ControllerLost
+from afspm.translator.trace import TRACE, ZEROMQ, TracedAnswer
 
 _NEVER = -1
 _OUTCOMES = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_CLOSED | zmq.EVENT_DISCONNECTED
@@ -53,6 +54,7 @@ class Link:
             hint = '"tcp://host:port", as given to zeromq_server_bind'
             raise ConfigError(f"{address!r} is not an address: {error}", where="address", hint=hint) from error
         self._await_connection()
+        self._trace = TRACE.connection(ZEROMQ)
 
     def _await_connection(self) -> None:
         """Return once the connection stands. Raises ControllerLost."""
@@ -82,7 +84,8 @@ class Link:
         message_id = str(next(self._numbers))
         message = xop.request(name, parameters, message_id)
         try:
-            found = self._exchange(message, message_id, name)
+            with self._trace.asking(name, message) as traced:
+                found = self._exchange(message, message_id, name, traced)
         except ControllerLost:
             self.close()
             raise
@@ -97,7 +100,7 @@ class Link:
         """Let go of it."""
         self._context.destroy(linger=0)
 
-    def _exchange(self, message: bytes, message_id: str, name: str) -> xop.Reply:
+    def _exchange(self, message: bytes, message_id: str, name: str, traced: TracedAnswer) -> xop.Reply:
         until_s = self._monotonic_s() + self._timeout_s
         try:
             self._socket.send_multipart([b"", message])
@@ -108,7 +111,10 @@ class Link:
             if left_s <= 0.0 or not self._socket.poll(math.ceil(left_s * 1000.0)):
                 told = f"no reply to {name} within {self._timeout_s:g} s"
                 raise ControllerLost(told, where=self._address, hint=_SILENT)
-            found = xop.reply(_payload(self._socket.recv_multipart()))
+            payload = _payload(self._socket.recv_multipart())
+            traced.add(payload)
+            traced.is_whole = True
+            found = xop.reply(payload)
             # an error found before Igor is asked comes without the id, and can only be that of what is in flight
             if found.message_id == message_id or (found.message_id is None and found.error is not None):
                 return found

@@ -12,7 +12,6 @@ from pathlib import Path, PureWindowsPath
 from typing import Final
 
 from afspm.errors import AfspmError, ConfigError, FileError
-from afspm.files import read
 from afspm.model import Scan, Spectrum
 from afspm.translator.result_files import (
     SCAN,
@@ -24,6 +23,7 @@ from afspm.translator.result_files import (
     lines_missing,
     modified_ns,
     newest,
+    read_result,
 )
 
 _PRECISION: Final = FilePrecision(part=1e-4, angle_rad=1e-4 * math.tau)
@@ -180,7 +180,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _content(path: Path, measured: Entry) -> Content:
-    found = read(path)
+    found = read_result(path)
     content: Sequence[Scan | Spectrum] = found.scans if measured["what"] == SCAN else found.spectra
     if not content:
         raise FileError(f"holds no {measured['what']}", where=str(path))

@@ -20,7 +20,7 @@ from afspm.translator.tcp import Receiver, TcpConnection
 _LONGEST: Final = 1 << 29
 _TYPES: Final = {f"<{kind}" for kind in ("f8", "f4", "i8", "i4", "u8", "u4", "i2", "u2")} | {"|u1", "|i1"}
 _SECRET: Final = "~/.afspm/gxsm-bridge-secret"
-_WELCOME: Final = {"value": "afspm bridge"}
+WELCOME: Final = {"value": "afspm bridge"}
 _HINT: Final = "is bridge.py running in GXSM's console? Nothing is answered while a call of it blocks"
 
 
@@ -47,7 +47,7 @@ class BridgeLink:
         """Call a function of GXSM (see `Link`)."""
         if not self._is_welcome:
             self._introduce()
-        reply = self._tcp.ask(method, _message(method, *arguments), _read)
+        reply = self._tcp.ask(method, message(method, *arguments), _read)
         if "error" in reply:
             raise GxsmError(str(reply["error"]), where=method)
         return reply["value"]
@@ -65,14 +65,14 @@ class BridgeLink:
                 raise ControllerLost(
                     "other users can read the bridge's secret", where=str(secret_file), hint="chmod 600"
                 )
-            reply = self._tcp.ask("the secret", secret_file.read_bytes().strip() + b"\n", _read)
+            reply = self._tcp.ask("the secret", secret_file.read_bytes().strip() + b"\n", _read, is_secret=True)
         except OSError as error:
             self.close()
             raise ControllerLost(f"the bridge's secret can't be read: {error}", hint=hint) from error
         except ControllerLost as error:
             self.close()
             raise ControllerLost(f"the bridge refused the connection: {error}", where=where, hint=hint) from error
-        if reply != _WELCOME:
+        if reply != WELCOME:
             self.close()
             raise ControllerLost("the bridge is of another version of afspm", where=where, hint=hint)
         self._is_welcome = True
@@ -93,8 +93,21 @@ def _read(receiver: Receiver) -> dict[str, object]:
 
 
 @lru_cache(256, typed=True)  # the same few are asked again and again, a frame by seven questions
-def _message(method: str, *arguments: str | int | float) -> bytes:
+def message(method: str, *arguments: str | int | float) -> bytes:
+    """Return the line that calls a function."""
     return json.dumps([method, *arguments]).encode() + b"\n"
+
+
+def value_line(value: object) -> bytes:
+    """Return the line by which the bridge gives a value."""
+    return json.dumps({"value": value}, default=_packed).encode() + b"\n"
+
+
+def _packed(value: object) -> object:
+    if isinstance(value, np.ndarray):
+        shown = base64.b64encode(value.tobytes()).decode()
+        return {"array": value.dtype.str, "shape": value.shape, "bytes": shown}
+    return value.item() if isinstance(value, np.generic) else str(value)
 
 
 def _reply(line: bytes) -> dict[str, object]:

@@ -10,11 +10,19 @@ from typing import Final
 
 from afspm.clock import NS_PER_S
 from afspm.errors import AfspmError
-from afspm.files import read
 from afspm.files.content import FileContent
 from afspm.microscopes.gxsm.scan_memory import Rows
 from afspm.model import Region
-from afspm.translator.result_files import SCAN, Content, Entry, FilePrecision, ResultFiles, as_region, lines_missing
+from afspm.translator.result_files import (
+    SCAN,
+    Content,
+    Entry,
+    FilePrecision,
+    ResultFiles,
+    as_region,
+    lines_missing,
+    read_result,
+)
 
 _NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+\.nc)$")
 _PRECISION: Final = FilePrecision(part=1e-5, angle_rad=1e-6)
@@ -143,7 +151,7 @@ class GxsmFiles(ResultFiles):
         return self._listed()
 
     def read(self, entry: Entry) -> Content:
-        contents = [self._whole.get(Path(file)) or read(file) for file in entry["files"]]
+        contents = [self._whole.get(Path(file)) or read_result(file) for file in entry["files"]]
         return [_PRECISION.as_set(one, entry) for content in contents for one in content]
 
     def _new(self, ended: Entry) -> dict[Path, FileContent]:
@@ -159,7 +167,7 @@ class GxsmFiles(ResultFiles):
                 self._whole.pop(file, None)
             elif file not in self._whole:
                 try:
-                    self._whole[file] = read(file)
+                    self._whole[file] = read_result(file)
                 except (AfspmError, OSError):
                     continue  # not yet
             content = self._whole.get(file)

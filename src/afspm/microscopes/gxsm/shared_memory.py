@@ -20,10 +20,11 @@ from threading import Event
 from typing import Final
 
 from afspm.errors import ConfigError
-from afspm.microscopes.gxsm import pickles
+from afspm.microscopes.gxsm import bridge_client, pickles
 from afspm.microscopes.gxsm.errors import BadReply, GxsmError
 from afspm.microscopes.gxsm.processes import GxsmProcess, NoProcess, find
 from afspm.translator.driver import ControllerLost
+from afspm.translator.trace import TCP, TRACE
 
 _FOLDER: Final = Path("/dev/shm")
 _BYTES: Final = 16_777_344
@@ -74,6 +75,10 @@ class SharedMemoryLink:
                 self.close()
             raise
         self._memory = self._mapped(path)
+        # traced as if the bridge had passed the calls on: it is one form for both, and can be played back anywhere
+        self._trace = TRACE.connection(TCP)
+        with self._trace.asking("the secret", None) as traced:
+            traced.add(bridge_client.value_line(bridge_client.WELCOME["value"]))
 
     def _mapped(self, path: Path) -> mmap.mmap:
         try:
@@ -90,8 +95,11 @@ class SharedMemoryLink:
         if self._closed.is_set():
             raise ControllerLost("the link was closed", where=self._where)
         try:
-            with self._alone():
-                return self._transaction(method, arguments)
+            with self._alone(), self._trace.asking(method, bridge_client.message(method, *arguments)) as traced:
+                found = self._transaction(method, arguments)
+                traced.add(bridge_client.value_line(found))
+                traced.is_whole = True
+                return found
         except ControllerLost:
             self.close()
             raise

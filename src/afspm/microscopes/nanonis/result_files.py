@@ -8,10 +8,18 @@ from pathlib import Path, PureWindowsPath
 from typing import Final
 
 from afspm.errors import AfspmError, FileError
-from afspm.files import read
 from afspm.microscopes.nanonis import fetched
 from afspm.translator.driver import LOST
-from afspm.translator.result_files import SCAN, Content, Entry, FilePrecision, ResultFiles, lines_missing, newest
+from afspm.translator.result_files import (
+    SCAN,
+    Content,
+    Entry,
+    FilePrecision,
+    ResultFiles,
+    lines_missing,
+    newest,
+    read_result,
+)
 
 _PRECISION: Final = FilePrecision(part=2e-6, angle_rad=1e-3, positions=True)
 """A file prints seven digits of a position, and degrees with three."""
@@ -159,4 +167,4 @@ def _files(folder: Path, what: str) -> list[Path]:
 
 
 def _content(path: Path, entry: Entry) -> Content:
-    return [_PRECISION.as_set(one, entry) for one in read(path)]
+    return [_PRECISION.as_set(one, entry) for one in read_result(path)]

@@ -191,6 +191,18 @@ class CheckClient:
         self.quiet()
         self.at_start = tuple(self.observations.all)
 
+    def regain_control(self, within_s: float) -> None:
+        """Ask for control again, after it was taken away while the controller was lost.
+
+        Raises:
+            Lost: it is not granted within so many real seconds.
+        """
+        until_s = self.clock.monotonic_s() + within_s
+        while not (response := self._asked_by(self._link, ControlRequest.REQUEST_CTRL, 0)).ok:
+            if self.clock.monotonic_s() >= until_s:
+                raise Lost(f"control was refused: {answer_in_words(response)}")
+            self.quiet()
+
     def end(self) -> None:
         """Give control back."""
         self._link.send_only(ControlRequest.RELEASE_CTRL)

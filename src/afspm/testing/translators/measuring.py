@@ -190,6 +190,14 @@ class CheckMeasurements:
             raise Skipped("no ScanParameters2d says which frame is set")
         return FrameSettings(self._whole)
 
+    def keep(self, what: str, taken: Taken) -> None:
+        """Keep a measurement that was taken otherwise."""
+        self._kept[what] = taken
+
+    def forget(self) -> None:
+        """Take all measurements anew when they are asked for."""
+        self._kept.clear()
+
     # --- scans ---
 
     def scan(self, name: str) -> Taken:

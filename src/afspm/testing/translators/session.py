@@ -83,7 +83,7 @@ class CheckSession:
 
     Attributes:
         support: what the microscope has.
-        translator: its class or command.
+        translator: its class or command; maker: of its controller, if the driver says.
         folder: of this run.
         excused: checks that this controller can't pass, with the reason.
         complaints: the warnings and errors that were logged; it grows.
@@ -97,6 +97,7 @@ class CheckSession:
     options: CheckOptions
     excused: Mapping[str, str]
     complaints: Sequence[str]
+    maker: str = ""
 
 
 def prepare(options: CheckOptions) -> Experiment:
@@ -143,9 +144,10 @@ def opened(options: CheckOptions) -> Iterator[CheckSession]:
         support = find_out(client, sorted(actions), sorted(parameters))
         named = translator.class_path or " ".join(translator.part.command)
         excused: Mapping[str, str] = {}
+        maker = ""
         if translator.component is not None and issubclass(translator.component, Driver):
-            excused = translator.component.excused(support.controller)
-        yield CheckSession(client, support, named, simulated, folder, options, excused, complaints)
+            excused, maker = translator.component.excused(support.controller), translator.component.maker
+        yield CheckSession(client, support, named, simulated, folder, options, excused, complaints, maker)
 
 
 @contextmanager

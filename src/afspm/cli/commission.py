@@ -1,0 +1,116 @@
+"""`afspm commission`: a new controller, step by step, in the terminal."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from afspm.cli.arguments import RUNS, Files, Runs, opt
+
+if TYPE_CHECKING:
+    from afspm.testing.commissioning.report import InstrumentReport
+
+_INTRODUCTION = """This goes through a controller step by step. Each step is explained, and nothing is moved before you
+confirm it. The first steps only read (connecting may change how the controller saves its scans). Ctrl-C at any moment
+stops the scan, puts the settings back, and withdraws the tip if it is at the sample. The same command goes on later."""
+
+
+def commission(
+    files: Files,
+    report: Annotated[
+        Path | None, opt("The report. Default: FILE-commissioning.toml, here.", "--report", metavar="REPORT")
+    ] = None,
+    runs: Runs = RUNS,
+    frame: Annotated[
+        str,
+        opt(
+            'Stay within a square of this side about the centre of the frame that is set, e.g. "500 nm". '
+            "Default: within the frame that is set.",
+            metavar="SIZE",
+        ),
+    ] = "",
+    anew: Annotated[bool, opt("Do all steps again, whatever the report says.", "--anew")] = False,
+    speed: Annotated[
+        float, typer.Option(min=1e-6, help="Experiment seconds in a real second; simulated microscopes only.")
+    ] = 20.0,
+) -> None:
+    """Take a new controller into use, step by step, with the tip withdrawn first.
+
+    Ends with a report for people and programs, and 0 if nothing was wrong.
+    """
+    from afspm.testing.commissioning.procedure import commission as walk
+    from afspm.testing.commissioning.report import TRIED_ON
+    from afspm.testing.translators import CheckOptions
+    from afspm.testing.translators.session import is_simulated, prepare
+    from afspm.units import si
+
+    options = CheckOptions(files, runs=runs, speed=speed, frame_m=si(frame, "m") if frame else None)
+    simulated = is_simulated(prepare(options), options)
+    terminal = Terminal()
+    terminal.show(_INTRODUCTION)
+    file = report or Path(f"{files[0].stem}-commissioning.toml")
+    before = None if anew else _before(file)
+    if before is not None:
+        terminal.show(f"going on with {file}: what has passed there is not done again")
+    tried_on = "emulator" if simulated else terminal.choose("What is connected?", TRIED_ON[:2])
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    ended = walk(options, terminal, file, tried_on, before)
+    if ended.lost:
+        terminal.show(f"not completed: {ended.lost}")
+    terminal.show(f"\nthe report: {file}")
+    terminal.show(f"log, trace and files: {ended.folder}")
+    raise typer.Exit(0 if ended.passed else 1)
+
+
+def _before(file: Path) -> InstrumentReport | None:
+    from afspm.testing.commissioning.report import InstrumentReport
+
+    return InstrumentReport.read(file) if file.exists() else None
+
+
+class Terminal:
+    """The person at this terminal. Without an answer, nothing is confirmed."""
+
+    def show(self, text: str) -> None:
+        """Show a text."""
+        typer.echo(text)
+
+    def confirm(self, question: str) -> bool:
+        """Ask yes or no."""
+        return self._line(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+
+    def text(self, question: str) -> str:
+        """Ask for a line."""
+        return self._line(f"{question}: ")
+
+    def choose(self, question: str, options: Sequence[str]) -> str:
+        """Ask for one of the options, by its number or its word, until it is one."""
+        numbered = ", ".join(f"{number} {option}" for number, option in enumerate(options, 1))
+        while True:
+            said = self._line(f"{question} [{numbered}] ").strip()
+            chosen = options[int(said) - 1] if said.isdigit() and 0 < int(said) <= len(options) else said
+            if chosen in options:
+                return chosen
+
+    def _line(self, question: str) -> str:
+        """Ask; Ctrl-C then interrupts, and the end of the input as well."""
+        with _interruptible():
+            try:
+                return input(question)
+            except EOFError:
+                raise KeyboardInterrupt from None
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Let Ctrl-C end a question at once: nothing is being asked of the microscope meanwhile."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

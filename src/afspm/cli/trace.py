@@ -1,0 +1,61 @@
+"""`afspm trace`: an experiment with all that is said to and by the controller kept in one file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from afspm.cli.arguments import RUNS, Files, Runs, opt
+
+if TYPE_CHECKING:
+    from afspm.experiment import Experiment
+
+
+def trace(
+    files: Files,
+    runs: Runs = RUNS,
+    speed: Annotated[
+        float | None, opt("Experiment seconds in a real second; simulated microscopes only.", min=1e-6)
+    ] = None,
+) -> None:
+    """Run an experiment, and record everything that is said to and by the controller.
+
+    The trace is in the run's folder: one file, with the files that the controller saved and without secrets. Send it
+    with a report of a bug: `afspm emulate --replay` plays it back. As `afspm run` with `trace = true` in the section of
+    the translator.
+    """
+    import sys
+
+    from afspm.cli.experiment_file import require_no_errors
+    from afspm.supervisor import run as running
+    from afspm.translator.trace import FILE
+
+    experiment = with_trace(files)
+    require_no_errors(experiment, (), ())
+    ended = running.run(experiment, running.RunOptions(runs=runs, speed=speed), terminal=sys.stdout)
+    file = ended.folder / FILE
+    typer.echo(f"the trace: {file}" if file.exists() else "nothing was said to the controller: there is no trace")
+    raise typer.Exit(ended.outcome.exit_code)
+
+
+def with_trace(files: list[Path]) -> Experiment:
+    """Return the experiment, with a trace.
+
+    Raises:
+        ConfigError: its translator has none.
+    """
+    import tempfile
+
+    from afspm.errors import ConfigError
+    from afspm.experiment import Role, load
+    from afspm.translator import Driver
+
+    translators = load(*files).resolved.with_role(Role.TRANSLATOR)
+    if not translators or not issubclass(translators[0].component or type, Driver):
+        raise ConfigError("only a translator of afspm keeps a trace", where=str(files[0]))
+    with tempfile.TemporaryDirectory() as folder:
+        overlay = Path(folder) / "trace.toml"
+        overlay.write_text(f"[{translators[0].name}]\ntrace = true\n", encoding="utf-8")
+        return load(*files, overlay)

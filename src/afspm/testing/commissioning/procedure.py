@@ -1,0 +1,184 @@
+"""The procedure: one step after the other, the report after each, and a safe state however it ends."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from afspm.experiment import Role
+from afspm.model import names
+from afspm.testing.commissioning.guide import Guide, Prompts, StepDeclined
+from afspm.testing.commissioning.progress import CommissioningProgress, CommissioningStep, StepOutcome, StepResult
+from afspm.testing.commissioning.report import InstrumentReport, steps_of
+from afspm.testing.commissioning.steps import all_steps
+from afspm.testing.translators.report import CheckReport
+from afspm.testing.translators.runner import begin_report, restored
+from afspm.testing.translators.session import CheckOptions, CheckSession, opened, prepare
+from afspm.testing.verdicts import Failed, Lost, Skipped
+from afspm.translator import Driver
+
+_NOT_WITHDRAWN = "THE TIP WAS NOT WITHDRAWN ({why}): withdraw it by hand, now."
+_MARKS = {StepOutcome.PASSED: "✓", StepOutcome.MISMATCH: "✗"}
+
+
+@dataclass
+class CommissioningResult:
+    """What came of it.
+
+    Attributes:
+        progress: the steps.
+        lost: why it ended before its end; empty if it did not.
+        folder: of the run, with the log and the trace.
+    """
+
+    progress: CommissioningProgress
+    file: Path
+    lost: str = ""
+    folder: Path = Path()
+
+    @property
+    def passed(self) -> bool:
+        return not self.lost and self.progress.passed
+
+
+def commission(
+    options: CheckOptions, prompts: Prompts, file: Path, tried_on: str, before: InstrumentReport | None = None
+) -> CommissioningResult:
+    """Take a person through all steps.
+
+    Args:
+        file: for the report, written after each step.
+        tried_on: see `TRIED_ON`.
+        before: the report of an unfinished commissioning of the same controller, to go on with.
+
+    Raises:
+        ConfigError: the experiment file is wrong; nothing was started.
+        KeyboardInterrupt: after the scan was stopped, the tip withdrawn if it was in contact, and all was put back.
+    """
+    result = CommissioningResult(CommissioningProgress.resumed(all_steps(), before.results() if before else {}), file)
+    try:
+        with ExitStack() as stack:
+            session = stack.enter_context(opened(_traced(options, stack)))
+            result.folder = session.folder
+            _in_session(session, prompts, result, tried_on)
+    except Lost as lost:
+        result.lost = str(lost)
+    return result
+
+
+def _in_session(session: CheckSession, prompts: Prompts, result: CommissioningResult, tried_on: str) -> None:
+    checks = begin_report(session)
+
+    def write() -> None:
+        _report(session, checks, result.progress, tried_on).write(result.file)
+
+    try:
+        with restored(session, checks) as kit:
+            walk = _Walk(Guide(kit, prompts, session.folder), result.progress, write)
+            try:
+                walk.through()
+            finally:
+                walk.withdraw()
+    finally:
+        write()
+        for line in checks.unrestored:
+            prompts.show(f"not put back: {line}")
+
+
+class _Walk:
+    """The way through the steps."""
+
+    def __init__(self, guide: Guide, progress: CommissioningProgress, write: Callable[[], None]) -> None:
+        self._guide = guide
+        self._progress = progress
+        self._write = write
+        self._in_contact = False
+
+    def through(self) -> None:
+        """Do what is left to do."""
+        while (step := self._progress.next()) is not None:
+            result = self._progress.results[step.name] = self._done(step)
+            self._say(step, result)
+            self._write()
+            if step.contact:
+                self.withdraw()
+
+    def withdraw(self) -> None:
+        """Withdraw a tip that was approached for these steps."""
+        if not self._in_contact:
+            return
+        self._in_contact = False
+        kit = self._guide.kit
+        try:
+            kit.client.come_to_rest()
+            kit.act(names.RETRACT)
+            kit.client.settled(kit.client.observations.mark())
+            self._guide.prompts.show("The tip was withdrawn.")
+        except (Failed, Skipped, Lost) as error:
+            self._guide.prompts.show(_NOT_WITHDRAWN.format(why=error))
+
+    def _done(self, step: CommissioningStep) -> StepResult:
+        missing = self._guide.kit.support.missing(step.needs)
+        if missing:
+            return StepResult(StepOutcome.SKIPPED, f"not supported: {', '.join(missing)}")
+        prompts = self._guide.prompts
+        prompts.show(f"\n{step.title}\n{step.explained}")
+        if step.moves and not prompts.confirm("Shall afspm do this now?"):
+            return StepResult(StepOutcome.DECLINED, "not confirmed")
+        try:
+            line = step.do(self._guide)
+        except Failed as failure:
+            self._come_to_rest()
+            return StepResult(StepOutcome.MISMATCH, str(failure))
+        except Skipped as skipped:
+            return StepResult(StepOutcome.SKIPPED, str(skipped))
+        except StepDeclined as declined:
+            return StepResult(StepOutcome.DECLINED, str(declined))
+        self._in_contact |= step.name == "contact"
+        return StepResult(StepOutcome.PASSED, line)
+
+    def _come_to_rest(self) -> None:
+        try:
+            self._guide.kit.client.come_to_rest()
+        except Failed as failure:
+            raise Lost(str(failure)) from failure
+
+    def _say(self, step: CommissioningStep, result: StepResult) -> None:
+        mark = _MARKS.get(result.outcome, f"– {result.outcome.value}:")
+        self._guide.prompts.show(f"{mark} {step.title}: {result.line}")
+        if result.outcome is StepOutcome.MISMATCH:
+            self._guide.prompts.show(f"  What to do: {step.remedy}")
+
+
+def _traced(options: CheckOptions, stack: ExitStack) -> CheckOptions:
+    """Return the options with a trace of all that is said to the controller."""
+    (translator,) = prepare(options).resolved.with_role(Role.TRANSLATOR)
+    if translator.component is None or not issubclass(translator.component, Driver):
+        return options
+    overlay = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "trace.toml"
+    overlay.write_text(f"[{translator.name}]\ntrace = true\n", encoding="utf-8")
+    return replace(options, files=[*options.files, overlay])
+
+
+def _report(
+    session: CheckSession, checks: CheckReport, progress: CommissioningProgress, tried_on: str
+) -> InstrumentReport:
+    support = session.support
+    lacking = [name for name, value in support.parameters.items() if value is None]
+    lacking += [name for name, has in support.actions.items() if has is False]
+    return InstrumentReport(
+        maker=session.maker or "unknown",
+        driver=session.translator,
+        release=support.controller or "not told",
+        tried_on=tried_on,
+        evidence="afspm commission",
+        began=checks.began,
+        afspm=checks.afspm,
+        operations=progress.operations(),
+        steps=steps_of(progress),
+        unsupported=lacking,
+        unrestored=checks.unrestored,
+    )

@@ -1,0 +1,83 @@
+"""The report of a commissioning: one TOML file for people and programs, from which the public matrix is made."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from afspm.errors import FileError
+from afspm.experiment.toml_writer import dumps
+from afspm.storage.atomic import write_atomic
+from afspm.testing.commissioning.progress import CommissioningProgress, StepOutcome, StepResult
+
+FORMAT: Final = 1
+TRIED_ON: Final = ("instrument", "maker's program", "maker's client", "emulator")
+"""The levels of the matrix, the best first."""
+_HEAD = """# A commissioning report of afspm. Send it to have it in the public matrix (docs/reference/instruments.md).
+# Its row there: {row}
+
+"""
+
+
+@dataclass(frozen=True)
+class InstrumentReport:
+    """Tries of the operations of one controller.
+
+    Attributes:
+        release: of the controller's program, as it tells, or as the person knows.
+        tried_on: one of `TRIED_ON`.
+        evidence: what was done: a command, or tests of the repository.
+        operations: the outcome of each.
+        steps: of `afspm commission`: outcome and line of each.
+        unsupported: actions and parameters that the controller does not have.
+        unrestored: settings that could not be put back.
+    """
+
+    maker: str
+    driver: str
+    release: str
+    tried_on: str
+    evidence: str
+    began: str
+    afspm: str
+    operations: Mapping[str, str]
+    steps: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    unsupported: Sequence[str] = ()
+    unrestored: Sequence[str] = ()
+    note: str = ""
+    format: int = FORMAT
+
+    @property
+    def row(self) -> str:
+        """The row of the matrix, in Markdown."""
+        told = [f"{name}: {outcome}" for name, outcome in self.operations.items()]
+        return f"| {self.maker} | {self.release} | {self.tried_on} | {', '.join(told)} |"
+
+    def write(self, file: Path) -> None:
+        """Write it. Raises FileError."""
+        text = _HEAD.format(row=self.row) + dumps(asdict(self))
+        write_atomic(file, [text.encode()])
+
+    @classmethod
+    def read(cls, file: Path) -> InstrumentReport:
+        """Read one. Raises FileError: it is none."""
+        try:
+            facts: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
+            found = cls(**facts)
+            if found.format != FORMAT or found.tried_on not in TRIED_ON:
+                raise ValueError(f"format {found.format}, tried on {found.tried_on!r}")
+            return found
+        except (OSError, ValueError, TypeError) as error:
+            raise FileError(f"is not a commissioning report: {error}", where=str(file)) from error
+
+    def results(self) -> dict[str, StepResult]:
+        """Return the results of the steps."""
+        return {name: StepResult(StepOutcome(one["outcome"]), one["line"]) for name, one in self.steps.items()}
+
+
+def steps_of(progress: CommissioningProgress) -> dict[str, dict[str, str]]:
+    """Return the results as they are written."""
+    return {name: {"outcome": one.outcome.value, "line": one.line} for name, one in progress.results.items()}

@@ -1,0 +1,338 @@
+"""The steps of a commissioning, in their order.
+
+Each returns a line that says what was seen, or raises Failed, Skipped or StepDeclined.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from afspm.drawing import raster
+from afspm.model import ControlRequest, Feedback, RegionChange, Scan, ScanParameters, ScopeState, names
+from afspm.testing.commissioning.guide import Guide, StepDeclined
+from afspm.testing.commissioning.progress import CommissioningStep
+from afspm.testing.translators.checks import frames, picture, scans
+from afspm.testing.translators.measuring import SCAN_S, FrameSetting, Taken, number
+from afspm.testing.verdicts import Skipped, expect
+
+READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES = (
+    "read", "frame", "angle", "scan", "end of a scan", "files", "stop", "lost connection", "axes",
+)  # fmt: skip
+OPERATIONS: Final = (READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES)
+_NOTICED_S: Final = 5.0
+"""Real seconds between the end of a scan at the panel and the one that afspm tells: reaction, saving, polling."""
+_LOST_S: Final = 60.0
+_STEPS: list[CommissioningStep] = []
+_FRAME = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
+
+
+def all_steps() -> tuple[CommissioningStep, ...]:
+    """Return all steps, in their order."""
+    return tuple(_STEPS)
+
+
+def _step(title: str, explained: str, remedy: str, **facts: object) -> Callable[[Callable[[Guide], str]], None]:
+    def marked(do: Callable[[Guide], str]) -> None:
+        name = do.__name__.strip("_").replace("_", "-")
+        _STEPS.append(CommissioningStep(name, title, explained, remedy, do, **facts))  # type: ignore[arg-type]
+
+    return marked
+
+
+# --- only reading ---
+
+
+@_step(
+    "The controller",
+    "afspm has connected and read what there is; nothing was moved and no value was set.",
+    "Check the address in the experiment file, and that no other controller runs at it.",
+    moves=False,
+    remembered=False,
+    operations=(READ,),
+)
+def _controller(guide: Guide) -> str:
+    support = guide.kit.support
+    lacking = [name for name, value in support.parameters.items() if value is None]
+    lacking += [name for name, has in support.actions.items() if has is False]
+    guide.prompts.show(f"controller: {support.controller or 'it does not say what it is'}")
+    guide.prompts.show(f"not supported: {', '.join(lacking) or 'nothing'}")
+    expect(not support.errors, "an answer to every question", "; ".join(support.errors))
+    guide.require("Is this the controller in front of you?", "the controller in front of the person")
+    return support.controller
+
+
+@_step(
+    "The panel",
+    "Choose at the controller's panel a frame that is not in the middle, not square and turned by some 20 degrees. "
+    "Then type what the panel shows. An empty line: it is not shown there.",
+    "Note both values and units. If a factor or a sign is wrong, change that row: [translator] parameters.",
+    after=("controller",),
+    moves=False,
+    operations=(READ,),
+    needs=_FRAME,
+)
+def _panel(guide: Guide) -> str:
+    guide.prompts.text("Press Enter when the frame is set")
+    guide.kit.client.quiet()
+    count = _compare_frame(guide, frames.current_frame(guide.kit)) + _compare_values(guide)
+    if not count:
+        raise Skipped("the panel shows none of the values")
+    return f"{count} values are those of the panel"
+
+
+def _compare_frame(guide: Guide, frame: FrameSetting) -> int:
+    """Compare a frame with the panel. Return how many of its values are shown there."""
+    region, (rows, columns) = frame.region, frame.shape
+    slack_nm = 0.01 * max(region.size_m) * 1e9
+    x_nm, y_nm = (value * 1e9 for value in region.center_m)
+    width_nm, height_nm = (value * 1e9 for value in region.size_m)
+    seen = [
+        guide.compare("width of the frame (x)", width_nm, "nm"),
+        guide.compare("height of the frame (y)", height_nm, "nm"),
+        guide.compare("x of its centre", x_nm, "nm", slack_nm),
+        guide.compare("y of its centre", y_nm, "nm", slack_nm),
+    ]
+    if guide.kit.support.has(names.SCAN_ANGLE):
+        turned_deg = math.degrees(math.remainder(region.angle_rad, math.tau))
+        seen.append(guide.compare("angle, counter-clockwise", turned_deg, "deg", 0.2))
+    seen += [guide.compare("pixels in a line", columns, ""), guide.compare("lines", rows, "")]
+    return sum(seen)
+
+
+def _compare_values(guide: Guide) -> int:
+    compared = 0
+    for name in (names.ZCTRL_SETPOINT, names.TIP_BIAS_VOLTAGE):
+        if guide.kit.support.has(name):
+            found = guide.kit.client.get(name)
+            compared += guide.compare(name, number(found, found.unit or ""), found.unit or "")
+    return compared
+
+
+# --- with the tip withdrawn ---
+
+
+@_step(
+    "The tip is withdrawn",
+    "All that follows until you are told moves the scanner sideways and takes scans. It never approaches.",
+    "Withdraw the tip with the coarse motor, so far that the scanner can't reach the sample, and begin again.",
+    after=("controller",),
+    moves=False,
+    remembered=False,
+)
+def _withdrawn(guide: Guide) -> str:
+    if not guide.prompts.confirm("Is the tip so far from the sample that the scanner can't reach it?"):
+        raise StepDeclined("the tip is not withdrawn")
+    return "confirmed"
+
+
+@_step(
+    "Setting a frame",
+    "afspm sets a frame. Look where the panel draws it.",
+    "Do not scan. Compare the values; report it with the trace of this run.",
+    after=("panel", "withdrawn"),
+    operations=(FRAME,),
+    needs=_FRAME,
+)
+def _frame(guide: Guide) -> str:
+    client, whole = guide.kit.client, guide.kit.frames.whole
+    frames.ask_for(guide.kit, guide.kit.frames.plain.request(guide.kit.support))
+    frames.require_in_force(guide.kit, guide.kit.frames.plain)
+    count = _compare_frame(guide, guide.kit.frames.plain)
+    x, y = whole.center_m
+    moved = (x, y + 0.3 * whole.size_m[1])
+    client.asked(ControlRequest.SET_SCAN_PARAMS, ScanParameters(_moved(guide, moved)), "moving the frame")
+    client.settled(client.observations.mark())
+    above = "The frame moved, by its y. Where to, in the panel's picture?"
+    seen = guide.require_choice(above, "up", ["down", "left", "right"], "a frame of a larger y")
+    if not (count or seen):
+        raise Skipped("set and read back; not seen at the panel")
+    return f"{count} values are those of the panel{', and y points up there' if seen else ''}"
+
+
+def _moved(guide: Guide, center_m: tuple[float, float]) -> RegionChange:
+    left, low = guide.kit.frames.plain.region.moved_to(center_m).top_left_m
+    return RegionChange(left_m=left, low_m=low)
+
+
+@_step(
+    "Turning a frame",
+    "afspm turns the frame by 20 degrees counter-clockwise. Look which way the panel turns it.",
+    "Do not use angles with this controller; report it with the trace of this run.",
+    after=("frame",),
+    operations=(ANGLE,),
+    needs=(*_FRAME, names.SCAN_ANGLE),
+)
+def _angle(guide: Guide) -> str:
+    frames.ask_for(guide.kit, guide.kit.frames.turned.request(guide.kit.support))
+    frames.require_in_force(guide.kit, guide.kit.frames.turned)
+    question = "In the panel's picture, which way is it turned against the frame before?"
+    seen = guide.require_choice(question, "counter-clockwise", ["clockwise", "not turned"], "a turned frame")
+    if not seen:
+        raise Skipped("set and read back; not seen at the panel")
+    return "turned counter-clockwise"
+
+
+@_step(
+    "A scan, and its end",
+    "afspm takes one scan with the tip withdrawn. Watch the panel: press Enter at the moment at which it ends there.",
+    "Stop the scan at the panel if it goes on. If afspm notices its end late, report it with the trace of this run.",
+    after=("frame",),
+    operations=(SCAN, END),
+    needs=(names.START_SCAN,),
+)
+def _scan(guide: Guide) -> str:
+    taken, panel_s = _watched(guide)
+    scans.require_order(taken.heard, ScopeState.SCANNING, Scan)
+    scans.require_frame(taken)
+    begin_s, free_s = taken.time_s(ScopeState.SCANNING), taken.time_s(ScopeState.FREE)
+    for one in taken.scans:
+        if one.time_ns is not None:
+            scans.require_time(one.time_ns, taken, ScopeState.SCANNING, f"scan {one.channel!r}")
+    if panel_s is not None:
+        late_s = guide.kit.client.clock.real_s(free_s - panel_s)
+        wanted = f"the end of the scan within {_NOTICED_S:g} s of the panel's"
+        expect(abs(late_s) <= _NOTICED_S, wanted, f"{abs(late_s):.0f} s {'later' if late_s > 0 else 'earlier'}")
+    elif taken.expected_s is not None:
+        wanted = f"a scan of about {taken.expected_s:.3g} s, by its speed"
+        most_s = 1.5 * taken.expected_s + 2.0 * _NOTICED_S
+        expect(free_s - begin_s <= most_s, wanted, f"{free_s - begin_s:.3g} s until its end was noticed")
+    return f"{free_s - begin_s:.3g} s, {len(taken.scans)} channels: {', '.join(one.channel for one in taken.scans)}"
+
+
+def _watched(guide: Guide) -> tuple[Taken, float | None]:
+    """Take the scan; and the experiment time at which the person saw it end."""
+    kit, client = guide.kit, guide.kit.client
+    frame = kit.frames.plain
+    expected_s = kit.prepare(frame, SCAN_S)
+    mark = client.observations.mark()
+    kit.act(names.START_SCAN)
+    client.wait_state(ScopeState.SCANNING, mark)
+    said = guide.prompts.text("Enter when the panel shows that the scan has ended (u: you can't see it)")
+    panel_s = None if said.strip() else client.clock.now_s()
+    limit_s = 1200.0 if expected_s is None else 5.0 * expected_s + 60.0
+    client.wait_state(ScopeState.FREE, mark, client.real_s(limit_s))
+    heard = client.settled(mark)
+    taken = Taken(frame, heard, expected_s)
+    expect(taken.scans, "a Scan2d of the scan", "none: see the files of the controller")
+    guide.kit.keep("scan of the plain frame", taken)
+    return taken, panel_s
+
+
+@_step(
+    "Files and folders",
+    "afspm has read the files of the scan. Compare them with the controller's own.",
+    "Set the folder in the experiment file, as the README of the driver says.",
+    after=("scan",),
+    moves=False,
+    operations=(FILES,),
+)
+def _files(guide: Guide) -> str:
+    found = guide.kit.scan("plain").scans
+    for one in found:
+        low, high = (float(value) for value in (np.nanmin(one.values), np.nanmax(one.values)))
+        file = Path(one.filename).name if one.filename else "no file"
+        guide.prompts.show(f"  {one.channel}: {low:.4g} to {high:.4g} {one.unit}  ({file})")
+    guide.require("Are these the channels that the panel records, with these units and values?", "the panel's channels")
+    return f"{len(found)} channels"
+
+
+@_step(
+    "Stopping a scan",
+    "afspm begins a scan and stops it. Watch that the panel stops, too.",
+    "Stop the scan at the panel. Do not leave this controller alone until this is solved.",
+    after=("scan",),
+    operations=(STOP,),
+    needs=(names.START_SCAN, names.STOP_SCAN),
+)
+def _stop(guide: Guide) -> str:
+    scans.cancel(guide.kit)
+    guide.require("Has the panel stopped, and does it wait?", "a panel that has stopped")
+    return "stopped, and no scan was published"
+
+
+@_step(
+    "Stopping at the panel",
+    "afspm begins a scan. Stop it at the panel: afspm has to notice.",
+    "Take over by `afspm pause` before you touch the panel; report it with the trace of this run.",
+    after=("stop",),
+    operations=(STOP,),
+    needs=(names.START_SCAN,),
+)
+def _stop_at_panel(guide: Guide) -> str:
+    client = guide.kit.client
+    mark = guide.kit.begin_long_scan(guide.kit.frames.other)
+    said = guide.prompts.text("Stop the scan at the panel, then press Enter (u: it can't be stopped there)")
+    if said.strip():
+        client.come_to_rest()
+        raise Skipped("not stopped at the panel")
+    client.wait_state(ScopeState.FREE, mark, client.real_s(60.0))
+    client.settled(mark)
+    return "noticed"
+
+
+@_step(
+    "Losing the connection",
+    "End the connection as the laboratory would: pull the network cable, or switch the controller's interface off. "
+    "The tip stays as it is.",
+    "Restore the connection, and see that nothing runs at the panel.",
+    after=("stop",),
+    operations=(LOSS,),
+)
+def _connection(guide: Guide) -> str:
+    client, mark = guide.kit.client, guide.kit.client.observations.mark()
+    if guide.prompts.text("End the connection, then press Enter (u: leave this out)").strip():
+        raise Skipped("left out")
+    client.wait_state(ScopeState.UNDEFINED, mark, _LOST_S)
+    mark = client.observations.mark()
+    guide.prompts.text("afspm has noticed. Restore the connection, then press Enter")
+    client.wait_state(ScopeState.FREE, mark, _LOST_S)
+    client.regain_control(_LOST_S)
+    return "noticed, and found again"
+
+
+# --- in contact ---
+
+
+@_step(
+    "The tip is at the sample",
+    "The last steps need a sample with something asymmetric in the frame. Approach by hand, as you always do, with the "
+    "feedback on. afspm does not approach.",
+    "Leave the tip withdrawn. All before this is reported.",
+    after=("withdrawn", "scan", "stop"),
+    moves=False,
+    remembered=False,
+)
+def _contact(guide: Guide) -> str:
+    if not guide.prompts.confirm("Is the tip at the sample, and the feedback stable?"):
+        raise StepDeclined("the tip stays withdrawn")
+    expect(guide.kit.support.has(names.STOP_SCAN), "a controller whose scans can be stopped", "they can't be")
+    feedback = guide.kit.client.observations.newest(Feedback)
+    expect(feedback is None or feedback.on is not False, "the feedback on", "it is off")
+    return "confirmed"
+
+
+@_step(
+    "Axes and angles",
+    "afspm takes a larger scan and details of it, one turned, and fits the details into it. Then compare the picture.",
+    "Do not use what was measured: axes or angles are wrong. Report it with the trace of this run.",
+    after=("contact",),
+    contact=True,
+    operations=(AXES,),
+    needs=(names.START_SCAN,),
+)
+def _axes(guide: Guide) -> str:
+    guide.kit.forget()  # what was taken with the tip withdrawn
+    picture.picture(guide.kit)
+    taken = guide.kit.scan("wide").scans
+    scan = next((one for one in taken if one.unit == "m"), taken[0])
+    file = guide.folder / "commissioning.png"
+    levels = raster.indices(scan.values[::-1], raster.value_range(scan.values))
+    file.write_bytes(raster.png(levels))
+    guide.prompts.show(f"  {scan.channel}, y upwards: {file}")
+    guide.require("Does the panel show the same picture, not mirrored and not turned?", "the panel's picture")
+    return "details fit into the larger scan as told"

@@ -1,0 +1,260 @@
+"""The trace of a controller: all that is said to it and by it, and the files that it writes, in one file of JSON lines.
+
+One process talks to one controller, so there is one trace in a process: `begin` opens it, and each vendor's connection
+tells it of an exchange by one line. Without `begin` nothing is kept. Secrets are left out by the connection that has
+them. Texts are kept as they are, other bytes in base64, so that a person can read the file.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import threading
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import IO, Any, Final
+
+from afspm.clock import NS_PER_S, Clock, ExperimentClock
+from afspm.errors import FileError
+
+FILE: Final = "controller.trace.jsonl"
+FORMAT: Final = 1
+TCP, ZEROMQ = "tcp", "zeromq"
+
+
+@dataclass(frozen=True)
+class TraceHeader:
+    """The first line: the class of the driver, the version of afspm, and the experiment time, UTC in ISO 8601."""
+
+    driver: str
+    afspm: str
+    began: str
+    trace: int = FORMAT
+
+
+@dataclass(frozen=True)
+class TracedExchange:
+    """A question and its answer.
+
+    Attributes:
+        connection: the number of the connection, from 0; transport: `TCP` or `ZEROMQ`.
+        what: the name of what was asked, for people.
+        asked: None: a secret.
+        answered: empty with `lost`: there was no answer, for this reason.
+        command: the request that the exchange carries out; empty: it only looks at the controller.
+        after: so many lines were in the file when it was asked: those between were said on other connections meanwhile.
+        at_s, took_s: real seconds since the beginning, and until the answer.
+    """
+
+    connection: int
+    transport: str
+    what: str
+    asked: bytes | None
+    answered: bytes
+    after: int
+    lost: str = ""
+    command: str = ""
+    at_s: float = 0.0
+    took_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class TracedFile:
+    """A file of the controller that was read, and when it was written, in real seconds since the beginning."""
+
+    file: str
+    content: bytes
+    at_s: float
+
+
+TraceLine = TraceHeader | TracedExchange | TracedFile
+
+
+def read_trace(file: Path) -> list[TraceLine]:
+    """Read a trace; a last line that was cut off by a power cut is left out.
+
+    Raises:
+        FileError: it is none, or of another version.
+    """
+    try:
+        lines = file.read_text(encoding="utf-8").split("\n")[:-1]
+        found = [_line(json.loads(line)) for line in lines]
+    except (OSError, ValueError, TypeError, KeyError, zlib.error) as error:
+        raise FileError(f"can't be read as a trace: {error}", where=str(file)) from error
+    if not found or not isinstance(found[0], TraceHeader) or found[0].trace != FORMAT:
+        raise FileError("is not a trace of this version of afspm", where=str(file), hint="afspm trace FILE records one")
+    return found
+
+
+class Trace:
+    """The trace of this process."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._file: IO[str] | None = None
+        self._clock: Clock | None = None
+        self._began_s = self._began_at_s = 0.0
+        self._lines = self._connections = 0
+        self._command = ""
+        self._files: set[tuple[Path, int]] = set()
+
+    def begin(self, file: Path, header: TraceHeader, clock: Clock) -> None:
+        """Keep what is said from now on."""
+        with self._lock:
+            self._file, self._clock, self._began_s = file.open("w", encoding="utf-8"), clock, clock.monotonic_s()
+            self._began_at_s = ExperimentClock.real().now_s()
+            self._lines = self._connections = 0
+            self._write(asdict(header))
+
+    def end(self) -> None:
+        """Keep nothing more."""
+        with self._lock:
+            if self._file is not None:
+                self._file.close()
+                self._file = None
+
+    @property
+    def is_kept(self) -> bool:
+        return self._file is not None
+
+    def connection(self, transport: str) -> TracedConnection:
+        """Number a connection that has just been made."""
+        with self._lock:
+            self._connections += 1
+            return TracedConnection(self, self._connections - 1, transport)
+
+    def command(self, request: str) -> None:
+        """What is asked from now on carries out this request; empty: it only looks."""
+        self._command = request
+
+    def file(self, path: Path) -> None:
+        """Keep a file that the controller wrote, if it is one."""
+        state = (path, path.stat().st_mtime_ns) if self.is_kept and path.is_file() else None
+        if state is not None and state not in self._files:
+            self._files.add(state)
+            content = base64.b64encode(zlib.compress(path.read_bytes())).decode()
+            with self._lock:
+                written_s = state[1] / NS_PER_S - self._began_at_s
+                self._write({"file": path.name, "at_s": round(min(written_s, self.now_s()), 6), "zlib": content})
+
+    @property
+    def lines(self) -> int:
+        return self._lines
+
+    def now_s(self) -> float:
+        """Return the real seconds since the beginning."""
+        return 0.0 if self._clock is None else self._clock.monotonic_s() - self._began_s
+
+    def exchange(self, one: TracedExchange) -> None:
+        """Write an exchange that is over."""
+        facts = {**asdict(one), "asked": _shown(one.asked), "answered": _shown(one.answered), "command": self._command}
+        with self._lock:
+            self._write({key: value for key, value in facts.items() if value or key not in ("lost", "command")})
+
+    def _write(self, facts: dict[str, Any]) -> None:
+        if self._file is not None:
+            self._file.write(json.dumps(facts, ensure_ascii=False) + "\n")
+            self._file.flush()
+            self._lines += 1
+
+
+class TracedConnection:
+    """One connection, for its vendor's part: `with connection.asking(name, message) as answer: answer.add(reply)`."""
+
+    def __init__(self, trace: Trace, number: int, transport: str) -> None:
+        self._trace = trace
+        self._number = number
+        self._transport = transport
+        self._question: tuple[str, bytes | None, int, float] = ("", b"", 0, 0.0)
+
+    def asked(self, what: str, content: bytes | None) -> None:
+        """Note a question that is going to be sent; None: a secret."""
+        self._question = (what, content, self._trace.lines, self._trace.now_s())
+
+    @contextmanager
+    def answering(self) -> Iterator[TracedAnswer]:
+        """Note at the end of the block what came in answer to the last question, also an error."""
+        answer = TracedAnswer(is_kept=self._trace.is_kept)
+        lost = ""
+        try:
+            yield answer
+        except BaseException as error:
+            lost = "" if answer.is_whole else f"{type(error).__name__}: {error}"
+            raise
+        finally:
+            if answer.is_kept:
+                self._write(bytes(answer.content), lost)
+
+    @contextmanager
+    def failing(self) -> Iterator[None]:
+        """Note that the last question could not be sent, if the block raises."""
+        try:
+            yield
+        except BaseException as error:
+            self._write(b"", f"{type(error).__name__}: {error}")
+            raise
+
+    @contextmanager
+    def asking(self, what: str, content: bytes | None) -> Iterator[TracedAnswer]:
+        """As `asked` and `answering`, where the question is sent and answered in one block."""
+        self.asked(what, content)
+        with self.answering() as answer:
+            yield answer
+
+    def _write(self, content: bytes, lost: str) -> None:
+        what, asked, after, at_s = self._question
+        took_s = round(self._trace.now_s() - at_s, 6)
+        where = (self._number, self._transport, what)
+        self._trace.exchange(TracedExchange(*where, asked, content, after, lost, at_s=round(at_s, 6), took_s=took_s))
+
+
+class TracedAnswer:
+    """The bytes of an answer, as they come.
+
+    Attributes:
+        is_whole: all of it has come, whatever is then made of it.
+    """
+
+    def __init__(self, *, is_kept: bool) -> None:
+        self.is_kept = is_kept
+        self.is_whole = False
+        self.content = bytearray()
+
+    def add(self, part: bytes) -> None:
+        """Note a part of the answer."""
+        if self.is_kept:
+            self.content += part
+
+
+TRACE: Final = Trace()
+
+
+def _shown(content: bytes | None) -> Any:
+    if content is None:
+        return None
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError:
+        text = ""
+    readable = text.replace("\n", "").replace("\t", "").isprintable() and bool(text)
+    return text if readable or not content else {"base64": base64.b64encode(content).decode()}
+
+
+def _content(shown: Any) -> bytes | None:
+    if isinstance(shown, dict):
+        return base64.b64decode(shown["base64"], validate=True)
+    return None if shown is None else str(shown).encode()
+
+
+def _line(facts: dict[str, Any]) -> TraceLine:
+    if "trace" in facts:
+        return TraceHeader(**facts)
+    if "file" in facts:
+        content = zlib.decompress(base64.b64decode(facts["zlib"], validate=True))
+        return TracedFile(facts["file"], content, facts["at_s"])
+    return TracedExchange(
+        **{**facts, "asked": _content(facts["asked"]), "answered": _content(facts["answered"]) or b""}
+    )

@@ -1,0 +1,132 @@
+"""A trace of an experiment, played back: the same experiment measures the same, and another one is found out."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import pytest
+from systems import PATIENCE
+
+from afspm.record.run_json import run_json_or_empty
+from afspm.translator.trace import FILE, TracedExchange, TracedFile, TraceHeader, read_trace
+
+ROOT = Path(__file__).parents[3]
+FILES = ROOT / "experiments" / "every_microscope"
+AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
+REPLAY = """
+[clock]
+start = {start}
+
+[controller]
+component = true
+class = "TraceReplay"
+trace = "{trace}"
+files = "{files}"
+
+[microscope]
+component = true
+class = "{driver}"
+{where} = {files_here}
+"""
+
+OTHER = """
+[details]
+regions = [{ center = ["0 nm", "0 nm"], size = ["400 nm", "500 nm"] }]
+
+[ender]
+component = true
+class = "ender.Ender"
+"""
+ENDER = """
+from afspm import Component
+
+
+class Ender(Component):
+    def on_problem(self, problem, flagged):
+        self.scope.end_experiment()
+"""
+
+
+def run(folder: Path, command: str, *files: Path) -> tuple[subprocess.CompletedProcess[str], Path]:
+    done = subprocess.run(
+        [*AFSPM, command, *map(str, files), "--runs", str(folder / "runs")],
+        capture_output=True,
+        encoding="utf-8",
+        timeout=90.0 * PATIENCE,
+        check=False,
+    )
+    return done, max((folder / "runs").glob("*-*"))
+
+
+@pytest.fixture(scope="module", params=["nanonis", "asylum", "gxsm"])
+def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path, Path]:
+    """The vendor, a trace, and the file of an experiment that plays it back."""
+    vendor, folder = str(request.param), tmp_path_factory.mktemp("recorded")
+    done, ran = run(folder, "trace", FILES / "experiment.toml", FILES / f"emulated_{vendor}.toml")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert str(ran / FILE) in done.stdout
+    trace = Path(shutil.move(ran / FILE, folder))
+    header = read_trace(trace)[0]
+    assert isinstance(header, TraceHeader)
+    start = (datetime.fromisoformat(header.began) - timedelta(minutes=10)).isoformat()
+    here, files = json.dumps(str(folder / "files")), folder / "files"
+    before = str(ran / "controller").replace("/", ":")  # as Igor writes folders
+    where = {"nanonis": "session_dir", "asylum": "folders", "gxsm": "scan_dir"}[vendor]
+    there = f"{{ {json.dumps(before)} = {here} }}" if vendor == "asylum" else here
+    file = folder / "replay.toml"
+    file.write_text(
+        REPLAY.format(start=start, trace=trace, files=files, driver=header.driver, where=where, files_here=there),
+        encoding="utf-8",
+    )
+    files.mkdir()
+    shutil.rmtree(ran)  # nothing of it is left to be found
+    return vendor, trace, file
+
+
+def test_a_trace_has_every_question_and_the_files(recorded: tuple[str, Path, Path]) -> None:
+    _, trace, _ = recorded
+    lines = read_trace(trace)
+    exchanges = [line for line in lines if isinstance(line, TracedExchange)]
+    assert any(one.command == "ACTION start-scan" for one in exchanges)
+    assert any(not one.command for one in exchanges)
+    assert all(one.answered or one.lost for one in exchanges)
+    assert [line for line in lines if isinstance(line, TracedFile)]
+
+
+def test_a_trace_has_no_secret(recorded: tuple[str, Path, Path]) -> None:
+    vendor, trace, _ = recorded
+    secret = Path("~/.afspm/gxsm-bridge-secret").expanduser()
+    if vendor != "gxsm":
+        pytest.skip("only GXSM's bridge has a secret")
+    assert secret.read_text(encoding="utf-8").strip() not in trace.read_text(encoding="utf-8")
+
+
+def test_the_same_experiment_measures_the_same_again(recorded: tuple[str, Path, Path], tmp_path: Path) -> None:
+    _, _, file = recorded
+    done, ran = run(tmp_path, "run", FILES / "experiment.toml", file)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "3 scans" in done.stdout
+    result = json.loads((ran / "controller" / "replay.json").read_text(encoding="utf-8"))
+    assert result == {"deviation": "", "not_asked": 0, "same": True}
+    assert run_json_or_empty(ran)["simulated"] is True
+
+
+def test_another_experiment_is_found_out_where_it_first_differs(
+    recorded: tuple[str, Path, Path], tmp_path: Path
+) -> None:
+    _, trace, file = recorded
+    other = tmp_path / "other.toml"
+    other.write_text(OTHER, encoding="utf-8")
+    (tmp_path / "ender.py").write_text(ENDER, encoding="utf-8")
+    _, ran = run(tmp_path, "run", FILES / "experiment.toml", file, other)
+    deviation = json.loads((ran / "controller" / "replay.json").read_text(encoding="utf-8"))["deviation"]
+    assert "(of SET_SCAN_PARAMS" in deviation
+    number = int(deviation.split("line ")[1].split(":")[0])
+    recorded_there = read_trace(trace)[number - 1]
+    assert isinstance(recorded_there, TracedExchange)
+    assert recorded_there.command.startswith("SET_SCAN_PARAMS")

@@ -1,0 +1,86 @@
+"""The order of a commissioning's steps: what follows from an outcome, what is resumed, and what the matrix is told."""
+
+from __future__ import annotations
+
+import pytest
+
+from afspm.testing.commissioning.progress import CommissioningProgress, CommissioningStep, StepOutcome, StepResult
+from afspm.testing.commissioning.steps import OPERATIONS, all_steps
+
+
+def step(name: str, *after: str, **facts: object) -> CommissioningStep:
+    return CommissioningStep(name, name, "", "", lambda guide: "", after=after, **facts)  # type: ignore[arg-type]
+
+
+STEPS = (
+    step("read"),
+    step("gate", "read", remembered=False),
+    step("scan", "gate", operations=("scan",)),
+    step("late", "scan", operations=("scan",)),
+)
+
+
+def walk(progress: CommissioningProgress, outcomes: dict[str, StepOutcome]) -> list[str]:
+    done = []
+    while (now := progress.next()) is not None:
+        done.append(now.name)
+        progress.results[now.name] = StepResult(outcomes.get(now.name, StepOutcome.PASSED))
+    return done
+
+
+def test_all_steps_are_done_in_their_order() -> None:
+    progress = CommissioningProgress(STEPS)
+    assert walk(progress, {}) == ["read", "gate", "scan", "late"]
+    assert progress.passed
+
+
+@pytest.mark.parametrize("outcome", [StepOutcome.MISMATCH, StepOutcome.DECLINED])
+def test_what_was_not_right_or_not_confirmed_blocks_all_that_needs_it(outcome: StepOutcome) -> None:
+    progress = CommissioningProgress(STEPS)
+    assert walk(progress, {"gate": outcome}) == ["read", "gate"]
+    assert progress.results["late"].outcome is StepOutcome.BLOCKED
+    assert not progress.passed
+
+
+def test_what_is_not_supported_blocks_nothing() -> None:
+    progress = CommissioningProgress(STEPS)
+    assert walk(progress, {"read": StepOutcome.SKIPPED})[1:] == ["gate", "scan", "late"]
+    assert progress.passed
+
+
+def test_resumed_it_asks_for_the_tip_again_and_leaves_out_what_has_passed() -> None:
+    first = CommissioningProgress(STEPS)
+    walk(first, {"late": StepOutcome.MISMATCH})
+    again = CommissioningProgress.resumed(STEPS, first.results)
+    assert walk(again, {}) == ["gate", "late"]
+    assert walk(CommissioningProgress.resumed(STEPS, again.results), {}) == []
+
+
+def test_the_worst_outcome_of_an_operation_counts_and_nothing_left_out_hides_a_pass() -> None:
+    progress = CommissioningProgress(STEPS)
+    walk(progress, {"late": StepOutcome.SKIPPED})
+    assert progress.operations() == {"scan": "passed"}
+    progress.results["late"] = StepResult(StepOutcome.MISMATCH)
+    assert progress.operations() == {"scan": "mismatch"}
+
+
+def test_nothing_acts_on_the_microscope_before_the_tip_is_withdrawn() -> None:
+    steps = {one.name: one for one in all_steps()}
+
+    def needs(name: str) -> set[str]:
+        return set(steps[name].after).union(*(needs(other) for other in steps[name].after))
+
+    for one in steps.values():
+        if one.moves:
+            assert "withdrawn" in needs(one.name)
+        if one.contact:
+            assert {"contact", "scan", "stop"} <= needs(one.name)
+    assert {operation for one in steps.values() for operation in one.operations} == set(OPERATIONS)
+
+
+def test_resumed_nothing_is_done_behind_a_gate_that_is_declined() -> None:
+    first = CommissioningProgress(STEPS)
+    walk(first, {"late": StepOutcome.MISMATCH})
+    again = CommissioningProgress.resumed(STEPS, first.results)
+    assert walk(again, {"gate": StepOutcome.DECLINED}) == ["gate"]
+    assert again.results["late"].outcome is StepOutcome.BLOCKED
