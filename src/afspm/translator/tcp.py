@@ -109,10 +109,14 @@ class TcpConnection:
         Raises:
             ControllerLost: it could not be sent; the connection is closed.
         """
+
+        def send() -> None:
+            self._socket.settimeout(self._timeout_s)
+            self._socket.sendall(message)
+
         self._trace.asked(what, None if is_secret else message)
-        self._socket.settimeout(self._timeout_s)
         with self._trace.failing():
-            self._guarded(what, self._timeout_s, lambda: self._socket.sendall(message))
+            self._guarded(what, self._timeout_s, send)
 
     def receive(self, what: str, read: Callable[[Receiver], T], *, longer_s: float = 0.0) -> T:
         """Return what `read` makes of the bytes of the answer.
