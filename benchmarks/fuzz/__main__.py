@@ -14,16 +14,19 @@ from afspm.emulators.asylum import AsylumEmulator
 from afspm.emulators.emulator import Emulator
 from afspm.emulators.gxsm import GxsmEmulator
 from afspm.emulators.nanonis import NanonisEmulator
+from afspm.emulators.nanosurf import NanosurfEmulator
 from benchmarks.fuzz.asylum import AsylumFuzzer
 from benchmarks.fuzz.frame import Fuzzer, fuzz
 from benchmarks.fuzz.gxsm import GxsmFuzzer
 from benchmarks.fuzz.nanonis import NanonisFuzzer
+from benchmarks.fuzz.nanosurf import NanosurfFuzzer
 
 
 def emulators() -> Iterator[tuple[type[Fuzzer[Any]], Emulator]]:
     """Each emulator, with what calls it."""
     yield NanonisFuzzer, NanonisEmulator()
     yield AsylumFuzzer, AsylumEmulator()
+    yield NanosurfFuzzer, NanosurfEmulator()
     yield GxsmFuzzer, GxsmEmulator(version=3)
     yield GxsmFuzzer, GxsmEmulator(version=4, card="RPSPMC")
     if sys.platform.startswith("linux"):

@@ -32,9 +32,16 @@ for _, name in ipairs({"pairs", "ipairs", "next", "type", "tostring", "tonumber"
   safe[name] = _G[name]
 end
 
+-- Scripts may add globals, which last; what is there they can't replace.
 local function environment(root)
-  local env = setmetatable({root = root}, {__index = safe})
-  return env
+  local known = setmetatable({root = root}, {__index = safe})
+  return setmetatable({}, {
+    __index = known,
+    __newindex = function(env, name, value)
+      if known[name] ~= nil then error(tostring(name) .. " can't be replaced", 2) end
+      rawset(env, name, value)
+    end,
+  })
 end
 
 local function start(text, env)
@@ -51,9 +58,12 @@ local function step(script)
   local results = table.pack(coroutine.resume(thread))
   if not results[1] then return "{1,{" .. written(tostring(results[2]), 0) .. "}}" end
   if coroutine.status(thread) ~= "dead" then return nil end
-  local parts = {}
-  for i = 2, results.n do parts[#parts + 1] = written(results[i], 0) end
-  return "{0,{" .. table.concat(parts, ",") .. "}}"
+  local fine, text = pcall(function()
+    local parts = {}
+    for i = 2, results.n do parts[#parts + 1] = written(results[i], 0) end
+    return "{0,{" .. table.concat(parts, ",") .. "}}"
+  end)
+  return fine and text or "{1,{" .. written(tostring(text), 0) .. "}}"
 end
 
 local function as_function(call)
