@@ -20,6 +20,7 @@ from afspm.emulators.rig import Rig
 from afspm.errors import AfspmError, ErrorCollector, TransportError
 from afspm.exit_codes import ExitCode
 from afspm.plain_data import PlainMapping
+from afspm.requirements import require
 from afspm.translator.emulated_controller import AddressNotice, notice_file
 from afspm.transport.polling import WakeUp
 from afspm.transport.port import Killed
@@ -115,12 +116,14 @@ class Emulator(ABC):
         """Check the settings.
 
         Raises:
-            ConfigError: of the world or the faults. FileError: a sample that can't be read.
+            ConfigError: of the world or the faults, or a package is missing. FileError: a sample that can't be read.
         """
         from afspm.simulation import World
         from afspm.simulation.settings import one_of
 
         errors = ErrorCollector()
+        with errors:
+            require(type(self))
         with errors:
             world = World.from_settings(self._world_settings, self.seed, 0.0)
             one_of(world.settings.feedback.mode, self.modes, "feedback.mode")

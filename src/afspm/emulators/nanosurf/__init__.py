@@ -25,6 +25,7 @@ class NanosurfEmulator(ScriptedEmulator):
     """
 
     vendor = "Nanosurf"
+    requires: ClassVar[tuple[str, ...]] = ("afspm[nanosurf]",)
     usual: ClassVar[Mapping[str, Any]] = {"port": 33030}
     modes: ClassVar[Sequence[str]] = ("amplitude", "frequency-shift")
 
@@ -42,7 +43,7 @@ class NanosurfEmulator(ScriptedEmulator):
         self._times = {"start_s": start_s, "file_s": file_s}
 
     def make_program(self) -> MakerProgram:
-        """Make Studio with its tree of commands. Raises ConfigError: lupa is missing."""
+        """Make Studio with its tree of commands."""
         self._levels: dict[Client, int | None] = {}
         self._client: Client = None
         program = StudioProgram(self.rig, self.faults, self.folder, self.log, **self._times)

@@ -9,7 +9,6 @@ from typing import Any, Final
 
 from afspm.emulators.nanosurf.studio import PANEL, StudioProgram
 from afspm.emulators.scripted import ScriptFailed
-from afspm.errors import ConfigError
 
 SESSION: Final = "91-01-000"
 """The name of a simulated controller in the maker's client."""
@@ -29,9 +28,6 @@ class CommandTree:
         level_chosen: called with a level when a client selects the session, None for the application.
         release: of Studio: 19 has no `is_scanning` any more.
         image_buffer: number of the low-level buffer with the running scan.
-
-    Raises:
-        ConfigError: lupa is missing.
     """
 
     def __init__(
@@ -39,8 +35,9 @@ class CommandTree:
     ) -> None:
         self._program, self._release, self._image_buffer = program, release, image_buffer
         self._level_chosen = level_chosen
-        lua_runtime = _lua_runtime()
-        self._lua = lua_runtime(register_eval=False, register_builtins=False, unpack_returned_tuples=True)
+        from lupa import lua54
+
+        self._lua = lua54.LuaRuntime(register_eval=False, register_builtins=False, unpack_returned_tuples=True)
         self._prelude = self._lua.execute(Path(__file__).with_name("prelude.lua").read_text(encoding="utf-8"))
         self._signals = {name: self._prelude.signal() for name in ("scanning_started", "scanning_finished")}
         program.on_signal = lambda name: self._signals[name].call()
@@ -220,12 +217,3 @@ def _described(table: Any) -> Nested:
         elif kind == "function":
             found[str(name)] = "function"
     return found
-
-
-def _lua_runtime() -> Any:
-    try:
-        from lupa import lua54
-    except ImportError as error:
-        hint = "pip install afspm[nanosurf]"
-        raise ConfigError("the emulated Nanosurf Studio runs scripts in Lua, and lupa is missing", hint=hint) from error
-    return lua54.LuaRuntime

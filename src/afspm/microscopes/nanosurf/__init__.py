@@ -11,7 +11,7 @@ from afspm.microscopes.nanosurf import commands, lines
 from afspm.microscopes.nanosurf.activity import FORCE, Activity, NanosurfFiles
 from afspm.microscopes.nanosurf.link import Link, StudioError
 from afspm.microscopes.nanosurf.session import Session
-from afspm.microscopes.nanosurf.settings import DIRECTION, UNITS, FrameSettings, TipPlace, direction
+from afspm.microscopes.nanosurf.settings import DIRECTION, UNITS, FrameSettings, Slopes, TipPlace, direction
 from afspm.model import ControlResponse, Region, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.translator.driver import ControllerLost, Driver, action
 from afspm.translator.parameters import ParameterSpec, Value
@@ -38,7 +38,7 @@ class Nanosurf(Driver):
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
-    translated = (*FrameSettings.names, *POSITION, *_AT_FIRST, names.CONTROLLER)
+    translated = (*FrameSettings.names, *Slopes.names, *POSITION, *_AT_FIRST, names.CONTROLLER)
     maker: ClassVar[str] = "Nanosurf"
     software: ClassVar[str] = "Nanosurf Studio"
     max_pixels: ClassVar[int] = 8192 * 8192
@@ -66,7 +66,7 @@ class Nanosurf(Driver):
         self._activity: Activity | None = None
         self._kept = KeptSettings(_AT_FIRST)
         self._place = TipPlace(self._studio)
-        self.groups = (self._kept, FrameSettings(self._studio), self._place)
+        self.groups = (self._kept, FrameSettings(self._studio), Slopes(self._studio), self._place)
 
     @classmethod
     def technique(cls, settings: Mapping[str, Any]) -> str:

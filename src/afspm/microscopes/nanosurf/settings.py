@@ -23,11 +23,12 @@ _X, _Y = "imaging.frame_center_offset_x", "imaging.frame_center_offset_y"
 _ANGLE, _RATE = "imaging.rotation", "imaging.line_rate"
 _COLUMNS, _ROWS = "imaging.points_per_line", "imaging.lines_per_frame"
 _FRAME: Final = (_X, _Y, _WIDTH, _HEIGHT, _ANGLE, _COLUMNS, _ROWS, _RATE)
+_SLOPES: Final = ("imaging.slope_x", "imaging.slope_y")
 _TARGET: Final = ("scanner.offset_x_target", "scanner.offset_y_target")
 _PLACE: Final = ("scanner.offset_x", "scanner.offset_y")
 UNITS: Final[dict[str, tuple[str, ...]]] = {
     **dict.fromkeys((_X, _Y, _WIDTH, _HEIGHT, *_TARGET, *_PLACE), ("m",)),
-    _ANGLE: ("°", "deg"),
+    **dict.fromkeys((_ANGLE, *_SLOPES), ("°", "deg")),
     _RATE: ("Hz", "1/s"),
 }
 """The units that the translation of these values is right for."""
@@ -61,6 +62,24 @@ class FrameSettings(SettingsGroup):
         rate = speed_m_s / (SPEED_PATH * width)
         angle_deg = math.degrees(region.angle_rad)
         self._session().put(dict(zip(_FRAME, (x, y, width, height, angle_deg, columns, rows, rate), strict=True)))
+
+
+class Slopes(SettingsGroup):
+    """The compensation of the sample's tilt, which Studio has as angles; their sense is not known (!)."""
+
+    names = (names.SAMPLE_SLOPE_X, names.SAMPLE_SLOPE_Y)
+
+    def __init__(self, session: Callable[[], Session]) -> None:
+        self._session = session
+
+    def read(self) -> dict[str, Value]:
+        angles = self._session().values(_SLOPES).values()
+        return {name: math.tan(math.radians(float(angle))) for name, angle in zip(self.names, angles, strict=True)}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        wanted = self.merged(values)
+        angles = (math.degrees(math.atan(float(wanted[name]))) for name in self.names)
+        self._session().put(dict(zip(_SLOPES, angles, strict=True)))
 
 
 class TipPlace(SettingsGroup):
