@@ -1,0 +1,66 @@
+"""Controllers that are wrong in one thing: each vendor's driver with something in between, on the vendor's emulator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from afspm.microscopes.asylum import Asylum
+from afspm.microscopes.gxsm import Gxsm
+from afspm.microscopes.nanonis import Nanonis
+from afspm.microscopes.nanosurf import Nanosurf
+from afspm.model import Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.translator import Driver
+
+LATE_S = 60.0
+"""Experiment seconds."""
+
+
+class MirroredY(Driver):
+    """Rows from the top to the bottom, as pictures have them."""
+
+    def load(self, result: str) -> Sequence[Scan | Spectrum]:
+        found = super().load(result)  # type: ignore[safe-super]
+        return [replace(one, values=one.values[::-1].copy()) if isinstance(one, Scan) else one for one in found]
+
+
+class OtherWay(Driver):
+    """Angles the other way round, wherever they are told: only the sample shows it."""
+
+    def write(self, values: Any) -> None:
+        super().write(turned(values))
+
+    def read(self, wanted: Any) -> dict[str, Any]:
+        return turned(super().read(wanted))
+
+    def load(self, result: str) -> Sequence[Scan | Spectrum]:
+        found = super().load(result)  # type: ignore[safe-super]
+        return [
+            replace(one, region=replace(one.region, angle_rad=-one.region.angle_rad)) if isinstance(one, Scan) else one
+            for one in found
+        ]
+
+
+class LateEnd(Driver):
+    """Notices the end of a scan a minute late."""
+
+    until_s = 0.0
+    before = ScopeState.FREE
+
+    def status(self) -> ScopeStatus:
+        found = super().status()  # type: ignore[safe-super]
+        if self.before is ScopeState.SCANNING and found.state is ScopeState.FREE:
+            self.until_s = self.clock.now_s() + LATE_S
+        self.before = found.state
+        return ScopeStatus(ScopeState.SCANNING) if self.clock.now_s() < self.until_s else found
+
+
+def turned(values: Any) -> dict[str, Any]:
+    return {name: -float(value) if name == names.SCAN_ANGLE else value for name, value in values.items()}
+
+
+for vendor in (Nanonis, Asylum, Gxsm, Nanosurf):
+    for fault in (MirroredY, OtherWay, LateEnd):
+        name = fault.__name__ + vendor.__name__
+        globals()[name] = type(name, (fault, vendor), {"__module__": __name__})

@@ -1,0 +1,245 @@
+"""A person at the panel goes through every vendor's emulator: what is right passes, what is wrong is found."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import psutil
+import pytest
+from systems import PATIENCE, freeze, not_on_wine
+
+from afspm.testing.commissioning.procedure import CommissioningResult, commission
+from afspm.testing.commissioning.progress import StepOutcome
+from afspm.testing.commissioning.report import InstrumentReport
+from afspm.testing.translators import CheckOptions
+from afspm.translator.trace import FILE, TracedExchange, read_trace
+
+HERE = Path(__file__).parent
+VENDORS = ("Nanonis", "Asylum", "Gxsm", "Nanosurf")
+EXPERIMENT = """
+[controller]
+component = true
+class = "{vendor}Emulator"
+surface = "particles"
+seed = 7
+
+[microscope]
+component = true
+class = "{driver}"
+"""
+
+
+@dataclass
+class Person:
+    """Answers as one at an emulator does, who sees where a frame is and no numbers.
+
+    Attributes:
+        says: answers to the questions that have these words in them.
+        shown: all texts.
+    """
+
+    says: dict[str, str | bool | Callable[[], str]] = field(default_factory=dict)
+    shown: list[str] = field(default_factory=list)
+
+    def show(self, text: str) -> None:
+        self.shown.append(text)
+
+    def confirm(self, question: str) -> bool:
+        return self._said(question, "y") in ("y", True)
+
+    def text(self, question: str) -> str:
+        default = "u" if "(u:" in question else ""
+        return str(self._said(question, default))
+
+    def choose(self, question: str, options: Sequence[str]) -> str:
+        return str(self._said(question, options[0]))
+
+    def _said(self, question: str, default: str) -> str | bool:
+        self.shown.append(question)
+        answer = next((answer for words, answer in self.says.items() if words in question), default)
+        return answer() if callable(answer) else answer
+
+
+def commissioned(folder: Path, vendor: str, person: Person, driver: str = "") -> CommissioningResult:
+    shutil.copy(HERE / "spoiled.py", folder)
+    file = folder / "experiment.toml"
+    file.write_text(EXPERIMENT.format(vendor=vendor, driver=driver or vendor), encoding="utf-8")
+    report = folder / "report.toml"
+    before = InstrumentReport.read(report) if report.exists() else None
+    return commission(CheckOptions([file], runs=folder / "runs"), person, report, "emulator", before)
+
+
+@pytest.mark.parametrize("vendor", VENDORS)
+def test_a_controller_that_is_right_passes_and_the_report_says_what_was_tried(vendor: str, tmp_path: Path) -> None:
+    result = commissioned(tmp_path, vendor, Person())
+    lines = {name: f"{one.outcome.value}: {one.line}" for name, one in result.progress.results.items()}
+    assert result.passed, (result.lost, lines)
+    report = InstrumentReport.read(tmp_path / "report.toml")
+    assert not report.unrestored
+    assert report.tried_on == "emulator"
+    assert report.operations["scan"] == report.operations["axes"] == report.operations["stop"] == "passed", lines
+    exchanges = [one for one in read_trace(result.folder / FILE) if isinstance(one, TracedExchange)]
+    assert any("start-scan" in one.command for one in exchanges)
+
+
+@pytest.mark.parametrize("vendor", VENDORS)
+@pytest.mark.parametrize(
+    ("fault", "step", "said"),
+    [
+        ("MirroredY", "axes", "with y mirrored"),
+        ("OtherWay", "axes", "with angles the other way round"),
+        ("LateEnd", "scan", "until its end was noticed"),
+    ],
+)
+def test_what_is_wrong_with_a_controller_is_found(
+    vendor: str, fault: str, step: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    person = Person()
+    result = commissioned(tmp_path, vendor, person, f"spoiled.{fault}{vendor}")
+    found = result.progress.results[step]
+    assert found.outcome is StepOutcome.MISMATCH, (found, result.lost)
+    assert said in found.line
+    assert any("What to do: " in line for line in person.shown)
+    assert not result.passed
+    if step == "axes":
+        assert any("The tip was withdrawn" in line or "WITHDRAW" in line.upper() for line in person.shown)
+    else:  # nothing that needs the step is done
+        assert result.progress.results["axes"].outcome is StepOutcome.BLOCKED
+
+
+@pytest.mark.parametrize("vendor", VENDORS)
+@pytest.mark.parametrize(
+    ("words", "answer", "step", "said"),
+    [
+        ("width of the frame", "77 um", "panel", "77 um"),
+        ("pixels in a line", "17", "panel", "17"),
+        ("Where to, in the panel", "down", "frame", "down at the panel"),
+        ("which way is it turned", "clockwise", "angle", "clockwise at the panel"),
+    ],
+)
+def test_a_panel_that_shows_something_else_is_a_mismatch(
+    vendor: str, words: str, answer: str, step: str, said: str, tmp_path: Path
+) -> None:
+    if vendor != "Nanonis" and step != "panel":
+        pytest.skip("what the person sees is the same with each vendor")
+    result = commissioned(tmp_path, vendor, Person({words: answer, "Is the tip at the sample": False}))
+    found = result.progress.results[step]
+    assert found.outcome is StepOutcome.MISMATCH
+    assert said in found.line
+
+
+def test_nothing_is_moved_before_it_is_confirmed(tmp_path: Path) -> None:
+    result = commissioned(tmp_path, "Nanonis", Person({"scanner can't reach it": False}))
+    exchanges = [one for one in read_trace(result.folder / FILE) if isinstance(one, TracedExchange)]
+    assert not [one.what for one in exchanges if one.command]
+    assert result.progress.results["frame"].outcome is StepOutcome.BLOCKED
+
+
+def test_it_goes_on_where_it_was_left_and_asks_for_the_tip_again(tmp_path: Path) -> None:
+    def leave() -> str:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        commissioned(tmp_path, "Nanonis", Person({"Has the panel stopped": leave}))
+    left = InstrumentReport.read(tmp_path / "report.toml")
+    assert left.steps["scan"]["outcome"] == "passed"
+    assert "stop" not in left.steps
+    assert not left.unrestored
+    person = Person({"Is the tip at the sample": False})
+    result = commissioned(tmp_path, "Nanonis", person)
+    assert any("scanner can't reach it" in line for line in person.shown)
+    assert not any("afspm takes one scan" in line for line in person.shown)
+    assert result.progress.results["stop"].outcome is StepOutcome.PASSED
+
+
+def test_ctrl_c_in_contact_withdraws_the_tip(tmp_path: Path) -> None:
+    def leave() -> str:
+        raise KeyboardInterrupt
+
+    person = Person({"Does the panel show the same picture": leave})
+    with pytest.raises(KeyboardInterrupt):
+        commissioned(tmp_path, "Nanonis", person)
+    assert "The tip was withdrawn." in person.shown
+    (run,) = (tmp_path / "runs").glob("test-*")
+    exchanges = [one for one in read_trace(run / FILE) if isinstance(one, TracedExchange)]
+    assert any("x-retract" in one.command for one in exchanges)
+    assert not InstrumentReport.read(tmp_path / "report.toml").unrestored
+
+
+@not_on_wine("a process can't be stopped and continued there")
+def test_a_lost_connection_is_noticed_and_found_again(tmp_path: Path) -> None:
+    def pid() -> int:
+        (run,) = (tmp_path / "runs").glob("test-*")
+        told = re.search(r"controller listens at 127.0.0.1:(\d+)", (run / "log.txt").read_text(encoding="utf-8"))
+        assert told
+        (found,) = [
+            child.pid
+            for child in psutil.Process().children(recursive=True)
+            if any(one.laddr.port == int(told[1]) and one.status == "LISTEN" for one in child.net_connections())
+        ]
+        return found
+
+    def end() -> str:
+        freeze(pid())
+        return ""
+
+    def restore() -> str:
+        os.kill(pid(), signal.SIGCONT)
+        return ""
+
+    says: dict[str, str | bool | Callable[[], str]] = {
+        "End the connection": end,
+        "Restore the connection": restore,
+        "Is the tip at the sample": False,
+    }
+    result = commissioned(tmp_path, "Nanonis", Person(says))
+    assert result.progress.results["connection"].outcome is StepOutcome.PASSED, (result.progress.results, result.lost)
+
+
+def test_the_command_asks_and_reports(tmp_path: Path) -> None:
+    file = tmp_path / "experiment.toml"
+    file.write_text(EXPERIMENT.format(vendor="Nanonis", driver="Nanonis"), encoding="utf-8")
+    panel = ["", *[""] * 9]
+    frame = ["y", *[""] * 7, "up"]
+    answers = ["y", *panel, "y", *frame, "y", "counter-clockwise", "y", "u", "y", "y", "y", "y", "u", "y", "u", "n"]
+    done = subprocess.run(
+        [sys.executable, "-c", "from afspm.cli import main; main()", "commission", "experiment.toml"],
+        input="\n".join(answers) + "\n",
+        cwd=tmp_path,
+        capture_output=True,
+        encoding="utf-8",
+        timeout=90.0 * PATIENCE,
+        check=False,
+    )
+    assert done.returncode == 1, done.stdout + done.stderr  # the tip was not approached
+    assert "✓ Stopping a scan" in done.stdout
+    assert "– declined: The tip is at the sample" in done.stdout
+    report = InstrumentReport.read(tmp_path / "experiment-commissioning.toml")
+    assert report.operations["scan"] == "passed"
+    assert report.operations["axes"] == "blocked"
+
+
+def test_the_end_of_the_answers_ends_it_safely(tmp_path: Path) -> None:
+    file = tmp_path / "experiment.toml"
+    file.write_text(EXPERIMENT.format(vendor="Gxsm", driver="Gxsm"), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-c", "from afspm.cli import main; main()", "commission", "experiment.toml"],
+        input="y\n",
+        cwd=tmp_path,
+        capture_output=True,
+        encoding="utf-8",
+        timeout=90.0 * PATIENCE,
+        check=False,
+    )
+    assert done.returncode == 130, done.stdout + done.stderr
+    assert InstrumentReport.read(tmp_path / "experiment-commissioning.toml").steps["controller"]["outcome"] == "passed"
