@@ -7,13 +7,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from afspm_process import AFSPM
 from test_snippets import FILE_NAME, ROOT, snippets
 
 import afspm
 from afspm.model import ScopeState
 
 PAGE = ROOT / "docs" / "how-to" / "use-a-notebook.md"
-AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
 DEADLINE_S = 60.0
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ui_lab import AFSPM
+from afspm_process import AFSPM
 
 from afspm import wire
 from afspm.model import ControlMode, ControlState, Frame, Packet, Region, Scan

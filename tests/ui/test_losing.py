@@ -8,7 +8,8 @@ import subprocess
 from contextlib import ExitStack
 from pathlib import Path
 
-from ui_lab import AFSPM, EXPERIMENT, Night, Opened
+from afspm_process import AFSPM
+from ui_lab import EXPERIMENT, Night, Opened
 
 from afspm.model import ProcessCondition
 

@@ -41,7 +41,7 @@ def ended(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ni
             scope.note("the door slammed")
             pids = [one.pid for one in night.until(lambda: night.follower.overview.processes.values())]
             scope.end_experiment()
-        night.wait_for(r"the dashboard stays at \S+; Ctrl-C to close")
+        night.wait_for(r"the dashboard is at \S+; press Ctrl-C to close it")
         assert not [pid for pid in pids if pid and is_running(pid)], "scheduler, translator and components are gone"
         page.wait_for_function("window.afspm?.scrubber", timeout=60_000)  # the page that was open is there again
         context.close()

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
-import sys
-import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+
+from afspm_process import AfspmProcess
 
 from afspm.client.follower import SMALL, Follower
 from afspm.model import ControlState, JournalEntry
 
 DEADLINE_S = 30.0
-AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
 Opened = Callable[..., Any]
 SCREENSHOTS = Path(__file__).parents[2] / "build" / "screenshots"
 
@@ -65,7 +64,7 @@ port = 0
 """
 
 
-class Night:
+class Night(AfspmProcess):
     """`afspm run` of an experiment with a dashboard, as a process of its own."""
 
     def __init__(
@@ -73,33 +72,14 @@ class Night:
     ) -> None:
         file = folder / "experiment.toml"
         file.write_text(EXPERIMENT.format(speed=speed, lines=lines) + more, encoding="utf-8")
-        self._lines: list[str] = []
-        self._changed = threading.Condition()
-        self.process = subprocess.Popen(
-            (*AFSPM, "run", str(file), "--runs", str(folder / "runs"), *options),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            encoding="utf-8",
-            start_new_session=True,
-            cwd=folder,
-        )
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
+        super().__init__("run", str(file), "--runs", str(folder / "runs"), *options, folder=folder)
         try:
-            self.folder = Path(self.wait_for(r"processes, into (.+)")[1])
-            self.url = self.wait_for(r"the dashboard is at (\S+)")[1]
+            self.url = self.wait_for_url("dashboard")
             self.follower = Follower(self.folder, "terminal", (*SMALL, "Scan2d", "Spec1d", "ScanLines"))
         except BaseException:
-            self._end()
+            super().close()
             raise
         self.follower.catch_up()
-
-    def wait_for(self, pattern: str) -> re.Match[str]:
-        """The first line so far, or to come, that fits."""
-        with self._changed:
-            found = self._changed.wait_for(lambda: self._found(pattern), DEADLINE_S)
-        assert found, f"no line like {pattern!r} in\n" + "\n".join(self._lines)
-        return found
 
     def until(self, condition: Callable[[], object]) -> Any:
         """Follow what the scheduler publishes until `condition()`; what it then is."""
@@ -129,25 +109,7 @@ class Night:
     def close(self) -> None:
         """End it, however it is."""
         self.follower.close()
-        self._end()
-
-    def _end(self) -> None:
         self.process.terminate()
-        try:
+        with suppress(subprocess.TimeoutExpired):
             self.process.wait(20.0)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-        self._reader.join()
-        assert self.process.stdout is not None
-        self.process.stdout.close()
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            with self._changed:
-                self._lines.append(line.rstrip())
-                self._changed.notify_all()
-
-    def _found(self, pattern: str) -> re.Match[str] | None:
-        return next((match for line in self._lines if (match := re.search(pattern, line))), None)
+        super().close()

@@ -1,11 +1,10 @@
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from experiment_lab import AFSPM, EXPERIMENT, SPEED, WITNESS, AfspmRun, Run
+from experiment_lab import EXPERIMENT, SPEED, WITNESS, AfspmRun, Run
 
 
 @pytest.fixture
@@ -14,18 +13,12 @@ def afspm_run(tmp_path: Path) -> Iterator[Run]:
     runs: list[AfspmRun] = []
 
     def start(*arguments: str, where: Path = tmp_path) -> AfspmRun:
-        command = (*AFSPM, "run", "--verbose", "--no-report", *arguments)
-        # in a group of its own, so that a Ctrl-C for it is not one for the tests
-        process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, cwd=where
-        )
-        runs.append(AfspmRun(process))
+        runs.append(AfspmRun("run", "--verbose", "--no-report", *arguments, folder=where))
         return runs[-1]
 
     yield start
     for one in runs:
-        one.process.kill()
-        one.process.wait()
+        one.close()
 
 
 @pytest.fixture

@@ -5,15 +5,13 @@ from __future__ import annotations
 import cmath
 import csv
 import json
-import os
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from experiment_lab import AFSPM, AfspmRun
+from experiment_lab import AfspmRun
 
 from afspm.files import read
 
@@ -237,18 +235,9 @@ class Rig:
         file = self._folder / "experiment.toml"
         file.write_text(EXPERIMENT.format(**settings), encoding="utf-8")
         options = ("--runs", str(self._folder / "runs"), "--verbose", "--no-report", "--without", "recorder")
-        command = (*AFSPM, "run", str(file), *options)
-        process = subprocess.Popen(
-            command,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            start_new_session=os.name != "nt",
-            cwd=self._folder,
-        )
-        self._runs.append(AfspmRun(process))
+        self._runs.append(AfspmRun("run", str(file), *options, folder=self._folder))
         return self._runs[-1]
 
     def close(self) -> None:
         for one in self._runs:
-            one.process.kill()
-            one.process.wait()
+            one.close()

@@ -4,23 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
-import re
-import subprocess
-import sys
-import threading
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from systems import PATIENCE, freeze, kill
+from afspm_process import AfspmProcess
+from systems import PATIENCE
 
 import afspm
 
-DEADLINE_S = 60.0 * PATIENCE
 SPEED = 120.0 / PATIENCE
-AFSPM = (sys.executable, "-P", "-c", "from afspm.cli import main; main()")
 Run = Callable[..., "AfspmRun"]
 
 EXPERIMENT = """
@@ -117,82 +111,8 @@ class Late(Component):
 '''
 
 
-@dataclass
-class AfspmRun:
-    """`afspm run` at work; its output can be waited for."""
-
-    process: subprocess.Popen[bytes]
-    lines: list[str] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self._changed = threading.Condition()
-        self._over = False
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        with self.process.stdout as pipe:
-            for line in pipe:
-                with self._changed:
-                    self.lines.append(line.decode(errors="replace").rstrip())
-                    self._changed.notify_all()
-        with self._changed:
-            self._over = True
-            self._changed.notify_all()
-
-    def wait_for(self, *wanted: str, count: int = 1) -> str:
-        """The line that matches all the patterns `wanted`, the `count`-th of that kind."""
-
-        def found() -> list[str]:
-            return [line for line in self.lines if all(re.search(text, line) for text in wanted)]
-
-        with self._changed:
-            self._changed.wait_for(lambda: len(found()) >= count or self._over, DEADLINE_S)
-            if len(found()) < count:
-                raise AssertionError(f"no line with {wanted} came:\n{self.output}")
-            return found()[count - 1]
-
-    @property
-    def output(self) -> str:
-        return "\n".join(self.lines)
-
-    def pid(self, name: str) -> int:
-        """The process id of the component's newest process."""
-        self.wait_for(rf" {name} .*started, process")
-        started = [line for line in self.lines if re.search(rf" {name} .*started, process", line)]
-        return int(started[-1].rsplit(" ", 1)[1])
-
-    def wait_for_next(self, *wanted: str) -> str:
-        """The next line of a kind, after those that have come already."""
-        with self._changed:
-            already = sum(all(re.search(text, line) for text in wanted) for line in self.lines)
-        return self.wait_for(*wanted, count=already + 1)
-
-    def wait_up(self, name: str, times: int) -> None:
-        """Wait until the component has come up so many times."""
-        self.wait_for(rf" {name} .*is up$", count=times)
-
-    def kill(self, name: str) -> None:
-        """Kill the component's process."""
-        kill(self.pid(name))
-
-    def freeze(self, name: str) -> None:
-        """Stop the component's process where it is."""
-        freeze(self.pid(name))
-
-    def end(self) -> int:
-        """The exit code, once it has ended by itself."""
-        try:
-            code = self.process.wait(DEADLINE_S)
-        except subprocess.TimeoutExpired:
-            raise AssertionError(f"the run did not end:\n{self.output}") from None
-        self._reader.join(DEADLINE_S)
-        return code
-
-    @property
-    def folder(self) -> Path:
-        return Path(self.wait_for("processes, into ").split(", into ")[1])
+class AfspmRun(AfspmProcess):
+    """`afspm run` at work, and what it leaves behind."""
 
     def facts(self) -> dict[str, Any]:
         facts: dict[str, Any] = json.loads((self.folder / "run.json").read_text(encoding="utf-8"))

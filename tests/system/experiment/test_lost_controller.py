@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from experiment_lab import AFSPM, WITNESS, AfspmRun
+from experiment_lab import WITNESS, AfspmRun
 
 FILES = Path(__file__).parents[3] / "experiments" / "every_microscope"
 ADDRESSES = {"nanonis": "127.0.0.1:{port}", "asylum": "tcp://127.0.0.1:{port}", "gxsm": "127.0.0.1:{port}"}
@@ -49,13 +48,9 @@ def run(request: pytest.FixtureRequest, tmp_path: Path, stranger: Any) -> Iterat
         str(tmp_path / "overlay.toml"),
     )
     options = ("--runs", str(tmp_path / "runs"), "--verbose", "--no-report", "--without", "metadata")
-    command = (*AFSPM, "run", *files, *options)
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, cwd=tmp_path
-    )
-    yield AfspmRun(process)
-    process.kill()
-    process.wait()
+    one = AfspmRun("run", *files, *options, folder=tmp_path)
+    yield one
+    one.close()
 
 
 def test_a_controller_that_is_killed_while_it_scans_is_a_malfunction_until_it_is_back(run: AfspmRun) -> None:

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from experiment_lab import AFSPM, DEADLINE_S, Run
+from afspm_process import AFSPM, DEADLINE_S
+from experiment_lab import Run
 
 SECRET = "T0PSECRET"
 MORE = """

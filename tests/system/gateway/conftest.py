@@ -21,4 +21,4 @@ def started(tmp_path: Path) -> Iterator[Started]:
 
     yield start
     for one in runs:
-        one.end()
+        one.close()

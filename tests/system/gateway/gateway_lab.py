@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import subprocess
-import sys
-import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,8 +12,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-AFSPM = (sys.executable, "-P", "-c", "from afspm.cli import main; main()")
-DEADLINE_S = 60.0
+from afspm_process import DEADLINE_S, AfspmProcess
+
 EXPERIMENT = """
 [clock]
 speed = {speed}
@@ -134,7 +131,7 @@ class Client:
             connection.close()
 
 
-class GatewayRun:
+class GatewayRun(AfspmProcess):
     """`afspm run` of an experiment with a gateway."""
 
     def __init__(
@@ -143,50 +140,8 @@ class GatewayRun:
         if file is None:
             file = folder / "experiment.toml"
             file.write_text(EXPERIMENT.format(speed=speed, settings=settings) + more, encoding="utf-8")
-        command = (*AFSPM, "run", "--verbose", "--no-report", str(file), "--runs", str(folder / "runs"))
-        self.process = subprocess.Popen(
-            command,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-            cwd=folder,
-            encoding="utf-8",
-        )
-        self.lines: list[str] = []
-        self._changed = threading.Condition()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-        self.folder = Path(self.wait_for("processes, into ").split(", into ")[1])
-        self.url = self.wait_for("the gateway is at ").rsplit(" ", 1)[1]
+        super().__init__("run", "--verbose", "--no-report", str(file), "--runs", str(folder / "runs"), folder=folder)
+        self.url = self.wait_for_url("gateway")
 
     def client(self, name: str = "", token: str = "") -> Client:
         return Client(self.url, name, token)
-
-    def wait_for(self, wanted: str, count: int = 1) -> str:
-        """The line that contains `wanted`, the `count`-th of that kind."""
-        with self._changed:
-            self._changed.wait_for(lambda: len(self.said(wanted)) >= count, DEADLINE_S)
-        assert len(self.said(wanted)) >= count, f"no line with {wanted!r}:\n" + "\n".join(self.lines)
-        return self.said(wanted)[count - 1]
-
-    def said(self, wanted: str) -> list[str]:
-        return [line for line in self.lines if wanted in line]
-
-    def pid(self, name: str) -> int:
-        """The process id of the component's newest process."""
-        started = [line for line in self.lines if f" {name} " in line and "started, process" in line]
-        return int(started[-1].rsplit(" ", 1)[1])
-
-    def end(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.wait()
-        self._reader.join(DEADLINE_S)
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        with self.process.stdout as pipe:
-            for line in pipe:
-                with self._changed:
-                    self.lines.append(line.rstrip())
-                    self._changed.notify_all()

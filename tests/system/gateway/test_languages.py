@@ -26,7 +26,7 @@ SAID = {"curl": '"state":"done"', "node": "64 x 64 pixels, the highest at", "oct
 def night(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GatewayRun]:
     run = GatewayRun(tmp_path_factory.mktemp("night"), file=SAMPLE / "experiment.toml")
     yield run
-    run.end()
+    run.close()
 
 
 @pytest.mark.parametrize("language", SCRIPTS)

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from afspm_process import AFSPM
 from numpy.typing import NDArray
 from systems import PATIENCE
 
 ROOT = Path(__file__).parents[3]
 FILES = ROOT / "experiments" / "every_microscope"
-AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
 DEADLINE_S = 90.0 * PATIENCE
 HEIGHTS = {
     "simulator": "Height",

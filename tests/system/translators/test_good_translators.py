@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from afspm_process import AFSPM
 from systems import can_interrupt, interrupt
 
 from afspm.errors import ConfigError
@@ -20,7 +21,6 @@ from afspm.testing.translators import CheckOptions, CheckOutcome, CheckReport, c
 from afspm.testing.translators.registry import all_checks
 
 DEADLINE_S = 60.0
-AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
 EXPERIMENT = """
 [clock]
 speed = 20.0

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from afspm_process import AFSPM
 
 from afspm.emulators import registry
 
 FILES = Path(__file__).parents[3] / "experiments" / "every_microscope"
-AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
 DEADLINE_S = 90.0
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from afspm_process import AFSPM
 
 DEADLINE_S = 60.0
-AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
 EXPERIMENT = """
 [clock]
 speed = 60.0

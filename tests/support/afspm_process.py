@@ -1,0 +1,106 @@
+"""`afspm` as a process of its own, whose output can be waited for."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+from systems import PATIENCE, freeze, kill
+
+AFSPM = (sys.executable, "-P", "-c", "from afspm.cli import main; main()")
+DEADLINE_S = 60.0 * PATIENCE
+
+
+class AfspmProcess:
+    """An `afspm` command at work, in a group of its own, so that a Ctrl-C for it is not one for the tests."""
+
+    def __init__(self, *arguments: str, folder: Path) -> None:
+        self.process = subprocess.Popen(
+            (*AFSPM, *arguments),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            cwd=folder,
+        )
+        self.lines: list[str] = []
+        self._changed = threading.Condition()
+        self._over = False
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        with self.process.stdout as pipe:
+            for line in pipe:
+                with self._changed:
+                    self.lines.append(line.decode(errors="replace").rstrip())
+                    self._changed.notify_all()
+        with self._changed:
+            self._over = True
+            self._changed.notify_all()
+
+    def said(self, *wanted: str) -> list[str]:
+        """The lines so far that match all the patterns `wanted`."""
+        return [line for line in self.lines if all(re.search(text, line) for text in wanted)]
+
+    def wait_for(self, *wanted: str, count: int = 1) -> str:
+        """The line that matches all the patterns `wanted`, the `count`-th of that kind."""
+        with self._changed:
+            self._changed.wait_for(lambda: len(self.said(*wanted)) >= count or self._over, DEADLINE_S)
+            if len(found := self.said(*wanted)) < count:
+                raise AssertionError(f"no line with {wanted} came:\n{self.output}")
+            return found[count - 1]
+
+    def wait_for_next(self, *wanted: str) -> str:
+        """The next line of a kind, after those that have come already."""
+        with self._changed:
+            already = len(self.said(*wanted))
+        return self.wait_for(*wanted, count=already + 1)
+
+    @property
+    def output(self) -> str:
+        return "\n".join(self.lines)
+
+    @property
+    def folder(self) -> Path:
+        return Path(self.wait_for("processes, into ").split(", into ")[1])
+
+    def wait_for_url(self, what: str) -> str:
+        """Where the dashboard, or the gateway, says that it is."""
+        (url,) = re.findall(r"https?://[^\s;]+", self.wait_for(f"the {what} is at "))
+        return str(url)
+
+    def pid(self, name: str) -> int:
+        """The process id of the component's newest process."""
+        self.wait_for(rf" {name} .*started, process")
+        return int(self.said(rf" {name} .*started, process")[-1].rsplit(" ", 1)[1])
+
+    def wait_up(self, name: str, times: int) -> None:
+        """Wait until the component has come up so many times."""
+        self.wait_for(rf" {name} .*is up$", count=times)
+
+    def kill(self, name: str) -> None:
+        """Kill the component's process."""
+        kill(self.pid(name))
+
+    def freeze(self, name: str) -> None:
+        """Stop the component's process where it is."""
+        freeze(self.pid(name))
+
+    def end(self) -> int:
+        """The exit code, once it has ended by itself."""
+        try:
+            code = self.process.wait(DEADLINE_S)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"the run did not end:\n{self.output}") from None
+        self._reader.join(DEADLINE_S)
+        return code
+
+    def close(self) -> None:
+        """End it however it is; its processes end with it."""
+        self.process.kill()
+        self.process.wait()
+        self._reader.join(DEADLINE_S)
