@@ -6,15 +6,15 @@ import difflib
 import importlib
 import inspect
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 from afspm import plugins
 from afspm.errors import AfspmError, ConfigError
+from afspm.plain_data import PlainMapping
 from afspm.requirements import require
 
 
 def named(
-    what: str, spec: str | Mapping[str, Any], ready_made: Mapping[str, str], default: str, *arguments: object
+    what: str, spec: str | PlainMapping, ready_made: Mapping[str, str], default: str, *arguments: object
 ) -> tuple[object, str]:
     """Return the part that a user asks for, and its name.
 
@@ -44,7 +44,7 @@ def named(
         raise ConfigError(f"the {what} {name} can't be made with these settings: {error}") from error
 
 
-def _imported(what: str, name: str) -> type[Any]:
+def _imported(what: str, name: str) -> type[object]:
     module_name, _, class_name = name.rpartition(".")
     try:
         module = importlib.import_module(module_name)
@@ -57,7 +57,7 @@ def _imported(what: str, name: str) -> type[Any]:
     return found
 
 
-def _ready_made(what: str, name: str, ready_made: Mapping[str, str]) -> type[Any]:
+def _ready_made(what: str, name: str, ready_made: Mapping[str, str]) -> type[object]:
     if name not in ready_made:
         if isinstance(plugin := plugins.load(f"afspm.{what}s", name), type):
             return plugin
@@ -67,7 +67,7 @@ def _ready_made(what: str, name: str, ready_made: Mapping[str, str]) -> type[Any
     return _imported(what, ready_made[name])
 
 
-def _check_settings(what: str, name: str, class_: type[Any], settings: Mapping[str, Any], given: int) -> None:
+def _check_settings(what: str, name: str, class_: type[object], settings: PlainMapping, given: int) -> None:
     """Settings are looked at first, so that a typo is told as one."""
     try:
         parameters = list(inspect.signature(class_).parameters.values())[given:]

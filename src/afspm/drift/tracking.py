@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping as Table
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from afspm.drift.mapping import Mapping
 from afspm.drift.registration import DriftScan, Registration
 from afspm.errors import InvalidValue
+from afspm.plain_data import Plain, PlainMapping
 
 Array = NDArray[np.float64]
 
@@ -50,7 +51,7 @@ class Forecast(Protocol):
         """The prediction for any time (before the newest scan too: the estimate for the newest scan, moved back)."""
         ...
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Plain:
         """As plain JSON, for `forecast_from_dict`."""
         ...
 
@@ -104,10 +105,10 @@ class Tracker(Protocol):
         """Take a scan in (in the order of time; one that is older than the newest is refused with InvalidValue)."""
         ...
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> Plain:
         """All that must survive a kill: numbers, texts, lists and dicts of JSON, and numpy arrays."""
         ...
 
-    def restore(self, state: Table[str, Any]) -> None:
+    def restore(self, state: PlainMapping) -> None:
         """Take up what `state` gave."""
         ...

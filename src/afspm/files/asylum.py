@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,5 +153,5 @@ def _curve(wave: igor.Wave, note: Note, path: Path, zone: tzinfo | None) -> File
     return FileContent(CONTROLLER, spectra=(spectrum,), header=note, start_ns=start, end_ns=end)
 
 
-def _float64(values: NDArray[Any]) -> NDArray[np.float64]:
+def _float64(values: np.ndarray) -> NDArray[np.float64]:
     return np.ascontiguousarray(values, dtype=np.float64)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from afspm.errors import FileError
 
@@ -31,7 +29,7 @@ class Wave:
     """
 
     name: str
-    values: NDArray[Any]
+    values: np.ndarray
     unit: str
     steps: tuple[float, ...]
     dimension_units: tuple[str, ...]
@@ -83,7 +81,7 @@ def decoded(text: bytes) -> str:
         return text.decode("latin-1")
 
 
-def _values(data: bytes, order: str) -> tuple[NDArray[Any], int]:
+def _values(data: bytes, order: str) -> tuple[np.ndarray, int]:
     """The values in their shape, and where what follows them begins."""
     (count,) = struct.unpack_from(f"{order}i", data, 76)
     (kind,) = struct.unpack_from(f"{order}h", data, 80)

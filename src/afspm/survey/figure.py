@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -265,5 +265,5 @@ def _scale_of(variables: Sequence[Variable]) -> tuple[float, str]:
 def _range(curves: Sequence[Floats]) -> tuple[float, float]:
     known = np.concatenate([curve[np.isfinite(curve)] for curve in curves])
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-    margin: Any = 0.04 * (high - low) or 1.0
+    margin = 0.04 * (high - low) or 1.0
     return low - margin, high + margin

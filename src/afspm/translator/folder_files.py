@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from afspm.errors import AfspmError, FileError
 from afspm.files import read
 from afspm.model import Scan, Spectrum
+from afspm.plain_data import PlainMapping
 from afspm.translator.result_files import (
     SCAN,
     Content,
@@ -32,7 +32,7 @@ class FolderFiles(ResultFiles):
     pattern: str
     precision: FilePrecision
 
-    def begin(self, what: str, folder: Path, taken: Mapping[str, Any]) -> None:
+    def begin(self, what: str, folder: Path, taken: PlainMapping) -> None:
         """A measurement begins.
 
         Args:

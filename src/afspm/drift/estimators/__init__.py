@@ -8,12 +8,12 @@ estimator({"class": "my_lab.Periodicity", "lattice_m": 2.5e-10})
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from afspm.drift.estimators.guarded import Guarded
 from afspm.drift.naming import named
 from afspm.drift.registration import Estimator
 from afspm.errors import ConfigError
+from afspm.plain_data import PlainMapping
 
 __all__ = ["DEFAULT", "READY_MADE", "Guarded", "estimator"]
 
@@ -28,7 +28,7 @@ READY_MADE: Mapping[str, str] = {
 }
 
 
-def estimator(spec: str | Mapping[str, Any] | Estimator = DEFAULT) -> Estimator:
+def estimator(spec: str | PlainMapping | Estimator = DEFAULT) -> Estimator:
     """The estimator that is meant, guarded: it refuses where it would have raised or told nonsense.
 
     Args:

@@ -78,7 +78,7 @@ def _skimage() -> Any:
     return feature
 
 
-def _keypoints(image: Image, rows_columns: NDArray[Any], descriptors: Descriptors) -> Keypoints:
+def _keypoints(image: Image, rows_columns: np.ndarray, descriptors: Descriptors) -> Keypoints:
     middle = (np.array(image.values.shape) - 1) / 2
     return Keypoints((np.asarray(rows_columns, dtype=np.float64) - middle)[:, ::-1], descriptors)
 
@@ -102,13 +102,13 @@ def _unit(values: Array) -> Array:
     return (values - low) / ((high - low) or 1.0)
 
 
-def _signs(bits: NDArray[Any]) -> Descriptors:
+def _signs(bits: np.ndarray) -> Descriptors:
     """Bits as ±1/2: the squared Euclidean distance is then the number of bits that differ."""
     signs: Descriptors = np.where(bits, 0.5, -0.5).astype(np.float32)
     return signs
 
 
-def _known(image: Image, rows_columns: NDArray[Any], reach_px: float | NDArray[Any]) -> NDArray[np.bool_]:
+def _known(image: Image, rows_columns: np.ndarray, reach_px: float | np.ndarray) -> NDArray[np.bool_]:
     """Which of the positions (n, 2) see nothing but measured pixels within their reach: a border pulls at what is
     found near it."""
     away = ndimage.distance_transform_edt(np.pad(image.known, 1))[1:-1, 1:-1]
@@ -117,7 +117,7 @@ def _known(image: Image, rows_columns: NDArray[Any], reach_px: float | NDArray[A
     return inside
 
 
-def _sharpened(response: Array, corners: NDArray[Any]) -> Array:
+def _sharpened(response: Array, corners: np.ndarray) -> Array:
     """Positions (row, column) of peaks between the pixels: the tops of parabolas along both axes."""
     padded = np.pad(response, 1, mode="edge")
     row, column = corners[:, 0] + 1, corners[:, 1] + 1

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from afspm.drawing.levelling import Levelling, levelled
 from afspm.drift.registration import DriftScan
+from afspm.plain_data import Plain
 
 Array = NDArray[np.float64]
 
@@ -24,7 +25,7 @@ DPI = 200
 LAYOUT: Literal["constrained"] | None = "constrained"
 HOUR_S = 3600.0
 _UNITS = ((1e-9, "pm", 1e12), (1e-6, "nm", 1e9), (np.inf, "µm", 1e6))
-_STYLE: dict[str, Any] = {
+_STYLE: Plain = {
     "font.size": 7,
     "axes.titlesize": 7,
     "axes.linewidth": 0.6,

@@ -8,7 +8,6 @@ tracker({"class": "my_lab.Follower"}, estimator)
 from __future__ import annotations
 
 from collections.abc import Mapping as Table
-from typing import Any
 
 from afspm.drift.estimators import estimator as default_estimator
 from afspm.drift.naming import named
@@ -19,6 +18,7 @@ from afspm.drift.trackers.paper import PaperForecast, PaperTracker
 from afspm.drift.tracking import FORECAST_VERSION, Forecast, Tracker
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model.snapshot import restored
+from afspm.plain_data import PlainMapping
 
 __all__ = ["DEFAULT", "READY_MADE", "BankTracker", "PaperTracker", "forecast_from_dict", "tracker"]
 
@@ -33,7 +33,7 @@ _FORECASTS: Table[str, type[BankForecast] | type[PaperForecast]] = {
 }
 
 
-def tracker(spec: str | Table[str, Any] = DEFAULT, estimator: Estimator | None = None) -> Tracker:
+def tracker(spec: str | PlainMapping = DEFAULT, estimator: Estimator | None = None) -> Tracker:
     """The tracker that is meant.
 
     Args:
@@ -51,7 +51,7 @@ def tracker(spec: str | Table[str, Any] = DEFAULT, estimator: Estimator | None =
     return made  # type: ignore[return-value]
 
 
-def forecast_from_dict(table: Table[str, Any]) -> Forecast:
+def forecast_from_dict(table: PlainMapping) -> Forecast:
     """Return the forecast that `Forecast.to_dict` was asked of, of any of our trackers.
 
     Raises:

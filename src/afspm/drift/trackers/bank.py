@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping as Table
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +19,7 @@ from afspm.drift.trackers.similarity import Similarity, SimilarityMeasurement
 from afspm.drift.tracking import Forecast, Prediction, Update, require_newer
 from afspm.errors import InvalidValue
 from afspm.model.snapshot import restored, snapshot
+from afspm.plain_data import Plain, PlainMapping
 
 Array = NDArray[np.float64]
 
@@ -86,7 +86,7 @@ class BankTracker:
         ConfigError: a setting without a meaning.
     """
 
-    def __init__(self, estimator: Estimator, **settings: Any) -> None:
+    def __init__(self, estimator: Estimator, **settings: object) -> None:
         self._settings, choice = BankSettings.split(settings)
         self._estimator = estimator
         self._references = ReferenceScans(choice)
@@ -349,11 +349,11 @@ class BankTracker:
         """Half of how far a scan may be off and still be compared."""
         return (1.0 - self._references.choice.overlap_min) * min(scan.region.size_m) / 2
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> Plain:
         """See `Tracker`."""
         return snapshot(self._state, "bank", VERSION)
 
-    def restore(self, state: Table[str, Any]) -> None:
+    def restore(self, state: PlainMapping) -> None:
         """See `Tracker`. Raises InvalidValue for the state of another tracker, or of one with other filters."""
         found = restored(BankState, state, "bank", VERSION)
         if (filters := found.filters) is not None:

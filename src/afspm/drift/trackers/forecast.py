@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from afspm.drift.mapping import Mapping
 from afspm.drift.trackers.filters import Filters, Models, mixed
 from afspm.drift.tracking import FORECAST_VERSION, Prediction
 from afspm.model.snapshot import snapshot
+from afspm.plain_data import Plain
 
 Array = NDArray[np.float64]
 
@@ -113,6 +114,6 @@ class BankForecast:
             mapping = mapping @ self.straight
         return Prediction(time_s, mapping, covariance[:2, :2], mean[2:], covariance[2:, 2:])
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Plain:
         """See `Forecast`."""
         return snapshot(self, self.KIND, FORECAST_VERSION, lists=True)

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping as Table
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from afspm.drift.registration import DriftScan, Estimator, Registration
 from afspm.drift.tracking import FORECAST_VERSION, Forecast, Prediction, Update, require_newer
 from afspm.errors import ConfigError
 from afspm.model.snapshot import restored, snapshot
+from afspm.plain_data import Plain, PlainMapping
 
 Array = NDArray[np.float64]
 
@@ -106,7 +106,7 @@ class PaperForecast:
         covariance = self.covariance_m2 + since_s**2 * self.rate_covariance
         return Prediction(time_s, mapping, covariance, velocity, self.rate_covariance)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Plain:
         """See `Forecast`."""
         return snapshot(self, self.KIND, FORECAST_VERSION, lists=True)
 
@@ -263,10 +263,10 @@ class PaperTracker:
         state.forecast = PaperForecast(scan.mid_s, mapping.matrix, rate, covariance, rate_covariance)
         state.newest_s = scan.mid_s
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> Plain:
         """See `Tracker`."""
         return snapshot(self._state, "paper", VERSION)
 
-    def restore(self, state: Table[str, Any]) -> None:
+    def restore(self, state: PlainMapping) -> None:
         """See `Tracker`. Raises InvalidValue for the state of another tracker."""
         self._state = restored(PaperState, state, "paper", VERSION)

@@ -6,13 +6,13 @@ import dataclasses
 import difflib
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from afspm.drift.trackers.filters import Models
 from afspm.drift.trackers.references import Choice
 from afspm.errors import ConfigError
+from afspm.plain_data import Plain
 
 TRANSFORMS = ("translation", "similarity")
 
@@ -74,7 +74,7 @@ class BankSettings:
             raise ConfigError("inflation must be above 1, widening and lost_after at least 1", where="inflation")
 
     @classmethod
-    def split(cls, settings: dict[str, Any]) -> tuple[BankSettings, Choice]:
+    def split(cls, settings: Plain) -> tuple[BankSettings, Choice]:
         """Those of the bank and those of its references.
 
         Raises:
@@ -87,7 +87,7 @@ class BankSettings:
                 hint = f"did you mean {close[0]!r}?" if close else ", ".join(sorted(own | others))
                 raise ConfigError(f"the tracker has no setting {name!r}", where=name, hint=hint)
         try:
-            values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
+            values: Plain = {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
             return (
                 cls(**{k: v for k, v in values.items() if k in own}),
                 Choice(**{k: v for k, v in values.items() if k in others}),

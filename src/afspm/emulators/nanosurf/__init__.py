@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from afspm.emulators.nanosurf.studio import StudioProgram
@@ -10,6 +10,7 @@ from afspm.emulators.nanosurf.tree import CommandTree
 from afspm.emulators.nanosurf.wire import StudioWire
 from afspm.emulators.program import MakerProgram
 from afspm.emulators.scripted import Client, OnRequest, ScriptedEmulator, ScriptWire, Unfinished
+from afspm.plain_data import PlainMapping
 from afspm.units import Duration
 
 
@@ -26,7 +27,7 @@ class NanosurfEmulator(ScriptedEmulator):
 
     vendor = "Nanosurf"
     requires: ClassVar[tuple[str, ...]] = ("afspm[nanosurf]",)
-    usual: ClassVar[Mapping[str, Any]] = {"port": 33030}
+    usual: ClassVar[PlainMapping] = {"port": 33030}
     modes: ClassVar[Sequence[str]] = ("amplitude", "frequency-shift")
 
     def __init__(
@@ -69,7 +70,7 @@ class NanosurfEmulator(ScriptedEmulator):
         """The value that Lua writes for 0/0."""
         return b"{0,{(0/0)}}"
 
-    def _run_on(self, client: Client, thread: Any) -> bytes | Unfinished:
+    def _run_on(self, client: Client, thread: object) -> bytes | Unfinished:
         self._client = client
         reply = self._tree.step(thread)
         return Unfinished(lambda: self._run_on(client, thread)) if reply is None else reply.encode()

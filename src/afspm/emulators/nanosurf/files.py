@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from afspm.emulators.activities import RETRACE, ScanActivity, SpectrumActivity
+from afspm.plain_data import PlainMapping
 from afspm.simulation.fields import Array
 
 _MISSING: Final = -(2**31)
@@ -55,9 +56,7 @@ def curve(spectrum: SpectrumActivity, now_s: float, mode: str) -> bytes:
     return _file({"group_type": "spectroscopy", "measurement_mode": mode}, {}, [there, back], now_s)
 
 
-def _file(
-    facts: Mapping[str, Any], frame: Mapping[str, Any], segments: Sequence[SegmentChannels], now_s: float
-) -> bytes:
+def _file(facts: PlainMapping, frame: PlainMapping, segments: Sequence[SegmentChannels], now_s: float) -> bytes:
     import h5py
 
     content = io.BytesIO()

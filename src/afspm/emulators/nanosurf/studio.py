@@ -13,6 +13,7 @@ from afspm.emulators.nanosurf import files
 from afspm.emulators.program import MakerProgram, NamedFile
 from afspm.errors import InvalidValue
 from afspm.model import Region
+from afspm.plain_data import Plain
 
 _INTEGRAL_GAIN: Final = 0.5
 """What Studio's integral gain of 1 is to the simulated feedback, in 1/s."""
@@ -91,7 +92,7 @@ class StudioProgram(MakerProgram):
 
     def __init__(self, *given: Any, **settings: Any) -> None:
         super().__init__(*given, **settings)
-        self.values: dict[str, Any] = {path: value.at_first for path, value in PANEL.items()}
+        self.values: Plain = {path: value.at_first for path, value in PANEL.items()}
         self.values["data.storage.gallery_directory"] = str(self.folder)
         self.on_signal: Callable[[str], None] = lambda name: None
         self._told_scanning = False
@@ -101,13 +102,13 @@ class StudioProgram(MakerProgram):
         if feedback.integral_gain is not None:
             self.values["z_control.i_gain"] = round(feedback.integral_gain / _INTEGRAL_GAIN)
 
-    def get(self, path: str) -> Any:
+    def get(self, path: str) -> object:
         """Return a value of a panel, or where the tip is."""
         if path in ("scanner.offset_x", "scanner.offset_y"):
             return self.rig.probe_at(self.rig.clock.now_s())[path.endswith("y")]
         return self.values[path]
 
-    def put(self, path: str, value: Any) -> None:
+    def put(self, path: str, value: object) -> None:
         """Set a value of a panel. Raises InvalidValue: it is read-only, out of bounds or of another type."""
         row = PANEL[path]
         if row.read_only:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path, PureWindowsPath
 from typing import Any, Final
 
 from afspm.emulators.nanosurf.studio import PANEL, StudioProgram
 from afspm.emulators.scripted import ScriptFailed
+from afspm.plain_data import Plain, PlainMapping
 
 SESSION: Final = "91-01-000"
 """The name of a simulated controller in the maker's client."""
@@ -18,7 +19,7 @@ _INT32: Final = 2**31 - 1
 _SYNCHRONIZED: Final = 3
 _WRAPPER: Final = Path(__file__).with_name("wrapper.py.in")
 
-Nested = dict[str, Any]
+Nested = Plain
 
 
 class CommandTree:
@@ -42,31 +43,31 @@ class CommandTree:
         self._signals = {name: self._prelude.signal() for name in ("scanning_started", "scanning_finished")}
         program.on_signal = lambda name: self._signals[name].call()
         shared = self._shared()
-        self._roots: dict[int | None, Any] = {None: self._prelude.environment(self._table(shared))}
+        self._roots: dict[int | None, object] = {None: self._prelude.environment(self._table(shared))}
         workflow = self._workflow()
         for level in range(1, ALL_LEVELS + 1):
             self._roots[level] = self._prelude.environment(self._table({**shared, **self._session(workflow, level)}))
 
-    def start(self, script: str, level: int | None) -> tuple[Any, str | None]:
+    def start(self, script: str, level: int | None) -> tuple[object, str | None]:
         """Return a script that is ready to run, or the reply that it can't be."""
         started = self._prelude.start(script, self._roots[level])
         return started if isinstance(started, tuple) else (started, None)
 
-    def step(self, thread: Any) -> str | None:
+    def step(self, thread: object) -> str | None:
         """Run a script on; return its reply, or None while it waits for the instrument."""
         reply: str | None = self._prelude.step(thread)
         return reply
 
     # -- inside
 
-    def _function(self, call: Callable[..., Any]) -> Any:
+    def _function(self, call: Callable[..., object]) -> object:
         return self._prelude.as_function(call)
 
-    def _table(self, nested: Mapping[str, Any]) -> Any:
+    def _table(self, nested: PlainMapping) -> object:
         """A Lua table of a nested dictionary; Python's functions become Lua's."""
         return self._lua.table_from({name: self._in_lua(inner) for name, inner in nested.items()})
 
-    def _in_lua(self, inner: Any) -> Any:
+    def _in_lua(self, inner: Any) -> object:
         if isinstance(inner, dict):
             return self._table(inner)
         return self._function(inner) if _is_python(inner) else inner
@@ -139,14 +140,14 @@ class CommandTree:
     def _now_s(self) -> float:
         return self._program.rig.clock.now_s()
 
-    def _blocking(self, call: Callable[[], None], waiting: Callable[[], bool]) -> Any:
+    def _blocking(self, call: Callable[[], None], waiting: Callable[[], bool]) -> object:
         return self._prelude.blocking(call, waiting, lambda: "")
 
-    def _property(self, path: str) -> Any:
+    def _property(self, path: str) -> object:
         row, program = PANEL[path], self._program
         field = "value_raw" if row.enum else "value"
         fields = {field: {"get": lambda: program.get(path), "set": lambda value: program.put(path, value)}}
-        told: dict[str, Any] = {"unit": row.unit} if row.unit else {}
+        told: Plain = {"unit": row.unit} if row.unit else {}
         if row.unit and row.low > -1e300:
             told |= {"min": row.low, "max": row.high}
         for name, value in told.items():
@@ -158,7 +159,7 @@ class CommandTree:
     def _buffers(self) -> Nested:
         """The low-level buffers of measured values, as far as the running scan is in one."""
 
-        def numbers(buffer: float, channel: float) -> Any:
+        def numbers(buffer: float, channel: float) -> object:
             values = self._channel(buffer, channel)[2]
             span = self._span(values)
             return self._lua.table_from([round(value / span * _INT32) for value in values])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from typing import Any, Final, cast
+from typing import Final, cast
 
 from afspm.emulators.emulator import LOOPBACK
 from afspm.emulators.scripted import Client, OnRequest
@@ -16,7 +16,7 @@ LONGEST_SCRIPT: Final = 1 << 20
 class StudioWire:
     """The socket. See `ScriptWire`."""
 
-    def __init__(self, port: int, on_request: OnRequest, wakes: Any) -> None:
+    def __init__(self, port: int, on_request: OnRequest, wakes: object) -> None:
         self._on_request = on_request
         self._server = TcpServer(LOOPBACK, [port], one_each=False, wakes=wakes, on_bytes=self._split)
 

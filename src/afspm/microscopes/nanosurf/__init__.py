@@ -13,6 +13,7 @@ from afspm.microscopes.nanosurf.link import Link, StudioError
 from afspm.microscopes.nanosurf.session import Session
 from afspm.microscopes.nanosurf.settings import DIRECTION, UNITS, FrameSettings, Slopes, TipPlace, direction
 from afspm.model import ControlResponse, Region, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.plain_data import PlainMapping
 from afspm.translator.driver import ControllerLost, Driver, action
 from afspm.translator.parameters import ParameterSpec, Value
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
@@ -69,7 +70,7 @@ class Nanosurf(Driver):
         self.groups = (self._kept, FrameSettings(self._studio), Slopes(self._studio), self._place)
 
     @classmethod
-    def technique(cls, settings: Mapping[str, Any]) -> str:
+    def technique(cls, settings: PlainMapping) -> str:
         return "AFM"
 
     def connect(self) -> None:

@@ -28,7 +28,7 @@ class BadLua(AfspmError):
     code = "bad-reply"
 
 
-def parse(text: str) -> Any:
+def parse(text: str) -> object:
     """Return a value: a table as a dictionary, where what has no key is numbered from 1. Raises BadLua."""
     reader = _Reader(text)
     value = reader.value(0)
@@ -68,8 +68,8 @@ class _Reader:
             return self._table(depth + 1)
         raise BadLua(f"{text!r} is no value")
 
-    def _table(self, depth: int) -> dict[Any, Any]:
-        found: dict[Any, Any] = {}
+    def _table(self, depth: int) -> dict[object, object]:
+        found: dict[object, object] = {}
         position = 0
         while True:
             kind, text = self.token(peek=True)
@@ -87,7 +87,7 @@ class _Reader:
             if text not in {",", ";"}:
                 raise BadLua(f"{text!r} within a table")
 
-    def _key(self, depth: int) -> Any:
+    def _key(self, depth: int) -> object:
         """Take `[key]=` or `key=`; None: there is none."""
         before = self._at
         kind, text = self.token()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Any
 
 from afspm.drift.mapping import Mapping
 from afspm.errors import AfspmError
@@ -39,6 +38,7 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
+from afspm.plain_data import Plain
 from afspm.scheduler.drift.forecast import CurrentForecast
 from afspm.scheduler.drift.frame import DriftFrame
 from afspm.scheduler.drift.messages import (
@@ -168,7 +168,7 @@ class DriftCore(SchedulerCore):
             if packet.envelope == "ScopeStateMsg":
                 self._note_state(packet.payload, packet.time_ns if source_ns is None else source_ns)
 
-    def _kept(self) -> dict[str, Any]:
+    def _kept(self) -> Plain:
         return {
             "knowledge": self.knowledge.to_dict(),
             "consequences": self._consequences.to_dict(),
@@ -295,7 +295,7 @@ class DriftCore(SchedulerCore):
         effects = following(lambda event: SchedulerCore.step(self, event, now_s, now_ns), now_ns)
         return [*effects, SaveState(self.snapshot())]
 
-    def _learn(self, forecast: dict[str, Any] | None) -> list[Effect]:
+    def _learn(self, forecast: Plain | None) -> list[Effect]:
         try:
             self.knowledge.learn(forecast)
         except AfspmError as error:

@@ -18,6 +18,7 @@ from afspm.drift.registration import DriftScan
 from afspm.drift.tracking import Tracker, Update
 from afspm.errors import ConfigError
 from afspm.model import Region
+from afspm.plain_data import Plain
 from afspm.scheduler.drift.messages import Registered
 from afspm.scheduler.drift.settings import RescanRule
 
@@ -31,18 +32,18 @@ class Estimation:
         save: keeps the state on disk, before anybody is told what is in it.
     """
 
-    def __init__(self, tracker: Tracker, rule: RescanRule, save: Callable[[dict[str, Any]], None]) -> None:
+    def __init__(self, tracker: Tracker, rule: RescanRule, save: Callable[[Plain], None]) -> None:
         self._tracker = tracker
         self._rule = rule
         self._save = save
         self._answers: OrderedDict[str, Registered] = OrderedDict()
 
     @property
-    def forecast(self) -> dict[str, Any] | None:
+    def forecast(self) -> Plain | None:
         """Of what is known now; None before the first scan."""
         return self._tracker.forecast.to_dict() if self._answers else None
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: Plain) -> None:
         """Take up what was saved. Raises InvalidValue, KeyError or TypeError if it is of something else."""
         self._tracker.restore(state["tracker"])
         self._answers = OrderedDict((one["key"], Registered(**one)) for one in state["answers"])
@@ -117,6 +118,6 @@ def _why_again(rule: RescanRule, scan: DriftScan, asked: Region | None, update: 
     return too_far_off(asked, scanned, update.after.sd_m, tolerance_m)
 
 
-def _plain(array: Any) -> list[Any]:
-    plain: list[Any] = np.asarray(array, dtype=np.float64).tolist()
+def _plain(array: object) -> list[Any]:
+    plain: list[object] = np.asarray(array, dtype=np.float64).tolist()
     return plain

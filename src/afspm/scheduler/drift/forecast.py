@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from afspm.drift.mapping import Mapping
 from afspm.drift.trackers import forecast_from_dict
 from afspm.drift.tracking import Forecast, Prediction
 from afspm.errors import AfspmError
+from afspm.plain_data import Plain
 from afspm.scheduler.drift.scan_gate import Matrix
 from afspm.scheduler.drift.settings import DriftCompensationSettings
 
@@ -23,9 +22,9 @@ class CurrentForecast:
         self.start_s: float | None = None
         self._settings = settings
         self._forecast: Forecast | None = None
-        self._plain: dict[str, Any] | None = None
+        self._plain: Plain | None = None
 
-    def learn(self, forecast: dict[str, Any] | None) -> None:
+    def learn(self, forecast: Plain | None) -> None:
         """Take a forecast as the worker tells it; None: it knows nothing yet. Raises InvalidValue if it is none."""
         if forecast is not None:
             self._forecast, self._plain = forecast_from_dict(forecast), forecast
@@ -51,11 +50,11 @@ class CurrentForecast:
         mapping = self.mapping_at(time_s)
         return None if mapping is None else mapping.matrix.tolist()
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Plain:
         """As plain JSON."""
         return {"start_s": self.start_s, "forecast": self._plain}
 
-    def restore(self, plain: dict[str, Any]) -> None:
+    def restore(self, plain: Plain) -> None:
         """Take up what `to_dict` wrote. Raises ValueError if it can't be."""
         self.start_s = plain["start_s"]
         try:

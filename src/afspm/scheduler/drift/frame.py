@@ -28,6 +28,7 @@ from afspm.model import (
     ScanParameters,
     names,
 )
+from afspm.plain_data import Plain
 from afspm.scheduler.drift.positions import (
     PlaceCodec,
     PositionPair,
@@ -75,8 +76,8 @@ class DriftFrame:
 
     def __init__(self, codec: PlaceCodec, mapping_at: MappingAt) -> None:
         self.upwards: bool | None = None
-        self.beside: Callable[[], dict[str, Any]] = dict
-        self.restored: dict[str, Any] = {}
+        self.beside: Callable[[], Plain] = dict
+        self.restored: Plain = {}
         self.durations = ScanDurations()
         self.region: TargetPosition[Region] = TargetPosition()
         self.probe: TargetPosition[ProbePosition] = TargetPosition()
@@ -159,11 +160,11 @@ class DriftFrame:
 
     def _to_tip(
         self, sample: Region | ProbePosition, said: bytes | None, rest: ScanParameters, now_s: float
-    ) -> tuple[PositionPair[Any], Any]:
+    ) -> tuple[PositionPair[Any], object]:
         """The place in both coordinates, and what the microscope is to be sent for it."""
         tip = self._tip_of(sample, now_s)
         if isinstance(sample, Region):
-            subject: Any = ScanParameters(tip, rest.shape, rest.unit)
+            subject: object = ScanParameters(tip, rest.shape, rest.unit)
             if said is None:
                 said = self._codec.encode(ScanParameters(sample))
             region_place = PositionPair(sample, said, tip, self._codec.encode(subject))
@@ -304,7 +305,7 @@ class DriftFrame:
 
     # --- over a kill ---
 
-    def snapshot(self) -> dict[str, Any]:
+    def snapshot(self) -> Plain:
         return {
             "region": self.region.current and self.region.current.to_list(),
             "probe": self.probe.current and self.probe.current.to_list(),
@@ -318,7 +319,7 @@ class DriftFrame:
             "beside": self.beside(),
         }
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: Plain) -> None:
         self.restored = state["beside"]
         if state["region"] is not None:
             self.region.current = self._place(_SET_SCAN, *state["region"])
@@ -358,7 +359,7 @@ def _place_of(request: Request) -> Region | RegionChange | ProbePosition | Posit
     return REGION_CHANGES[subject.name](value) if subject.name in REGION_CHANGES else PROBE_CHANGES[subject.name](value)
 
 
-def _names(asked: Any) -> tuple[str, ...]:
+def _names(asked: object) -> tuple[str, ...]:
     if isinstance(asked, Parameter):
         return (asked.name,)
     if isinstance(asked, ScanParameters):

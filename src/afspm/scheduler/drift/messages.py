@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 from afspm.drift.mapping import Mapping
 from afspm.model import Region, RescanKind, Scan
+from afspm.plain_data import Plain
 from afspm.scheduler.drift.positions import PlaceCodec
 
 Matrix = list[list[float]]
@@ -40,7 +41,7 @@ class Registered:
     residual_m: list[float]
     references: list[str]
     rescan: str
-    forecast: dict[str, Any]
+    forecast: Plain
 
     @property
     def mapping(self) -> Mapping:
@@ -51,7 +52,7 @@ class Registered:
 class Forecasted:
     """The worker is there, or knows something new without a scan."""
 
-    forecast: dict[str, Any] | None
+    forecast: Plain | None
 
 
 @dataclass(frozen=True)

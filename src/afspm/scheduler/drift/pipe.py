@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import struct
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.registration import DriftScan
 from afspm.model import Frame, Region
+from afspm.plain_data import Plain
 from afspm.scheduler.drift.messages import ScanJob
 
 _LENGTHS = struct.Struct("<IQ")
@@ -19,7 +20,7 @@ _NOTHING = b""
 Array = NDArray[np.float64]
 
 
-def write(pipe: IO[bytes], head: dict[str, Any], values: Array | None = None) -> None:
+def write(pipe: IO[bytes], head: Plain, values: Array | None = None) -> None:
     """Send a message. Raises OSError or ValueError if nobody is there."""
     text = json.dumps(head).encode()
     data = _NOTHING if values is None else np.ascontiguousarray(values, "<f8").data.cast("B")
@@ -29,7 +30,7 @@ def write(pipe: IO[bytes], head: dict[str, Any], values: Array | None = None) ->
     pipe.flush()
 
 
-def read(pipe: IO[bytes]) -> tuple[dict[str, Any], bytes] | None:
+def read(pipe: IO[bytes]) -> tuple[Plain, bytes] | None:
     """The next message; None: the other side has gone."""
     lengths = pipe.read(_LENGTHS.size)
     if len(lengths) < _LENGTHS.size:
@@ -41,7 +42,7 @@ def read(pipe: IO[bytes]) -> tuple[dict[str, Any], bytes] | None:
     return json.loads(text), data
 
 
-def job_to_head(job: ScanJob) -> dict[str, Any]:
+def job_to_head(job: ScanJob) -> Plain:
     """A scan to be registered, but for its values."""
     return {
         "do": "register",
@@ -55,7 +56,7 @@ def job_to_head(job: ScanJob) -> dict[str, Any]:
     }
 
 
-def job_from_head(head: dict[str, Any], data: bytes) -> tuple[DriftScan, Region | None]:
+def job_from_head(head: Plain, data: bytes) -> tuple[DriftScan, Region | None]:
     """The scan, and the region that was meant in sample coordinates."""
     values = np.frombuffer(data, "<f8").reshape(head["shape"])
     region = _region(head["region"], Frame.TIP)

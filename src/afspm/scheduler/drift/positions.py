@@ -6,7 +6,7 @@ import base64
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from afspm.logic.events import Codec
 from afspm.model import Parameter, ProbePosition, Region, names
@@ -32,7 +32,7 @@ _VALUES = {
 class PlaceCodec(Codec, Protocol):
     """The wire as far as places matter."""
 
-    def encode(self, thing: Any) -> bytes:
+    def encode(self, thing: object) -> bytes:
         """A ScanParameters or ProbePosition as a message."""
 
     def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from afspm.model import (
     Response,
     names,
 )
+from afspm.plain_data import Plain
 from afspm.scheduler.drift.forecast import CurrentForecast
 from afspm.scheduler.drift.frame import DriftFrame
 from afspm.scheduler.drift.messages import DriftCodec, Registered, RescanWanted, ScanJob, Worker
@@ -185,11 +185,11 @@ class DriftResponse:
 
     # --- over a kill ---
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Plain:
         """As plain JSON."""
         return {"started": self._started, "unregistered": self._unregistered, "given_m_s": self._given_m_s}
 
-    def restore(self, plain: dict[str, Any]) -> None:
+    def restore(self, plain: Plain) -> None:
         self._started, self._given_m_s = bool(plain["started"]), [float(v) for v in plain["given_m_s"]]
         self._unregistered = int(plain["unregistered"])
 

@@ -90,7 +90,7 @@ class ScanDurations:
             return exact_s
         return known_s * (shape[0] * size_m[0]) / (known_shape[0] * known_size_m[0])
 
-    def to_list(self) -> list[list[Any]]:
+    def to_list(self) -> list[list[object]]:
         """As plain JSON."""
         return [[*shape, *size_m, duration_s] for (shape, size_m), duration_s in self._known.items()]
 

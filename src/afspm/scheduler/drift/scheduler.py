@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from afspm.errors import ConfigError
 from afspm.model import Frame
+from afspm.plain_data import PlainMapping
 from afspm.process.context import ProcessContext
 from afspm.scheduler.drift.codec import DriftWireCodec
 from afspm.scheduler.drift.core import MAPPING, DriftCore
@@ -48,9 +48,9 @@ class DriftCompensatedScheduler(Scheduler):
     def __init__(
         self,
         drift: DriftCompensationSettings | None = None,
-        control: Mapping[str, Any] | None = None,
-        limits: Mapping[str, Any] | None = None,
-        cache: Mapping[str, Any] | None = None,
+        control: PlainMapping | None = None,
+        limits: PlainMapping | None = None,
+        cache: PlainMapping | None = None,
     ) -> None:
         super().__init__(control, limits, cache)
         self.drift = (
@@ -84,7 +84,7 @@ class DriftCompensatedScheduler(Scheduler):
         self._registrar.late = context.clock.late
         return DriftCore(self._settings(context), drift, DriftWireCodec(), self._registrar, launch.name)
 
-    def _shell(self, core: SchedulerCore, sockets: SchedulerSockets, *others: Any) -> SchedulerShell:
+    def _shell(self, core: SchedulerCore, sockets: SchedulerSockets, *others: object) -> SchedulerShell:
         assert isinstance(core, DriftCore)
         self._registrar.wake = sockets.wake_up
         return DriftShell(self._registrar, core, sockets, *others)

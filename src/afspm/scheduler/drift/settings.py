@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from afspm.errors import ConfigError, InvalidValue
+from afspm.plain_data import Plain
 from afspm.units import Duration, Length
 
 _STRICT = {"extra": "forbid"}
@@ -28,7 +29,7 @@ class RescanRule:
     tolerance: Length | None = None
     f_rescan: float = 0.75
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[object] = _STRICT
 
     def __post_init__(self) -> None:
         if self.tolerance is not None and not self.tolerance > 0.0:
@@ -44,7 +45,7 @@ class Compensate:
     x: str
     y: str
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[object] = _STRICT
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,8 @@ class DriftCompensationSettings:
         longest_registration: for how long (real) what the microscope publishes waits for a scan to be registered.
     """
 
-    estimator: str | dict[str, Any] = "least-squares"
-    tracker: str | dict[str, Any] = "bank"
+    estimator: str | Plain = "least-squares"
+    tracker: str | Plain = "bank"
     channel: str | None = None
     correct: bool = True
     correct_after: Duration = 0.0
@@ -73,7 +74,7 @@ class DriftCompensationSettings:
     compensate: Compensate | None = None
     longest_registration: Duration = 30.0
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[object] = _STRICT
 
     def __post_init__(self) -> None:
         for name in ("correct_after", "longest_registration"):
@@ -87,7 +88,7 @@ class DriftCompensationSettings:
         return self if "thermal-drift" in solved else replace(self, at_start="nothing")
 
     @classmethod
-    def from_table(cls, table: dict[str, Any]) -> DriftCompensationSettings:
+    def from_table(cls, table: Plain) -> DriftCompensationSettings:
         """Out of plain JSON, already in SI.
 
         Raises:

@@ -12,9 +12,10 @@ import sys
 import threading
 from dataclasses import asdict
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from afspm.errors import AfspmError, FileError
+from afspm.plain_data import Plain
 from afspm.process.parent import leave_interrupts_to_parent, take_standard_input
 from afspm.scheduler.drift import pipe
 from afspm.scheduler.drift.settings import DriftCompensationSettings
@@ -50,10 +51,10 @@ class _Orders:
     def __init__(self, descriptor: int) -> None:
         self.ended = False
         self._pipe = os.fdopen(descriptor, "rb")
-        self._read: queue.SimpleQueue[tuple[dict[str, Any], bytes] | None] = queue.SimpleQueue()
+        self._read: queue.SimpleQueue[tuple[Plain, bytes] | None] = queue.SimpleQueue()
         threading.Thread(target=self._read_all, name="orders", daemon=True).start()
 
-    def next(self) -> tuple[dict[str, Any], bytes] | None:
+    def next(self) -> tuple[Plain, bytes] | None:
         """Wait for the next message; None: there are no more."""
         return self._read.get()
 
@@ -67,7 +68,7 @@ class _Orders:
 class _Worker:
     """Answers what it is asked, one after the other."""
 
-    def __init__(self, settings: dict[str, Any], orders: _Orders, answers: IO[bytes]) -> None:
+    def __init__(self, settings: Plain, orders: _Orders, answers: IO[bytes]) -> None:
         from afspm.scheduler.drift.worker_state import WorkerStateFile
 
         self._drift = DriftCompensationSettings.from_table(settings["drift"])
@@ -95,7 +96,7 @@ class _Worker:
             hint = "use the tracker that wrote it, or remove the file: the position of the sample is then unknown"
             raise FileError(reason, where=str(self._store.path), hint=hint) from error
 
-    def _save(self, state: dict[str, Any]) -> None:
+    def _save(self, state: Plain) -> None:
         """Unless the scheduler was killed meanwhile: the next one's worker knows more by now."""
         if self._orders.ended:
             raise BrokenPipeError
@@ -108,7 +109,7 @@ class _Worker:
         else:
             self._told_full = False
 
-    def take(self, head: dict[str, Any], data: bytes) -> None:
+    def take(self, head: Plain, data: bytes) -> None:
         if head["do"] == "register":
             self._register(head, data)
             return
@@ -118,7 +119,7 @@ class _Worker:
             self._complain(str(error))
         self._tell_forecast()
 
-    def _register(self, head: dict[str, Any], data: bytes) -> None:
+    def _register(self, head: Plain, data: bytes) -> None:
         try:
             answer = self._estimation.register(*pipe.job_from_head(head, data))
         except BrokenPipeError:

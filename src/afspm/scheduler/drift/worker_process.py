@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from afspm.interpreter import python_command, python_environment
+from afspm.plain_data import Plain
 from afspm.scheduler.drift import pipe
 from afspm.scheduler.drift.messages import Forecasted, NotRegistered, Registered, ScanJob, WorkerGone, WorkerSaid
 from afspm.scheduler.drift.settings import DriftCompensationSettings
@@ -44,7 +45,7 @@ class DriftWorkerProcess:
         self._said: deque[tuple[int, WorkerSaid]] = deque()
         self._life = 0
         self._process: subprocess.Popen[bytes] | None = None
-        self._orders: queue.SimpleQueue[tuple[dict[str, Any], Any] | None] = queue.SimpleQueue()
+        self._orders: queue.SimpleQueue[tuple[Plain, object] | None] = queue.SimpleQueue()
 
     def start(self) -> None:
         """Begin, or kill what is there and begin anew."""
@@ -131,7 +132,7 @@ _SAID: dict[str, Callable[..., WorkerSaid]] = {
 }
 
 
-def _write_all(process: subprocess.Popen[bytes], orders: queue.SimpleQueue[tuple[dict[str, Any], Any] | None]) -> None:
+def _write_all(process: subprocess.Popen[bytes], orders: queue.SimpleQueue[tuple[Plain, Any] | None]) -> None:
     """In a thread: a worker that is busy does not read, and the scheduler must not wait for it."""
     assert process.stdin is not None
     with contextlib.suppress(OSError, ValueError), process.stdin:

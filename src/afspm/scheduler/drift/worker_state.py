@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from afspm.errors import FileError
+from afspm.plain_data import Plain
 from afspm.storage.atomic import write_atomic
 
 _JSON = "json"
@@ -26,7 +27,7 @@ class WorkerStateFile:
     def __init__(self, path: Path | None) -> None:
         self.path = path
 
-    def save(self, state: dict[str, Any]) -> None:
+    def save(self, state: Plain) -> None:
         """Write it aside and rename; a power cut leaves the one or the other.
 
         Raises:
@@ -34,13 +35,13 @@ class WorkerStateFile:
         """
         if self.path is None:
             return
-        arrays: dict[str, np.ndarray[Any, Any]] = {}
+        arrays: dict[str, np.ndarray] = {}
         text = json.dumps(_without_arrays(state, arrays))
         file = io.BytesIO()
         np.savez(file, **{_JSON: np.frombuffer(text.encode(), np.uint8)}, **arrays)  # type: ignore[arg-type]
         write_atomic(self.path, [file.getbuffer()], synced=True)
 
-    def load(self) -> dict[str, Any] | None:
+    def load(self) -> Plain | None:
         """Return what was saved last; None if nothing was.
 
         Raises:
@@ -51,13 +52,13 @@ class WorkerStateFile:
         try:
             with self.path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                 state = json.loads(arrays[_JSON].tobytes())
-                found: dict[str, Any] = _with_arrays(state, arrays)
+                found: Plain = _with_arrays(state, arrays)
         except Exception as error:  # a damaged file makes numpy raise whatever it likes
             raise FileError(f"can't be read: {error}", where=str(self.path), hint="remove it to begin anew") from error
         return found
 
 
-def _without_arrays(thing: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
+def _without_arrays(thing: object, arrays: dict[str, np.ndarray]) -> object:
     if isinstance(thing, np.ndarray):
         name = f"{_ARRAY}{len(arrays)}"
         arrays[name] = thing
@@ -71,7 +72,7 @@ def _without_arrays(thing: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
     return thing
 
 
-def _with_arrays(thing: Any, arrays: Any) -> Any:
+def _with_arrays(thing: object, arrays: Any) -> Any:
     if isinstance(thing, dict):
         if thing.keys() == {_ARRAY}:
             return arrays[thing[_ARRAY]]
