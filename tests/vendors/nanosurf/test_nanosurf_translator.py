@@ -135,6 +135,18 @@ def test_the_tip_is_withdrawn_at_any_time_and_brought_back(bench: Make) -> None:
     assert made.emulator.rig.engaged
 
 
+def test_the_tip_is_withdrawn_where_a_second_connection_waits(bench: Make) -> None:
+    made = bench(speed=10.0, one_client=True)
+    peer = made.start(reply_timeout_s=1.0)
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    assert peer.act(names.RETRACT).ok
+    made.until_said("the tip is withdrawn by the first")
+    peer.until(FREE)
+    assert not made.emulator.rig.engaged
+
+
 def test_a_run_that_is_stopped_stops_the_scan(bench: Make) -> None:
     made = bench(speed=10.0)
     peer = made.start(retracts=True)
@@ -179,6 +191,8 @@ def test_a_translator_that_is_started_again_finds_the_scan(bench: Make) -> None:
         ({"release": 19}, {"release": 18}, "Studio is of release 19, not 18"),
         ({}, {"session": "91-99-999"}, "Studio has no single measurement session 91-99-999"),
         ({}, {"parameters": {"zctrl-setpoint": {"unit": "nm"}}}, "Studio has z_control.setpoint in V, not in nm"),
+        ({}, {"parameters": {"x-a": {"vendor": "no.such"}}}, "Studio has no no.such"),
+        ({}, {"parameters": {"x-a": {"vendor": "imaging.overscan_x", "unit": "m"}}}, "no imaging.overscan_x"),
         ({}, {"gallery_dir": "/nowhere/at/all"}, "does not exist on this computer"),
     ],
 )
@@ -188,6 +202,18 @@ def test_what_does_not_fit_is_told(
     made = bench(**emulator)
     made.start(**settings)
     made.until_said(told)
+
+
+def test_values_that_studio_refuses_change_none(bench: Make) -> None:
+    made = bench()
+    peer = made.start(parameters={"scan-speed": {"range": [1e-9, 1.0]}})
+    ready(peer)
+    before = dict(made.emulator.program.values)  # type: ignore[attr-defined]
+    # at this speed, the narrow frame takes more lines in a second than Studio allows
+    refused = peer.set(names.SCAN_SPEED, 0.9, "m/s")
+    assert "Studio refused" in refused.reason
+    assert "not within" in refused.reason
+    assert made.emulator.program.values == before  # type: ignore[attr-defined]
 
 
 def test_no_command_is_called_that_the_release_does_not_have(bench: Make) -> None:

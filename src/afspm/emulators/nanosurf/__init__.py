@@ -22,6 +22,7 @@ class NanosurfEmulator(ScriptedEmulator):
         image_buffer: number of the low-level buffer that the lines of a running scan are read from.
         start_s: how long the ramp to the first line takes, experiment time.
         file_s: how long after the end a file begins to appear; the other half of it comes as much later.
+        one_client: whether a further connection waits until the first has gone.
         seed, faults, and all of the simulated world: as of every emulator.
     """
 
@@ -37,10 +38,12 @@ class NanosurfEmulator(ScriptedEmulator):
         image_buffer: int = 4410,
         start_s: Duration = 0.2,
         file_s: Duration = 0.1,
+        one_client: bool = False,
         **settings: Any,
     ) -> None:
         super().__init__(**settings)
         self._release, self._image_buffer = release, image_buffer
+        self._one_client = one_client
         self._times = {"start_s": start_s, "file_s": file_s}
 
     def make_program(self) -> MakerProgram:
@@ -53,7 +56,7 @@ class NanosurfEmulator(ScriptedEmulator):
 
     def open_wire(self, port: int, on_request: OnRequest) -> ScriptWire:
         """Listen for the connections of clients."""
-        return StudioWire(port, on_request, self.woken)
+        return StudioWire(port, on_request, self.woken, one_client=self._one_client)
 
     def answer(self, client: Client, request: bytes) -> bytes | Unfinished:
         """Run a script in the tree that the client has selected."""

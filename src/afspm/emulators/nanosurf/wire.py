@@ -16,9 +16,9 @@ LONGEST_SCRIPT: Final = 1 << 20
 class StudioWire:
     """The socket. See `ScriptWire`."""
 
-    def __init__(self, port: int, on_request: OnRequest, wakes: object) -> None:
+    def __init__(self, port: int, on_request: OnRequest, wakes: object, *, one_client: bool) -> None:
         self._on_request = on_request
-        self._server = TcpServer(LOOPBACK, [port], one_each=False, wakes=wakes, on_bytes=self._split)
+        self._server = TcpServer(LOOPBACK, [port], one_each=one_client, wakes=wakes, on_bytes=self._split)
 
     @property
     def port(self) -> int:

@@ -15,7 +15,7 @@ from afspm.microscopes.nanosurf.settings import DIRECTION, UNITS, FrameSettings,
 from afspm.model import ControlResponse, Region, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.plain_data import PlainMapping
 from afspm.translator.driver import ControllerLost, Driver, action
-from afspm.translator.parameters import ParameterSpec, Value
+from afspm.translator.parameters import Value
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
 from afspm.units import Duration
 
@@ -77,7 +77,7 @@ class Nanosurf(Driver):
         self.close()
         session = self._session = Session(self._open_link, self._release, self._session_name, self._level)
         self.prove()
-        self._check_units(session)
+        self._check_table(session)
         self._kept.kept_in(self.memory)
         self._files = NanosurfFiles(self.memory, self.log)
         self._activity = Activity(
@@ -202,17 +202,15 @@ class Nanosurf(Driver):
             told = f"Studio's gallery {folder} does not exist on this computer"
             raise ConfigError(told, where="gallery_dir", hint='gallery_dir = "/where/it/is/mounted"')
 
-    def _check_units(self, session: Session) -> None:
-        """Check that Studio counts as the table says. Raises ConfigError."""
-        rows = [row for row in self.table.values() if _has_unit(row)]
-        expected = {**UNITS, **{row.vendor: (row.unit,) for row in rows}}
+    def _check_table(self, session: Session) -> None:
+        """Check that Studio has what the table names, and counts as it says. Raises ConfigError."""
+        rows = {row.vendor: row for row in self.table.values() if "." in row.vendor}
+        for path in session.missing(rows):
+            raise ConfigError(f"Studio has no {path}", where=rows[path].name, hint="a path below root.workflow")
+        expected = {**UNITS, **{path: (row.unit,) for path, row in rows.items() if row.type == "float"}}
         for path, unit in session.units(expected).items():
             if unit not in expected[path]:
-                told = f"Studio has {path} in {unit}, not in {expected[path][0]}"
-                row = next((row.name for row in rows if row.vendor == path), "")
-                hint = f'[microscope.parameters.{row}] unit = "{unit}", with a range' if row else "report it"
-                raise ConfigError(told, where=row or path, hint=hint)
-
-
-def _has_unit(row: ParameterSpec) -> bool:
-    return "." in row.vendor and bool(row.unit) and row.type == "float"
+                told = f"Studio has {path} in {unit or 'no unit'}, not in {expected[path][0] or 'none'}"
+                name = rows[path].name if path in rows else ""
+                hint = f'[microscope.parameters.{name}] unit = "{unit}", with a range' if name else "report it"
+                raise ConfigError(told, where=name or path, hint=hint)

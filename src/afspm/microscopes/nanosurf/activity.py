@@ -14,6 +14,7 @@ from afspm.microscopes.nanosurf.link import LongCall, StudioError
 from afspm.microscopes.nanosurf.session import Session
 from afspm.microscopes.nanosurf.settings import TipPlace
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
+from afspm.translator.driver import ControllerLost
 from afspm.translator.folder_files import FolderFiles
 from afspm.translator.result_files import SCAN, FilePrecision, as_list
 
@@ -126,7 +127,11 @@ class Activity:
         """Take the tip away, whatever is going on."""
         self.stopped()
         self.close()
-        self._call = self._session.begin("withdrawal", commands.WITHDRAW, self._wake)
+        try:
+            self._call = self._session.begin("withdrawal", commands.WITHDRAW, self._wake, commands.STOP_ALL)
+        except ControllerLost as lost:
+            self._log.warning("there is no further connection (%s): the tip is withdrawn by the first", lost)
+            self._session.run(f"{commands.STOP_ALL} {commands.WORKFLOW}.{commands.WITHDRAW}() return 0")
 
     def stopped(self) -> None:
         """Note that what is running was told to stop: nothing comes of it."""

@@ -49,6 +49,40 @@ return missing
 """Returns those of a list of paths that the tree does not have."""
 
 
+UNITS: Final = """
+local units = {}
+for i, path in ipairs({%s}) do
+  local node = root.workflow
+  for name in path:gmatch("[^.]+") do node = type(node) == "table" and node[name] or nil end
+  units[i] = node ~= nil and node.unit_get ~= nil and node.unit_get() or ""
+end
+return units
+"""
+"""Returns the units of a list of paths."""
+
+PUT_ALL: Final = """
+local done = {}
+local function put(node, field, value)
+  local before = node[field .. "_get"]()
+  node[field .. "_set"](value)
+  table.insert(done, 1, function() node[field .. "_set"](before) end)
+end
+local fine, problem = pcall(function() %s end)
+if not fine then
+  for _, back in ipairs(done) do pcall(back) end
+  error(problem, 0)
+end
+return 0
+"""
+"""Sets values; if Studio refuses one, puts back those that were set."""
+
+STOP_ALL: Final = f"""
+local imaging, spectroscopy, approach = {WORKFLOW}.imaging, {WORKFLOW}.spectroscopy, {WORKFLOW}.approach
+pcall(imaging.stop) pcall(spectroscopy.stop) pcall(approach.stop_approach)
+"""
+"""Stops what is going on, as far as that can be stopped."""
+
+
 def has_old_commands(release: int) -> bool:
     """Return whether a release has the commands of before 17, too.
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any, Final
 
 from afspm.errors import ConfigError, Refused
@@ -74,53 +74,66 @@ class Session:
         """Return values of panels by their paths.
 
         Raises:
-            ControllerLost: a number is not finite: such a reply is not to be trusted.
+            ControllerLost: there is none, or a number is not finite: such a reply is not to be trusted.
         """
         script = ", ".join(f"{WORKFLOW}.{path}.{_field(path)}_get()" for path in paths)
-        found = dict(zip(paths, self.run(f"return {script}"), strict=False))
+        found = dict(zip(paths, self._told(script), strict=False))
         for path in paths:
             value = found.get(path)
-            if not isinstance(value, bool | int | float | str) or (isinstance(value, float) and math.isnan(value)):
+            if not isinstance(value, bool | int | float | str) or (isinstance(value, float) and not isfinite(value)):
                 raise ControllerLost(f"Studio replied {value} for {path}")
         return found
 
     def put(self, values: Mapping[str, Value]) -> None:
-        """Set values of panels. Raises Refused: Studio does not take one."""
-        script = " ".join(f"{WORKFLOW}.{path}.{_field(path)}_set({written(value)})" for path, value in values.items())
+        """Set values of panels, all or none. Raises Refused: Studio does not take one."""
+        puts = " ".join(
+            f"put({WORKFLOW}.{path}, {written(_field(path))}, {written(value)})" for path, value in values.items()
+        )
         try:
-            self.run(f"{script} return 0")
+            self.run(commands.PUT_ALL % puts)
         except StudioError as error:
             raise Refused(ControlResponse.PARAM_ERROR, f"Studio refused {', '.join(values)}: {error}") from error
 
     def units(self, paths: Iterable[str]) -> dict[str, str]:
-        """Return the units that Studio says its values are in."""
+        """Return the units that Studio says its values are in; empty: it says none."""
         paths = list(paths)
-        script = ", ".join(f"{WORKFLOW}.{path}.unit_get()" for path in paths)
-        return dict(zip(paths, map(str, self.run(f"return {script}")), strict=False))
+        told = self.run(commands.UNITS % ", ".join(map(written, paths)))[0]
+        return {path: str(told.get(number, "")) for number, path in enumerate(paths, 1)}
+
+    def missing(self, paths: Iterable[str]) -> list[str]:
+        """Return those paths that Studio does not have."""
+        return [str(one) for one in self.run(commands.MISSING % ", ".join(map(written, paths)))[0].values()]
 
     def scanning(self) -> Scanning:
         """Return whether a scan runs."""
         script = f"{WORKFLOW}.{commands.IS_SCANNING}(), 0" if self._old else "afspm_seen.scanning, afspm_seen.started"
-        told = self.run(f"return {script}")
+        told = self._told(script)
         if len(told) != 2 or not isinstance(told[0], bool) or not isinstance(told[1], int):
             raise ControllerLost(f"Studio replied {told} to whether it scans")
         return Scanning(*told)
 
-    def begin(self, what: str, command: str, done: Callable[[], None]) -> LongCall:
-        """Begin what takes long; `done` is called, from another thread, at its end."""
+    def begin(self, what: str, command: str, done: Callable[[], None], first: str = "") -> LongCall:
+        """Begin what takes long, after the script `first`; `done` is called, from another thread, at its end."""
         link = self._open_link()
         try:
             self._select(link)
         except BaseException:
             link.close()
             raise
-        return LongCall(what, link, f"return {WORKFLOW}.{command}()", done)
+        return LongCall(what, link, f"{first} return {WORKFLOW}.{command}()", done)
 
     def close(self) -> None:
         """Let go of it."""
         self._link.close()
 
     # --- inside ---
+
+    def _told(self, script: str) -> list[Any]:
+        """Return the values of a script that any session runs. Raises ControllerLost: this one does not any more."""
+        try:
+            return self.run(f"return {script}")
+        except StudioError as error:
+            raise ControllerLost(f"Studio's session is not what it was: {error}") from error
 
     def _checked_name(self, name: str) -> str:
         """Return the name of the session to select. Raises ConfigError: Studio is of another release."""
@@ -144,10 +157,9 @@ class Session:
 
     def _check(self) -> None:
         """Check that the release has what is used of it, and takes note of scans."""
-        listed = ", ".join(map(written, commands.used(self._release)))
-        missing = self.run(commands.MISSING % listed)[0]
+        missing = self.missing(commands.used(self._release))
         if missing:
-            names = ", ".join(map(str, missing.values()))
+            names = ", ".join(missing)
             hint = "name its release (Help > About) in the setting release, and look at the level of its licence"
             raise ConfigError(f"{self.controller} has no {names}", where="release", hint=hint)
         if not self._old and self.run(commands.WATCH)[0]:
