@@ -36,7 +36,7 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run that has ended by itself."""
     folder = tmp_path_factory.mktemp("night")
     (folder / "shorter.toml").write_text(SHORTER, encoding="utf-8")
-    command = [sys.executable, "-m", "afspm", "run", str(SAMPLE), "shorter.toml", "--speed", "300"]
+    command = [sys.executable, "-m", "afspm", "run", str(SAMPLE), "shorter.toml", "--speed", f"{300 / PATIENCE:g}"]
     ended = subprocess.run(command, cwd=folder, capture_output=True, timeout=DEADLINE_S, encoding="utf-8", check=False)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     (run,) = (folder / "runs").glob("tip_repair-*")  # some systems have no links
