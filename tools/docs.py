@@ -26,6 +26,8 @@ from afspm.microscopes.simulator.instrument import PanelEvent
 from afspm.simulation.drift import Relaxation
 from afspm.simulation.surfaces import KINDS
 from afspm.simulation.world import WorldSettings
+from afspm.testing.commissioning.report import TRIED_ON, InstrumentReport
+from afspm.testing.commissioning.steps import OPERATIONS
 from afspm.units import Unit
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -45,6 +47,29 @@ def transition_table() -> str:
         done = ", ".join(_done(do) for do in row.do if do is not arbitration.ControlChange.FORWARD) or "nothing changes"
         lines.append(f"| {event.value} | {row.when.text} | {answer} | {done} | {row.why} |")
     return "\n".join(lines) + "\n"
+
+
+def instruments() -> str:
+    """The matrix: how far each operation of each maker's controller has been tried, from the reports."""
+    reports = [InstrumentReport.read(file) for file in sorted((ROOT / "docs/reference/instruments").glob("*.toml"))]
+    rows = sorted({(report.maker, report.release) for report in reports})
+    lines = ["| maker | release | " + " | ".join(OPERATIONS) + " |", "| --- " * (len(OPERATIONS) + 2) + "|"]
+    for row in rows:
+        of_row = [report for report in reports if (report.maker, report.release) == row]
+        cells = [_tried(of_row, operation) for operation in OPERATIONS]
+        lines.append("| " + " | ".join([*row, *cells]) + " |")
+    told = [f"- {one.maker}, {one.release}, *{one.tried_on}*: {one.evidence}. {one.note}".rstrip() for one in reports]
+    return "\n".join([*lines, "", *told]) + "\n"
+
+
+def _tried(reports: list[InstrumentReport], operation: str) -> str:
+    """Return the best level at which an operation was tried: a mismatch at a level hides what passed at lower ones."""
+    for level in TRIED_ON:
+        outcomes = [one.operations.get(operation, "") for one in reports if one.tried_on == level]
+        for outcome, shown in (("mismatch", f"**wrong** ({level})"), ("passed", level), ("not supported", "none")):
+            if outcome in outcomes:
+                return shown
+    return ""
 
 
 def _done(do: arbitration.ControlChange) -> str:
@@ -197,6 +222,7 @@ def _value(default: Any, hint: Any, metadata: Any) -> str:
 PARTS: dict[str, Callable[[], str]] = {
     "state-diagram": state_diagram,
     "transition-table": transition_table,
+    "instruments": instruments,
     "components": component_pages,
     "simulator": simulator_page,
     "python-api": python_api.python_api,

@@ -77,7 +77,7 @@ def _in_session(session: CheckSession, prompts: Prompts, result: CommissioningRe
 
     try:
         with restored(session, checks) as kit:
-            walk = _Walk(Guide(kit, prompts, session.folder), result.progress, write)
+            walk = _Walk(Guide(kit, prompts, session.folder, has_panel=not session.simulated), result.progress, write)
             try:
                 walk.through()
             finally:
@@ -123,7 +123,7 @@ class _Walk:
     def _done(self, step: CommissioningStep) -> StepResult:
         missing = self._guide.kit.support.missing(step.needs)
         if missing:
-            return StepResult(StepOutcome.SKIPPED, f"not supported: {', '.join(missing)}")
+            return StepResult(StepOutcome.UNSUPPORTED, ", ".join(missing))
         prompts = self._guide.prompts
         prompts.show(f"\n{step.title}\n{step.explained}")
         if step.moves and not prompts.confirm("Shall afspm do this now?"):

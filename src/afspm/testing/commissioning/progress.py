@@ -17,15 +17,23 @@ class StepOutcome(Enum):
     PASSED = "passed"
     MISMATCH = "mismatch"
     SKIPPED = "skipped"
+    UNSUPPORTED = "not supported"
     DECLINED = "declined"
     BLOCKED = "blocked"
 
 
-_GOES_ON = (StepOutcome.PASSED, StepOutcome.SKIPPED)
+_GOES_ON = (StepOutcome.PASSED, StepOutcome.SKIPPED, StepOutcome.UNSUPPORTED)
 """What is not supported, or not shown at the panel, keeps nothing else from being tried."""
 
 
-_WORSE = (StepOutcome.SKIPPED, StepOutcome.PASSED, StepOutcome.BLOCKED, StepOutcome.DECLINED, StepOutcome.MISMATCH)
+_WORSE = (
+    StepOutcome.UNSUPPORTED,
+    StepOutcome.SKIPPED,
+    StepOutcome.PASSED,
+    StepOutcome.BLOCKED,
+    StepOutcome.DECLINED,
+    StepOutcome.MISMATCH,
+)
 
 
 @dataclass(frozen=True)

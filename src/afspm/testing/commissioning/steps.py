@@ -150,7 +150,7 @@ def _frame(guide: Guide) -> str:
     above = "The frame moved, by its y. Where to, in the panel's picture?"
     seen = guide.require_choice(above, "up", ["down", "left", "right"], "a frame of a larger y")
     if not (count or seen):
-        raise Skipped("set and read back; not seen at the panel")
+        return guide.unseen()
     return f"{count} values are those of the panel{', and y points up there' if seen else ''}"
 
 
@@ -172,9 +172,7 @@ def _angle(guide: Guide) -> str:
     frames.require_in_force(guide.kit, guide.kit.frames.turned)
     question = "In the panel's picture, which way is it turned against the frame before?"
     seen = guide.require_choice(question, "counter-clockwise", ["clockwise", "not turned"], "a turned frame")
-    if not seen:
-        raise Skipped("set and read back; not seen at the panel")
-    return "turned counter-clockwise"
+    return "turned counter-clockwise" if seen else guide.unseen()
 
 
 @_step(
@@ -308,6 +306,10 @@ def _connection(guide: Guide) -> str:
     remembered=False,
 )
 def _contact(guide: Guide) -> str:
+    if not guide.kit.support.has(names.RETRACT):
+        guide.prompts.show(
+            "afspm can't withdraw the tip of this controller: stay at the panel until the steps are over."
+        )
     if not guide.prompts.confirm("Is the tip at the sample, and the feedback stable?"):
         raise StepDeclined("the tip stays withdrawn")
     expect(guide.kit.support.has(names.STOP_SCAN), "a controller whose scans can be stopped", "they can't be")

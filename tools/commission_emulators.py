@@ -1,0 +1,50 @@
+"""Writes the reports of the emulated controllers, for the matrix: `python tools/commission_emulators.py [NAME…]`.
+
+It goes through `afspm commission` with each, as a person who sees no panel.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from afspm.testing.commissioning.guide import UNSEEN
+from afspm.testing.commissioning.procedure import commission
+from afspm.testing.commissioning.report import InstrumentReport
+from afspm.testing.translators import CheckOptions
+
+ROOT = Path(__file__).resolve().parents[1]
+REPORTS = ROOT / "docs/reference/instruments"
+EXPERIMENTS = ROOT / "experiments/every_microscope"
+
+
+class NoPanel:
+    """Confirms all, and sees nothing."""
+
+    def show(self, text: str) -> None:
+        sys.stdout.write(f"{text}\n")
+
+    def confirm(self, question: str) -> bool:
+        return True
+
+    def text(self, question: str) -> str:
+        return "u" if "(u:" in question else ""
+
+    def choose(self, question: str, options: Sequence[str]) -> str:
+        return UNSEEN
+
+
+def main(names: Sequence[str]) -> None:
+    for name in names or sorted(file.stem.removeprefix("emulated_") for file in EXPERIMENTS.glob("emulated_*.toml")):
+        file = REPORTS / f"emulated_{name}.toml"
+        options = CheckOptions([EXPERIMENTS / f"emulated_{name}.toml"], runs=ROOT / "build/commissioning")
+        result = commission(options, NoPanel(), file, "emulator")
+        sys.stdout.write(f"{name}: {'passed' if result.passed else 'NOT AS IT SHOULD BE'} {result.lost}\n")
+        report = InstrumentReport.read(file)
+        replace(report, evidence="`afspm commission`, without a panel").write(file)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
