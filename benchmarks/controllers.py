@@ -20,6 +20,7 @@ from afspm.microscopes.asylum import Asylum
 from afspm.microscopes.asylum.link import Link as AsylumLink
 from afspm.microscopes.gxsm import Gxsm
 from afspm.microscopes.nanonis import Nanonis
+from afspm.microscopes.nanosurf import Nanosurf
 from afspm.model import ControlRequest, Parameter, Region, Request, ScanParameters, ScopeState, names
 from afspm.process.memory import Memory
 from afspm.translator.driver import Driver
@@ -34,6 +35,7 @@ AT_MOST_MS = 1.0
 VENDORS: dict[str, tuple[type[Driver], tuple[type, str]]] = {
     "asylum": (Asylum, (AsylumLink, "_exchange")),
     "nanonis": (Nanonis, (Receiver, "some")),
+    "nanosurf": (Nanosurf, (Receiver, "some")),
     "gxsm": (Gxsm, (Receiver, "some")),
 }
 """The driver, and the class and its method that waits for the answer of the controller."""

@@ -28,6 +28,7 @@ def scans_again(peer: Peer) -> None:
         ("half-reply", "the connection was closed after"),
         ("garbage", "a reply that is not Lua"),
         ("nan", "Studio replied"),
+        ("error", "Studio's session is not what it was: an emulated error"),
     ],
 )
 def test_a_bad_reply_has_a_name_and_studio_is_found_again(bench: Make, kind: str, told: str) -> None:
