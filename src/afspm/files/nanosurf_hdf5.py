@@ -8,11 +8,11 @@ counter-clockwise and degrees, are not known (!).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from datetime import datetime, tzinfo
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,10 @@ from afspm.errors import FileError
 from afspm.files import hdf5
 from afspm.files.content import FileContent
 from afspm.model import Region, Scan, Spectrum
+from afspm.plain_data import PlainMapping
+
+if TYPE_CHECKING:
+    import h5py
 
 CONTROLLER: Final = "Nanosurf Studio"
 _TYPES: Final = {0: "int32", 1: "uint8", 2: "uint16", 3: "uint32", 4: "uint64", 5: "int16", 6: "int64", 7: "double"}
@@ -55,11 +59,11 @@ def read_nhf(path: Path, zone: tzinfo | None) -> FileContent:
     )
 
 
-def _kind(group: Any) -> str:
+def _kind(group: h5py.Group) -> str:
     return hdf5.text(group.attrs.get("group_type", group.attrs.get("measurement_type", "")))
 
 
-def _scans(group: Any) -> Iterator[Scan]:
+def _scans(group: h5py.Group) -> Iterator[Scan]:
     """Every channel that fits the image; maps with more values in a pixel are left out."""
     if _kind(group) in _SPECTROSCOPY:
         return
@@ -76,7 +80,7 @@ def _scans(group: Any) -> Iterator[Scan]:
             yield Scan(region, f"{name} {_segment_name(segment)}", unit, values)
 
 
-def _curves(group: Any) -> Iterator[Spectrum]:
+def _curves(group: h5py.Group) -> Iterator[Spectrum]:
     """The segments of a curve one after the other, as far as all have the channel; positions are not told (!)."""
     parts = [_blocks(segment) for segment in _segments(group)]
     shared = [name for name in parts[0] if all(name in part for part in parts)] if parts else []
@@ -89,7 +93,7 @@ def _curves(group: Any) -> Iterator[Spectrum]:
         yield Spectrum(None, "force", tuple(shared), units, np.column_stack(columns))
 
 
-def _blocks(segment: Any) -> dict[str, tuple[str, list[Array]]]:
+def _blocks(segment: h5py.Group) -> dict[str, tuple[str, list[Array]]]:
     """Channel -> (unit, the values of each curve)."""
     found = {}
     for name, unit, dataset in _channels(segment):
@@ -100,7 +104,7 @@ def _blocks(segment: Any) -> dict[str, tuple[str, list[Array]]]:
     return found
 
 
-def _block_sizes(segment: Any, dataset: Any) -> NDArray[np.int64]:
+def _block_sizes(segment: h5py.Group, dataset: h5py.Dataset) -> NDArray[np.int64]:
     """How many values each curve has: told by a dataset beside it."""
     source = dataset.attrs.get("dataset_block_size_source")
     for other in segment.values():
@@ -111,15 +115,15 @@ def _block_sizes(segment: Any, dataset: Any) -> NDArray[np.int64]:
     return np.array([dataset.size])
 
 
-def _segments(group: Any) -> list[Any]:
+def _segments(group: h5py.Group) -> list[h5py.Group]:
     return [one for _, one in sorted(group.items()) if hasattr(one, "keys")]
 
 
-def _segment_name(segment: Any) -> str:
+def _segment_name(segment: h5py.Group) -> str:
     return hdf5.text(segment.attrs.get("segment_name", segment.attrs.get("name", "")))
 
 
-def _channels(segment: Any) -> Iterator[tuple[str, str, Any]]:
+def _channels(segment: h5py.Group) -> Iterator[tuple[str, str, h5py.Dataset]]:
     """The datasets that are signals: name, unit, dataset."""
     for _, dataset in sorted(segment.items()):
         attributes = dataset.attrs
@@ -130,7 +134,7 @@ def _channels(segment: Any) -> Iterator[tuple[str, str, Any]]:
             yield hdf5.text(name), hdf5.text(unit), dataset
 
 
-def _values(dataset: Any) -> Array:
+def _values(dataset: h5py.Dataset) -> Array:
     """The values in their unit: integers lie in a range of the type, and in format 2 one of them means none."""
     raw = hdf5.array(dataset)
     attributes = dataset.attrs
@@ -149,7 +153,7 @@ def _values(dataset: Any) -> Array:
     return (raw - smallest) * ((high - low) / (largest - smallest)) + low
 
 
-def _frame(attributes: Mapping[str, Any]) -> tuple[Region, tuple[int, int]]:
+def _frame(attributes: PlainMapping) -> tuple[Region, tuple[int, int]]:
     """The frame and its (rows, columns)."""
     if "rect_axis_size" in attributes:
         rows, columns = (int(number) for number in attributes["rect_axis_size"])
@@ -166,6 +170,6 @@ def _plain(value: Any) -> Any:
     return hdf5.text(value) if isinstance(value, bytes | str) else getattr(value, "tolist", lambda: value)()
 
 
-def _time_ns(text: Any) -> int | None:
+def _time_ns(text: object) -> int | None:
     """A time with its zone, "2023-07-18T15:26:38.320Z"; None: there is none."""
     return None if not text else round(datetime.fromisoformat(str(text)).timestamp() * 1e6) * 1000

@@ -158,7 +158,7 @@ class BankTracker:
             raise InvalidValue("a velocity was set before the first scan", hint="positions are counted from that")
         velocity = np.asarray(velocity_m_s, dtype=np.float64) + state.compensation.velocity_m_s(time_s)
         noise = np.asarray(covariance, dtype=np.float64)
-        state.filters = self._with_velocity(state.filters, time_s, velocity, noise)
+        state.filters = state.filters.with_velocity(time_s, velocity, noise, rarest=self._settings.rarest)
 
     def compensated(self, time_s: float, velocity_m_s: ArrayLike) -> None:
         """From a time on, the controller moves tip coordinates along with a velocity (2,) by itself.
@@ -205,7 +205,7 @@ class BankTracker:
             return filters
         # The displacement between them will be compared like any other.
         velocity = found.by_shear_m_s + self._state.compensation.velocity_m_s(found.time_s)
-        return self._with_velocity(filters, found.time_s, velocity, found.by_shear_covariance)
+        return filters.with_velocity(found.time_s, velocity, found.by_shear_covariance, rarest=self._settings.rarest)
 
     def _is_blind(self, newest: NewestScan) -> bool:
         """True if it is too uncertain where to look, against each of the scans that it can be compared with."""
@@ -330,12 +330,6 @@ class BankTracker:
         state.filters = state.filters.without_scan(number)
         if state.similarity is not None:
             state.similarity = state.similarity.without_scan(number)
-
-    def _with_velocity(self, filters: Filters, time_s: float, velocity_m_s: Array, covariance: Array) -> Filters:
-        """With a velocity of the sample itself that was measured at about the time of the filters."""
-        elsewhen = filters.models.over(abs(filters.time_s - time_s))[1][:, 2:, 2:]
-        rarest = self._settings.rarest
-        return filters.updated(filters.velocity_rows(), velocity_m_s, covariance + elsewhen, forget=1.0, rarest=rarest)
 
     def _forecast_of(self, filters: Filters) -> BankForecast:
         state = self._state

@@ -167,6 +167,11 @@ class Filters:
         """Mean (m,) and covariance (m, m) of `rows` (m, s) @ state over all filters."""
         return mixed(self.weight, self.mean @ rows.T, rows @ self.covariance @ rows.T)
 
+    def with_velocity(self, time_s: float, velocity_m_s: Array, covariance: Array, *, rarest: float) -> Filters:
+        """After a velocity of the sample itself that was measured at about the time of the filters."""
+        elsewhen = self.models.over(abs(self.time_s - time_s))[1][:, 2:, 2:]
+        return self.updated(self.velocity_rows(), velocity_m_s, covariance + elsewhen, forget=1.0, rarest=rarest)
+
     def updated(self, rows: Array, measured: Array, noise: Array, *, forget: float, rarest: float) -> Filters:
         """After `measured` (m,) = `rows` (m, s) @ state + noise of a covariance (m, m), or one for
         each filter (n, m, m).

@@ -38,13 +38,11 @@ class RunStory:
     """A run, reckoned up. Times in ns of experiment time since the Unix epoch.
 
     Attributes:
-        start_ns, end_ns: the first and the last that is known of it.
+        start_ns: the first that is known of it.
         speed: experiment seconds in a real second.
         ended: how it ended, in words; that it goes on, or was cut off.
-        end: the journal's entry of the end: the component or person that asked for it, and why; None: none did.
         frame: of all places.
         problems: spans of all problems in the order of time.
-        restarts, given_up: of processes.
         actions: what was done to the tip, e.g. pulses.
         seen_late: the first request to flag each problem that was only noticed after the end.
     """
@@ -54,24 +52,41 @@ class RunStory:
     metadata: Mapping[str, str]
     simulated: bool
     start_ns: int
-    end_ns: int
     speed: float
     ended: str
-    end: JournalEntry | None
     frame: Frame
     overview: Overview
     scans: Sequence[ScanRow]
     spectra: int
     refusals: Sequence[Refusals]
-    restarts: Sequence[ProcessRestart]
-    given_up: Sequence[str]
     actions: Sequence[JournalEntry]
     notes: Sequence[NoteRow]
     seen_late: Sequence[JournalEntry]
 
     @property
+    def end_ns(self) -> int:
+        """The last that is known of it."""
+        return max(self.overview.newest_ns, self.start_ns)
+
+    @property
     def lasted_ns(self) -> int:
         return max(0, self.end_ns - self.start_ns)
+
+    @property
+    def end(self) -> JournalEntry | None:
+        """The journal's entry of the end: the component or person that asked for it, and why; None: none did."""
+        entries = reversed(self.overview.entries)
+        return next((one for one in entries if one.event is ControlEvent.EXPERIMENT_ENDED), None)
+
+    @property
+    def restarts(self) -> list[ProcessRestart]:
+        return list(self.overview.restarts)
+
+    @property
+    def given_up(self) -> list[str]:
+        """Return the processes that were given up."""
+        states = self.overview.processes.items()
+        return [name for name, state in states if state.condition is ProcessCondition.GIVEN_UP]
 
     def problem_name(self, entry: JournalEntry) -> str:
         """Return the name of the problem that an entry is about."""
@@ -121,20 +136,16 @@ def read(run: Run) -> RunStory:
         metadata=run.metadata,
         simulated=run.simulated,
         start_ns=start_ns,
-        end_ns=max(overview.newest_ns, start_ns),
         speed=float(clock.get("speed", 1.0)),
         ended=describe_state(run.folder),
-        end=next((one for one in reversed(overview.entries) if one.event is ControlEvent.EXPERIMENT_ENDED), None),
         frame=run.frame,
         overview=overview,
         scans=list(scans),
         spectra=len(run.spectra),
         refusals=gathered([entry for entry in run.refusals if entry not in late]),
-        restarts=list(overview.restarts),
         actions=[entry for entry in run.journal if entry.what in names.EXTENSION_ACTIONS and entry.response == 0],
         notes=list(run.notes),
         seen_late=list({entry.problem: entry for entry in reversed(late)}.values()),
-        given_up=[n for n, state in overview.processes.items() if state.condition is ProcessCondition.GIVEN_UP],
     )
 
 

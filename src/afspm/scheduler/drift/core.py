@@ -52,10 +52,9 @@ from afspm.scheduler.drift.messages import (
 )
 from afspm.scheduler.drift.positions import is_same
 from afspm.scheduler.drift.response import DriftResponse, Step
-from afspm.scheduler.drift.scan_gate import HeldScan, Matrix, ScanGate
+from afspm.scheduler.drift.scan_gate import DriftChannel, HeldScan, Matrix, ScanGate
 from afspm.scheduler.drift.scan_timing import ScanStartTracker
 from afspm.scheduler.drift.settings import DriftCompensationSettings
-from afspm.units import same_kind
 
 MAPPING = "DriftMapping"
 Following = Callable[[Step, int], list[Effect]]
@@ -94,11 +93,11 @@ class DriftCore(SchedulerCore):
         self._gate = ScanGate()
         self._jobs: dict[str, ScanJob] = {}
         self._beginning = ScanStartTracker()
-        self._channel = drift.channel
+        self._channel = DriftChannel(drift.channel)
         self._following: deque[tuple[float, Following]] = deque()
         self._ends = 0
         self._waits_for_a_person = False
-        self._told_channel = self._told_slow = False
+        self._told_slow = False
 
     # --- life ---
 
@@ -159,7 +158,7 @@ class DriftCore(SchedulerCore):
             self.knowledge.restore(kept["knowledge"])
             self._consequences.restore(kept["consequences"])
             self._gate.restore(kept["scans"])
-            self._channel = self._settings.channel or kept["channel"]
+            self._channel.name = self._settings.channel or kept["channel"]
 
     def restore_cache(self, packets: Iterable[LoggedPacket]) -> None:
         entries = list(packets)
@@ -173,7 +172,7 @@ class DriftCore(SchedulerCore):
             "knowledge": self.knowledge.to_dict(),
             "consequences": self._consequences.to_dict(),
             "scans": self._gate.to_list(),
-            "channel": self._channel,
+            "channel": self._channel.name,
         }
 
     # --- packets ---
@@ -217,19 +216,13 @@ class DriftCore(SchedulerCore):
             scan = self._codec.decode_packet(message, event.packet.payload)
             if not isinstance(scan, Scan) or not scan.values.size:
                 return []
-            if scan_key(scan, event.packet) == held.key and self._is_channel(scan):
+            if scan_key(scan, event.packet) == held.key and self._channel.is_of(scan):
                 self._register(held, scan, event, now_ns)
         return []
 
-    def _is_channel(self, scan: Scan) -> bool:
-        if self._channel is None and same_kind(scan.unit, "m"):
-            self._channel = scan.channel
-        return scan.channel == self._channel
-
     def _without_channel(self, key: str, now_s: float, now_ns: int) -> list[Effect]:
-        why = f"a scan without the channel {self._channel or 'in a unit of length'}: it can't be used for drift"
-        effects: list[Effect] = [] if self._told_channel else [Log("WARNING", why)]
-        self._told_channel = True
+        why, is_new = self._channel.missing()
+        effects: list[Effect] = [Log("WARNING", why)] if is_new else []
         return effects + self._give_up(key, why, now_s, now_ns)
 
     def _register(self, held: HeldScan, scan: Scan, event: PacketIn, now_ns: int) -> None:
@@ -253,11 +246,8 @@ class DriftCore(SchedulerCore):
 
     def _middle_s(self, scan: Scan, event: PacketIn, now_ns: int) -> float:
         """Between when it began and its own end, so that a file that comes late biases nothing."""
-        end_s = _end_s(scan, event, now_ns)
-        begun = self._beginning.of_scan(end_s)
-        if begun is not None:
-            return (begun.time_s + end_s) / 2
-        return end_s - self.frame.durations.expected_s(scan.shape, scan.region.size_m) / 2
+        expected_s = self.frame.durations.expected_s(scan.shape, scan.region.size_m)
+        return self._beginning.middle_s(_end_s(scan, event, now_ns), expected_s)
 
     def _note_state(self, payload: bytes | memoryview, time_ns: int | None) -> None:
         status = self._codec.decode_packet("ScopeStateMsg", payload)

@@ -9,6 +9,8 @@ from collections import OrderedDict, deque
 from dataclasses import dataclass
 
 from afspm.logic.events import PacketIn, TranslatorCaughtUp
+from afspm.model import Scan
+from afspm.units import same_kind
 
 Matrix = list[list[float]]
 Waits = PacketIn | TranslatorCaughtUp
@@ -80,3 +82,22 @@ class ScanGate:
     def restore(self, plain: list[tuple[str, Matrix | None]]) -> None:
         for key, matrix in plain:
             self.settle(str(key), matrix)
+
+
+class DriftChannel:
+    """The channel that is registered: as set, or the first in a unit of length."""
+
+    def __init__(self, name: str | None) -> None:
+        self.name = name
+        self._told = False
+
+    def is_of(self, scan: Scan) -> bool:
+        """Return whether a scan is of this channel."""
+        if self.name is None and same_kind(scan.unit, "m"):
+            self.name = scan.channel
+        return scan.channel == self.name
+
+    def missing(self) -> tuple[str, bool]:
+        """Return why a scan without it is not registered, and whether that is said for the first time."""
+        is_new, self._told = not self._told, True
+        return f"a scan without the channel {self.name or 'in a unit of length'}: it can't be used for drift", is_new

@@ -56,6 +56,11 @@ class ScanStartTracker:
         """That of the scan which ended at a time; None: it is not known."""
         return self._begun if self._begun is not None and self._begun.time_s < end_s else None
 
+    def middle_s(self, end_s: float, expected_s: float) -> float:
+        """Return the middle of the scan that ended then: of what was seen, or of as long as is expected."""
+        begun = self.of_scan(end_s)
+        return end_s - expected_s / 2 if begun is None else (begun.time_s + end_s) / 2
+
 
 class ScanDurations:
     """Learnt from finished scans; empty again when the speed is set."""
