@@ -30,6 +30,8 @@ CONTROLLER: Final = "Nanosurf Studio"
 _TYPES: Final = {0: "int32", 1: "uint8", 2: "uint16", 3: "uint32", 4: "uint64", 5: "int16", 6: "int64", 7: "double"}
 """Of format 1, which numbers the types that format 2 names."""
 _SPECTROSCOPY: Final = ("spectroscopy", "spectroscopy_grid")
+_MEASUREMENTS: Final = (*_SPECTROSCOPY, "image_line_based", "wavemode_nma")
+"""Kinds of groups; a file of format 2 has others, such as one of calibrations."""
 
 Array = NDArray[np.float64]
 
@@ -40,7 +42,7 @@ def read_nhf(path: Path, zone: tzinfo | None) -> FileContent:
         version = int(file.attrs.get("nsf_file_version_major", 0))
         if version not in (1, 2):
             raise FileError(f"is of Nanosurf's format {version}, not 1 or 2")
-        groups = [group for group in file.values() if any(hasattr(inner, "keys") for inner in group.values())]
+        groups = [group for group in file.values() if _kind(group) in _MEASUREMENTS]
         scans = [replace(scan, filename=str(path)) for group in groups for scan in _scans(group)]
         curves = [one for group in groups if _kind(group) in _SPECTROSCOPY for one in _curves(group)]
         spectra = [replace(one, filename=str(path)) for one in curves]
@@ -73,6 +75,8 @@ def _scans(group: h5py.Group) -> Iterator[Scan]:
         for name, unit, dataset in _channels(segment):
             if dataset.size != rows * columns:
                 continue
+            if min(rows, columns) < 2:
+                raise FileError(f"holds an image of {columns} x {rows} pixels")
             values = _values(dataset).reshape(rows, columns)
             if acquired < rows:
                 upwards = hdf5.text(group.attrs.get("image_scan_direction", "up")) == "up"
@@ -98,7 +102,7 @@ def _blocks(segment: h5py.Group) -> dict[str, tuple[str, list[Array]]]:
     found = {}
     for name, unit, dataset in _channels(segment):
         sizes = _block_sizes(segment, dataset)
-        if sizes.sum() != dataset.size:
+        if (sizes < 0).any() or sizes.sum() != dataset.size:
             raise FileError(f"{name} holds {dataset.size} values instead of {sizes.sum()}")
         found[name] = (unit, np.split(_values(dataset), np.cumsum(sizes)[:-1]))
     return found

@@ -23,6 +23,7 @@ from afspm.files.content import FileContent, local_ns
 from afspm.model import Region, Scan, Spectrum
 
 _DATA: Final = b"#!"
+_CHANNEL: Final = re.compile(r"Gr(\d{1,6})-Ch(\d{1,6})")
 _CURVE: Final = re.compile(r"Spec (forward|backward)")
 _BITS: Final = {8: "<i1", 16: "<i2", 32: "<i4"}
 
@@ -68,21 +69,20 @@ def _sections(text: str) -> dict[str, Section]:
 def _channels(sections: Mapping[str, Section], data: bytes) -> Iterator[tuple[Section, Array]]:
     """The channels in the order in which their values lie in the file, with all values [line, point]."""
     dataset, at = sections["DataSet"], 0
-    for group in range(int(dataset["GroupCount"])):
-        for number in range(int(dataset[f"Gr{group}-Count"])):
-            name = dataset.get(f"Gr{group}-Ch{number}")
-            if name is None:
-                continue
-            channel = sections[name]
-            kind = np.dtype(_BITS[int(channel["SaveBits"])])
-            shape = int(channel["Lines"]), int(channel["Points"])
-            size = shape[0] * shape[1] * kind.itemsize
-            if at + size > len(data):
-                raise FileError(f"ends within {name}")
-            raw = np.frombuffer(data, kind, shape[0] * shape[1], at).reshape(shape)
-            at += size
-            steps = 2.0 ** (8 * kind.itemsize)
-            yield channel, (raw / steps + 0.5) * float(channel["Dim2Range"]) + float(channel["Dim2Min"])
+    listed = ((_CHANNEL.fullmatch(key), name) for key, name in dataset.items())
+    for _, name in sorted((tuple(map(int, key.groups())), name) for key, name in listed if key is not None):
+        channel = sections[name]
+        kind = np.dtype(_BITS[int(channel["SaveBits"])])
+        shape = int(channel["Lines"]), int(channel["Points"])
+        if min(shape) < 1:
+            raise FileError(f"{name} has {shape[0]} lines of {shape[1]} points")
+        size = shape[0] * shape[1] * kind.itemsize
+        if at + size > len(data):
+            raise FileError(f"ends within {name}")
+        raw = np.frombuffer(data, kind, shape[0] * shape[1], at).reshape(shape)
+        at += size
+        steps = 2.0 ** (8 * kind.itemsize)
+        yield channel, (raw / steps + 0.5) * float(channel["Dim2Range"]) + float(channel["Dim2Min"])
 
 
 def _is_image(channel: Section) -> bool:
@@ -91,6 +91,8 @@ def _is_image(channel: Section) -> bool:
 
 def _scan(channel: Section, values: Array, frame: Region | None) -> Scan:
     """One channel, "Z-Axis forward"; the frame is told by the parameters, in files that have them."""
+    if min(values.shape) < 2:
+        raise FileError("holds an image of less than two lines or columns")
     width, height = float(channel["Dim0Range"]), float(channel["Dim1Range"])
     region = Region((0.0, 0.0) if frame is None else frame.center_m, (width, height), frame.angle_rad if frame else 0.0)
     way = re.sub("scan ", "", channel["Frame"], flags=re.IGNORECASE)
@@ -141,4 +143,8 @@ def _taken(channel: Section, values: Array, line: int) -> Array:
 
 
 def _points(channel: Section, line: int) -> int:
-    return int(channel.get(f"LineDim{line}Points", channel["Points"]))
+    most = int(channel["Points"])
+    points = int(channel.get(f"LineDim{line}Points", most))
+    if not 0 <= points <= most:
+        raise FileError(f"a curve of {points} points where there are {most}")
+    return points

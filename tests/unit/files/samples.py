@@ -175,6 +175,44 @@ def nsid(path: Path) -> None:
                 note[key] = value.strip()
 
 
+def nhf(path: Path) -> None:
+    """Of format 1, as the maker's example."""
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        file.attrs["nsf_file_version_major"], file.attrs["nsf_file_version_minor"] = np.uint32(1), np.uint32(1)
+        group = file.create_group("measurement_0")
+        group.attrs.update(measurement_type="image_line_based", created="2023-07-18T15:26:38.320Z", name="Image 1")
+        group.attrs.update(image_points_per_line=NX, image_number_of_lines=NY, image_scan_direction="up")
+        group.attrs.update(image_size_x=50e-9, image_size_y=30e-9, scanner_offset_x=1e-7, scanner_rotation=10.0)
+        for k, way in enumerate(("Forward", "Backward")):
+            segment = group.create_group(f"segment_{k}")
+            segment.attrs["name"] = way
+            values = np.rint(HEIGHT_M / 1e-6 * 2**31).astype(np.int32).ravel()
+            data = segment.create_dataset("dataset_0", data=values)
+            data.attrs.update(name="Topography", base_calibration_unit="m", dataset_element_type=np.uint32(0))
+            data.attrs.update(base_calibration_min=-1e-6, base_calibration_max=1e-6)
+
+
+def nid() -> bytes:
+    """An image and a curve of two lines."""
+    image = (
+        f"Version=2\r\nPoints={NX}\r\nLines={NY}\r\nFrame=Scan forward\r\nDim0Unit=m\r\nDim0Range=5e-08\r\n"
+        "Dim1Range=3e-08\r\nDim2Name=Z-Axis\r\nDim2Unit=m\r\nDim2Range=2e-06\r\nDim2Min=-1e-06\r\nSaveBits=32\r\n"
+    )
+    curve = (
+        "Version=3\r\nPoints=4\r\nLines=2\r\nFrame=Spec forward\r\nDim0Name=Z-Axis\r\nDim0Unit=m\r\nDim0Range=1e-06\r\n"
+        "Dim0Min=0\r\nDim2Name=Deflection\r\nDim2Unit=N\r\nDim2Range=4e-06\r\nDim2Min=-2e-06\r\nLineDim1Min=0\r\n"
+        "LineDim1Range=5e-07\r\nLineDim1Points=3\r\nSaveBits=32\r\n"
+    )
+    head = (
+        "[DataSet]\r\nVersion=2\r\nGroupCount=2\r\nGr0-Count=8\r\nGr1-Count=8\r\nGr0-Ch1=DataSet-0:1\r\n"
+        f"Gr1-Ch0=DataSet-1:0\r\n\r\n[DataSet-0:1]\r\n{image}\r\n[DataSet-1:0]\r\n{curve}\r\n"
+    )
+    values = np.rint(HEIGHT_M / 1e-6 * 2**31).astype("<i4").tobytes()
+    return head.encode() + b"#!" + values + np.arange(8, dtype="<i4").tobytes()
+
+
 def written(content: Callable[[], bytes]) -> Callable[[Path], None]:
     return lambda path: (path.write_bytes(content()), None)[1]
 
@@ -193,4 +231,6 @@ WHOLE: dict[str, Callable[[Path], None]] = {
     "gxsm4.nc": gxsm4,
     "curve-VP001-VP.vpdata": written(vpdata),
     "nsid.h5": nsid,
+    "image.nhf": nhf,
+    "image.nid": written(nid),
 }

@@ -93,7 +93,7 @@ def test_the_makers_image() -> None:
     assert [scan.channel for scan in content.scans][:2] == ["Z-Axis forward", "Amplitude forward"]
     heights = content.scans[0]
     assert (heights.values.shape, heights.unit, heights.region.size_m) == ((256, 256), "m", (2.5e-6, 2.5e-6))
-    # as Gwyddion 2.66 shows it, where the first row is the upper one
+    # as Gwyddion 2.62 shows it, where the first row is the upper one
     assert heights.values.min() == pytest.approx(-3.4497025077044964e-06)
     assert heights.values.max() == pytest.approx(-3.3933982e-06, rel=1e-4)
     assert content.upwards is True

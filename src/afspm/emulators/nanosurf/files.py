@@ -65,7 +65,7 @@ def _file(facts: PlainMapping, frame: PlainMapping, segments: Sequence[SegmentCh
         file.attrs.update(nsf_file_version_major=np.uint32(2), nsf_file_version_minor=np.uint32(0), created=written)
         group = file.create_group("group_0000")
         group.attrs.update(facts)
-        group.attrs.update(name="SIMULATED", created=written, modified=written)
+        group.attrs.update(measurement_name="SIMULATED", created=written, modified=written)
         for number, (name, channels) in enumerate(zip(_SEGMENTS, segments, strict=True)):
             segment = group.create_group(f"segment_{number:04d}")
             segment.attrs.update(frame)
@@ -74,6 +74,7 @@ def _file(facts: PlainMapping, frame: PlainMapping, segments: Sequence[SegmentCh
                 _add(segment, f"dataset_{index:04d}", signal, unit, values)
             if not frame:
                 _add_blocks(segment, channels)
+        file.create_group("group_0001").attrs["group_type"] = "calibration"
     return content.getvalue()
 
 
@@ -87,6 +88,7 @@ def _add(segment: Any, name: str, signal: str, unit: str, values: Array) -> None
     dataset = segment.create_dataset(name, data=integers.ravel(), fillvalue=_MISSING)
     dataset.attrs.update(
         signal_name=signal,
+        signal_unit=unit,
         signal_calibration_unit=unit,
         signal_calibration_min=low,
         signal_calibration_max=high,
