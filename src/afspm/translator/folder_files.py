@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from afspm.errors import AfspmError, FileError
-from afspm.files import read
 from afspm.model import Scan, Spectrum
 from afspm.plain_data import PlainMapping
 from afspm.translator.result_files import (
@@ -92,7 +91,7 @@ class FolderFiles(ResultFiles):
         return list(folder.glob(self.pattern)) if folder.is_dir() else []
 
     def _content_of(self, path: Path, measured: Entry) -> Content:
-        found = read(path)
+        found = read_result(path)
         content: Sequence[Scan | Spectrum] = found.scans if measured["what"] == SCAN else found.spectra
         if not content:
             raise FileError(f"holds no {measured['what']}", where=str(path))

@@ -34,6 +34,8 @@ class = "{driver}"
 {where} = {files_here}
 """
 
+WHERE = {"nanonis": "session_dir", "asylum": "folders", "gxsm": "scan_dir", "nanosurf": "gallery_dir"}
+"""The setting that says where the controller's files are."""
 OTHER = """
 [details]
 regions = [{ center = ["0 nm", "0 nm"], size = ["400 nm", "500 nm"] }]
@@ -63,11 +65,16 @@ def run(folder: Path, command: str, *files: Path) -> tuple[subprocess.CompletedP
     return done, max((folder / "runs").glob("*-*"))
 
 
-@pytest.fixture(scope="module", params=["nanonis", "asylum", "gxsm"])
+@pytest.fixture(scope="module", params=["nanonis", "asylum", "gxsm", "gxsm-shm", "nanosurf"])
 def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path, Path]:
     """The vendor, a trace, and the file of an experiment that plays it back."""
-    vendor, folder = str(request.param), tmp_path_factory.mktemp("recorded")
-    done, ran = run(folder, "trace", FILES / "experiment.toml", FILES / f"emulated_{vendor}.toml")
+    vendor, _, transport = str(request.param).partition("-")
+    if transport and not sys.platform.startswith("linux"):
+        pytest.skip("GXSM's shared memory is there on Linux alone")
+    folder = tmp_path_factory.mktemp("recorded")
+    how = folder / "how.toml"
+    how.write_text(f'[controller]\ntransport = "{transport}"\n' if transport else "", encoding="utf-8")
+    done, ran = run(folder, "trace", FILES / "experiment.toml", FILES / f"emulated_{vendor}.toml", how)
     assert done.returncode == 0, done.stdout + done.stderr
     assert str(ran / FILE) in done.stdout
     trace = Path(shutil.move(ran / FILE, folder))
@@ -76,7 +83,7 @@ def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     start = (datetime.fromisoformat(header.began) - timedelta(minutes=10)).isoformat()
     here, files = json.dumps(str(folder / "files")), folder / "files"
     before = str(ran / "controller").replace("/", ":")  # as Igor writes folders
-    where = {"nanonis": "session_dir", "asylum": "folders", "gxsm": "scan_dir"}[vendor]
+    where = WHERE[vendor]
     there = f"{{ {json.dumps(before)} = {here} }}" if vendor == "asylum" else here
     file = folder / "replay.toml"
     file.write_text(

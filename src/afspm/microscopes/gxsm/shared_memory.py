@@ -106,7 +106,11 @@ class SharedMemoryLink:
 
     def working_folder(self) -> Path | None:
         """Return the folder in which GXSM was started."""
-        return self._process.working_folder()
+        folder = self._process.working_folder()
+        with self._trace.asking("getcwd", bridge_client.message("getcwd")) as traced:
+            traced.add(bridge_client.value_line(str(folder)))
+            traced.is_whole = True
+        return folder
 
     def close(self) -> None:
         """Let go of the block."""

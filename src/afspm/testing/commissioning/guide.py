@@ -42,6 +42,7 @@ class Guide:
 
     Attributes:
         folder: of the run, for pictures.
+        in_contact: the person has approached; the tip is withdrawn when the steps at the sample are over.
         has_panel: True of a real controller; what has none can't be compared with it.
     """
 
@@ -49,6 +50,7 @@ class Guide:
     prompts: Prompts
     folder: Path
     has_panel: bool = True
+    in_contact: bool = False
 
     def unseen(self) -> str:
         """Return the line of a step whose outcome could not be seen at the panel; Skipped if there is one."""

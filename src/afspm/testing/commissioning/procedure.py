@@ -95,7 +95,6 @@ class _Walk:
         self._guide = guide
         self._progress = progress
         self._write = write
-        self._in_contact = False
 
     def through(self) -> None:
         """Do what is left to do."""
@@ -103,14 +102,14 @@ class _Walk:
             result = self._progress.results[step.name] = self._done(step)
             self._say(step, result)
             self._write()
-            if step.contact:
+            if step.contact or result.outcome is not StepOutcome.PASSED:
                 self.withdraw()
 
     def withdraw(self) -> None:
         """Withdraw a tip that was approached for these steps."""
-        if not self._in_contact:
+        if not self._guide.in_contact:
             return
-        self._in_contact = False
+        self._guide.in_contact = False
         kit = self._guide.kit
         try:
             kit.client.come_to_rest()
@@ -137,7 +136,6 @@ class _Walk:
             return StepResult(StepOutcome.SKIPPED, str(skipped))
         except StepDeclined as declined:
             return StepResult(StepOutcome.DECLINED, str(declined))
-        self._in_contact |= step.name == "contact"
         return StepResult(StepOutcome.PASSED, line)
 
     def _come_to_rest(self) -> None:

@@ -312,6 +312,7 @@ def _contact(guide: Guide) -> str:
         )
     if not guide.prompts.confirm("Is the tip at the sample, and the feedback stable?"):
         raise StepDeclined("the tip stays withdrawn")
+    guide.in_contact = True
     expect(guide.kit.support.has(names.STOP_SCAN), "a controller whose scans can be stopped", "they can't be")
     feedback = guide.kit.client.observations.newest(Feedback)
     expect(feedback is None or feedback.on is not False, "the feedback on", "it is off")
