@@ -17,6 +17,7 @@ from afspm.translator.result_files import (
     lines_missing,
     modified_ns,
     newest,
+    read_result,
 )
 
 
