@@ -29,7 +29,7 @@ class FolderFiles(ResultFiles):
         precision: of its files.
     """
 
-    pattern: str
+    pattern: str = "*"
     precision: FilePrecision
 
     def begin(self, what: str, folder: Path, taken: PlainMapping) -> None:
@@ -54,36 +54,49 @@ class FolderFiles(ResultFiles):
         """Return the last results, oldest first."""
         self.broken_off = False
         ended, running = self._kept["ended"], self._kept["running"]
-        if ended is not None and self._take(ended) is not None:
+        if ended is not None and self._take(ended):
             self._kept["ended"] = None
-        elif running is not None and running["what"] == SCAN:  # it may go on with the next image
-            taken_ns = self._take({**running, "end_ns": now_ns})
-            running["newest_ns"] = running["newest_ns"] if taken_ns is None else taken_ns
+        elif running is not None and running["what"] == SCAN and self._take({**running, "end_ns": now_ns}):
+            self._goes_on(running)
         return self._listed()
 
     def read(self, entry: Entry) -> Content:
-        path = Path(entry["result"])
+        path = Path(entry["file"])
         if modified_ns(path) != entry["modified_ns"]:
             raise FileError("was overwritten or deleted", where=str(path))
         return self._content_of(path, entry)
 
-    def _take(self, measured: Entry) -> int | None:
-        """Take the file as a result, if it is whole, or note that it was broken off; return when it was written."""
+    # -- what a controller may have otherwise
+
+    def result_name(self, path: Path) -> str:
+        """Return the name of the result in a file."""
+        return str(path)
+
+    def check(self, path: Path, one: Scan | Spectrum, measured: Entry) -> None:
+        """Look at the first of a file that is taken."""
+
+    def _goes_on(self, running: Entry) -> None:
+        """The controller goes on with the next image."""
+        running["newest_ns"] = newest(self._files(Path(running["folder"])))[0]
+
+    def _take(self, measured: Entry) -> bool:
+        """Return True if all is known of what was measured: its file is a result, or no whole scan."""
         path = self._file(measured)
         if path is None:
-            return None
+            return False
         written_ns = modified_ns(path)
         try:
             content = self._content_of(path, measured)
         except (AfspmError, OSError):
-            return None  # not yet whole
+            return False  # not yet whole
         if modified_ns(path) != written_ns:
-            return None
+            return False
         if lines_missing(content):  # it was saved when the scan was broken off
             self.broken_off = True
-        else:
-            self._add(str(path), measured, {"modified_ns": written_ns}, content)
-        return written_ns
+            return True
+        self.check(path, content[0], measured)
+        self._add(self.result_name(path), measured, {"file": str(path), "modified_ns": written_ns}, content)
+        return True
 
     def _file(self, measured: Entry) -> Path | None:
         return newest(self._files(Path(measured["folder"])), measured["newest_ns"])[1]

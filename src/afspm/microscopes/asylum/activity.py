@@ -125,7 +125,7 @@ class Activity:
             if "led_away" in self._kept:  # it was sent somewhere
                 self._kept["led_away"] = True
             taken = {"frame": as_list(self._frame_in_force())}
-        self._files.begin(what, self._target(what), taken)
+        self._files.begin_at(what, self._target(what), taken)
 
     def saves(self, what: str) -> None:
         """Have it saved where it can be found.
