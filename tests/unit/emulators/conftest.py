@@ -2,31 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
-
 import pytest
+from fake_clock import FakeClock
 
 from afspm.emulators.rig import Rig
-
-
-class FakeClock:
-    def __init__(self, t_s: float = 1000.0) -> None:
-        self.t_s = t_s
-
-    def now_s(self) -> float:
-        return self.t_s
-
-    def now_ns(self) -> int:
-        return int(self.t_s * 1e9)
-
-    def monotonic_s(self) -> float:
-        return self.t_s
-
-    def real_s(self, experiment_s: float) -> float:
-        return experiment_s
-
-    def late(self) -> AbstractContextManager[None]:
-        return nullcontext()
 
 
 @pytest.fixture

@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from fake_clock import FakeClock
 
 from afspm import wire
 from afspm.errors import FileError, Refused
@@ -51,26 +51,6 @@ x-mode = { vendor = "Mode", type = "text", choices = ["IV", "force"] }
 x-serial = { vendor = "Serial", type = "text", read_only = true }
 tip-bias-voltage = { vendor = "Bias", unit = "mV", range = ["-10 V", "10 V"], while_busy = true }
 """
-
-
-class FakeClock:
-    def __init__(self) -> None:
-        self.t_s = 1000.0
-
-    def now_s(self) -> float:
-        return self.t_s
-
-    def now_ns(self) -> int:
-        return int(self.t_s * 1e9)
-
-    def monotonic_s(self) -> float:
-        return self.t_s
-
-    def real_s(self, experiment_s: float) -> float:
-        return experiment_s
-
-    def late(self) -> AbstractContextManager[None]:
-        return nullcontext()
 
 
 class FakePort:
