@@ -34,8 +34,7 @@ def scanned(microscope: ImageMicroscope, folder: Path, clock: Any) -> Scan:
     microscope.memory, microscope.wake = {}, lambda: None
     microscope.connect()
     microscope.start_scan()
-    assert microscope._instrument._scan is not None
-    microscope._instrument._scan.result()
+    assert microscope._instrument._drawing.wait() is not None
     clock.t_s += 1e4
     assert microscope.status().state is ScopeState.FREE
     (height,) = [scan for scan in microscope.load(microscope.results()[-1]) if getattr(scan, "channel", "") == "Height"]
