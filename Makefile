@@ -66,7 +66,7 @@ test-gateway: $(TEST)
 	@AFSPM_SCHEMATHESIS_S=240 $(BIN)/pytest tests/system/gateway
 
 ## each base operation of every translator: the simulated microscope's, the image's, and those of emulated controllers
-TRANSLATORS ?= simulator image emulated_nanonis emulated_asylum emulated_gxsm emulated_nanosurf
+TRANSLATORS ?= simulator image emulated_nanonis emulated_asylum emulated_gxsm emulated_nanosurf emulated_park
 test-translators: $(TEST)
 	@failed=; for name in $(TRANSLATORS); do \
 	  $(BIN)/afspm test-translator experiments/every_microscope/$$name.toml --frame "500 nm" --runs build/translators \

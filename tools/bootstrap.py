@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 VENV = ROOT / ".venv"
 TOOLS = ROOT / "build" / "tools"
 UV_VERSION = "uv>=0.5,<1"
-EXTRAS = ("dashboard", "features", "gateway", "messages", "nanosurf", "study", "testing", "xarray")
+EXTRAS = ("dashboard", "features", "gateway", "messages", "nanosurf", "park", "study", "testing", "xarray")
 """What the tests use; Jupyter they install where they need it."""
 APART = {"bluesky": ("--group=test", "--extra=bluesky")}
 """What has an environment of its own, build/<name>-env: too heavy for all others."""

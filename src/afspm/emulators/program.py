@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -68,12 +69,12 @@ class MakerProgram(ABC):
         """The same before a curve."""
 
     @abstractmethod
-    def scan_file(self, scan: ScanActivity, now_s: float) -> NamedFile | None:
-        """Return the file of a scan that has ended; None: it is not saved."""
+    def scan_files(self, scan: ScanActivity, now_s: float) -> Sequence[NamedFile]:
+        """Return the files of a scan that has ended; none: it is not saved."""
 
     @abstractmethod
-    def curve_file(self, curve: SpectrumActivity, now_s: float) -> NamedFile | None:
-        """Return the file of a curve that has ended; None: it is not saved."""
+    def curve_files(self, curve: SpectrumActivity, now_s: float) -> Sequence[NamedFile]:
+        """Return the files of a curve that has ended; none: it is not saved."""
 
     # -- what goes on
 
@@ -109,7 +110,7 @@ class MakerProgram(ABC):
             self._watch_scan(self._scan, now_s)
         if self._curve is not None and not self._curve.running(now_s):
             ended, self._curve = self._curve, None
-            self._save(self.curve_file(ended, now_s), now_s)
+            self._save(self.curve_files(ended, now_s), now_s)
         due_s = self._disk.advance(now_s, there=True)
         return min((at_s for at_s in (due_s, self._starts_at_s) if at_s is not None and at_s > now_s), default=None)
 
@@ -126,7 +127,7 @@ class MakerProgram(ABC):
         if ended is not None:
             self.rig.stop_scan()
             if self.saves_partial:
-                self._save(self.scan_file(ended, now_s), now_s)
+                self._save(self.scan_files(ended, now_s), now_s)
 
     def start_curve(self, kind: str, now_s: float) -> None:
         """Take a curve where the tip is. Raises RigBusy, InvalidValue."""
@@ -182,7 +183,7 @@ class MakerProgram(ABC):
     def _watch_scan(self, scan: ScanActivity, now_s: float) -> None:
         if not scan.running(now_s):
             self._scan = None
-            self._save(self.scan_file(scan, now_s), now_s)
+            self._save(self.scan_files(scan, now_s), now_s)
             if self.repeats:
                 self._starts_at_s = now_s + self._start_s
         elif self.faults.strikes("stopped", now_s):
@@ -190,11 +191,11 @@ class MakerProgram(ABC):
         elif self.faults.strikes("withdrawn", now_s):
             self.withdraw(now_s)
 
-    def _save(self, file: NamedFile | None, now_s: float) -> None:
-        if file is None or self.faults.strikes("no-file", now_s):
+    def _save(self, files: Sequence[NamedFile], now_s: float) -> None:
+        if not files or self.faults.strikes("no-file", now_s):
             return
         late, half = (self.faults.strikes(kind, now_s) for kind in ("late-file", "half-file"))
         at_s = now_s + self._file_s + (late.duration_s if late else 0.0)
         rest_at_s = at_s + self._file_s + (half.duration_s if half else 0.0)
-        name, content = file
-        self._disk.save(self.folder / name, content, at_s, rest_at_s)
+        for name, content in files:
+            self._disk.save(self.folder / name, content, at_s, rest_at_s)

@@ -13,7 +13,7 @@ PURE = (
     "afspm.components",
     "afspm.emulators",
     "afspm.scheduler",
-    *(f"afspm.microscopes.{one}" for one in ("asylum", "gxsm", "image", "nanonis", "nanosurf", "simulator")),
+    *(f"afspm.microscopes.{one}" for one in ("asylum", "gxsm", "image", "nanonis", "nanosurf", "park", "simulator")),
 )
 """Classes from here, and those derived from them, do nothing in `__init__` but to keep and to check their settings."""
 

@@ -26,12 +26,16 @@ FORMATS = {
     ".gsf": "gsf:read_field",
     ".nhf": "nanosurf_hdf5:read_nhf",
     ".nid": "nanosurf_nid:read_nid",
+    ".tif": "park:read_tiff",
+    ".tiff": "park:read_tiff",
 }
 
 
 def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
-    """The scans and spectra of a file: Asylum (.ibw, NSID .h5), Nanonis (.sxm, .dat), GXSM (.nc, .vpdata), Nanosurf
-    (.nhf, .nid), Gwyddion's simple fields (.gsf) and those of the simulated microscope (.nc). Of channels of one name,
+    """The scans and spectra of a file.
+
+    Asylum (.ibw, NSID .h5), Nanonis (.sxm, .dat), GXSM (.nc, .vpdata), Nanosurf (.nhf, .nid), Park (images in .tiff),
+    Gwyddion's simple fields (.gsf) and those of the simulated microscope (.nc). Of channels of one name,
     the second is "name #2".
 
     Args:

@@ -22,12 +22,14 @@ HEIGHTS = {
     "asylum": "HeightTrace",
     "gxsm": "ZS-Topo",
     "nanosurf": "Height Forward",
+    "park": "Height Forward",
 }
 ADDRESSES = {
     "nanonis": "127.0.0.1:{port}",
     "asylum": "tcp://127.0.0.1:{port}",
     "gxsm": "127.0.0.1:{port}",
     "nanosurf": "127.0.0.1:{port}",
+    "park": "tcp://127.0.0.1:{port}",
 }
 NOISE_M = 0.8e-9
 """The rms between two scans of the same place whose lines are not taken at the same moments."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -179,19 +179,19 @@ class StudioProgram(MakerProgram):
             self.rig.setup.feedback, setpoint=self.values[SETPOINT], integral_gain=gain, on=True
         )
 
-    def scan_file(self, scan: ScanActivity, now_s: float) -> NamedFile | None:
-        return self._file(lambda: files.image(scan, now_s, self.values["mode.name"]), now_s)
+    def scan_files(self, scan: ScanActivity, now_s: float) -> Sequence[NamedFile]:
+        return self._files(lambda: files.image(scan, now_s, self.values["mode.name"]), now_s)
 
-    def curve_file(self, curve: SpectrumActivity, now_s: float) -> NamedFile | None:
-        return self._file(lambda: files.curve(curve, now_s, self.values["mode.name"]), now_s)
+    def curve_files(self, curve: SpectrumActivity, now_s: float) -> Sequence[NamedFile]:
+        return self._files(lambda: files.curve(curve, now_s, self.values["mode.name"]), now_s)
 
-    def _file(self, made: Callable[[], bytes], now_s: float) -> NamedFile | None:
+    def _files(self, made: Callable[[], bytes], now_s: float) -> Sequence[NamedFile]:
         values = self.values
         if not values["data.storage.nhf_backend_enabled"] or values["data.storage.nhf_auto_store_mode"] == 0:
-            return None
+            return []
         while (self.folder / (name := self._next_name(now_s))).exists():
             pass
-        return name, made()
+        return [(name, made())]
 
     def _next_name(self, now_s: float) -> str:
         """Return the name of the next file, and count on; a file never leaves its folder."""

@@ -1,0 +1,113 @@
+"""Scripts of JavaScript, each in an engine of its own, that wait for the instrument without holding anything else up.
+
+An engine can't be left in the middle of a script, so each has a thread; what a script asks of the instrument is done by
+the emulator's own thread, which takes turns with it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import Thread
+from typing import Any, Final
+
+from afspm.emulators.scripted import ScriptFailed
+from afspm.errors import AfspmError
+
+LONGEST_S: Final = 5.0
+"""Real seconds of computing after which a script is given up."""
+_MEMORY: Final = 64 << 20
+_PRELUDE: Final = Path(__file__).with_name("prelude.js")
+_END: Final = json.dumps({"error": "the script was ended"})
+
+
+@dataclass(frozen=True)
+class Wait:
+    """What a method returns that takes its time: the script waits until `waiting` is false."""
+
+    waiting: Callable[[], bool]
+
+
+Ask = Callable[[str, str, list[Any]], Any]
+"""Does what a script asks for: "get", "set" or "call", a path below `spm`, and what is given. Raises AfspmError."""
+
+
+class Script:
+    """A script that runs.
+
+    Args:
+        names: the "values" and "methods" of `spm`.
+    """
+
+    def __init__(self, source: str, names: str, ask: Ask) -> None:
+        self._ask = ask
+        self._asks: SimpleQueue[tuple[str, str]] = SimpleQueue()
+        self._answers: SimpleQueue[str] = SimpleQueue()
+        self._wait: Wait | None = None
+        self._ended = False
+        Thread(target=self._work, args=(source, names), name="emulated script", daemon=True).start()
+
+    def step(self) -> tuple[Any, str] | None:
+        """Run on; return its value as it is and as text, or None while it waits. Raises ScriptFailed."""
+        if self._wait is not None:
+            if self._wait.waiting():
+                return None
+            self._wait = None
+            self._answers.put(json.dumps({"value": None}))
+        while True:
+            try:
+                kind, content = self._asks.get(timeout=LONGEST_S)
+            except Empty:
+                self.end()
+                raise ScriptFailed("the script does not come to an end") from None
+            if kind == "failed":
+                raise ScriptFailed(content)
+            if kind == "done":
+                value, text = json.loads(content)
+                return value, text
+            if not self._answered(content):
+                return None
+
+    def end(self) -> None:
+        """Run it no further: whatever it asks for fails."""
+        self._ended, self._wait = True, None
+        self._answers.put(_END)
+
+    def _answered(self, content: str) -> bool:
+        """Do what was asked for; return False if the script waits for it."""
+        try:
+            value = self._ask(*json.loads(content))
+        except (AfspmError, ArithmeticError, TypeError, ValueError) as error:
+            self._answers.put(json.dumps({"error": str(error)}))
+            return True
+        if isinstance(value, Wait) and value.waiting():
+            self._wait = value
+            return False
+        self._answers.put(json.dumps({"value": None if isinstance(value, Wait) else value}))
+        return True
+
+    # -- in the script's thread
+
+    def _work(self, source: str, names: str) -> None:
+        import quickjs
+
+        try:
+            context = quickjs.Context()
+            context.set_memory_limit(_MEMORY)
+            context.set("__names", names)
+            context.add_callable("__ask", self._asked)
+            context.eval(_PRELUDE.read_text(encoding="utf-8"))
+            context.set("__source", source)
+            self._asks.put(("done", context.eval("__run(__source)")))
+        except (quickjs.JSException, quickjs.StackOverflow, MemoryError, UnicodeError, ValueError) as error:
+            self._asks.put(("failed", str(error).partition("\n")[0]))
+
+    def _asked(self, content: str) -> str:
+        """Never raises: the engine would not survive it."""
+        if self._ended:
+            return _END
+        self._asks.put(("ask", content))
+        return self._answers.get()

@@ -1,0 +1,171 @@
+"""Park, over SmartScan's SmartRemote. See the README beside this."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from afspm.errors import ConfigError, Refused
+from afspm.microscopes.park.activity import STOP, Activity
+from afspm.microscopes.park.link import Link, SmartScanError
+from afspm.microscopes.park.result_files import SETTLE_S, ParkFiles
+from afspm.microscopes.park.session import FALSE, TRUE, LongCall, Session
+from afspm.microscopes.park.settings import MICROMETRE, FrameSettings, TipPlace
+from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.translator.driver import ControllerLost, Driver, action
+from afspm.translator.parameters import Value
+from afspm.translator.setting_groups import FRAME, POSITION, frame
+from afspm.units import Duration, Length
+
+_SCANNING: Final = TRUE | {"scanning", "running"}
+_IDLE: Final = FALSE | {"idle", "ready", "done", "stopped"}
+_FOLDER: Final = "dataLocation.baseDir"
+
+
+class Park(Driver):
+    """The microscope behind SmartScan.
+
+    Args:
+        address: of SmartRemote, e.g. "tcp://192.168.0.10:5581".
+        data_dir: where SmartScan's base folder of data is seen from here; left out: SmartScan runs on this computer.
+        lift: how far the stage moves away from the sample after the scanner has, to withdraw the tip.
+        scanning_words, idle_words: further words by which SmartScan says whether it scans.
+        reply_timeout_s: how long a reply may take, in real time.
+        poll_period_s, common: as for every microscope.
+    """
+
+    parameters_file = Path(__file__).with_name("parameters.toml")
+    translated = (*FrameSettings.names, *POSITION, names.CONTROLLER)
+    maker: ClassVar[str] = "Park Systems"
+    software: ClassVar[str] = "SmartScan"
+    max_pixels: ClassVar[int] = 8192 * 8192
+    program_s: ClassVar[float] = 2.0 + SETTLE_S
+
+    def __init__(
+        self,
+        *,
+        address: str = "tcp://127.0.0.1:5581",
+        data_dir: str | None = None,
+        lift: Length = 100e-6,
+        scanning_words: Sequence[str] = (),
+        idle_words: Sequence[str] = (),
+        reply_timeout_s: Duration = 5.0,
+        poll_period_s: Duration = 0.25,
+        **common: Any,
+    ) -> None:
+        super().__init__(poll_period_s=poll_period_s, **common)
+        if lift < 0.0:
+            raise ConfigError(f"{lift} m would move the tip to the sample", where="lift", hint="0 or more")
+        self.controller_at = address
+        self._data_dir, self._lift_m, self._reply_timeout_s = data_dir, lift, reply_timeout_s
+        self._scanning = _SCANNING | {word.casefold() for word in scanning_words}
+        self._idle = _IDLE | {word.casefold() for word in idle_words}
+        both = self._scanning & self._idle
+        if both:
+            raise ConfigError(f"{', '.join(sorted(both))} would mean both", where="idle_words", hint="take one away")
+        self._session: Session | None = None
+        self._activity: Activity | None = None
+        self._place = TipPlace(self._smartscan, self._begun)
+        self.groups = (FrameSettings(self._smartscan), self._place)
+
+    @classmethod
+    def technique(cls, settings: Mapping[str, Any]) -> str:
+        return "AFM"
+
+    def connect(self) -> None:
+        self.close()
+        session = self._session = Session(self._open_link, self._scanning, self._idle)
+        self.prove()
+        self._place.kept_in(self.memory)
+        folder = self._folder()
+        if not folder.is_dir():
+            told = f"SmartScan's folder of data {folder} does not exist on this computer"
+            raise ConfigError(told, where="data_dir", hint='data_dir = "/where/it/is/mounted"')
+        self._files = ParkFiles(self.memory, self.log, self.clock.monotonic_s)
+        self._activity = Activity(session, self._files, self._folder, self._frame_in_force, self.clock, self.log)
+
+    def close(self) -> None:
+        if self._activity is not None:
+            self._activity.close()
+            self._activity = None
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    def status(self) -> ScopeStatus:
+        return self._doing.status()
+
+    def get(self, vendor: str) -> Value:
+        return "SmartScan" if vendor == names.CONTROLLER else self._smartscan().values([vendor])[vendor]
+
+    def set(self, values: Mapping[str, Value]) -> None:
+        self._smartscan().put(values)
+
+    def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
+        """Return values of the table, all by one question."""
+        rows = [self.table[name] for name in wanted if name != names.CONTROLLER]
+        values = self._smartscan().values([row.vendor for row in rows]) if rows else {}
+        found = {row.name: row.from_vendor(values[row.vendor]) for row in rows}
+        return found | super().read_rows([name for name in wanted if name not in found])
+
+    def results(self) -> Sequence[str]:
+        return self._files.results(self.clock.now_ns())
+
+    def load(self, result: str) -> Sequence[Scan | Spectrum]:
+        return self._files.load(result)
+
+    # --- actions ---
+
+    @action(names.START_SCAN)
+    def start_scan(self) -> None:
+        """Scan the frame once."""
+        self._doing.start_scan()
+
+    @action(names.STOP_SCAN)
+    def stop_scan(self) -> None:
+        self._smartscan().do(STOP)
+        self._doing.stopped()
+
+    @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
+    def retract(self) -> None:
+        """Withdraw the tip, whatever is going on: the scanner, and then the stage by `lift`."""
+        self._doing.withdraw(self._lift_m / MICROMETRE)
+
+    @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
+    def engage(self) -> None:
+        """Bring the tip to the sample: SmartScan's quick and safe approach."""
+        self._doing.approach()
+
+    def command(self, text: str) -> None:
+        """Evaluate an expression, e.g. `spm.ncm.sweepAutoFullRange()`."""
+        try:
+            self._smartscan().run(f"({text}, 0)")
+        except SmartScanError as error:
+            raise Refused(ControlResponse.ACTION_ERROR, f"SmartScan: {error}") from error
+
+    # --- inside ---
+
+    def _open_link(self) -> Link:
+        return Link(self.controller_at, self._reply_timeout_s, self.clock.monotonic_s)
+
+    def _smartscan(self) -> Session:
+        if self._session is None:
+            raise ControllerLost("SmartScan is not connected", where=self.controller_at)
+        return self._session
+
+    @property
+    def _doing(self) -> Activity:
+        if self._activity is None:
+            raise ControllerLost("SmartScan is not connected", where=self.controller_at)
+        return self._activity
+
+    def _begun(self, call: LongCall) -> None:
+        self._doing.begun(call)
+
+    def _frame_in_force(self) -> Region:
+        return frame(self.in_force(FRAME))[0]
+
+    def _folder(self) -> Path:
+        """The folder of SmartScan's files, as seen from here."""
+        return Path(self._data_dir or str(self._smartscan().values([_FOLDER])[_FOLDER]))

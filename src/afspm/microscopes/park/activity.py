@@ -1,0 +1,127 @@
+"""The state of SmartScan, and what is awaited of it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from afspm.clock import Clock
+from afspm.errors import Refused
+from afspm.microscopes.park.link import SmartScanError
+from afspm.microscopes.park.result_files import ParkFiles
+from afspm.microscopes.park.session import LongCall, Session
+from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
+from afspm.translator.result_files import SCAN, as_list
+
+START, STOP = "scan.triggerImageScan()", "scan.stop()"
+APPROACH: Final = '(spm.approach.start("q+s"), 0)'
+_ENDED_FIRST: Final = ("scan.stop", "approach.stop")
+_SETTLES_S: Final = 2.0
+"""So long, in real time, a scan that was begun may take to be seen running."""
+MOVE: Final = "move"
+
+
+class Activity:
+    """The scan or move that runs, begun by a request or at SmartScan's panel.
+
+    Args:
+        folder: gives the folder of SmartScan's files as seen from here.
+        frame_in_force: as it was set.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        files: ParkFiles,
+        folder: Callable[[], Path],
+        frame_in_force: Callable[[], Region],
+        clock: Clock,
+        log: logging.Logger,
+    ) -> None:
+        self._session, self._files = session, files
+        self._folder, self._frame_in_force = folder, frame_in_force
+        self._clock, self._log = clock, log
+        self._call: LongCall | None = None
+        self._stopping = self._failed = False
+
+    def status(self) -> ScopeStatus:
+        """Return what it is doing now; what has ended is awaited from here on."""
+        scanning = self._session.scanning()
+        self._stopping = self._stopping and scanning
+        call = self._watched_call()
+        if self._files.what and not scanning:
+            self._files.end(self._clock.now_ns())
+        if scanning and not self._stopping and not self._files.what:
+            self._begin_scan()  # at the panel
+        if scanning:
+            return ScopeStatus(ScopeState.SCANNING)
+        if call is not None:
+            return ScopeStatus(ScopeState.MOVING if call.what == MOVE else ScopeState.COARSE_MOTOR)
+        failed, self._failed = self._failed, False
+        return ScopeStatus(ScopeState.INTERRUPTED if failed or self._files.broken_off else ScopeState.FREE)
+
+    def start_scan(self) -> None:
+        """Scan the frame. Raises Refused: SmartScan does not."""
+        self._stopping = False
+        self._begin_scan()
+        try:
+            self._session.do(START)
+            self._settle()
+        except Refused:
+            self._files.forget()
+            raise
+
+    def approach(self) -> None:
+        """Bring the tip to the sample."""
+        self.begun(self._session.begin("approach", APPROACH))
+
+    def withdraw(self, lift_um: float) -> None:
+        """Take the tip away, whatever is going on: the scanner first, and then the stage."""
+        self.stopped()
+        self.close()
+        ended = " ".join(f"try {{ spm.{one}(); }} catch (ignored) {{}}" for one in _ENDED_FIRST)
+        away = f"spm.zscanner.retractAll(); if ({lift_um!r} > 0) {{ spm.zstage.move({lift_um!r}, 1); }}"
+        self.begun(self._session.begin("withdrawal", f"(function() {{ {ended} {away} return 0; }})()"))
+
+    def begun(self, call: LongCall) -> None:
+        """Watch a script that takes long, instead of the one before."""
+        self.close()
+        self._call = call
+
+    def stopped(self) -> None:
+        """Note that what is running was told to stop: nothing comes of it."""
+        self._stopping = True
+        self._files.forget()
+
+    def close(self) -> None:
+        """Wait no longer for what takes long."""
+        if self._call is not None:
+            self._call.close()
+            self._call = None
+
+    # --- inside ---
+
+    def _begin_scan(self) -> None:
+        self._files.begin(SCAN, self._folder(), {"frame": as_list(self._frame_in_force())})
+
+    def _settle(self) -> None:
+        """Wait until a scan is seen running, or has ended already. Raises Refused."""
+        until_s = self._clock.monotonic_s() + _SETTLES_S
+        while self._clock.monotonic_s() < until_s:
+            if self._session.scanning() or self._files.has_file():
+                return
+        raise Refused(ControlResponse.ACTION_ERROR, "SmartScan did not begin the scan that it was asked for")
+
+    def _watched_call(self) -> LongCall | None:
+        """Return the script that takes long, while it does. Raises ControllerLost."""
+        call = self._call
+        try:
+            if call is not None and not call.running():
+                self.close()
+        except SmartScanError as error:
+            self._log.error("the %s failed: %s", call.what if call else "", error)
+            self._failed = True
+            self.close()
+        return self._call

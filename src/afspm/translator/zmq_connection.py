@@ -1,0 +1,134 @@
+"""A ZeroMQ connection to a controller that answers one request after the other, and never speaks unasked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final, TypeVar
+
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from afspm.errors import ConfigError
+from afspm.translator.driver import ControllerLost
+from afspm.translator.trace import TRACE, ZEROMQ, TracedAnswer
+
+T = TypeVar("T")
+
+_NEVER: Final = -1
+_OUTCOMES: Final = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_CLOSED | zmq.EVENT_DISCONNECTED
+
+
+class ZmqConnection:
+    """A connection. For one thread.
+
+    A DEALER, since a REQ socket is of no use any more after one lost reply. Whatever goes wrong, it is closed: a late
+    reply must never be taken for that to the next request. It never connects a second time: there may be somebody else
+    by then.
+
+    Args:
+        address: e.g. "tcp://127.0.0.1:5555".
+        timeout_s: how long a reply may take, in real time.
+        monotonic_s: real time.
+        hints: what to look at where the address is none, where nobody listens, and where no reply comes.
+
+    Raises:
+        ControllerLost: nobody listens there. ConfigError: it is no address.
+    """
+
+    def __init__(
+        self, address: str, timeout_s: float, monotonic_s: Callable[[], float], hints: tuple[str, str, str]
+    ) -> None:
+        self._address, self._timeout_s, self._monotonic_s, self._hints = address, timeout_s, monotonic_s, hints
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket: zmq.Socket[bytes] = self._context.socket(zmq.DEALER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        # nothing waits for a peer that is not there, and is then done when nobody expects it any more
+        self._socket.setsockopt(zmq.IMMEDIATE, 1)
+        self._socket.setsockopt(zmq.RECONNECT_IVL, _NEVER)
+        self._socket.setsockopt(zmq.SNDTIMEO, max(1, round(timeout_s * 1000)))
+        try:
+            self._socket.connect(address)
+        except zmq.ZMQError as error:
+            self.close()
+            raise ConfigError(f"{address!r} is not an address: {error}", where="address", hint=hints[0]) from error
+        self._await_connection()
+        self._trace = TRACE.connection(ZEROMQ)
+
+    def ask(self, what: str, message: bytes, parse: Callable[[bytes], T | None]) -> T:
+        """Send a request, and return what `parse` makes of the reply; None: it is a reply to something else.
+
+        Raises:
+            ControllerLost: no reply, or none to be trusted, as `parse` may say, too.
+        """
+        try:
+            with self._trace.asking(what, message) as traced:
+                until_s = self._monotonic_s() + self._timeout_s
+                self._send(what, message)
+                while True:
+                    self._await_reply(what, until_s)
+                    found = parse(self._taken(traced))
+                    if found is not None:
+                        return found
+        except ControllerLost:
+            self.close()
+            raise
+        except zmq.ZMQError as error:
+            raise self._lost(what, error) from error
+
+    def begin(self, what: str, message: bytes) -> None:
+        """Send a request whose reply takes its time: see `reply`. Raises ControllerLost."""
+        self._trace.asked(what, message)
+        try:
+            with self._trace.failing():
+                self._send(what, message)
+        except zmq.ZMQError as error:
+            raise self._lost(what, error) from error
+
+    def reply(self, what: str) -> bytes | None:
+        """Return the reply to what was begun, or None while there is none. Raises ControllerLost."""
+        try:
+            if not self._socket.poll(0):
+                return None
+            with self._trace.answering() as traced:
+                return self._taken(traced)
+        except zmq.ZMQError as error:
+            raise self._lost(what, error) from error
+
+    def close(self) -> None:
+        """Let go of it."""
+        self._context.destroy(linger=0)
+
+    def _await_connection(self) -> None:
+        """Return once the connection stands. Raises ControllerLost."""
+        monitor = self._socket.get_monitor_socket(_OUTCOMES)
+        came = monitor.poll(max(1, round(self._timeout_s * 1000)))
+        stands = bool(came) and recv_monitor_message(monitor)["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED
+        self._socket.disable_monitor()
+        if not stands:
+            self.close()
+            raise ControllerLost("nothing listens at this address", where=self._address, hint=self._hints[1])
+
+    def _send(self, what: str, message: bytes) -> None:
+        try:
+            self._socket.send_multipart([b"", message])
+        except zmq.Again as error:
+            raise ControllerLost(f"the connection was lost before {what}", where=self._address) from error
+
+    def _await_reply(self, what: str, until_s: float) -> None:
+        left_s = until_s - self._monotonic_s()
+        if left_s <= 0.0 or not self._socket.poll(math.ceil(left_s * 1000.0)):
+            told = f"no reply to {what} within {self._timeout_s:g} s"
+            raise ControllerLost(told, where=self._address, hint=self._hints[2])
+
+    def _taken(self, traced: TracedAnswer) -> bytes:
+        frames = self._socket.recv_multipart()
+        if len(frames) != 2 or frames[0]:
+            raise ControllerLost(f"the controller sent a reply of {len(frames)} frames", where=self._address)
+        traced.add(frames[1])
+        traced.is_whole = True
+        return frames[1]
+
+    def _lost(self, what: str, error: zmq.ZMQError) -> ControllerLost:
+        self.close()
+        return ControllerLost(f"the connection was lost at {what}: {error}", where=self._address)

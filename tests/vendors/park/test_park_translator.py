@@ -1,0 +1,180 @@
+"""The Park translator against an emulated SmartScan: what is asked happens, where it should, and is published."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from park_bench import Bench
+from vendor_bench import FLAT, SOON, TURNED, moved, ready, scanned, scans, small, states
+
+from afspm.exit_codes import ExitCode
+from afspm.model import ControlResponse, Region, Scan, ScopeState, names
+
+Make = Callable[..., Bench]
+Settings = dict[str, Any]
+FREE, UNDEFINED = ScopeState.FREE, ScopeState.UNDEFINED
+VARIANTS: list[Settings] = [
+    {"errors": errors, "values": values, "replies": replies, "scan_words": words}
+    for errors, values, replies, words in (
+        ("rpc", "text", "at-end", ("true", "false")),
+        ("result", "native", "at-once", ("Scanning", "Idle")),
+        ("value", "text", "at-once", ("1", "0")),
+        ("result", "text", "at-end", ("running", "stopped")),
+    )
+]
+
+
+def test_a_scan_shows_the_sample_as_it_lies(bench: Make) -> None:
+    made = bench(tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
+    peer = made.start()
+    region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
+    ready(peer, region, (48, 32))
+    found = scanned(peer)
+    x, y = region.pixels_m((48, 32))
+    truth = made.emulator.rig.world.sample.surface_m(x, y)
+
+    def likeness(values: np.ndarray) -> float:
+        return float(np.corrcoef(values.ravel(), truth.ravel())[0, 1])
+
+    assert {"Height Forward", "Height Backward"} <= set(found)
+    for channel in ("Height Forward", "Height Backward"):
+        scan = found[channel]
+        assert scan.region == region
+        assert likeness(scan.values) > 0.95
+        for mirrored in (scan.values[::-1], scan.values[:, ::-1], scan.values[::-1, ::-1]):
+            assert likeness(mirrored) < likeness(scan.values) - 0.1
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_whatever_smartscan_turns_out_to_say_the_tip_is_moved_scanned_with_and_withdrawn(
+    bench: Make, variant: Settings
+) -> None:
+    made = bench(**variant)
+    peer = made.start()
+    ready(peer)
+    moved(peer, 120e-9, -40e-9)
+    assert made.emulator.rig.probe_m == pytest.approx((120e-9, -40e-9))
+    assert scanned(peer)
+    for action, engaged in ((names.RETRACT, False), (names.ENGAGE, True)):
+        assert peer.act(action).ok
+        assert states(peer.until(FREE)) == ["COARSE_MOTOR", "FREE"]
+        assert made.emulator.rig.engaged is engaged
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_what_smartscan_refuses_is_refused_with_its_own_words(bench: Make, variant: Settings) -> None:
+    made = bench(**variant)
+    peer = small(made)
+    made.at_panel(lambda emulator: emulator.program.start_scan(made.clock.now_s()))
+    peer.until(ScopeState.SCANNING)
+    peer.until(FREE)
+    made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4))
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "busy with a calibration" in response.reason
+
+
+def test_one_scan_after_the_other_each_its_own(bench: Make) -> None:
+    peer = small(bench())
+    files = [scanned(peer)["Height Forward"].filename.rpartition("SIMULATED")[2] for _ in range(3)]
+    assert files == [f"_{number:04d}_Height_Forward.tiff" for number in (1, 2, 3)]
+
+
+def test_a_scan_that_is_stopped_gives_none(bench: Make) -> None:
+    peer = bench(speed=10.0).start()
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    assert states(peer.until(ScopeState.SCANNING)) == ["SCANNING"]
+    assert peer.act(names.STOP_SCAN).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"]
+    assert not any(isinstance(one, Scan) for one in heard)
+
+
+def test_a_scan_that_begins_at_the_panel_is_published(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = made.start()
+    ready(peer, shape=(32, 32))
+    made.at_panel(lambda emulator: emulator.program.start_scan(made.clock.now_s()))
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "FREE"]
+    assert {scan.region for scan in scans(heard)} == {TURNED}
+
+
+def test_withdrawing_ends_a_scan_and_lifts_the_stage(bench: Make) -> None:
+    made = bench(speed=10.0)
+    peer = made.start(lift="250 um")
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    assert peer.act(names.RETRACT).ok
+    peer.until(FREE)
+    assert not made.emulator.rig.engaged
+    assert made.emulator.program.stage_um[2] == 250.0  # type: ignore[attr-defined]
+
+
+def test_the_tip_is_withdrawn_when_the_translator_ends(bench: Make) -> None:
+    made = bench()
+    small(made, retracts=True)
+    assert made.stop() == ExitCode.OK
+    assert not made.emulator.rig.engaged
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        ("no-reply", "no reply to"),
+        ("late-reply", "no reply to"),
+        ("half-reply", "a reply that is not JSON"),
+        ("garbage", "a reply that is not JSON"),
+        ("nan", "SmartScan replied"),
+        ("dialog", "a dialog may wait on its screen"),
+    ],
+)
+def test_a_bad_reply_has_a_name_and_smartscan_is_found_again(bench: Make, kind: str, told: str) -> None:
+    made = bench()
+    peer = small(made, **SOON)
+    made.strike(kind, duration_s=500.0)
+    peer.until(UNDEFINED)
+    peer.until(FREE)
+    made.until_said(told)
+    response = peer.act_once_free(names.START_SCAN)
+    assert response.ok, response.reason
+    assert scans(peer.until(FREE))
+
+
+def test_a_word_that_is_not_known_is_named_and_not_guessed_at(bench: Make) -> None:
+    made = bench(scan_words=("true", "schläft"))
+    with pytest.raises(AssertionError):
+        small(made, **SOON)
+    made.until_said("replied 'schläft' to scan_query")
+
+
+def test_a_word_can_be_taught(bench: Make) -> None:
+    peer = bench(scan_words=("misst", "ruht")).start(scanning_words=["misst"], idle_words=["Ruht"])
+    ready(peer)
+    assert scanned(peer)
+
+
+@pytest.mark.parametrize(("kind", "state"), [("late-file", "FREE"), ("half-file", "FREE")])
+def test_a_file_that_is_late_is_waited_for(bench: Make, kind: str, state: str) -> None:
+    made = bench()
+    peer = small(made)
+    made.strike(kind, duration_s=300.0)
+    assert peer.act(names.START_SCAN).ok
+    heard = peer.until(FREE)
+    assert scans(heard)
+    assert states(heard)[-1] == state
+
+
+def test_a_scan_that_does_not_begin_is_refused(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    made.strike("scan-refused")
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "did not begin the scan" in response.reason

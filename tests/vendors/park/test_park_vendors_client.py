@@ -1,0 +1,93 @@
+"""The maker's own client (smartremote), unmodified, drives the emulated SmartScan."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from park_bench import Emulated
+
+Run = Callable[[str, str], dict[str, object]]
+BEGINS = """
+import json, sys
+from SmartRemote import SmartRemote
+SmartRemote.address = sys.argv[1]
+remote = SmartRemote()
+"""
+DEADLINE_S = 60.0
+
+
+@pytest.fixture
+def client() -> Run:
+    """Run a script with the client in a process of its own."""
+    if importlib.util.find_spec("SmartRemote") is None:
+        pytest.skip("smartremote is not installed")
+
+    def run(address: str, script: str) -> dict[str, object]:
+        done = subprocess.run(
+            [sys.executable, "-c", BEGINS + script, address], capture_output=True, encoding="utf-8", timeout=DEADLINE_S
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        found = json.loads(done.stdout.splitlines()[-1])
+        assert isinstance(found, dict)
+        return found
+
+    return run
+
+
+def test_its_queries_are_answered(tmp_path: Path, client: Run) -> None:
+    with Emulated(seed=2).running(tmp_path / "data") as address:
+        told = client(
+            address,
+            """
+print(json.dumps({
+    "connected": remote.check_connection(), "runs": remote.check_status(), "scans": remote.query_scan_status(),
+    "stage": remote.query_stage_pos(), "frame": remote.query_geometry(),
+}))
+""",
+        )
+    frame = {"pixelHeight": 128, "pixelWidth": 128, "width": 1.0, "height": 1.0, "offsetX": 0.0, "offsetY": 0.0}
+    assert told == {
+        "connected": "true",
+        "runs": "false",
+        "scans": "false",
+        "stage": {"x": 0.0, "y": 0.0, "z": 0.0},
+        "frame": {**frame, "rotation": 0.0},
+    }
+
+
+@pytest.mark.parametrize("replies", ["at-end", "at-once"])
+def test_it_approaches_scans_and_withdraws(tmp_path: Path, client: Run, replies: str) -> None:
+    made = Emulated(seed=2, start_s=0.01, file_s=0.01, replies=replies)
+    with made.running(tmp_path / "data") as address:
+        told = client(
+            address,
+            """
+frame = {"pixelHeight": 12, "pixelWidth": 24, "width": 0.2, "height": 0.1, "offsetX": 0.3, "offsetY": -0.1}
+remote.run(f"spm.scan.setScanGeometry({json.dumps({**frame, 'rotation': 30})})")
+remote.run("spm.scan.rate = 60")
+remote.run("spm.approach.start('q+s')")
+remote.run("spm.scan.startImageScan()")
+ended = remote.query_scan_status()
+remote.run("spm.zscanner.retractAll()")
+script = "var xy = spm.xystage.pos\\nvar told = xy.x + ',' + xy.y\\ntold;"
+print(json.dumps({"value": remote.run(script)["value"], "ended": ended, "frame": remote.query_geometry()}))
+""",
+        )
+        assert not made.rig.engaged
+    assert (told["value"], told["ended"]) == ("0,0", "false")
+    scan = made.rig.scan
+    assert scan is not None
+    assert (scan.shape, scan.region.size_m) == ((12, 24), pytest.approx((2e-7, 1e-7)))
+    assert scan.region.center_m == pytest.approx((3e-7, -1e-7))
+
+
+def test_what_is_computed_needs_no_instrument(tmp_path: Path, client: Run) -> None:
+    with Emulated(seed=2, values="native").running(tmp_path / "data") as address:
+        told = client(address, """print(json.dumps({"sum": remote.run("[1, 2, 3].map(x => x * x)")["value"]}))""")
+    assert told == {"sum": [1, 4, 9]}
