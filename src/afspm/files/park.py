@@ -24,6 +24,7 @@ VERSIONS: Final = {0x1000001: 356, 0x1000002: 580}
 """The shortest header of each version."""
 MAGIC_TAG, VERSION_TAG, DATA_TAG, HEADER_TAG = 50432, 50433, 50434, 50435
 DATE_TAG: Final = 306
+_STRIPS, _STRIP_SIZES = 273, 279
 IMAGE: Final = 0
 MICROMETRE: Final = 1e-6
 _DATE: Final = "%Y:%m:%d %H:%M:%S"
@@ -90,9 +91,13 @@ def _tags(path: Path) -> dict[int, Any]:
         with Image.open(path, formats=("TIFF",)) as image:
             if not isinstance(image, TiffImagePlugin.TiffImageFile):
                 raise FileError("is not a TIFF")
-            return dict(image.tag_v2)
+            tags = dict(image.tag_v2)
     except UnidentifiedImageError as error:
         raise FileError("is not a TIFF") from error
+    ends = [at + size for at, size in zip(tags.get(_STRIPS, ()), tags.get(_STRIP_SIZES, ()), strict=True)]
+    if max(ends, default=0) > path.stat().st_size:
+        raise FileError("ends within the picture")
+    return tags
 
 
 def _numbers(header: np.void, data: bytes, *, newer: bool) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -70,7 +70,7 @@ def test_a_crash_on_the_command_line_ends_with_1(tmp_path: Path) -> None:
         assert process.wait(DEADLINE_S) == 1
 
 
-@pytest.mark.parametrize("vendor", ["nanonis", "asylum", "gxsm", "nanosurf"])
+@pytest.mark.parametrize("vendor", ["nanonis", "asylum", "gxsm", "nanosurf", "park"])
 def test_a_port_that_is_taken_is_told_in_one_sentence(vendor: str, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from park_bench import Bench
-from vendor_bench import FLAT, SOON, TURNED, moved, ready, scanned, scans, small, states
+from vendor_bench import FLAT, SOON, TURNED, left_in_danger, moved, ready, scanned, scans, small, states
 
-from afspm.exit_codes import ExitCode
 from afspm.model import ControlResponse, Region, Scan, ScopeState, names
 
 Make = Callable[..., Bench]
@@ -69,9 +68,6 @@ def test_whatever_smartscan_turns_out_to_say_the_tip_is_moved_scanned_with_and_w
 def test_what_smartscan_refuses_is_refused_with_its_own_words(bench: Make, variant: Settings) -> None:
     made = bench(**variant)
     peer = small(made)
-    made.at_panel(lambda emulator: emulator.program.start_scan(made.clock.now_s()))
-    peer.until(ScopeState.SCANNING)
-    peer.until(FREE)
     made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4))
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.ACTION_ERROR
@@ -107,20 +103,20 @@ def test_a_scan_that_begins_at_the_panel_is_published(bench: Make) -> None:
 
 def test_withdrawing_ends_a_scan_and_lifts_the_stage(bench: Make) -> None:
     made = bench(speed=10.0)
-    peer = made.start(lift="250 um")
+    peer = made.start(lift=250e-6)
     ready(peer, shape=(64, 32))
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     assert peer.act(names.RETRACT).ok
     peer.until(FREE)
     assert not made.emulator.rig.engaged
-    assert made.emulator.program.stage_um[2] == 250.0  # type: ignore[attr-defined]
+    assert made.emulator.program.stage_um[2] == pytest.approx(250.0)  # type: ignore[attr-defined]
 
 
-def test_the_tip_is_withdrawn_when_the_translator_ends(bench: Make) -> None:
-    made = bench()
-    small(made, retracts=True)
-    assert made.stop() == ExitCode.OK
+@pytest.mark.parametrize("scanning", [True, False])
+def test_the_tip_is_withdrawn_when_the_run_ends(bench: Make, scanning: bool) -> None:
+    made = bench(speed=10.0)
+    left_in_danger(made, scanning=scanning, retracts=True)
     assert not made.emulator.rig.engaged
 
 
