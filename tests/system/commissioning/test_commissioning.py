@@ -14,7 +14,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from systems import PATIENCE, freeze, not_on_wine
+from systems import PATIENCE, can_interrupt, freeze, interrupt, not_on_wine
 
 from afspm.testing.commissioning.procedure import CommissioningResult, commission
 from afspm.testing.commissioning.progress import StepOutcome
@@ -243,3 +243,26 @@ def test_the_end_of_the_answers_ends_it_safely(tmp_path: Path) -> None:
     )
     assert done.returncode == 130, done.stdout + done.stderr
     assert InstrumentReport.read(tmp_path / "experiment-commissioning.toml").steps["controller"]["outcome"] == "passed"
+
+
+@can_interrupt
+def test_ctrl_c_at_a_question_ends_it_with_the_report_written(tmp_path: Path) -> None:
+    file = tmp_path / "experiment.toml"
+    file.write_text(EXPERIMENT.format(vendor="Nanonis", driver="Nanonis"), encoding="utf-8")
+    command = [sys.executable, "-c", "from afspm.cli import main; main()", "commission", "experiment.toml"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, cwd=tmp_path, stdin=pipe, stdout=pipe, encoding="utf-8") as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.write("y\n")
+        process.stdin.flush()
+        said = ""
+        while not said.endswith("Press Enter when the frame is set: "):
+            said += (one := process.stdout.read(1))
+            assert one, said
+        interrupt(process)
+        process.communicate(timeout=60.0 * PATIENCE)
+        assert process.returncode == 130
+    report = InstrumentReport.read(tmp_path / "experiment-commissioning.toml")
+    assert report.steps["controller"]["outcome"] == "passed"
+    assert not report.unrestored
