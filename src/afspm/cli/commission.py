@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from afspm.cli.arguments import RUNS, Files, Runs, opt
+from afspm.cli.joining import plain_console
 
 if TYPE_CHECKING:
     from afspm.testing.commissioning.report import InstrumentReport
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
 _INTRODUCTION = """This goes through a controller step by step. Each step is explained, and nothing is moved before you
 confirm it. The first steps only read (connecting may change how the controller saves its scans). Ctrl-C at any moment
 stops the scan, puts the settings back, and withdraws the tip if it is at the sample. The same command goes on later."""
+
+
+_STYLES = {"✓": "green", "✗": "bold red", "–": "yellow"}
 
 
 def commission(
@@ -76,9 +80,16 @@ def _before(file: Path) -> InstrumentReport | None:
 class Terminal:
     """The person at this terminal. Without an answer, nothing is confirmed."""
 
+    def __init__(self) -> None:
+        self._console = plain_console()
+
     def show(self, text: str) -> None:
-        """Show a text."""
-        typer.echo(text)
+        """Show a text; of one that begins with an empty line, the first line is a title."""
+        title, _, rest = text.removeprefix("\n").partition("\n") if text.startswith("\n") else ("", "", text)
+        if title:
+            self._console.print(f"\n{title}", style="bold")
+        if rest:
+            self._console.print(rest, style=_STYLES.get(rest[:1]))
 
     def confirm(self, question: str) -> bool:
         """Ask yes or no."""
