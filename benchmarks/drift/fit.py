@@ -1,7 +1,9 @@
-"""`python -m benchmarks.drift.fit`: fit the acceptance of the default estimator on the fitted half of the families.
+"""`python -m benchmarks.drift.fit`: fit the probabilities and the ellipses of the default estimator.
 
-Writes src/afspm/drift/estimators/coefficients.py, or with `--figure` a reliability diagram of what is there, on both
-halves. Outcomes are kept in build/, and taken from there with `--again`.
+On the fitted half of the families alone. Writes src/afspm/drift/estimators/coefficients.py, or with `--figure` a
+reliability diagram of what is there, on both halves. The outcomes of all pairs are kept in build/ as they come: a run
+that was stopped goes on where it was, and one with more rounds adds to them. A change of the estimator asks for new
+ones: delete the file.
 """
 
 from __future__ import annotations
@@ -10,8 +12,9 @@ import argparse
 import math
 import os
 import pickle
-from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, replace
+from itertools import groupby
 from pathlib import Path
 
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
@@ -22,42 +25,71 @@ from scipy.stats import beta
 
 from afspm.drift.estimators import DEFAULT, acceptance
 from afspm.drift.estimators.acceptance import MatchEvidence
-from afspm.drift.estimators.coefficients import SPREAD
 from benchmarks.drift.conditions import Array
 from benchmarks.drift.families import HALVES, Half
-from benchmarks.drift.trials import ELLIPSE_95, Outcome
+from benchmarks.drift.trials import ELLIPSE_95, Outcome, Trial
 from benchmarks.drift.unseen import trials
 from benchmarks.drift.workers import done
 
-PAIRS = {"real": 40, "hard": 32, "null": 32, "null+prior": 32, "hard+prior": 16}
+CELLS = ("real", "hard", "hard+prior", "null", "null+prior")
 SEED = 20_000
 RIDGE = 1.0
 KEPT = Path("build")
 COEFFICIENTS = Path(acceptance.__file__).with_name("coefficients.py")
+THRESHOLDS = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15)
+WRONG_SHARE = 0.002  # of accepted ones, at most: less than half of what is asked for elsewhere
+DOUBTS = ("varied", "shared", "unclear")
+COVERED = 0.93  # of right matches, by the ellipses of 95 %, at least on each surface under each condition
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.drift.fit", description=__doc__)
-    parser.add_argument("--again", action="store_true", help="with the outcomes of last time")
+    parser.add_argument("--rounds", type=int, default=100, help="of one pair for each surface and condition")
     parser.add_argument("--figure", type=Path, help="draw how far the probabilities are right")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     asked = parser.parse_args(arguments)
+    halves: tuple[Half, ...] = HALVES[:1] if asked.figure is None else HALVES
+    outcomes = {half: gathered(half, asked.rounds, asked.processes) for half in halves}
     if asked.figure is None:
-        COEFFICIENTS.write_text(fitted(_outcomes("fitted", asked)), encoding="utf-8")
+        COEFFICIENTS.write_text(fitted(outcomes["fitted"]), encoding="utf-8")
     else:
-        drawn({half: _outcomes(half, asked) for half in HALVES}, asked.figure)
+        drawn(outcomes, asked.figure)
     print(f"wrote {asked.figure or COEFFICIENTS}")
     return 0
 
 
-def _outcomes(half: Half, asked: argparse.Namespace) -> list[Outcome]:
-    kept = KEPT / f"drift-{half}.pickle"
-    if not asked.again:
-        jobs = trials(half, {cell: range(SEED, SEED + n) for cell, n in PAIRS.items()}, (DEFAULT,))
-        kept.parent.mkdir(exist_ok=True)
-        kept.write_bytes(pickle.dumps([one for each in done(jobs, asked.processes).values() for one in each]))
-    outcomes: list[Outcome] = pickle.loads(kept.read_bytes())
-    return outcomes
+def gathered(half: Half, rounds: int, processes: int) -> list[Outcome]:
+    """Return the outcomes of so many rounds: those that are kept, and the missing ones, which are kept from now on."""
+    file = KEPT / f"drift-{half}.pickles"
+    file.parent.mkdir(exist_ok=True)
+    kept = list(_kept(file))
+    known = {(one.cell, one.surface, one.seed) for one in kept}
+    for seed in range(SEED, SEED + rounds):
+        jobs = trials(half, {cell: [seed] for cell in CELLS}, (DEFAULT,))
+        missing = [job for job in jobs if (job.cell, job.surface, job.seed) not in known]
+        with file.open("ab") as written:
+            for one in _outcomes(missing, processes):
+                pickle.dump(one, written)
+                kept.append(one)
+    return [one for one in kept if SEED <= one.seed < SEED + rounds]
+
+
+def _kept(file: Path) -> Iterator[Outcome]:
+    if not file.exists():
+        return
+    with file.open("rb") as written:
+        while True:
+            try:
+                yield pickle.load(written)
+            except EOFError:
+                return
+
+
+def _outcomes(jobs: Sequence[Trial], processes: int) -> list[Outcome]:
+    if not jobs:
+        return []
+    found = [job.run() for job in jobs] if processes == 1 else done(jobs, processes).values()
+    return [one for each in found for one in each]
 
 
 def evidence(outcome: Outcome) -> MatchEvidence | None:
@@ -67,44 +99,82 @@ def evidence(outcome: Outcome) -> MatchEvidence | None:
 
 
 def fitted(outcomes: Sequence[Outcome]) -> str:
-    """The module of coefficients: a logistic regression with a ridge, by features of unit variance."""
-    pairs = [(found.features(), one.failed) for one in outcomes if (found := evidence(one)) is not None]
-    names = list(pairs[0][0])
-    x = np.array([list(features.values()) for features, _ in pairs])
+    """The module of coefficients: a logistic regression with a ridge, by features of unit variance; the most that a
+    match may be wrong by; and the spread of the ellipses, with which the former have been found."""
+    spread = _spread(outcomes)
+    pairs = [(_with_spread(found, one, spread), one.failed) for one in outcomes if (found := evidence(one)) is not None]
+    features = [found.features() for found, _ in pairs]
+    x = np.array([list(one.values()) for one in features])
     wrong = np.array([failed for _, failed in pairs], dtype=np.float64)
     right = np.median(x[wrong == 0.0], axis=0)
     scale = x.std(axis=0)
     weights = _logistic((x - right) / scale, wrong)
-    rows = [f'    "{name}": {value:.4f},' for name, value in zip(names, weights[1:] / scale, strict=True)]
-    middle = [f'    "{name}": {value:.4f},' for name, value in zip(names, right, strict=True)]
+    odds = weights[0] + (x - right) / scale @ weights[1:]
+    names = list(features[0])
     return "\n".join([
-        '"""Coefficients of the probability that a match is wrong. Written by `python -m benchmarks.drift.fit`.',
+        '"""Coefficients of the default estimator. Written by `python -m benchmarks.drift.fit`.',
         "",
         f"Fitted to {len(pairs)} pairs of the fitted half of the families, from seed {min(o.seed for o in outcomes)};",
         f"{wrong.sum():.0f} of them were wrong.",
         '"""',
         "",
         f"INTERCEPT = {weights[0]:.4f}",
+        '"""Of the logarithm of the odds that a match is wrong, when it is as the median of right ones."""',
         "",
-        "WEIGHTS = {",
-        *rows,
-        "}",
+        *_table("WEIGHTS", names, weights[1:] / scale),
         "",
-        "RIGHT = {",
-        *middle,
-        "}",
+        *_table("RIGHT", names, right),
         '"""The median of right matches."""',
         "",
-        f"SPREAD = {_spread(outcomes):.2f}",
-        '"""By which covariances are larger than their model says, so that their ellipses hold what they promise."""',
+        f"WRONG_AT_MOST = {_threshold(1.0 / (1.0 + np.exp(-odds)), wrong)}",
+        f'"""The largest probability with which at most {WRONG_SHARE:.1%} of those accepted were wrong."""',
+        "",
+        *_table("SPREAD", list(spread), list(spread.values())),
+        '"""By which covariances are larger than their model says, see `Doubt`."""',
         "",
     ])  # fmt: skip
 
 
-def _spread(outcomes: Sequence[Outcome]) -> float:
-    """From the 95 % quantile of chi square of right matches, which were found with the present factor."""
-    chi2 = [one.chi2 for one in outcomes if not one.failed and one.quality]
-    return SPREAD * float(np.quantile(chi2, 0.95)) / ELLIPSE_95
+def _table(title: str, names: Sequence[str], values: Sequence[float] | Array) -> list[str]:
+    return [f"{title} = {{", *(f'    "{n}": {v:.4f},' for n, v in zip(names, values, strict=True)), "}"]
+
+
+def _with_spread(found: MatchEvidence, outcome: Outcome, spread: Mapping[str, float]) -> MatchEvidence:
+    """Evidence as it will be with another spread than that which it was found with."""
+    changed = math.exp(_log_spread(outcome, spread)) / outcome.quality["spread"]
+    return replace(found, sd_px=found.sd_px * math.sqrt(changed))
+
+
+def _log_spread(outcome: Outcome, spread: Mapping[str, float]) -> float:
+    return math.log(spread["all"]) + sum(spread[name] * outcome.quality[name] for name in DOUBTS)
+
+
+def _threshold(probability: Array, wrong: Array) -> float:
+    fitting = [at for at in THRESHOLDS if wrong[probability <= at].sum() <= WRONG_SHARE * (probability <= at).sum()]
+    return max(fitting, default=min(THRESHOLDS))
+
+
+def _spread(outcomes: Sequence[Outcome]) -> dict[str, float]:
+    """The likeliest factor by which errors of accepted right matches exceed their model, taken as Student's t of two
+    dimensions; raised until the ellipses hold enough of them on each surface."""
+    right = [one for one in outcomes if one.accepted and not one.failed]
+    chi2 = np.array([one.chi2 * one.quality["spread"] for one in right])
+    columns = np.array([[1.0, *(one.quality[name] for name in DOUBTS)] for one in right])
+
+    def cost(free: Array) -> float:
+        freedom, log_spread = math.exp(free[0]) + 1.0, columns @ free[1:]
+        tails = (freedom + 2.0) / 2 * np.log1p(chi2 * np.exp(-log_spread) / freedom)
+        return float(np.sum(log_spread + tails) + RIDGE * np.sum(free[2:] ** 2) / 2)
+
+    best = minimize(cost, np.array([2.0, 1.0, *np.zeros(len(DOUBTS))]), method="BFGS").x[1:]
+    ordered = sorted(zip(right, chi2 * np.exp(-columns @ best), strict=True), key=lambda pair: _kind(pair[0]))
+    quantiles = [np.quantile([c for _, c in each], COVERED) for _, each in groupby(ordered, lambda p: _kind(p[0]))]
+    raised = math.exp(best[0]) * float(max(quantiles)) / ELLIPSE_95
+    return {"all": raised, **dict(zip(DOUBTS, best[1:].tolist(), strict=True))}
+
+
+def _kind(outcome: Outcome) -> tuple[str, str]:
+    return outcome.cell, outcome.surface
 
 
 def _logistic(x: Array, wrong: Array) -> Array:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from benchmarks.drift import fit
-from benchmarks.drift.trials import ELLIPSE_95, Outcome
+from benchmarks.drift.trials import Outcome
 
 from afspm.drift.estimators.acceptance import MatchEvidence
-from afspm.drift.estimators.coefficients import SPREAD
 
 GOOD = MatchEvidence(
     overlap=0.8, sd_px=0.02, gap=300.0, rival=0.05,
@@ -58,12 +58,48 @@ def test_the_fit_tells_probabilities_that_are_right() -> None:
     exec(fit.fitted(outcomes), module)
     assert module["WEIGHTS"]["agreement"] == pytest.approx(-10.0, rel=0.1)
     assert abs(module["WEIGHTS"]["gap"]) < 0.2
-    assert module["SPREAD"] == pytest.approx(SPREAD * 3.0 / ELLIPSE_95, rel=0.01)
+    assert module["WRONG_AT_MOST"] == min(fit.THRESHOLDS)  # one in fifty of the surest of these is wrong
 
 
-def _outcome(seed: int, found: MatchEvidence, *, wrong: bool) -> Outcome:
+def test_ellipses_are_as_large_as_errors_are_and_grow_with_the_doubt_that_tells() -> None:
+    random = np.random.default_rng(3)
+    outcomes = []
+    for seed in range(2000):
+        shared, varied = random.uniform(0.0, 1.0, 2)
+        chi2 = 2.0 * math.exp(1.5 * shared) * random.exponential(2.0)
+        doubts = {"varied": varied, "shared": shared, "unclear": 0.0, "spread": 1.0}
+        outcomes.append(_outcome(seed, GOOD, wrong=False, chi2=chi2, **doubts))
+    spread = fit._spread(outcomes)
+    assert spread["shared"] == pytest.approx(1.5, abs=0.2)
+    assert abs(spread["varied"]) < 0.2
+    assert spread["all"] == pytest.approx(2.0 * math.log(1.0 - fit.COVERED) / math.log(0.05), rel=0.15)
+
+
+def test_a_fit_that_was_stopped_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: list[int] = []
+    monkeypatch.setattr(fit, "KEPT", tmp_path)
+    monkeypatch.setattr(fit, "trials", lambda half, seeds, names: [_Job(seed, ran) for seed in seeds["real"]])
+    assert len(fit.gathered("fitted", 2, 1)) == 2
+    assert len(fit.gathered("fitted", 3, 1)) == 3
+    assert ran == [fit.SEED, fit.SEED + 1, fit.SEED + 2]
+
+
+@dataclass
+class _Job:
+    seed: int
+    ran: list[int]
+    cell: str = "real"
+    surface: str = "rough"
+
+    def run(self) -> list[Outcome]:
+        self.ran.append(self.seed)
+        return [_outcome(self.seed, GOOD, wrong=False)]
+
+
+def _outcome(seed: int, found: MatchEvidence, *, wrong: bool, chi2: float = 3.0, **doubts: float) -> Outcome:
+    quality = {**asdict(found), "varied": 0.0, "shared": 0.0, "unclear": 0.0, "spread": 1.0, **doubts}
     error = (5.0, 0.0) if wrong else (0.01, 0.0)
     return Outcome(
-        cell="real", surface="rough", estimator="", seed=seed, accepted=True, reason="", error_px=error, chi2=3.0,
-        bound_px=0.01, white_bound_px=0.01, cpu_s=0.1, half="fitted", quality=asdict(found),
+        cell="real", surface="rough", estimator="", seed=seed, accepted=True, reason="", error_px=error, chi2=chi2,
+        bound_px=0.01, white_bound_px=0.01, cpu_s=0.1, half="fitted", quality=quality,
     )  # fmt: skip

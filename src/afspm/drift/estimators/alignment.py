@@ -1,9 +1,8 @@
-"""Alignment of two images by Gauss-Newton steps, its covariance, and its average over plausible shears."""
+"""Alignment of two images by Gauss-Newton steps, its covariance, and what an expected shear tells of it."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterable
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -152,15 +151,46 @@ def _row_weights(residual: Array, known: NDArray[np.bool_]) -> Array:
 
 
 FLOOR_PX = 1e-3
+CLEAR_PX = 0.02  # a shift known better than this is as certain as its model says
 
 
-def covariance(fit: Fit, believed: Believed) -> Array:
-    """(8, 8) of theta: (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ (White, Econometrica 50, 1, 1982),
-    scaled by what the shift really varies with the blocks of the image left out.
+@dataclass(frozen=True)
+class Doubt:
+    """The signs that a shift is less certain than the model of its noise says.
 
-    The variation is that of the cluster jackknife (CV3; MacKinnon, Nielsen and Webb, J. Appl. Econom. 38, 671, 2023),
-    which allows for noise that is correlated within a block. Of 8 x 8 numbers it would know little, as few blocks hold
-    most of the features: only its size is taken, and only where it is larger.
+    Attributes:
+        varied: its variance with blocks of the image left out in turn, over that of the model.
+        shared: its standard deviation over what it would be if the rest of theta were known: what shear, creep and
+            contrast do to an image that the model knows nothing of goes to the shift as well.
+        sd_px: the largest standard deviation by the model: the weaker the features are beside the noise, the more do
+            disturbances count.
+    """
+
+    varied: float
+    shared: float
+    sd_px: float
+
+    def features(self) -> dict[str, float]:
+        """The same as logarithms, 0 for no doubt."""
+        return {
+            "varied": math.log(max(self.varied, 1.0)),
+            "shared": math.log(max(self.shared, 1.0)),
+            "unclear": math.log(max(self.sd_px / CLEAR_PX, 1.0)),
+        }
+
+    @property
+    def spread(self) -> float:
+        """The factor by which the covariance is larger, fitted by `python -m benchmarks.drift.fit`."""
+        return SPREAD["all"] * math.exp(sum(SPREAD[name] * value for name, value in self.features().items()))
+
+
+def covariance(fit: Fit, believed: Believed) -> tuple[Array, Doubt]:
+    """(COUNT, COUNT) of theta: (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ (White, Econometrica 50, 1,
+    1982), times the spread of its doubt.
+
+    What the shift varies by with blocks left out is that of the cluster jackknife (CV3; MacKinnon, Nielsen and Webb,
+    J. Appl. Econom. 38, 671, 2023), which allows for noise that is correlated within a block. As few blocks hold most
+    of the features it scatters widely, so it is one sign among others.
     """
     used = np.abs(fit.curvature).max(axis=(1, 2)) > 0.0
     n = int(used.sum())
@@ -172,55 +202,36 @@ def covariance(fit: Fit, believed: Believed) -> Array:
     except np.linalg.LinAlgError:
         raise Unusable("too small to estimate the uncertainty of a displacement") from None
     varied = change.T @ change * (n - 1) / n + inverse @ believed.precision @ inverse.T
-    size = float(np.trace(np.linalg.solve(model[:2, :2], varied[:2, :2]))) / 2
-    total: Array = SPREAD * max(size, 1.0) * (model + model.T) / 2
+    model = (model + model.T) / 2
+    shift, alone = model[:2, :2], whole[:2, :2]
+    doubt = Doubt(
+        varied=float(np.trace(np.linalg.solve(shift, varied[:2, :2]))) / 2,
+        shared=abs(float(np.linalg.det(shift) * np.linalg.det(alone))) ** 0.25,
+        sd_px=math.sqrt(float(np.linalg.eigvalsh(shift)[-1])),
+    )
+    total: Array = doubt.spread * model
     total[:2, :2] += FLOOR_PX**2 * np.eye(2)
-    return total
+    return total, doubt
 
 
-DRIFTS = (2e-4, 0.001, 0.002, 0.004, 0.008, 0.016, 0.03)  # displacement per length along y
-BESIDES = (2e-4, 0.01)  # of each element: next to nothing; or creep, a sample that turns, another calibration
+BESIDES = 0.01  # of each element of a linear map: creep, a sample that turns, another calibration
 
 
-def of_drift(sd: float) -> Array:
-    """Covariance of (axx, axy, ayx, ayy) when drift during the scans shears them: each row is displaced against the one
-    before, so what depends on y varies alone."""
-    return sd**2 * np.diag([0.0, 1.0, 0.0, 1.0])
-
-
-def shear_models(drift: float | None, aspect: float) -> list[Array]:
-    """Return the models of shear: covariances of the linear map of pixel coordinates.
+def shear_model(drift: float, aspect: float) -> Array:
+    """Return the covariance of (axx, axy, ayx, ayy) of pixel coordinates when drift during the scans shears them: each
+    row is displaced against the one before, so what depends on y varies more.
 
     Args:
-        drift: displacement per length along y; None: not known, so all are tried.
+        drift: standard deviation of the displacement per length along y.
         aspect: height of a pixel over its width.
     """
     to_px = np.diag([1.0, aspect, 1.0 / aspect, 1.0])
-    drifts = DRIFTS if drift is None else (drift,)
-    return [to_px @ (of_drift(d) + b**2 * np.eye(4)) @ to_px for d, b in itertools.product(drifts, BESIDES)]
+    model: Array = to_px @ (np.diag([0.0, drift**2, 0.0, drift**2]) + BESIDES**2 * np.eye(4)) @ to_px
+    return model
 
 
-def averaged(theta: Array, covariance: Array, covariances: Iterable[Array], mean: Array) -> tuple[Array, Array]:
-    """Bayesian model averaging over what the linear map may be (Hoeting, Stat. Sci. 14, 382, 1999).
-
-    Where features are few, shift and shear are nearly the same thing, and what shear is plausible decides the shift.
-    Each model says that the map is normal about `mean` with its covariance; it conditions the shift on that, and weighs
-    by how likely the map found is in it.
-
-    Returns:
-        theta and its covariance, the moments of the mixture.
-    """
-    weights, thetas, totals = [], [], []
-    off = theta[LINEAR] - mean
-    for model in covariances:
-        spread = covariance[LINEAR, LINEAR] + model
-        gain = covariance[:, LINEAR] @ np.linalg.inv(spread)
-        weights.append(-0.5 * off @ np.linalg.solve(spread, off) - 0.5 * np.linalg.slogdet(spread)[1])
-        thetas.append(theta - gain @ off)
-        totals.append(covariance - gain @ covariance[LINEAR])
-    weight = np.exp(np.array(weights) - max(weights))
-    weight /= weight.sum()
-    best: Array = weight @ np.array(thetas)
-    apart = np.array(thetas) - best
-    total: Array = np.tensordot(weight, np.array(totals), 1) + np.einsum("k,ki,kj->ij", weight, apart, apart)
-    return best, total
+def conditioned(theta: Array, covariance: Array, mean: Array, model: Array) -> tuple[Array, Array]:
+    """Return theta and its covariance, given that its linear map is normal about `mean` with the covariance `model`:
+    where features are few, shift and shear are nearly the same thing, and what shear is plausible decides the shift."""
+    gain = covariance[:, LINEAR] @ np.linalg.inv(covariance[LINEAR, LINEAR] + model)
+    return theta - gain @ (theta[LINEAR] - mean), covariance - gain @ covariance[LINEAR]

@@ -12,12 +12,14 @@ from afspm.drift.estimators.alignment import (
     COARSE,
     SHIFT,
     Believed,
-    averaged,
+    Doubt,
+    conditioned,
     covariance,
     generalised_least_squares,
     least_squares,
-    shear_models,
+    shear_model,
 )
+from afspm.drift.estimators.coefficients import WRONG_AT_MOST
 from afspm.drift.estimators.images import CommonGrid, Unusable, onto_common_grid, prepare
 from afspm.drift.estimators.noise import FineFilter, without_lines
 from afspm.drift.estimators.search import ExpectedShift, MaskedCorrelation, Scorer, candidates, shear_by_drift
@@ -34,7 +36,6 @@ BEND_SD = 0.15
 BORDER_PX = 1  # where a filter and a spline have to guess what lies beyond
 FARTHEST_PX = 8.0  # from where the search has found it
 ELSEWHERE_PX = 32  # the farthest shift that a match is compared with
-WRONG_AT_MOST = 0.15  # of the fitted half, the most with which no more are accepted wrongly
 
 
 class LeastSquares:
@@ -43,7 +44,8 @@ class LeastSquares:
     1. `prepare`: rows flattened, outliers cut; scans that hold nothing refused. `grid`: a common pixel.
     2. `search` and `score`: candidates by normalised cross-correlation, the likeliest of them.
     3. `align`: Gauss-Newton, coarse to fine; the fine stage through the filter of `spectra`, weighted by `rows`.
-    4. `covariance`: by the jackknife; `shear`: the shift, given what shear is plausible.
+    4. `covariance`: what the noise leaves uncertain, and more where there is doubt; `conditioned`: given the shear that
+       drift makes, where that is known.
     5. `acceptance`: is it a match at all?
 
     Args:
@@ -73,7 +75,8 @@ class LeastSquares:
         if start is None or box is None:
             return Registration.refused("the scans overlap too little")
         try:
-            theta, total, seen = _fine(scene, box, start[0], expected, _shear_models(prior, reference, scan, grid))
+            shear = _expected_shear(prior, reference, scan, grid)
+            theta, total, seen, doubt = _fine(scene, box, start[0], expected, shear)
         except Unusable as reason:
             rows, columns = box.shape
             return Registration.refused(f"the overlap of {columns} x {rows} pixels is {reason}")
@@ -81,7 +84,8 @@ class LeastSquares:
             return Registration.refused("no displacement fits: the scans have no features in common")
         found = _evidence(scene, box, theta, total, start[1:], expected)
         registration = self._registration(theta, total, box, grid, found)
-        return replace(registration, linear_seen=_in_m(seen, grid))
+        quality = {**registration.quality, **doubt.features(), "spread": doubt.spread}
+        return replace(registration, linear_seen=_in_m(seen, grid), quality=quality)
 
     def _registration(
         self, theta: Array, total: Array, box: OverlapBox, grid: CommonGrid, found: MatchEvidence
@@ -116,17 +120,18 @@ def _coarse(scene: Scene, expected: ExpectedShift | None) -> tuple[Array, float,
 
 
 def _fine(
-    scene: Scene, box: OverlapBox, theta: Array, expected: ExpectedShift | None, shears: tuple[Array, list[Array]]
-) -> tuple[Array, Array, LinearSeen]:
-    """theta and its covariance, and its linear map before what shear is plausible was reckoned with."""
+    scene: Scene, box: OverlapBox, theta: Array, expected: ExpectedShift | None, shear: tuple[Array, Array] | None
+) -> tuple[Array, Array, LinearSeen, Doubt]:
+    """theta and its covariance, its linear map before the shear that is expected was reckoned with, and doubts."""
     fine = FineFilter.of(scene.first.values, scene.second.values)
     values = fine.applied(scene.first.values), fine.applied(scene.second.values)
     pair = WarpedPair(*scene.splines(values, order=5), box.without_border(BORDER_PX), theta[:2])
     believed = _believed(expected)
     fit = generalised_least_squares(pair, theta, believed, fine)
-    spread = covariance(fit, believed)
+    spread, doubt = covariance(fit, believed)
     seen = LinearSeen(fit.theta[LINEAR].reshape(2, 2), spread[LINEAR, LINEAR])
-    return *averaged(fit.theta, spread, shears[1], shears[0]), seen
+    theta, spread = (fit.theta, spread) if shear is None else conditioned(fit.theta, spread, *shear)
+    return theta, spread, seen, doubt
 
 
 def _in_m(seen: LinearSeen, grid: CommonGrid) -> LinearSeen:
@@ -151,16 +156,18 @@ def _believed(expected: ExpectedShift | None) -> Believed:
     return Believed(mean, precision)
 
 
-def _shear_models(
+def _expected_shear(
     prior: Prior | None, reference: DriftScan, scan: DriftScan, grid: CommonGrid
-) -> tuple[Array, list[Array]]:
-    """Mean and covariances of the linear map of pixels, (axx, axy, ayx, ayy)."""
+) -> tuple[Array, Array] | None:
+    """Mean and covariance of the linear map of pixels, (axx, axy, ayx, ayy), where the velocity of drift is known."""
     mean_m, sd = shear_by_drift(prior, reference, scan)
+    if sd is None:
+        return None
     angle = reference.region.angle_rad
     slow = np.array([-np.sin(angle), np.cos(angle)])
     width, height = np.hypot(*grid.to_m)
     mean: Array = np.linalg.inv(grid.to_m) @ np.outer(mean_m, slow) @ grid.to_m
-    return mean.ravel(), shear_models(sd, float(height / width))
+    return mean.ravel(), shear_model(sd, float(height / width))
 
 
 def _evidence(
