@@ -112,12 +112,22 @@ def seen(columns: Array, weight: Array, metric: Array | None) -> Array:
     Returns:
         Like `columns`; the root of the weight of g is in it.
     """
+    if metric is None and weight.min() == 1.0 == weight.max():
+        parabolas = _parabolas(columns.shape[2])
+        return columns - (columns @ parabolas) @ parabolas.T
     found = np.empty_like(columns)
     at_once = max(1, CACHED // columns[0].size)
     for first in range(0, len(columns), at_once):
         some = slice(first, first + at_once)
         found[some] = _seen(columns[some], weight[some], metric)
     return found
+
+
+@cache
+def _parabolas(width: int) -> Array:
+    """Orthonormal 1, x, x² of a row, (x, 3)."""
+    x = np.linspace(-1.0, 1.0, width)
+    return np.linalg.qr(np.stack([np.ones(width), x, x**2], axis=1))[0]
 
 
 def _seen(columns: Array, weight: Array, metric: Array | None) -> Array:
