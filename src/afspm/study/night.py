@@ -29,7 +29,7 @@ class SimulatedNight:
     """The outcome of a night. "Misplaced" is how far off its place on the sample a scan was taken.
 
     Attributes:
-        record: scan by scan.
+        record: scan by scan, without the second direction of the first one.
         truth_m: (n, 2) what the drift was at the middle of each scan, from the first on.
         rescans: how many scans were taken again.
         lost: whether the tracker ever said that it was lost.
@@ -87,7 +87,9 @@ def night(settings: NightSettings, seed: int) -> SimulatedNight:
         scans.append(scan)
         updates.append(update)
         fits = scan.end_s + settings.line_s + scan.duration_s <= start_s + settings.every_s
-        if fits and _again(settings, place, scan, update):
+        if fits and number == 0 and settings.at_start == "up-down":
+            _taken(world, following, place, settings, scan.end_s + settings.line_s, upwards=False)
+        elif fits and _again(settings, place, scan, update):
             rescans += 1
             scan, update = _taken(world, following, place, settings, scan.end_s + settings.line_s)
             scans.append(scan)
@@ -98,13 +100,14 @@ def night(settings: NightSettings, seed: int) -> SimulatedNight:
 
 
 def _taken(
-    world: World, following: Tracker, place: Region, settings: NightSettings, start_s: float
+    world: World, following: Tracker, place: Region, settings: NightSettings, start_s: float, *, upwards: bool = True
 ) -> tuple[DriftScan, Update]:
     middle_s = start_s + settings.pixels * settings.line_s / 2
     region = following.forecast.at(middle_s).mapping.to_tip(place)
-    taken = world.scan(region, (settings.pixels, settings.pixels), settings.line_s, start_s)
+    shape, direction = (settings.pixels, settings.pixels), "up" if upwards else "down"
+    taken = world.scan(region, shape, settings.line_s, start_s, direction=direction)
     _, values = taken.channels()["Height"]
-    scan = DriftScan(values, region, taken.start_s, taken.end_s, upwards=True, key=f"{start_s:g} s")
+    scan = DriftScan(values, region, taken.start_s, taken.end_s, upwards=upwards, key=f"{start_s:g} s")
     return scan, following.add(scan)
 
 

@@ -28,6 +28,7 @@ class NightSettings:
         rescan: when a scan is taken again, see `afspm.drift.overlap`: "tolerance", "paper" or "never".
         tolerance_m: for that rule; None: a tenth of the size.
         f_rescan: for that of the paper.
+        at_start: "up-down": the first place is scanned in both directions, as by the scheduler's default; "nothing".
         estimator, tracker: "class" and settings.
     """
 
@@ -41,12 +42,15 @@ class NightSettings:
     rescan: str = "tolerance"
     tolerance_m: float | None = None
     f_rescan: float = F_RESCAN
+    at_start: str = "up-down"
     estimator: Table = field(default_factory=lambda: {"class": DEFAULT_ESTIMATOR})
     tracker: Table = field(default_factory=lambda: {"class": DEFAULT_TRACKER})
 
     def __post_init__(self) -> None:
         if self.rescan not in RULES:
             raise ConfigError(f"no rule {self.rescan!r} for rescans", hint=f"one of {', '.join(RULES)}")
+        if self.at_start not in STARTS:
+            raise ConfigError(f"no start {self.at_start!r} of a night", hint=f"one of {', '.join(STARTS)}")
         if self.pixels * self.line_s > self.every_s:
             raise InvalidValue(
                 f"a scan of {self.pixels * self.line_s:g} s does not fit into {self.every_s:g} s",
@@ -85,6 +89,7 @@ class NightSettings:
 
 PARTS = ("estimator", "tracker")
 RULES = ("tolerance", "paper", "never")
+STARTS = ("up-down", "nothing")
 _DEFAULTS = {"estimator": DEFAULT_ESTIMATOR, "tracker": DEFAULT_TRACKER}
 
 

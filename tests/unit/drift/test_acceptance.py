@@ -16,7 +16,7 @@ from afspm.drift.estimators.acceptance import MatchEvidence
 
 GOOD = MatchEvidence(
     overlap=0.8, sd_px=0.02, gap=300.0, rival=0.05,
-    agreement=1.0, correlation=0.99, above_repeats=math.inf, surprise=1.0,
+    agreement=1.0, above_repeats=math.inf, surprise=1.0, searched=1.0,
 )  # fmt: skip
 
 
@@ -28,7 +28,6 @@ GOOD = MatchEvidence(
         {"gap": 1.0},
         {"rival": 0.95},
         {"agreement": 0.5},
-        {"correlation": 0.5},
         {"above_repeats": 2.0},
         {"surprise": 60.0},
     ],

@@ -34,11 +34,12 @@ class MatchEvidence:
         rival: likelihood of another shift, in nats, over that of the match, both compared with none. Where features of
             one kind are far apart, one may fit another as well as itself, and only shows less.
         agreement: share of the parts of the overlap with features that correlate.
-        correlation: mean over the parts, by their features.
         above_repeats: standard deviations by which the match exceeds the sites about it that look the same. A prior
             singles out one site, whether or not it is the right one. A wrong one is one of many, and as far from their
             mean as chance has it; the right one alone has its defects in their places.
         surprise: chi² of the shift, given the prior.
+        searched: share of the scan's area in which the prior lets the match be; 1 without one. The fewer places there
+            are, the fewer can fit by chance.
     """
 
     overlap: float
@@ -46,9 +47,9 @@ class MatchEvidence:
     gap: float
     rival: float
     agreement: float
-    correlation: float
     above_repeats: float
     surprise: float
+    searched: float
 
     def features(self) -> dict[str, float]:
         """The same on scales on which they add up, within what is ever seen of right matches and wrong ones."""
@@ -58,9 +59,9 @@ class MatchEvidence:
             "gap": math.log1p(max(self.gap, 0.0)),
             "rival": -math.log(min(max(1.0 - self.rival, 0.01), 2.0)),
             "agreement": self.agreement,
-            "correlation": math.atanh(min(max(self.correlation, -0.9), 0.9999)),
             "above_repeats": math.log(min(max(self.above_repeats, 1.0), MOST_REPEATS)),
             "surprise": math.log1p(min(max(self.surprise, 0.0), 100.0)),
+            "searched": math.log(min(max(self.searched, 1e-4), 1.0)),
         }
 
     def objections(self) -> dict[str, float]:
@@ -89,15 +90,15 @@ _REASONS = {
     "gap": "ambiguous: another displacement is almost as likely ({gap:.1f} nats less)",
     "rival": "ambiguous: another displacement explains {rival:.0%} as much",
     "agreement": "no common features: {agreement:.0%} of the parts with features agree",
-    "correlation": "no common features: the correlation is {correlation:.2f}",
     "above_repeats": "the surface repeats itself: a site like the others ({above_repeats:.1f} standard deviations)",
     "surprise": "far from what was expected (chi² {surprise:.0f})",
+    "searched": "one of many places at which a match could be",
 }
 
 
-def agreement(one: Array, two: Array, known: Mask) -> tuple[float, float]:
-    """Of 8 x 8 parts of two aligned images: the share of those with features (twice the power of what a typical part
-    has left) that correlate by more than 0.5; and the correlation within the parts, each by its power."""
+def agreement(one: Array, two: Array, known: Mask) -> float:
+    """Return, of those of the 8 x 8 parts of two aligned images that have features (twice the power of what a typical
+    part has left), the share that correlates by more than 0.5."""
     n = np.maximum(_sums(known.astype(np.float64)), 1.0)
     a, b = _sums(one * known) / n, _sums(two * known) / n
     aa, bb, ab = (
@@ -105,8 +106,7 @@ def agreement(one: Array, two: Array, known: Mask) -> tuple[float, float]:
     )
     features = np.maximum(aa, bb) > 2.0 * np.median(aa + bb - 2.0 * ab)
     size = np.sqrt(np.maximum(aa, 0.0) * np.maximum(bb, 0.0))
-    share = float(np.mean(ab[features] > 0.5 * size[features])) if features.any() else 0.0
-    return share, float(ab.sum() / max(size.sum(), 1e-300))
+    return float(np.mean(ab[features] > 0.5 * size[features])) if features.any() else 0.0
 
 
 def _sums(values: Array) -> Array:

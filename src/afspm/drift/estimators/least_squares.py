@@ -180,15 +180,14 @@ def _evidence(
 ) -> MatchEvidence:
     one, two, known = WarpedPair(*scene.smooth_splines, box, theta[:2]).warped(theta)
     one, two = without_lines(one, known), without_lines(two, known)
-    share, correlation = agreement(one, two, known)
     elsewhere = MaskedCorrelation(known, known, ELSEWHERE_PX)
     return MatchEvidence(
         overlap=float(known.sum() / scene.least_known),
         sd_px=float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[-1])),
         gap=likelihoods[0] - likelihoods[1],
         rival=likelihoods[1] / max(likelihoods[0], 1e-300),
-        agreement=share,
-        correlation=correlation,
+        agreement=agreement(one, two, known),
         above_repeats=above_repeats(elsewhere.of(one, two), elsewhere.overlap, elsewhere.origin),
         surprise=0.0 if expected is None else expected.surprise(theta[:2], total[:2, :2]),
+        searched=1.0 if expected is None else min(expected.area_px2 / scene.least_known, 1.0),
     )

@@ -18,6 +18,9 @@ from afspm.drift.registration import DriftScan, Prior
 Array = NDArray[np.float64]
 
 
+GATE = 25.0  # chi² of an expected shift, beyond which nothing is looked for
+
+
 @dataclass(frozen=True, eq=False)
 class ExpectedShift:
     """Expected shift, px, and its covariance, px²."""
@@ -35,6 +38,11 @@ class ExpectedShift:
         off = shift_px - self.mean
         chi2: Array = np.einsum("...i,ij,...j", off, np.linalg.inv(self.covariance), off)
         return chi2
+
+    @property
+    def area_px2(self) -> float:
+        """The area in which a match is looked for."""
+        return float(GATE * math.pi * np.sqrt(np.linalg.det(self.covariance)))
 
     def surprise(self, shift_px: Array, covariance: Array) -> float:
         """chi² of an estimate, which has a covariance too."""
@@ -139,7 +147,7 @@ class MaskedCorrelation:
         enough = self.overlap >= LEAST_OVERLAP * min(mask.sum() for mask in self._masks)
         if prior is not None:
             at = np.stack(np.meshgrid(*(np.arange(n) for n in self._full), indexing="ij"), axis=-1)
-            enough &= prior.chi2(self.shifts_px(at)) < 25.0
+            enough &= prior.chi2(self.shifts_px(at)) < GATE
         height = np.where(enough, np.arctanh(self.of(one, two)) * np.sqrt(self.overlap), -np.inf)
         top = (height == maximum_filter(height, 3)) & (height > 0.0)
         index = np.argwhere(top)
