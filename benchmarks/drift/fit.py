@@ -107,7 +107,7 @@ def fitted(outcomes: Sequence[Outcome]) -> str:
     x = np.array([list(one.values()) for one in features])
     wrong = np.array([failed for _, failed in pairs], dtype=np.float64)
     right = np.median(x[wrong == 0.0], axis=0)
-    scale = x.std(axis=0)
+    scale = np.maximum(x.std(axis=0), 1e-9)  # what none of the pairs tells apart weighs nothing
     weights = _logistic((x - right) / scale, wrong)
     odds = weights[0] + (x - right) / scale @ weights[1:]
     names = list(features[0])
