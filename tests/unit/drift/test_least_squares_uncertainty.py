@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from afspm.drift.estimators.alignment import averaged, shear_models
+from afspm.drift.estimators.alignment import conditioned, shear_model
 from afspm.drift.estimators.least_squares import LeastSquares
 from afspm.drift.estimators.noise import denoised
 from afspm.drift.estimators.search import shear_by_drift
@@ -121,10 +121,10 @@ def test_what_shear_is_plausible_decides_where_shift_and_shear_are_alike() -> No
     theta = np.array([1.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0])
     covariance = np.diag([1.01, 1e-4, 1e-6, 0.0101, 1e-6, 1e-6, 1e-4, 1e-4])
     covariance[0, 3] = covariance[3, 0] = 0.1
-    still, total = averaged(theta, covariance, shear_models(1e-6, 1.0), np.zeros(4))
+    still, total = conditioned(theta, covariance, np.zeros(4), shear_model(1e-6, 1.0))
     assert abs(still[0]) < 0.1
     assert total[0, 0] < 0.1
-    drifting, _ = averaged(theta, covariance, shear_models(1.0, 1.0), np.zeros(4))
+    drifting, _ = conditioned(theta, covariance, np.zeros(4), shear_model(1.0, 1.0))
     assert drifting[0] == pytest.approx(1.0, abs=0.05)
 
 
