@@ -15,10 +15,12 @@ import pickle
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
+from scipy import sparse
 from scipy.optimize import linprog, minimize
 from scipy.stats import beta
 
@@ -161,8 +163,10 @@ def _spread(outcomes: Sequence[Outcome]) -> dict[str, float]:
     columns = np.array([[1.0, *(one.quality[name] for name in DOUBTS)] for one in right])
     count, free = columns.shape
     cost = np.concatenate([np.zeros(2 * free), np.full(count, COVERED), np.full(count, 1.0 - COVERED)])
-    equal = np.hstack([columns, -columns, np.eye(count), -np.eye(count)])
+    parts: list[Any] = [columns, -columns, sparse.eye(count), -sparse.eye(count)]
+    equal: Any = sparse.hstack(parts)
     found = linprog(cost, A_eq=equal, b_eq=log_chi2, bounds=(0.0, None)).x
+    assert found is not None, "there is always a solution"
     best = found[:free] - found[free : 2 * free]
     return {"all": math.exp(best[0]), **dict(zip(DOUBTS, best[1:].tolist(), strict=True))}
 

@@ -63,7 +63,7 @@ def test_the_fit_tells_probabilities_that_are_right() -> None:
 def test_ellipses_are_as_large_as_errors_are_and_grow_with_the_doubt_that_tells() -> None:
     random = np.random.default_rng(3)
     outcomes = []
-    for seed in range(2000):
+    for seed in range(8000):
         shared, varied = random.uniform(0.0, 1.0, 2)
         chi2 = 2.0 * math.exp(1.5 * shared) * random.exponential(2.0)
         doubts = {"varied": varied, "shared": shared, "unclear": 0.0, "spread": 1.0}

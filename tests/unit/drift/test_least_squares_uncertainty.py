@@ -78,7 +78,7 @@ def test_a_known_drift_velocity_makes_the_shift_more_certain() -> None:
     guessed = LeastSquares().register(reference, scan, Prior(*expected))
     known = LeastSquares().register(reference, scan, Prior(*expected, velocity_m_s, 0.002 * velocity_m_s[0]))
     assert known.sd_m < 0.95 * guessed.sd_m
-    assert known.linear[0, 1] == pytest.approx(shear, abs=0.2 * shear)
+    assert known.linear[0, 1] == pytest.approx(shear, abs=0.25 * shear)
 
 
 def prior(velocity_m_s: tuple[float, float], sd_m_s: float | None = 1e-12) -> Prior:
