@@ -39,7 +39,7 @@ class NoPanel:
 def main(names: Sequence[str]) -> None:
     for name in names or sorted(file.stem.removeprefix("emulated_") for file in EXPERIMENTS.glob("emulated_*.toml")):
         file = REPORTS / f"emulated_{name}.toml"
-        options = CheckOptions([EXPERIMENTS / f"emulated_{name}.toml"], runs=ROOT / "build/commissioning")
+        options = CheckOptions([EXPERIMENTS / f"emulated_{name}.toml"], runs=ROOT / "build/commissioning", speed=5.0)
         result = commission(options, NoPanel(), file, "emulator")
         sys.stdout.write(f"{name}: {'passed' if result.passed else 'NOT AS IT SHOULD BE'} {result.lost}\n")
         report = InstrumentReport.read(file)

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Final
 
 from afspm.errors import AfspmError, FileError
-from afspm.files import read
 from afspm.plain_data import Plain
 from afspm.translator.folder_files import FolderFiles
-from afspm.translator.result_files import Content, Entry, FilePrecision, lines_missing, modified_ns
+from afspm.translator.result_files import Content, Entry, FilePrecision, lines_missing, modified_ns, read_result
 
 SETTLE_S: Final = 1.0
 """So long, in real time, no other file may have come before a scan's are taken: how many there will be is not known."""
@@ -59,4 +58,4 @@ class ParkFiles(FolderFiles):
         return max(written_ns for _, written_ns in files)
 
     def _scans_of(self, paths: list[Path], measured: Entry) -> Content:
-        return [self.precision.as_set(one, measured) for path in paths for one in read(path).scans]
+        return [self.precision.as_set(one, measured) for path in paths for one in read_result(path).scans]
