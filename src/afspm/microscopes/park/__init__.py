@@ -29,7 +29,7 @@ class Park(Driver):
     Args:
         address: of SmartRemote, e.g. "tcp://192.168.0.10:5581".
         data_dir: where SmartScan's base folder of data is seen from here; left out: SmartScan runs on this computer.
-        lift: how far the stage moves away from the sample after the scanner has, to withdraw the tip.
+        lift: how far the stage moves away from the sample after the scanner has, to withdraw the tip; 0: not at all.
         scanning_words, idle_words: further words by which SmartScan says whether it scans.
         reply_timeout_s: how long a reply may take, in real time.
         poll_period_s, common: as for every microscope.
@@ -47,7 +47,7 @@ class Park(Driver):
         *,
         address: str = "tcp://127.0.0.1:5581",
         data_dir: str | None = None,
-        lift: Length = 100e-6,
+        lift: Length = 0.0,
         scanning_words: Sequence[str] = (),
         idle_words: Sequence[str] = (),
         reply_timeout_s: Duration = 5.0,
@@ -129,7 +129,7 @@ class Park(Driver):
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
-        """Withdraw the tip, whatever is going on: the scanner, and then the stage by `lift`."""
+        """Withdraw the tip, whatever is going on: the scanner, and then the stage by `lift`, if one is set."""
         self._doing.withdraw(self._lift_m / MICROMETRE)
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
