@@ -38,24 +38,24 @@ class ParkFiles(FolderFiles):
                 raise FileError("was overwritten or deleted", where=str(path))
         return self._scans_of([path for path, _ in files], entry)
 
-    def _take(self, measured: Entry) -> int | None:
-        """Take the files as a result once no more come and all are whole; return when the last was written."""
+    def _take(self, measured: Entry) -> bool:
+        """Take the files as a result once no more come and all are whole."""
         listed = [(str(path), modified_ns(path)) for path in self._files(Path(measured["folder"]))]
         files = sorted(one for one in listed if one[1] > measured["newest_ns"])
         now_s = self._monotonic_s()
         if files != self._seen[0]:
             self._seen = (files, now_s)
         if not files or now_s - self._seen[1] < SETTLE_S:
-            return None
+            return False
         try:
             content = self._scans_of([Path(name) for name, _ in files], measured)
         except (AfspmError, OSError):
-            return None  # not yet whole
+            return False  # not yet whole
         if lines_missing(content):  # it was saved when the scan was broken off
             self.broken_off = True
         else:
             self._add(files[0][0], measured, {"files": [list(one) for one in files]}, content)
-        return max(written_ns for _, written_ns in files)
+        return True
 
     def _scans_of(self, paths: list[Path], measured: Entry) -> Content:
         return [self.precision.as_set(one, measured) for path in paths for one in read_result(path).scans]
