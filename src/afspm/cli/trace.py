@@ -49,13 +49,11 @@ def with_trace(files: list[Path]) -> Experiment:
     import tempfile
 
     from afspm.errors import ConfigError
-    from afspm.experiment import Role, load
-    from afspm.translator import Driver
+    from afspm.experiment import load
+    from afspm.experiment.tracing import trace_overlay
 
-    translators = load(*files).resolved.with_role(Role.TRANSLATOR)
-    if not translators or not issubclass(translators[0].component or type, Driver):
-        raise ConfigError("only a translator of afspm keeps a trace", where=str(files[0]))
     with tempfile.TemporaryDirectory() as folder:
-        overlay = Path(folder) / "trace.toml"
-        overlay.write_text(f"[{translators[0].name}]\ntrace = true\n", encoding="utf-8")
+        overlay = trace_overlay(load(*files).resolved, Path(folder))
+        if overlay is None:
+            raise ConfigError("no translator here talks to a controller: nothing to trace", where=str(files[0]))
         return load(*files, overlay)

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from afspm.experiment import Role
+from afspm.experiment.tracing import trace_overlay
 from afspm.model import names
 from afspm.testing.commissioning.guide import Guide, Prompts, StepDeclined
 from afspm.testing.commissioning.progress import CommissioningProgress, CommissioningStep, StepOutcome, StepResult
@@ -18,7 +18,6 @@ from afspm.testing.translators.report import CheckReport
 from afspm.testing.translators.runner import begin_report, restored
 from afspm.testing.translators.session import CheckOptions, CheckSession, opened, prepare
 from afspm.testing.verdicts import Failed, Lost, Skipped
-from afspm.translator import Driver
 
 _NOT_WITHDRAWN = "THE TIP WAS NOT WITHDRAWN ({why}): withdraw it by hand, now."
 _MARKS = {StepOutcome.PASSED: "✓", StepOutcome.MISMATCH: "✗"}
@@ -153,12 +152,8 @@ class _Walk:
 
 def _traced(options: CheckOptions, stack: ExitStack) -> CheckOptions:
     """Return the options with a trace of all that is said to the controller."""
-    (translator,) = prepare(options).resolved.with_role(Role.TRANSLATOR)
-    if translator.component is None or not issubclass(translator.component, Driver):
-        return options
-    overlay = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "trace.toml"
-    overlay.write_text(f"[{translator.name}]\ntrace = true\n", encoding="utf-8")
-    return replace(options, files=[*options.files, overlay])
+    overlay = trace_overlay(prepare(options).resolved, Path(stack.enter_context(tempfile.TemporaryDirectory())))
+    return options if overlay is None else replace(options, files=[*options.files, overlay])
 
 
 def _report(

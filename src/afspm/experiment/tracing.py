@@ -1,0 +1,19 @@
+"""An experiment with a trace of all that is said to and by its controller."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from afspm.experiment.resolution import ResolvedExperiment
+from afspm.experiment.settings import default_of
+from afspm.model import Role
+
+
+def trace_overlay(experiment: ResolvedExperiment, folder: Path) -> Path | None:
+    """Write a file for `folder` that has the translator keep a trace; None if it has no controller to talk to."""
+    for translator in experiment.with_role(Role.TRANSLATOR):
+        if translator.component is not None and default_of(translator.component, "trace") is not None:
+            overlay = folder / "trace.toml"
+            overlay.write_text(f"[{translator.name}]\ntrace = true\n", encoding="utf-8")
+            return overlay
+    return None
