@@ -10,8 +10,9 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
+from afspm.plain_data import Plain
 from afspm.translator.trace import TracedExchange, TracedFile, TraceLine
 
 _IDS: Final = ("messageID", "id")
@@ -171,7 +172,7 @@ def _with_ids_of(asked: bytes, answer: bytes) -> bytes:
     return json.dumps({**found, **ids}).encode() if ids else answer
 
 
-def _json(content: bytes) -> dict[str, Any] | None:
+def _json(content: bytes) -> Plain | None:
     if not content.startswith(b"{"):
         return None
     try:

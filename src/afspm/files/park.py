@@ -114,5 +114,5 @@ def _in_si(unit: str) -> tuple[str, float]:
     return (found[2], _PREFIX[found[1]]) if found else (unit, 1.0)
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: Any) -> object:
     return text(value) if isinstance(value, np.void) else value.item()

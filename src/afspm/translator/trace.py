@@ -19,6 +19,7 @@ from typing import IO, Any, Final
 
 from afspm.clock import NS_PER_S, Clock, ExperimentClock
 from afspm.errors import FileError
+from afspm.plain_data import Plain
 
 FILE: Final = "controller.trace.jsonl"
 FORMAT: Final = 1
@@ -154,7 +155,7 @@ class Trace:
         with self._lock:
             self._write({key: value for key, value in facts.items() if value or key not in ("lost", "command")})
 
-    def _write(self, facts: dict[str, Any]) -> None:
+    def _write(self, facts: Plain) -> None:
         if self._file is not None:
             self._file.write(json.dumps(facts, ensure_ascii=False) + "\n")
             self._file.flush()
@@ -232,7 +233,7 @@ class TracedAnswer:
 TRACE: Final = Trace()
 
 
-def _shown(content: bytes | None) -> Any:
+def _shown(content: bytes | None) -> object:
     if content is None:
         return None
     try:
@@ -249,7 +250,7 @@ def _content(shown: Any) -> bytes | None:
     return None if shown is None else str(shown).encode()
 
 
-def _line(facts: dict[str, Any]) -> TraceLine:
+def _line(facts: Plain) -> TraceLine:
     if "trace" in facts:
         return TraceHeader(**facts)
     if "file" in facts:

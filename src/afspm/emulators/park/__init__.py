@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, Final, Literal
 
 from afspm.emulators.park.engine import Script
@@ -12,6 +12,7 @@ from afspm.emulators.park.wire import SmartRemoteWire
 from afspm.emulators.program import MakerProgram
 from afspm.emulators.scripted import Client, OnRequest, ScriptedEmulator, ScriptFailed, ScriptWire, Unfinished
 from afspm.errors import AfspmError
+from afspm.plain_data import PlainMapping
 from afspm.units import Duration
 
 _DONE: Final = "Done"
@@ -33,7 +34,7 @@ class ParkEmulator(ScriptedEmulator):
 
     vendor = "Park"
     requires: ClassVar[tuple[str, ...]] = ("afspm[park]",)
-    usual: ClassVar[Mapping[str, Any]] = {"port": 5581}
+    usual: ClassVar[PlainMapping] = {"port": 5581}
     modes: ClassVar[Sequence[str]] = ("amplitude", "frequency-shift")
 
     def __init__(
@@ -147,7 +148,7 @@ class ParkEmulator(ScriptedEmulator):
         return _reply(request, result=_DONE, value=text if self._values == "text" else value)
 
 
-def _reply(request: bytes, **fields: Any) -> bytes:
+def _reply(request: bytes, **fields: object) -> bytes:
     try:
         asked = json.loads(request)
     except ValueError:

@@ -31,7 +31,7 @@ class Wait:
     waiting: Callable[[], bool]
 
 
-Ask = Callable[[str, str, list[Any]], Any]
+Ask = Callable[[str, str, list[Any]], object]
 """Does what a script asks for: "get", "set" or "call", a path below `spm`, and what is given. Raises AfspmError."""
 
 
@@ -50,7 +50,7 @@ class Script:
         self._ended = False
         Thread(target=self._work, args=(source, names), name="emulated script", daemon=True).start()
 
-    def step(self) -> tuple[Any, str] | None:
+    def step(self) -> tuple[object, str] | None:
         """Run on; return its value as it is and as text, or None while it waits. Raises ScriptFailed."""
         if self._wait is not None:
             if self._wait.waiting():

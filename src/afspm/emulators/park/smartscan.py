@@ -16,6 +16,7 @@ from afspm.emulators.program import MakerProgram, NamedFile
 from afspm.errors import InvalidValue
 from afspm.files.park import MICROMETRE
 from afspm.model import Region
+from afspm.plain_data import Plain
 
 GEOMETRY: Final[dict[str, tuple[type, float, float]]] = {
     "pixelHeight": (int, 1, 8192),
@@ -44,7 +45,7 @@ class SmartScanProgram(MakerProgram):
         super().__init__(*given, **settings)
         self.geometry: dict[str, float] = dict(zip(GEOMETRY, (128, 128, 1.0, 1.0, 0.0, 0.0, 0.0), strict=True))
         feedback = self.rig.setup.feedback
-        self._values: dict[str, Any] = {
+        self._values: Plain = {
             _RATE: 1.0,
             _SETPOINT: 0.7 if feedback.setpoint is None else feedback.setpoint,
             _ENABLE: True,
@@ -56,7 +57,7 @@ class SmartScanProgram(MakerProgram):
             "scan.options": {"twoWay": False, "overScan": {"enable": False, "percent": 5}},
             "dataLocation": {"baseDir": str(self.folder), **_LOCATION},
         }
-        self._told: dict[str, Callable[[], Any]] = {
+        self._told: dict[str, Callable[[], object]] = {
             "zscanner.pos": lambda: 0.0 if self.rig.engaged else _RETRACTED_UM,
             "zscanner.fullyRetractedPos": lambda: _RETRACTED_UM,
             "zscanner.fullyExtendedPos": lambda: _EXTENDED_UM,
@@ -64,7 +65,7 @@ class SmartScanProgram(MakerProgram):
             "xystage.pos": lambda: {"x": self.stage_um[0], "y": self.stage_um[1]},
             "approach.state": lambda: "approaching" if self.engages else "idle",
         }
-        self._methods: dict[str, Callable[..., Any]] = {
+        self._methods: dict[str, Callable[..., object]] = {
             "scan.setScanGeometry": self._set_geometry,
             "scan.triggerImageScan": lambda: self.start_scan(self.now_s),
             "scan.startImageScan": self._start_and_wait,
@@ -90,12 +91,13 @@ class SmartScanProgram(MakerProgram):
         """What there is below `spm`, in JSON."""
         return json.dumps({"values": [*self._values, *self._told], "methods": list(self._methods)})
 
-    def ask(self, kind: str, path: str, given: list[Any]) -> Any:
+    def ask(self, kind: str, path: str, given: list[Any]) -> object:
         """Do what a script asks for. Raises AfspmError, TypeError."""
         if kind == "call":
             return self._methods[path](*given)
         if kind == "set":
-            return self._set(path, given[0])
+            self._set(path, given[0])
+            return None
         return self._told[path]() if path in self._told else self._values[path]
 
     # -- methods
@@ -116,7 +118,7 @@ class SmartScanProgram(MakerProgram):
         self._values[path] = value
         self._apply()
 
-    def _set_geometry(self, wanted: dict[str, Any]) -> None:
+    def _set_geometry(self, wanted: Plain) -> None:
         for name, (kind, low, high) in GEOMETRY.items():
             _number(name, wanted.get(name, self.geometry[name]), low, high, whole=kind is int)
         self.geometry |= {name: wanted[name] for name in GEOMETRY if name in wanted}
@@ -148,7 +150,7 @@ class SmartScanProgram(MakerProgram):
         self.rig.move_probe((x_um * MICROMETRE, y_um * MICROMETRE))
         return Wait(lambda: self.rig.doing(self.now_s) == "move")
 
-    def _read_channel(self, name: str) -> dict[str, Any]:
+    def _read_channel(self, name: str) -> Plain:
         signals = self.rig.signals(self.now_s)
         if name not in signals:
             raise InvalidValue(f"there is no channel {name!r}")

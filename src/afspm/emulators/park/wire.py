@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final, cast
+from typing import Final, cast
 
 import zmq
 
@@ -15,7 +15,7 @@ LONGEST_REQUEST: Final = 1 << 20
 class SmartRemoteWire:
     """The socket. See `ScriptWire`."""
 
-    def __init__(self, port: int, on_request: OnRequest, wakes: Any) -> None:
+    def __init__(self, port: int, on_request: OnRequest, wakes: object) -> None:
         self._on_request = on_request
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)

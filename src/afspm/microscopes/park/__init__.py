@@ -13,6 +13,7 @@ from afspm.microscopes.park.result_files import SETTLE_S, ParkFiles
 from afspm.microscopes.park.session import FALSE, TRUE, LongCall, Session
 from afspm.microscopes.park.settings import MICROMETRE, FrameSettings, TipPlace
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.plain_data import PlainMapping
 from afspm.translator.driver import ControllerLost, Driver, action
 from afspm.translator.parameters import Value
 from afspm.translator.setting_groups import FRAME, POSITION, frame
@@ -70,7 +71,7 @@ class Park(Driver):
         self.groups = (FrameSettings(self._smartscan), self._place)
 
     @classmethod
-    def technique(cls, settings: Mapping[str, Any]) -> str:
+    def technique(cls, settings: PlainMapping) -> str:
         return "AFM"
 
     def connect(self) -> None:

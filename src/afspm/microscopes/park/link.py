@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from afspm.errors import AfspmError
+from afspm.plain_data import Plain
 from afspm.translator.driver import ControllerLost
 from afspm.translator.zmq_connection import ZmqConnection
 
@@ -77,7 +78,7 @@ class Link:
         """Let go of it."""
         self._connection.close()
 
-    def _outcome(self, reply: dict[str, Any]) -> Any:
+    def _outcome(self, reply: Plain) -> Any:
         value = reply.get("value")
         try:
             told = json.loads(value) if isinstance(value, str) else value
@@ -121,7 +122,7 @@ def _request(method: str, parameters: str) -> bytes:
     return json.dumps({"jsonrpc": "2.0", "method": method, "params": parameters, "id": _ID}).encode()
 
 
-def _fields(raw: bytes) -> dict[str, Any]:
+def _fields(raw: bytes) -> Plain:
     """Return a reply. Raises SmartScanError: it is an error. ControllerLost: it is none."""
     try:
         reply = json.loads(raw)

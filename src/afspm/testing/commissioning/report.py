@@ -6,10 +6,11 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from afspm.errors import FileError
 from afspm.experiment.toml_writer import dumps
+from afspm.plain_data import Plain
 from afspm.storage.atomic import write_atomic
 from afspm.testing.commissioning.progress import CommissioningProgress, StepOutcome, StepResult
 
@@ -65,7 +66,7 @@ class InstrumentReport:
     def read(cls, file: Path) -> InstrumentReport:
         """Read one. Raises FileError: it is none."""
         try:
-            facts: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
+            facts: Plain = tomllib.loads(file.read_text(encoding="utf-8"))
             found = cls(**facts)
             if found.format != FORMAT or found.tried_on not in TRIED_ON:
                 raise ValueError(f"format {found.format}, tried on {found.tried_on!r}")
