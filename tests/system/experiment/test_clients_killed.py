@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from experiment_lab import DEADLINE_S, Run
+from afspm_process import DEADLINE_S
+from experiment_lab import Run
 
 import afspm
 from afspm.model import ScopeState

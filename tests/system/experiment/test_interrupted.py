@@ -9,7 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from experiment_lab import DEADLINE_S, AfspmRun
+from afspm_process import DEADLINE_S
+from experiment_lab import AfspmRun
 
 import afspm
 from afspm.model import ScopeState

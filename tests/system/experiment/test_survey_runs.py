@@ -47,7 +47,7 @@ def outcomes(folder: Path) -> list[str]:
 def require_each_once(one: AfspmRun, targets: int, said: str = "") -> None:
     """The survey, each zoom and each curve was taken once, and the table and the picture are there."""
     with afspm.open_run(one.folder) as record:
-        scans = [row for row in record.scans if not row.interrupted]
+        scans = [row for row in record.scans if not row.interrupted and row.holder != "rescanner"]
         spectra = list(record.spectra)
     numbers = range(1, targets + 1)
     wanted = ["survey", *(f"zoom-{number}" for number in numbers)]
@@ -119,7 +119,8 @@ def test_the_script_of_the_tutorial_does_the_same_in_under_thirty_lines(afspm_ru
     assert outcomes(tmp_path) == ["measured"] * 2
     assert (tmp_path / "targets.png").stat().st_size > 50_000
     with afspm.open_run(one.folder) as record:
-        assert [row.key for row in record.scans] == ["survey", "zoom-1", "zoom-2"]
+        own = [row.key for row in record.scans if row.holder != "rescanner"]
+        assert own == ["survey", "zoom-1", "zoom-2"]
 
 
 def test_zooms_outside_the_limits_are_told_as_refused_and_an_early_end_leaves_table_and_picture(
