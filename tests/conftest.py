@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -103,3 +104,24 @@ def plain() -> Iterator[Callable[..., Any]]:
 
     yield socket
     context.destroy(linger=0)
+
+
+NO_BROWSER = (
+    "no chromium is found: `apt install chromium` (or another way to have it; AFSPM_CHROMIUM=/path says where), "
+    "and the package playwright"
+)
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """A browser without a window: one a process, since Playwright allows no second one in it."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason=NO_BROWSER)
+    named = os.environ.get("AFSPM_CHROMIUM")
+    program = named or shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if program is None:
+        pytest.skip(NO_BROWSER)
+    with sync_api.sync_playwright() as playwright:
+        # in a container it has no sandbox of its own
+        started = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield started
+        started.close()

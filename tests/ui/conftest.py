@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,11 +11,6 @@ import pytest
 from ui_lab import SCREENSHOTS, Night, Opened
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # `benchmarks` has a stage to publish on, which serves here too
-
-NO_BROWSER = (
-    "no chromium is found: `apt install chromium` (or another way to have it; AFSPM_CHROMIUM=/path says where), "
-    "and the package playwright"
-)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -31,21 +24,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if item.path.is_relative_to(here):  # one browser, one experiment: one after the other
             item.add_marker(pytest.mark.xdist_group("ui"))
             item.add_marker(pytest.mark.timeout(180))
-
-
-@pytest.fixture(scope="session")
-def browser() -> Iterator[Any]:
-    """A browser without a window."""
-    sync_api = pytest.importorskip("playwright.sync_api", reason=NO_BROWSER)
-    named = os.environ.get("AFSPM_CHROMIUM")
-    program = named or shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if program is None:
-        pytest.skip(NO_BROWSER)
-    with sync_api.sync_playwright() as playwright:
-        # in a container it has no sandbox of its own
-        started = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        yield started
-        started.close()
 
 
 @pytest.fixture(scope="module")
