@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Final
 
 from afspm.clock import NS_PER_S, Clock, ExperimentClock
 from afspm.errors import FileError
@@ -244,7 +244,7 @@ def _shown(content: bytes | None) -> object:
     return text if readable or not content else {"base64": base64.b64encode(content).decode()}
 
 
-def _content(shown: Any) -> bytes | None:
+def _content(shown: object) -> bytes | None:
     if isinstance(shown, dict):
         return base64.b64decode(shown["base64"], validate=True)
     return None if shown is None else str(shown).encode()

@@ -197,7 +197,7 @@ class CommandTree:
         file.write_text(text, encoding="utf-8")
 
 
-def _is_python(value: Any) -> bool:
+def _is_python(value: object) -> bool:
     return callable(value) and type(value).__module__ != "lupa" and not type(value).__module__.startswith("lupa.")
 
 
