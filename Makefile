@@ -1,5 +1,5 @@
 # Two commands: `make demo` runs the main job, `make test` passes the tests. Both set up .venv by themselves:
-# 360 MB for the demonstrations, 570 MB for the tests (730 with those of the page), 830 with the tools of `make check`.
+# 360 MB for the demonstrations, 620 MB for the tests (780 with those of the page), 880 with the tools of `make check`.
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -19,12 +19,12 @@ $(DEMO): $(SOURCES)
 	@touch $@
 
 $(TEST): $(SOURCES)
-	@echo "Setting up .venv for the tests: 570 MB, with a chromium 730 MB …"
+	@echo "Setting up .venv for the tests: 620 MB, with a chromium 780 MB …"
 	@$(PYTHON) tools/bootstrap.py test
 	@touch $(DEMO) $@
 
 $(SETUP): $(SOURCES)
-	@echo "Setting up .venv with all tools: 830 MB …"
+	@echo "Setting up .venv with all tools: 880 MB …"
 	@$(PYTHON) tools/bootstrap.py all
 	@touch $(DEMO) $(TEST) $@
 
