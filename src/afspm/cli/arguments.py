@@ -27,6 +27,20 @@ def opt(help_text: str, *flags: str, **more: Any) -> object:
     return typer.Option(*flags, help=help_text, show_default=False, **more)
 
 
+_SPEED = "Experiment seconds in a real second; simulated microscopes only."
+Speed = Annotated[float | None, opt(_SPEED, min=1e-6)]
+CheckSpeed = Annotated[float, typer.Option(min=1e-6, help=_SPEED)]
+"""Of commands that check a microscope, which have a speed of their own for simulated ones."""
+WithinFrame = Annotated[
+    str,
+    opt(
+        'Stay within a square of this side about the centre of the frame that is set, e.g. "500 nm". '
+        "Default: within the frame that is set.",
+        metavar="SIZE",
+    ),
+]
+
+
 def names_in(given: list[str] | None) -> tuple[str, ...]:
     """Return names given by repeating the option, by commas, or both."""
     return tuple(name.strip() for names in given or () for name in names.split(",") if name.strip())

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from afspm.cli.arguments import RUNS, Files, Runs, opt
+from afspm.cli.arguments import RUNS, CheckSpeed, Files, Runs, WithinFrame, opt
 from afspm.cli.joining import plain_console
 
 if TYPE_CHECKING:
@@ -30,18 +30,9 @@ def commission(
         Path | None, opt("The report. Default: FILE-commissioning.toml, here.", "--report", metavar="REPORT")
     ] = None,
     runs: Runs = RUNS,
-    frame: Annotated[
-        str,
-        opt(
-            'Stay within a square of this side about the centre of the frame that is set, e.g. "500 nm". '
-            "Default: within the frame that is set.",
-            metavar="SIZE",
-        ),
-    ] = "",
+    frame: WithinFrame = "",
     anew: Annotated[bool, opt("Do all steps again, whatever the report says.", "--anew")] = False,
-    speed: Annotated[
-        float, typer.Option(min=1e-6, help="Experiment seconds in a real second; simulated microscopes only.")
-    ] = 20.0,
+    speed: CheckSpeed = 20.0,
 ) -> None:
     """Take a new controller into use, step by step, with the tip withdrawn first.
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from afspm.cli.arguments import RUNS, Runs, names_in, opt
+from afspm.cli.arguments import RUNS, CheckSpeed, Runs, WithinFrame, names_in, opt
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,17 +38,8 @@ def check_translator(
     ] = None,
     report: Annotated[Path | None, opt("Write the report here, too.", "--report", metavar="FILE")] = None,
     runs: Runs = RUNS,
-    speed: Annotated[
-        float, typer.Option(min=1e-6, help="Experiment seconds in a real second; simulated microscopes only.")
-    ] = 20.0,
-    frame: Annotated[
-        str,
-        opt(
-            'Stay within a square of this side about the centre of the frame that is set, e.g. "500 nm". '
-            "Default: within the frame that is set.",
-            metavar="SIZE",
-        ),
-    ] = "",
+    speed: CheckSpeed = 20.0,
+    frame: WithinFrame = "",
     yes: Annotated[bool, typer.Option("--yes", "-y", help="The tip is withdrawn: don't ask.")] = False,
     listed: Annotated[bool, typer.Option("--list", help="List the checks, and do none.")] = False,
 ) -> None:

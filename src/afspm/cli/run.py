@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from afspm.cli.arguments import RUNS, FilesUnlessResumed, Runs, names_in, opt
+from afspm.cli.arguments import RUNS, FilesUnlessResumed, Runs, Speed, names_in, opt
 
 if TYPE_CHECKING:
     from afspm.experiment import Experiment, ProcessStart
@@ -23,9 +23,7 @@ def run(
         list[str] | None, opt("Start all processes here but these.", "--without", metavar="NAME[,NAME…]")
     ] = None,
     runs: Runs = RUNS,
-    speed: Annotated[
-        float | None, opt("Experiment seconds in a real second; simulated microscopes only.", min=1e-6)
-    ] = None,
+    speed: Speed = None,
     dashboard: Annotated[bool, opt("Show it in the browser, too, if the file doesn't say so.", "--dashboard")] = False,
     resume: Annotated[
         Path | None,

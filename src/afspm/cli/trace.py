@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from afspm.cli.arguments import RUNS, Files, Runs, opt
+from afspm.cli.arguments import RUNS, Files, Runs, Speed
 
 if TYPE_CHECKING:
     from afspm.experiment import Experiment
@@ -16,9 +16,7 @@ if TYPE_CHECKING:
 def trace(
     files: Files,
     runs: Runs = RUNS,
-    speed: Annotated[
-        float | None, opt("Experiment seconds in a real second; simulated microscopes only.", min=1e-6)
-    ] = None,
+    speed: Speed = None,
 ) -> None:
     """Run an experiment, and record everything that is said to and by the controller.
 
