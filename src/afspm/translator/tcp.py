@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Final, TypeVar
 
+from afspm.errors import ConfigError
 from afspm.translator.driver import ControllerLost
 from afspm.translator.trace import TCP, TRACE, TracedAnswer
 
@@ -155,3 +156,11 @@ class TcpConnection:
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
+
+
+def host_and_port(address: str, hint: str = '"host:port"') -> tuple[str, int]:
+    """Return both parts of the setting `address`. Raises ConfigError: it is no address."""
+    host, _, port = address.rpartition(":")
+    if not (host and port.isdigit()):
+        raise ConfigError(f"{address!r} is not an address", where="address", hint=hint)
+    return host, int(port)

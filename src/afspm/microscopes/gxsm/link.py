@@ -10,6 +10,7 @@ from typing import Any, Protocol
 from afspm.errors import ConfigError
 from afspm.microscopes.gxsm.errors import BadReply, GxsmError
 from afspm.translator.driver import ControllerLost
+from afspm.translator.tcp import host_and_port
 
 BLOCK = "gxsm4_py_shm_data_block"
 PROCESS = "gxsm4"
@@ -61,10 +62,8 @@ class Address:
             if "/" in block:
                 raise ConfigError(f"{block!r} is not a name of shared memory", where="address", hint=HINT)
             return cls(block=block or BLOCK, process=process or PROCESS)
-        host, _, port = text.rpartition(":")
-        if not host or not port.isdigit():
-            raise ConfigError(f"{text!r} is not an address", where="address", hint=HINT)
-        return cls(host=host, port=int(port))
+        host, port = host_and_port(text, HINT)
+        return cls(host=host, port=port)
 
 
 def open_link(

@@ -8,10 +8,10 @@ from concurrent.futures import Future
 from threading import Thread
 from typing import Any, Final
 
-from afspm.errors import AfspmError, ConfigError
+from afspm.errors import AfspmError
 from afspm.microscopes.nanosurf.lua_values import BadLua, parse
 from afspm.translator.driver import ControllerLost
-from afspm.translator.tcp import Receiver, TcpConnection
+from afspm.translator.tcp import Receiver, TcpConnection, host_and_port
 
 _LENGTH: Final = struct.Struct("<I")
 _LONGEST_REPLY: Final = 1 << 28
@@ -33,7 +33,7 @@ class Link:
     """One connection. Raises ControllerLost: nobody listens there. ConfigError: it is no address."""
 
     def __init__(self, address: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
-        self._connection = TcpConnection(_host_and_port(address), timeout_s, monotonic_s, _HINTS)
+        self._connection = TcpConnection(host_and_port(address), timeout_s, monotonic_s, _HINTS)
 
     def run(self, script: str) -> list[Any]:
         """Run a script, and return the values that it returns.
@@ -119,10 +119,3 @@ def _shown(script: str) -> str:
     """Return the beginning of a script, for messages."""
     first = " ".join(script.split())
     return first if len(first) <= _SHOWN else f"{first[:_SHOWN]}…"
-
-
-def _host_and_port(address: str) -> tuple[str, int]:
-    host, _, port = address.rpartition(":")
-    if not (host and port.isdigit()):
-        raise ConfigError(f"{address!r} is not an address", where="address", hint='"host:port"')
-    return host, int(port)
