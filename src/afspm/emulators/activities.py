@@ -196,6 +196,19 @@ class SpectrumActivity:
         """True until it has ended."""
         return now_s < self.end_s
 
+    def both_ways(self) -> tuple[Channels, Channels]:
+        """Return the variables there and back, in the order in which they were measured; one that has no way back of
+        its own has the same values there.
+        """
+        table = dict(zip(self.names, zip(self.units, self.values.T, strict=True), strict=True))
+        there = {name: data for name, data in table.items() if not name.endswith(RETRACE)}
+        back = {
+            name: (unit, table.get(f"{name}{RETRACE}", (unit, values))[1]) for name, (unit, values) in there.items()
+        }
+        turned = there if self.kind == "force" else back  # a force curve begins away from the sample
+        turned.update({name: (unit, values[::-1]) for name, (unit, values) in turned.items()})
+        return there, back
+
 
 @dataclass(frozen=True)
 class ValuesInAir:

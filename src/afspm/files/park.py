@@ -1,14 +1,14 @@
-"""Park's TIFF files: one channel in one direction each, in private tags.
+"""Park's TIFF files: one channel of a scan in one direction each, or curves.
 
-From pspylib 0.1.2, the maker's own reader, and against Gwyddion: rows ascend, lengths are in micrometres, a value is
-gain · (number · scale + offset) in a unit of its own. Offsets are taken as the centre of the frame, a rotation as
-counter-clockwise, and backward lines as not mirrored (!). Curves are not read.
+Of images, rows ascend, lengths are in micrometres, and a value is gain · (number · scale + offset) in a unit of its
+own. Offsets are taken as the centre of the frame, a rotation as counter-clockwise, and backward lines as not mirrored
+(!). Of curves, the numbers lie channel by channel, in each both ways one after the other; a value is gain · number, as
+the makers of both readers have it. Places are taken as those of the scanner, in micrometres (!).
 """
 
 from __future__ import annotations
 
 import math
-import re
 from datetime import tzinfo
 from pathlib import Path
 from typing import Any, Final
@@ -17,74 +17,62 @@ import numpy as np
 
 from afspm.errors import FileError
 from afspm.files.content import FileContent, local_ns
-from afspm.model import Region, Scan
-
-MAGIC: Final = 0x0E031301
-VERSIONS: Final = {0x1000001: 356, 0x1000002: 580}
-"""The shortest header of each version."""
-MAGIC_TAG, VERSION_TAG, DATA_TAG, HEADER_TAG = 50432, 50433, 50434, 50435
-DATE_TAG: Final = 306
-_STRIPS, _STRIP_SIZES = 273, 279
-IMAGE: Final = 0
-MICROMETRE: Final = 1e-6
-_DATE: Final = "%Y:%m:%d %H:%M:%S"
-_NUMBERS: Final = {0: "<i2", 1: "<i4", 2: "<f4"}
-_UNIT: Final = re.compile(r"([fpnuµμmk]?)(m|V|A|N|Hz)")
-_PREFIX: Final = {"": 1.0, "f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "k": 1e3}
-
-HEADER: Final = np.dtype(
-    [("kind", "<u4"), ("source", "V64"), ("mode", "V16"), ("low_pass", "<f8"), ("flattened", "<u4"), ("ac", "<u4")]
-    + [("columns", "<u4"), ("rows", "<u4"), ("angle_deg", "<f8"), ("sine", "<u4"), ("overscan", "<f8")]
-    + [("forward", "<u4"), ("upwards", "<u4"), ("swapped", "<u4")]
-    + [(name, "<f8") for name in ("width_um", "height_um", "x_um", "y_um", "rate_hz", "setpoint")]
-    + [("setpoint_unit", "V16"), ("tip_bias_v", "<f8"), ("sample_bias_v", "<f8")]
-    + [("gain", "<f8"), ("scale", "<f8"), ("offset", "<f8"), ("unit", "V16")]
-    + [("lowest", "<i4"), ("highest", "<i4"), ("mean", "<i4")]
-    + [("compressed", "<u4"), ("logarithmic", "<u4"), ("squared", "<u4")]
-    + [("z_gain", "<f8"), ("z_range", "<f8"), ("xy_voltage", "V16"), ("z_voltage", "V16"), ("xy_servo", "V16")]
-    + [("numbers", "<u4")]
+from afspm.files.park_header import (
+    CURVE_KINDS,
+    CURVES,
+    CURVES_DATA_TAG,
+    CURVES_TAG,
+    DATA_TAG,
+    DATE_TAG,
+    HEADER,
+    HEADER_TAG,
+    IMAGE,
+    MAGIC,
+    MAGIC_TAG,
+    MICROMETRE,
+    NUMBERS,
+    OLD_CURVES,
+    POINT,
+    SPECTROSCOPY,
+    STRIP_SIZES,
+    STRIPS,
+    VERSION_TAG,
+    VERSIONS,
+    in_si,
+    text,
 )
-"""The beginning of a header; version 1 ends before `z_gain`, and its numbers are of the first kind."""
+from afspm.model import Region, Scan, Spectrum
+
+_DATE: Final = "%Y:%m:%d %H:%M:%S"
+Tags = dict[int, Any]
 
 
 def read_tiff(path: Path, zone: tzinfo | None) -> FileContent:
-    """The image of a file. Raises FileError: not whole, or another kind of TIFF."""
+    """The image or the curves of a file. Raises FileError: not whole, or another kind of TIFF."""
     tags = _tags(path)
     version, raw = int(tags.get(VERSION_TAG, 0)), bytes(tags.get(HEADER_TAG, b""))
     if tags.get(MAGIC_TAG) != MAGIC:
         raise FileError("is not a TIFF of a Park microscope")
     if len(raw) < VERSIONS.get(version, math.inf):
         raise FileError(f"has a header of {len(raw)} bytes in version {version:#x}, which afspm does not know")
-    header = np.frombuffer(raw, HEADER, 1)[0]
-    if header["kind"] != IMAGE:
-        raise FileError("holds a line or a curve; afspm reads Park's images alone")
-    if header["compressed"] or header["swapped"]:
-        raise FileError("is compressed, or scanned along y, which afspm does not read")
-    unit, factor = _in_si(text(header["unit"]) or "um")
-    scale = float(header["scale"]) or 1.0
-    numbers = _numbers(header, bytes(tags.get(DATA_TAG, b"")), newer=version == max(VERSIONS))
-    values = factor * float(header["gain"]) * (numbers * scale + float(header["offset"]))
-    size = (abs(float(header["width_um"])) * MICROMETRE, abs(float(header["height_um"])) * MICROMETRE)
-    center = (float(header["x_um"]) * MICROMETRE, float(header["y_um"]) * MICROMETRE)
-    region = Region(center, size, math.radians(float(header["angle_deg"])))
-    channel = f"{text(header['source'])} {'Forward' if header['forward'] else 'Backward'}"
+    header = np.frombuffer(raw.ljust(HEADER.itemsize, b"\0"), HEADER, 1)[0]
+    kind = int(header["kind"])
+    if kind not in (IMAGE, SPECTROSCOPY):
+        raise FileError("holds a line; afspm reads Park's images and curves")
+    newer = version == max(VERSIONS)
     told = {name: _plain(header[name]) for name in HEADER.names or ()}
     date = str(tags.get(DATE_TAG, "")).strip("\0 ")
     return FileContent(
         f"Park {text(header['mode'])}".strip(),
-        (Scan(region, channel, unit, values, filename=str(path)),),
+        scans=(_scan(header, tags, path, newer=newer),) if kind == IMAGE else (),
+        spectra=_curves(tags, path, newer=newer) if kind == SPECTROSCOPY else (),
         header=told,
         start_ns=local_ns(date, _DATE, zone) if date else None,
-        upwards=bool(header["upwards"]),
+        upwards=bool(header["upwards"]) if kind == IMAGE else None,
     )
 
 
-def text(raw: np.void) -> str:
-    """Return a text of a header: two bytes a character, and zeros behind it."""
-    return raw.tobytes().decode("utf-16-le", "replace").partition("\0")[0].strip()
-
-
-def _tags(path: Path) -> dict[int, Any]:
+def _tags(path: Path) -> Tags:
     from PIL import Image, TiffImagePlugin, UnidentifiedImageError
 
     try:
@@ -94,24 +82,67 @@ def _tags(path: Path) -> dict[int, Any]:
             tags = dict(image.tag_v2)
     except UnidentifiedImageError as error:
         raise FileError("is not a TIFF") from error
-    ends = [at + size for at, size in zip(tags.get(_STRIPS, ()), tags.get(_STRIP_SIZES, ()), strict=True)]
+    ends = [at + size for at, size in zip(tags.get(STRIPS, ()), tags.get(STRIP_SIZES, ()), strict=True)]
     if max(ends, default=0) > path.stat().st_size:
         raise FileError("ends within the picture")
     return tags
 
 
-def _numbers(header: np.void, data: bytes, *, newer: bool) -> np.ndarray[Any, np.dtype[np.float64]]:
-    kind = np.dtype(_NUMBERS[int(header["numbers"]) if newer else 0])
-    rows, columns = int(header["rows"]), int(header["columns"])
-    if not rows * columns or len(data) < rows * columns * kind.itemsize:
-        raise FileError(f"has {len(data)} bytes of data for {columns} x {rows} pixels")
-    return np.frombuffer(data, kind, rows * columns).reshape(rows, columns).astype(np.float64)
+def _scan(header: np.void, tags: Tags, path: Path, *, newer: bool) -> Scan:
+    if header["compressed"] or header["swapped"]:
+        raise FileError("is compressed, or scanned along y, which afspm does not read")
+    shape = int(header["rows"]), int(header["columns"])
+    numbers = _numbers(tags, DATA_TAG, header, shape, newer=newer)
+    unit, factor = in_si(text(header["unit"]) or "um")
+    scale = float(header["scale"]) or 1.0
+    values = factor * float(header["gain"]) * (numbers * scale + float(header["offset"]))
+    size = (abs(float(header["width_um"])) * MICROMETRE, abs(float(header["height_um"])) * MICROMETRE)
+    center = (float(header["x_um"]) * MICROMETRE, float(header["y_um"]) * MICROMETRE)
+    region = Region(center, size, math.radians(float(header["angle_deg"])))
+    channel = f"{text(header['source'])} {'Forward' if header['forward'] else 'Backward'}"
+    return Scan(region, channel, unit, values, filename=str(path))
 
 
-def _in_si(unit: str) -> tuple[str, float]:
-    """Return the unit without its prefix, and what to multiply with."""
-    found = _UNIT.fullmatch(unit)
-    return (found[2], _PREFIX[found[1]]) if found else (unit, 1.0)
+def _curves(tags: Tags, path: Path, *, newer: bool) -> tuple[Spectrum, ...]:
+    raw = bytes(tags.get(CURVES_TAG, b""))
+    if len(raw) < OLD_CURVES:
+        raise FileError(f"has a header of {len(raw)} bytes for its curves, not of {OLD_CURVES}")
+    header = np.frombuffer(raw.ljust(CURVES.itemsize, b"\0"), CURVES, 1)[0]
+    points, count, driving = (int(header[name]) for name in ("points", "channel_count", "driving"))
+    if points < 1 or not 0 <= driving < count <= len(header["channels"]):
+        raise FileError(f"has {points} curves of {count} channels, driven by number {driving}")
+    if header["logarithmic"][:count].any() or header["squared"][:count].any():
+        raise FileError("has logarithms or squares of values, which afspm does not read")
+    numbers = _numbers(tags, CURVES_DATA_TAG, header, (points, count, int(header["numbers_each"])), newer=newer)
+    order = [driving, *(number for number in range(count) if number != driving)]
+    channels = [header["channels"][number] for number in order]
+    units, factors = zip(*(in_si(text(channel["unit"])) for channel in channels), strict=True)
+    values = numbers[:, order] * np.multiply(factors, [channel["gain"] for channel in channels])[:, None]
+    kind = CURVE_KINDS.get(int(header["kind"])) or ("IV" if units[0] == "V" else "force")
+    names = tuple(text(channel["name"]) for channel in channels)
+    return tuple(
+        Spectrum(place, kind, names, units, curve.T, filename=str(path))
+        for place, curve in zip(_places(raw[CURVES.itemsize :], points), values, strict=True)
+    )
+
+
+def _places(raw: bytes, count: int) -> list[tuple[float, float] | None]:
+    if len(raw) < count * POINT.itemsize:
+        return [None] * count
+    points = np.frombuffer(raw, POINT, count)
+    return [(float(one["x_um"]) * MICROMETRE, float(one["y_um"]) * MICROMETRE) for one in points]
+
+
+def _numbers(
+    tags: Tags, tag: int, header: np.void, shape: tuple[int, ...], *, newer: bool
+) -> np.ndarray[Any, np.dtype[np.float64]]:
+    data, number = bytes(tags.get(tag, b"")), int(header["numbers"]) if newer else 0
+    if number not in NUMBERS:
+        raise FileError(f"has numbers of kind {number}, which afspm does not know")
+    kind, size = np.dtype(NUMBERS[number]), math.prod(shape)
+    if min(shape) < 1 or len(data) < size * kind.itemsize:
+        raise FileError(f"has {len(data)} bytes of data for {' x '.join(map(str, shape))} numbers")
+    return np.frombuffer(data, kind, size).reshape(shape).astype(np.float64)
 
 
 def _plain(value: Any) -> object:

@@ -10,6 +10,7 @@ from afspm.microscopes.asylum import Asylum
 from afspm.microscopes.gxsm import Gxsm
 from afspm.microscopes.nanonis import Nanonis
 from afspm.microscopes.nanosurf import Nanosurf
+from afspm.microscopes.park import Park
 from afspm.model import Scan, ScopeState, ScopeStatus, Spectrum, names
 from afspm.translator import Driver
 
@@ -60,7 +61,7 @@ def turned(values: Any) -> dict[str, Any]:
     return {name: -float(value) if name == names.SCAN_ANGLE else value for name, value in values.items()}
 
 
-for vendor in (Nanonis, Asylum, Gxsm, Nanosurf):
+for vendor in (Nanonis, Asylum, Gxsm, Nanosurf, Park):
     for fault in (MirroredY, OtherWay, LateEnd):
         name = fault.__name__ + vendor.__name__
         globals()[name] = type(name, (fault, vendor), {"__module__": __name__})

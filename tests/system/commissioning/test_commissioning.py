@@ -23,7 +23,9 @@ from afspm.testing.translators import CheckOptions
 from afspm.translator.trace import FILE, TracedExchange, read_trace
 
 HERE = Path(__file__).parent
-VENDORS = ("Nanonis", "Asylum", "Gxsm", "Nanosurf")
+VENDORS = ("Nanonis", "Asylum", "Gxsm", "Nanosurf", "Park")
+SPEEDS = {"Park": 5.0}
+"""Of the clock, where the usual one is too fast: the translator waits a second of real time for further files."""
 EXPERIMENT = """
 [controller]
 component = true
@@ -74,7 +76,8 @@ def commissioned(folder: Path, vendor: str, person: Person, driver: str = "") ->
     file.write_text(EXPERIMENT.format(vendor=vendor, driver=driver or vendor), encoding="utf-8")
     report = folder / "report.toml"
     before = InstrumentReport.read(report) if report.exists() else None
-    return commission(CheckOptions([file], runs=folder / "runs"), person, report, "emulator", before)
+    options = CheckOptions([file], runs=folder / "runs", speed=SPEEDS.get(vendor, CheckOptions.speed))
+    return commission(options, person, report, "emulator", before)
 
 
 @pytest.mark.parametrize("vendor", VENDORS)

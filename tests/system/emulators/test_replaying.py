@@ -34,7 +34,13 @@ class = "{driver}"
 {where} = {files_here}
 """
 
-WHERE = {"nanonis": "session_dir", "asylum": "folders", "gxsm": "scan_dir", "nanosurf": "gallery_dir"}
+WHERE = {
+    "nanonis": "session_dir",
+    "asylum": "folders",
+    "gxsm": "scan_dir",
+    "nanosurf": "gallery_dir",
+    "park": "data_dir",
+}
 """The setting that says where the controller's files are."""
 OTHER = """
 [details]
@@ -65,7 +71,7 @@ def run(folder: Path, command: str, *files: Path) -> tuple[subprocess.CompletedP
     return done, max((folder / "runs").glob("*-*"))
 
 
-@pytest.fixture(scope="module", params=["nanonis", "asylum", "gxsm", "gxsm-shm", "nanosurf"])
+@pytest.fixture(scope="module", params=["nanonis", "asylum", "gxsm", "gxsm-shm", "nanosurf", "park"])
 def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path, Path]:
     """The vendor, a trace, and the file of an experiment that plays it back."""
     vendor, _, transport = str(request.param).partition("-")

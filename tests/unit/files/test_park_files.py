@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 import afspm
-from afspm.emulators.activities import ScanActivity
+from afspm.emulators.activities import RETRACE, ScanActivity, SpectrumActivity
 from afspm.emulators.park import files
 from afspm.errors import FileError
 from afspm.model import Feedback, Region
@@ -60,6 +60,63 @@ def test_directions_and_units_are_told_apart(written: dict[str, Path]) -> None:
     (back,), (phase,) = (afspm.read(written[name]).scans for name in ("Z Height_Backward", "Phase_Forward"))
     assert (back.channel, phase.channel, phase.unit) == ("Z Height Backward", "Phase Forward", "deg")
     np.testing.assert_allclose(phase.values, HEIGHTS * 1e9, rtol=1e-6)
+
+
+SWEPT = np.linspace(-2.0, 2.0, 50) * 1e-7
+CURVES = {
+    "force": ("Z", "m", {"Force": ("N", SWEPT), f"Force{RETRACE}": ("N", SWEPT + 1e-9)}),
+    "IV": ("Bias", "V", {"Current": ("A", SWEPT), f"Current{RETRACE}": ("A", SWEPT + 1e-9), "dI/dV": ("S", SWEPT)}),
+}
+
+
+def curve_file(folder: Path, kind: str) -> Path:
+    swept, unit, columns = CURVES[kind]
+    names, units = (swept, *columns), (unit, *(one for one, _ in columns.values()))
+    values = np.column_stack([SWEPT, *(values for _, values in columns.values())])
+    taken = SpectrumActivity(1, kind, (2e-6, -3e-6), 0.0, 1.0, names, units, values)
+    path = folder / f"{kind}.tiff"
+    path.write_bytes(files.curve(taken, 1.7e9, "CAFM"))
+    return path
+
+
+@pytest.mark.parametrize(("kind", "names"), [("force", ("Z", "Force")), ("IV", ("Bias", "Current", "dI/dV"))])
+def test_a_curve_is_read_there_and_back(kind: str, names: tuple[str, ...], tmp_path: Path) -> None:
+    content = afspm.read(curve_file(tmp_path, kind))
+    (curve,) = content.spectra
+    assert not content.scans
+    assert (curve.kind, curve.names, content.controller) == (kind, names, "Park CAFM")
+    assert curve.units[:2] == (CURVES[kind][1], CURVES[kind][2][names[1]][0])
+    assert curve.position_m == pytest.approx((2e-6, -3e-6))
+    there, back = (SWEPT[::-1], SWEPT) if kind == "force" else (SWEPT, SWEPT[::-1])
+    np.testing.assert_allclose(curve.values[:, 0], [*there, *back], atol=1e-13)
+    np.testing.assert_allclose(curve.values[:, 1], [*there, *(back + 1e-9)], atol=1e-13)
+
+
+def test_curves_that_are_not_whole_are_refused(tmp_path: Path) -> None:
+    whole = curve_file(tmp_path, "force").read_bytes()
+    half = tmp_path / "half.tiff"
+    for size in range(0, len(whole) - 1, 97):
+        half.write_bytes(whole[:size])
+        with pytest.raises(FileError):
+            afspm.read(half)
+
+
+def test_the_makers_own_reader_reads_the_same(written: dict[str, Path], tmp_path: Path) -> None:
+    """It wants a picture in colours and in several strips, which every Park file has."""
+    tiff = pytest.importorskip(
+        "pspylib.tiff", reason="pspylib, Park's own reader, is not installed (pip install pspylib)"
+    )
+    image = tiff.TiffReader(str(written["Z Height_Forward"])).data
+    np.testing.assert_allclose(np.reshape(image.scanData.ZData, (12, 20)) * 1e-6, HEIGHTS, atol=1e-13)
+    assert len(image.metaData.thumbnail) == HEIGHTS.size
+    curve = tiff.TiffReader(str(curve_file(tmp_path, "force"))).data
+    gains = [curve.spectHeader.channelInfo[number]["gain"][0] for number in (0, 1)]
+    ours = afspm.read(tmp_path / "force.tiff").spectra[0].values
+    factors = np.array([1e-6, 1e-9])  # it leaves the units to who asks
+    np.testing.assert_allclose((curve.spectData.rawData[0].T * gains) * factors, ours, rtol=1e-6)
+    assert curve.spectHeader.spectHeader["spectType"][0] == 2
+    point = curve.spectHeader.pointInfo[0]
+    assert (point["fPosX"][0], point["fPosY"][0]) == pytest.approx((2.0, -3.0))
 
 
 @pytest.mark.skipif(shutil.which("gwyddion") is None, reason="Gwyddion is not installed")

@@ -49,11 +49,7 @@ def image(scan: ScanActivity, now_s: float, mode: str) -> bytes:
 
 def curve(spectrum: SpectrumActivity, now_s: float, mode: str) -> bytes:
     """The file of a force curve: a segment towards the sample, another back."""
-    table = dict(zip(spectrum.names, zip(spectrum.units, spectrum.values.T, strict=True), strict=True))
-    there = {name: data for name, data in table.items() if not name.endswith(RETRACE)}
-    back = {name: (unit, table.get(f"{name}{RETRACE}", (unit, values))[1]) for name, (unit, values) in there.items()}
-    there = {name: (unit, values[::-1]) for name, (unit, values) in there.items()}
-    return _file({"group_type": "spectroscopy", "measurement_mode": mode}, {}, [there, back], now_s)
+    return _file({"group_type": "spectroscopy", "measurement_mode": mode}, {}, spectrum.both_ways(), now_s)
 
 
 def _file(facts: PlainMapping, frame: PlainMapping, segments: Sequence[SegmentChannels], now_s: float) -> bytes:

@@ -14,7 +14,7 @@ from afspm.emulators.park import files
 from afspm.emulators.park.engine import Wait
 from afspm.emulators.program import MakerProgram, NamedFile
 from afspm.errors import InvalidValue
-from afspm.files.park import MICROMETRE
+from afspm.files.park_header import MICROMETRE
 from afspm.model import Region
 from afspm.plain_data import Plain
 
