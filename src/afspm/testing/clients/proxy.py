@@ -7,7 +7,8 @@ commands, each frame that the scheduler sends belongs to a reply.
 from __future__ import annotations
 
 import contextlib
-import random
+import itertools
+import math
 import socket
 import threading
 from dataclasses import dataclass, field
@@ -47,16 +48,17 @@ class CuttingProxy:
 
     Args:
         target: the scheduler's address, "tcp://host:port".
-        share: of the replies that are lost, and their connection with them.
+        longest: one connection is cut at its first chunk with replies, the next at its second and so on, up to this.
+            Those cut at the first have lost the answer to the greeting; the others replies to what was asked.
 
     Attributes:
         cuts: how many connections were cut.
     """
 
-    def __init__(self, target: str, share: float) -> None:
+    def __init__(self, target: str, longest: int) -> None:
         host, _, port = target.removeprefix("tcp://").rpartition(":")
         self._target = (host, int(port))
-        self._share, self._random = share, random.Random(1)
+        self._lengths = itertools.cycle(range(1, 1 + longest))
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.address = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
         self._open: set[socket.socket] = set()
@@ -84,16 +86,18 @@ class CuttingProxy:
                 server.settimeout(None)
                 with self._lock:
                     self._open |= {client, server}
-                for pair in ((client, server, False), (server, client, True)):
+                for pair in ((client, server, math.inf), (server, client, next(self._lengths))):
                     threading.Thread(target=self._pass_on, args=pair, daemon=True).start()
 
-    def _pass_on(self, source: socket.socket, sink: socket.socket, replies: bool) -> None:
+    def _pass_on(self, source: socket.socket, sink: socket.socket, chunks: float) -> None:
+        """Pass on until so many chunks with frames have come; the last of them is lost."""
         counter = FrameCounter()
         with contextlib.suppress(OSError):
             for chunk in iter(lambda: source.recv(_CHUNK), b""):
                 before = counter.messages
                 counter.feed(chunk)
-                if replies and counter.messages > before and self._random.random() < self._share:
+                chunks -= counter.messages > before
+                if chunks <= 0:
                     self.cuts += 1
                     break
                 sink.sendall(chunk)
