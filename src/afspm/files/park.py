@@ -3,7 +3,7 @@
 Of images, rows ascend, lengths are in micrometres, and a value is gain · (number · scale + offset) in a unit of its
 own. Offsets are taken as the centre of the frame, a rotation as counter-clockwise, and backward lines as not mirrored
 (!). Of curves, the numbers lie channel by channel, in each both ways one after the other; a value is gain · number, as
-the makers of both readers have it. Places are taken as those of the scanner, in micrometres (!).
+pspylib and AtomicJ have it. Places are taken as those of the scanner, in micrometres (!).
 """
 
 from __future__ import annotations

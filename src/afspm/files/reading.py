@@ -34,7 +34,7 @@ FORMATS = {
 def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     """The scans and spectra of a file.
 
-    Asylum (.ibw, NSID .h5), Nanonis (.sxm, .dat), GXSM (.nc, .vpdata), Nanosurf (.nhf, .nid), Park (images in .tiff),
+    Asylum (.ibw, NSID .h5), Nanonis (.sxm, .dat), GXSM (.nc, .vpdata), Nanosurf (.nhf, .nid), Park (.tiff),
     Gwyddion's simple fields (.gsf) and those of the simulated microscope (.nc). Of channels of one name,
     the second is "name #2".
 

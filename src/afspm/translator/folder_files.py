@@ -1,4 +1,4 @@
-"""The results of a controller that saves each measurement to a new file in a folder."""
+"""The results of a controller that saves each measurement to a new file in a folder, or to several."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class FolderFiles(ResultFiles):
             self._ends({"end_ns": now_ns})
 
     def has_file(self) -> bool:
-        """Return True if the file of what is running has appeared."""
+        """Return True if a file of what is running has appeared."""
         running = self._kept["running"]
         return running is not None and self._file(running) is not None
 
@@ -61,16 +61,22 @@ class FolderFiles(ResultFiles):
         return self._listed()
 
     def read(self, entry: Entry) -> Content:
-        path = Path(entry["file"])
-        if modified_ns(path) != entry["modified_ns"]:
-            raise FileError("was overwritten or deleted", where=str(path))
-        return self._content_of(path, entry)
+        files = [(Path(name), written_ns) for name, written_ns in entry["files"]]
+        for path, written_ns in files:
+            if modified_ns(path) != written_ns:
+                raise FileError("was overwritten or deleted", where=str(path))
+        return self._content_of([path for path, _ in files], entry)
 
     # -- what a controller may have otherwise
 
     def result_name(self, path: Path) -> str:
         """Return the name of the result in a file."""
         return str(path)
+
+    def files_of(self, measured: Entry) -> list[tuple[str, int]]:
+        """Return the files of what was measured, and when they were written; none: not all are there."""
+        path = self._file(measured)
+        return [] if path is None else [(str(path), modified_ns(path))]
 
     def check(self, path: Path, one: Scan | Spectrum, measured: Entry) -> None:
         """Look at the first of a file that is taken."""
@@ -80,22 +86,20 @@ class FolderFiles(ResultFiles):
         running["newest_ns"] = newest(self._files(Path(running["folder"])))[0]
 
     def _take(self, measured: Entry) -> bool:
-        """Return True if all is known of what was measured: its file is a result, or no whole scan."""
-        path = self._file(measured)
-        if path is None:
-            return False
-        written_ns = modified_ns(path)
+        """Return True if all is known of what was measured: its files are a result, or no whole scan."""
+        files = self.files_of(measured)
+        paths = [Path(name) for name, _ in files]
         try:
-            content = self._content_of(path, measured)
+            content = self._content_of(paths, measured) if paths else ()
         except (AfspmError, OSError):
             return False  # not yet whole
-        if modified_ns(path) != written_ns:
+        if not content or [modified_ns(path) for path in paths] != [written_ns for _, written_ns in files]:
             return False
         if lines_missing(content):  # it was saved when the scan was broken off
             self.broken_off = True
             return True
-        self.check(path, content[0], measured)
-        self._add(self.result_name(path), measured, {"file": str(path), "modified_ns": written_ns}, content)
+        self.check(paths[0], content[0], measured)
+        self._add(self.result_name(paths[0]), measured, {"files": [list(one) for one in files]}, content)
         return True
 
     def _file(self, measured: Entry) -> Path | None:
@@ -104,9 +108,9 @@ class FolderFiles(ResultFiles):
     def _files(self, folder: Path) -> list[Path]:
         return list(folder.glob(self.pattern)) if folder.is_dir() else []
 
-    def _content_of(self, path: Path, measured: Entry) -> Content:
-        found = read_result(path)
-        content: Sequence[Scan | Spectrum] = found.scans if measured["what"] == SCAN else found.spectra
-        if not content:
-            raise FileError(f"holds no {measured['what']}", where=str(path))
-        return [self.precision.as_set(one, measured) for one in content]
+    def _content_of(self, paths: Sequence[Path], measured: Entry) -> Content:
+        is_scan = measured["what"] == SCAN
+        found = [one for path in paths for one in read_result(path) if isinstance(one, Scan) is is_scan]
+        if not found:
+            raise FileError(f"holds no {measured['what']}", where=str(paths[0]))
+        return [self.precision.as_set(one, measured) for one in found]

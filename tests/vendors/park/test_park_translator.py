@@ -11,7 +11,7 @@ import pytest
 from park_bench import Bench
 from vendor_bench import FLAT, SOON, TURNED, left_in_danger, moved, ready, scanned, scans, small, states
 
-from afspm.model import ControlResponse, Region, Scan, ScopeState, names
+from afspm.model import ControlResponse, Region, Scan, ScopeState, Spectrum, names
 
 Make = Callable[..., Bench]
 Settings = dict[str, Any]
@@ -174,3 +174,69 @@ def test_a_scan_that_does_not_begin_is_refused(bench: Make) -> None:
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.ACTION_ERROR
     assert "did not begin the scan" in response.reason
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize(("kind", "swept"), [("force", "Z"), ("IV", "Bias")])
+def test_a_curve_is_taken_where_the_tip_was_sent(bench: Make, kind: str, swept: str, variant: Settings) -> None:
+    made = bench(**variant)
+    peer = made.start()
+    ready(peer)
+    moved(peer, 120e-9, -40e-9)
+    scanned(peer)
+    assert peer.set(names.SPEC_KIND, kind).ok
+    assert peer.act(names.START_SPEC).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SPEC", "FREE"]
+    (curve,) = [one for one in heard if isinstance(one, Spectrum)]
+    assert (curve.kind, curve.names[0], curve.position_m) == (kind, swept, (120e-9, -40e-9))
+    taken = made.emulator.rig.spectrum
+    assert taken is not None
+    assert taken.position_m == pytest.approx((120e-9, -40e-9))
+    there, back = taken.both_ways()
+    for name, (_, values) in there.items():
+        np.testing.assert_allclose(curve[name], [*values, *back[name][1]], rtol=1e-5, atol=1e-6 * np.ptp(values))
+
+
+def test_a_curve_can_be_stopped(bench: Make) -> None:
+    made = bench(speed=1.0, force={"duration_s": 20.0})
+    peer = small(made)
+    assert peer.act(names.START_SPEC).ok
+    peer.until(ScopeState.SPEC)
+    assert peer.act(names.STOP_SPEC).ok
+    heard = peer.until(FREE)
+    assert not any(isinstance(one, Spectrum) for one in heard)
+
+
+def test_a_curve_that_is_stopped_on_the_way_to_it_is_not_taken(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    moved(peer, 120e-9, -40e-9)
+    made.at_panel(lambda emulator: emulator.rig.move_probe((1e-6, 0.0)))
+    made.at_panel(lambda emulator: setattr(emulator.rig.setup, "move_speed_m_s", 5e-9))
+    assert peer.act(names.START_SPEC).ok
+    peer.until(ScopeState.SPEC)
+    assert peer.act(names.STOP_SPEC).ok
+    assert states(peer.until(FREE)) == ["INTERRUPTED", "MOVING", "FREE"]
+    assert made.emulator.rig.spectrum is None
+
+
+def test_withdrawing_ends_a_curve(bench: Make) -> None:
+    made = bench(speed=1.0, force={"duration_s": 20.0})
+    peer = small(made)
+    assert peer.act(names.START_SPEC).ok
+    peer.until(ScopeState.SPEC)
+    assert peer.act(names.RETRACT).ok
+    assert not any(isinstance(one, Spectrum) for one in peer.until(FREE))
+    assert not made.emulator.rig.engaged
+
+
+def test_a_curve_that_smartscan_refuses_is_no_result(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4))
+    peer.act(names.START_SPEC)
+    heard = peer.until(FREE)
+    assert states(heard)[-2:] == ["INTERRUPTED", "FREE"]
+    made.until_said("busy with a calibration")

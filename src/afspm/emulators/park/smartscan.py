@@ -28,6 +28,7 @@ GEOMETRY: Final[dict[str, tuple[type, float, float]]] = {
     "rotation": (float, -360.0, 360.0),
 }
 """The frame, in the order in which it is told: type and bounds, in micrometres and degrees."""
+_CURVES: Final = {"fd": "force", "iv": "IV"}
 _LOCATION: Final = {"subDir": "", "fileName": "SIMULATED", "fileSuffix": "", "direction": "auto", "jpegSave": False}
 _RETRACTED_UM, _EXTENDED_UM = 7.5, -7.5
 _SETPOINT, _ENABLE, _RATE, _BIAS = "zservo.setpoint.value", "zservo.enable", "scan.rate", "bias.tip"
@@ -71,6 +72,9 @@ class SmartScanProgram(MakerProgram):
             "scan.startImageScan": self._start_and_wait,
             "scan.stop": lambda: self.stop_scan(self.now_s),
             "scan.channels.names": lambda: list(self.rig.channels),
+            "spect.start": self._measure_curve,
+            "spect.trigger": self._start_curve,
+            "spect.stop": self.stop_curve,
             "approach.start": self._approach,
             "approach.stop": self.stop_engaging,
             "zscanner.retractAll": self._retract,
@@ -127,6 +131,16 @@ class SmartScanProgram(MakerProgram):
         self.start_scan(self.now_s)
         return Wait(lambda: self.scanning)
 
+    def _start_curve(self, mode: str | Plain = "fd", place: str = "given") -> None:
+        told = mode if isinstance(mode, dict) else {"mode": mode, "type": place}
+        if told.get("mode") not in _CURVES or told.get("type") != "here":
+            raise InvalidValue(f"no points are given for {mode!r}, or there is no such spectroscopy")
+        self.start_curve(_CURVES[told["mode"]], self.now_s)
+
+    def _measure_curve(self, *given: Any) -> Wait:
+        self._start_curve(*given)
+        return Wait(lambda: self.measuring_curve)
+
     def _approach(self, mode: str = "q+s") -> Wait:
         if mode not in ("q", "quick", "q+s", "quickAndsafe", "inc", "incremental", "incz", "incrementalzscanner"):
             raise InvalidValue(f"there is no approach {mode!r}")
@@ -169,17 +183,21 @@ class SmartScanProgram(MakerProgram):
     def prepare_curve(self) -> None: ...
 
     def scan_files(self, scan: ScanActivity, now_s: float) -> Sequence[NamedFile]:
-        location = self._values["dataLocation"]
-        self._saved += 1
-        folder = f"{_plain(location['subDir'])}/" if location["subDir"] else ""
-        name = f"{folder}{_plain(location['fileName'])}_{self._saved:04d}"
-        while list(self.folder.glob(f"{name}_*")):
-            self._saved += 1
-            name = f"{folder}{_plain(location['fileName'])}_{self._saved:04d}"
+        name = self._next_name()
         return [(f"{name}_{_plain(channel)}.tiff", content) for channel, content in files.images(scan, now_s, "NCM")]
 
     def curve_files(self, curve: SpectrumActivity, now_s: float) -> Sequence[NamedFile]:
-        return ()
+        return [(f"{self._next_name()}_{curve.kind}.tiff", files.curve(curve, now_s, "NCM"))]
+
+    def _next_name(self) -> str:
+        """Return the beginning of the next files' names, which no file has."""
+        location = self._values["dataLocation"]
+        folder = f"{_plain(location['subDir'])}/" if location["subDir"] else ""
+        while True:
+            self._saved += 1
+            name = f"{folder}{_plain(location['fileName'])}_{self._saved:04d}"
+            if not list(self.folder.glob(f"{name}_*")):
+                return name
 
     def _apply(self) -> None:
         setup = self.rig.setup

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.errors import ConfigError, Refused
-from afspm.microscopes.park.activity import STOP, Activity
+from afspm.microscopes.park.activity import STOP, STOP_CURVE, Activity
 from afspm.microscopes.park.link import Link, SmartScanError
 from afspm.microscopes.park.result_files import SETTLE_S, ParkFiles
 from afspm.microscopes.park.session import FALSE, TRUE, LongCall, Session
@@ -16,11 +16,12 @@ from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, 
 from afspm.plain_data import PlainMapping
 from afspm.translator.driver import ControllerLost, Driver, action
 from afspm.translator.parameters import Value
-from afspm.translator.setting_groups import FRAME, POSITION, frame
+from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
 from afspm.units import Duration, Length
 
 _SCANNING: Final = TRUE | {"scanning", "running"}
 _IDLE: Final = FALSE | {"idle", "ready", "done", "stopped"}
+_AT_FIRST: Final[dict[str, Value]] = {names.SPEC_KIND: "force"}
 _FOLDER: Final = "dataLocation.baseDir"
 
 
@@ -37,7 +38,7 @@ class Park(Driver):
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
-    translated = (*FrameSettings.names, *POSITION, names.CONTROLLER)
+    translated = (*FrameSettings.names, *POSITION, *_AT_FIRST, names.CONTROLLER)
     maker: ClassVar[str] = "Park Systems"
     software: ClassVar[str] = "SmartScan"
     max_pixels: ClassVar[int] = 8192 * 8192
@@ -68,7 +69,8 @@ class Park(Driver):
         self._session: Session | None = None
         self._activity: Activity | None = None
         self._place = TipPlace(self._smartscan, self._begun)
-        self.groups = (FrameSettings(self._smartscan), self._place)
+        self._kept = KeptSettings(_AT_FIRST)
+        self.groups = (self._kept, FrameSettings(self._smartscan), self._place)
 
     @classmethod
     def technique(cls, settings: PlainMapping) -> str:
@@ -78,7 +80,8 @@ class Park(Driver):
         self.close()
         session = self._session = Session(self._open_link, self._scanning, self._idle)
         self.prove()
-        self._place.kept_in(self.memory)
+        for group in (self._kept, self._place):
+            group.kept_in(self.memory)
         folder = self._folder()
         if not folder.is_dir():
             told = f"SmartScan's folder of data {folder} does not exist on this computer"
@@ -126,6 +129,16 @@ class Park(Driver):
     @action(names.STOP_SCAN)
     def stop_scan(self) -> None:
         self._smartscan().do(STOP)
+        self._doing.stopped()
+
+    @action(names.START_SPEC)
+    def start_spec(self) -> None:
+        """Take a curve of the kind `x-spec-kind` where the tip was sent, as it is set in SmartScan."""
+        self._doing.start_curve(str(self._kept[names.SPEC_KIND]), self._place.xy_m())
+
+    @action(names.STOP_SPEC)
+    def stop_spec(self) -> None:
+        self._smartscan().do(STOP_CURVE)
         self._doing.stopped()
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)

@@ -12,19 +12,22 @@ from afspm.errors import Refused
 from afspm.microscopes.park.link import SmartScanError
 from afspm.microscopes.park.result_files import ParkFiles
 from afspm.microscopes.park.session import LongCall, Session
+from afspm.microscopes.park.settings import MOVE, way_to
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
-from afspm.translator.result_files import SCAN, as_list
+from afspm.translator.result_files import SCAN, XY, as_list
 
-START, STOP = "scan.triggerImageScan()", "scan.stop()"
+START, STOP, STOP_CURVE = "scan.triggerImageScan()", "scan.stop()", "spect.stop()"
+CURVES: Final = {"force": "fd", "IV": "iv"}
+"""Kinds of curves, and what SmartScan calls them."""
 APPROACH: Final = '(spm.approach.start("q+s"), 0)'
-_ENDED_FIRST: Final = ("scan.stop", "approach.stop")
+_ENDED_FIRST: Final = ("scan.stop", "spect.stop", "approach.stop")
+_STATES: Final = {MOVE: ScopeState.MOVING, **dict.fromkeys(CURVES, ScopeState.SPEC)}
 _SETTLES_S: Final = 2.0
 """So long, in real time, a scan that was begun may take to be seen running."""
-MOVE: Final = "move"
 
 
 class Activity:
-    """The scan or move that runs, begun by a request or at SmartScan's panel.
+    """The measurement or move that runs, begun by a request or at SmartScan's panel.
 
     Args:
         folder: gives the folder of SmartScan's files as seen from here.
@@ -44,21 +47,23 @@ class Activity:
         self._folder, self._frame_in_force = folder, frame_in_force
         self._clock, self._log = clock, log
         self._call: LongCall | None = None
+        self._curve_at: XY | None = None  # of a curve to be taken once the tip is there
         self._stopping = self._failed = False
 
     def status(self) -> ScopeStatus:
         """Return what it is doing now; what has ended is awaited from here on."""
-        scanning = self._session.scanning()
-        self._stopping = self._stopping and scanning
         call = self._watched_call()
-        if self._files.what and not scanning:
+        curve = call is not None and call.what in CURVES  # it may count as a scan, too (!)
+        scanning = not curve and self._session.scanning()
+        self._stopping = self._stopping and scanning
+        if self._files.what and not scanning and not curve:
             self._files.end(self._clock.now_ns())
         if scanning and not self._stopping and not self._files.what:
             self._begin_scan()  # at the panel
         if scanning:
             return ScopeStatus(ScopeState.SCANNING)
         if call is not None:
-            return ScopeStatus(ScopeState.MOVING if call.what == MOVE else ScopeState.COARSE_MOTOR)
+            return ScopeStatus(_STATES.get(call.what, ScopeState.COARSE_MOTOR))
         failed, self._failed = self._failed, False
         return ScopeStatus(ScopeState.INTERRUPTED if failed or self._files.broken_off else ScopeState.FREE)
 
@@ -72,6 +77,11 @@ class Activity:
         except Refused:
             self._files.forget()
             raise
+
+    def start_curve(self, kind: str, place_m: XY) -> None:
+        """Take a curve where the tip was sent: after a scan, it goes there first."""
+        self.begun(self._session.begin(kind, way_to(place_m)))
+        self._curve_at = place_m
 
     def approach(self) -> None:
         """Bring the tip to the sample."""
@@ -91,12 +101,15 @@ class Activity:
         self._call = call
 
     def stopped(self) -> None:
-        """Note that what is running was told to stop: nothing comes of it."""
-        self._stopping = True
+        """Note that what is running was told to stop: nothing comes of it, but a tip on its way goes on."""
+        if self._call is not None and self._curve_at is not None:
+            self._call.what = MOVE
+        self._stopping, self._curve_at = True, None
         self._files.forget()
 
     def close(self) -> None:
         """Wait no longer for what takes long."""
+        self._curve_at = None
         if self._call is not None:
             self._call.close()
             self._call = None
@@ -114,14 +127,22 @@ class Activity:
                 return
         raise Refused(ControlResponse.ACTION_ERROR, "SmartScan did not begin the scan that it was asked for")
 
+    def _take_curve(self, kind: str, place_m: XY) -> None:
+        self._files.begin(kind, self._folder(), {"position": list(place_m)})
+        self._call = self._session.begin(kind, f'(spm.spect.start("{CURVES[kind]}", "here"), 0)')
+
     def _watched_call(self) -> LongCall | None:
         """Return the script that takes long, while it does. Raises ControllerLost."""
-        call = self._call
+        call, place_m = self._call, self._curve_at
         try:
             if call is not None and not call.running():
                 self.close()
+                if place_m is not None:
+                    self._take_curve(call.what, place_m)
         except SmartScanError as error:
             self._log.error("the %s failed: %s", call.what if call else "", error)
             self._failed = True
+            if call is not None and call.what == self._files.what:
+                self._files.forget()
             self.close()
         return self._call

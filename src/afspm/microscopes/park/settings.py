@@ -14,9 +14,11 @@ from afspm.errors import InvalidValue
 from afspm.microscopes.park.session import LongCall, Session
 from afspm.model import Region, names
 from afspm.translator.parameters import Value
+from afspm.translator.result_files import XY
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, SettingsGroup, frame, frame_values
 
 MICROMETRE: Final = 1e-6
+MOVE: Final = "move"
 _RATE: Final = "scan.rate"
 _SPEED_PATH: Final = 2.0
 """Widths of the frame that the tip travels in a line."""
@@ -69,6 +71,16 @@ class TipPlace(KeptSettings):
 
     def write(self, values: Mapping[str, Value]) -> None:
         wanted = self.merged(values)
-        x, y = (float(wanted[name]) / MICROMETRE for name in POSITION)
-        self._begun(self._session().begin("move", f"(spm.xyscanner.moveTo({x!r}, {y!r}), 0)"))
+        self._begun(self._session().begin(MOVE, way_to((float(wanted[POSITION[0]]), float(wanted[POSITION[1]])))))
         super().write(values)
+
+    def xy_m(self) -> XY:
+        """Return where the tip was sent."""
+        x, y = map(self.number, POSITION)
+        return x, y
+
+
+def way_to(place_m: XY) -> str:
+    """Return the script that leads the tip to a place."""
+    x, y = (length / MICROMETRE for length in place_m)
+    return f"(spm.xyscanner.moveTo({x!r}, {y!r}), 0)"
