@@ -31,8 +31,8 @@ from afspm.gateway.parameter_cache import ParameterCache
 from afspm.gateway.problems import RefusalCode, RefusedRequest
 from afspm.gateway.services import GatewayServices
 from afspm.gateway.stream import MOST_STREAMS, server_sent
-from afspm.model import ControlMode, ControlState, names
-from afspm.record.overview import ScanSummary
+from afspm.model import ControlMode, ControlState, Spectrum, names
+from afspm.record.overview import ScanSummary, SpectrumSummary
 from afspm.web.person_commands import PersonCommands
 
 NEWEST = "newest"
@@ -148,11 +148,7 @@ class ReadingRoutes:
 
     async def spectrum(self, which: Which) -> SpectrumModel:
         """Return a spectrum without its values."""
-        with self._watch.reading() as overview:
-            found = [one for one in overview.spectra if which in (NEWEST, str(one.time_ns))]
-        if not found:
-            raise RefusedRequest(RefusalCode.NOT_FOUND, f"there is no spectrum {which}")
-        return views.spectrum_model(found[-1])
+        return views.spectrum_model(self._spectrum(which))
 
     async def scan_values(
         self,
@@ -175,12 +171,8 @@ class ReadingRoutes:
         format: SpectrumFormat = SpectrumFormat.NPY,
     ) -> Response:
         """Return the values of a spectrum, a column for each variable."""
-        with self._watch.reading():
-            kept = self._watch.spectra.newest(1 if which == NEWEST else 0)
-            found = next((one for time_ns, one in reversed(kept) if which in (NEWEST, str(time_ns))), None)
-        if found is None:
-            raise RefusedRequest(RefusalCode.NOT_FOUND, f"the values of a spectrum {which} are not kept here")
-        return await _values(found.values, list(found.units), ValueFormat(format.value), bytes)
+        spectrum = await asyncio.to_thread(self._spectrum_values, self._spectrum(which).time_ns)
+        return await _values(spectrum.values, list(spectrum.units), ValueFormat(format.value), bytes)
 
     async def events(
         self,
@@ -209,6 +201,22 @@ class ReadingRoutes:
         if found is None:
             raise RefusedRequest(RefusalCode.NOT_FOUND, f"there is no scan {which}")
         return found
+
+    def _spectrum(self, which: str) -> SpectrumSummary:
+        with self._watch.reading() as overview:
+            known = overview.spectra
+        found = next((one for one in reversed(known) if which in (NEWEST, str(one.time_ns))), None)
+        if found is None:
+            raise RefusedRequest(RefusalCode.NOT_FOUND, f"there is no spectrum {which}")
+        return found
+
+    def _spectrum_values(self, time_ns: int) -> Spectrum:
+        with self._watch.reading():
+            spectrum = self._watch.spectra.at(time_ns)
+        spectrum = spectrum or self._services.archive.spectrum(time_ns)
+        if spectrum is None:
+            raise RefusedRequest(RefusalCode.GONE, "the values of this spectrum are not kept here any more")
+        return spectrum
 
     def _values(self, scan: ScanSummary) -> NDArray[np.float64]:
         with self._watch.reading():

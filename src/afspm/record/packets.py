@@ -13,7 +13,7 @@ from afspm.errors import FileError, WireError
 from afspm.model import Frame, Packet, Scan, Spectrum
 from afspm.record.journal import SCHEDULER
 from afspm.record.measured_tables import Row
-from afspm.wire.values import with_values
+from afspm.wire.values import with_nan, with_values
 
 if TYPE_CHECKING:
     import numpy as np
@@ -53,17 +53,19 @@ def packets(
 def without_reading_files(
     query: Query, frame: Frame, messages: Sequence[str] | None
 ) -> Iterator[tuple[Packet, str, Any]]:
-    """Packets, names of their messages, and what is in them: scans of the right shape, but with NaN for values.
+    """Packets, names of their messages, and what is in them: scans and spectra of the right shape, with NaN for values.
 
     Lines of running scans and what can't be read are left out.
     """
-    for time_ns, envelope, message, payload, scan, _, _, _, _ in _rows(query, -1, messages):
+    for time_ns, envelope, message, payload, scan, spectrum, _, _, _ in _rows(query, -1, messages):
         if not message or message == "ScanLines":
             continue
         try:
-            thing = wire.decode(message, payload)
+            thing = wire.decode(message, payload if spectrum is None else with_nan(payload))
             if isinstance(thing, Scan) and scan is not None:
-                thing = _without_numbers(thing)
+                thing = replace(thing, values=_nan(thing.shape))
+            elif isinstance(thing, Spectrum):
+                thing = replace(thing, values=_nan(thing.values.shape))
         except WireError:
             continue
         yield Packet(envelope, payload, time_ns), message, _placed(thing, frame)
@@ -80,10 +82,10 @@ def _rows(query: Query, since_ns: int, messages: Sequence[str] | None) -> Iterat
         after = rows[-1][:2]
 
 
-def _without_numbers(scan: Scan) -> Scan:
+def _nan(shape: tuple[int, ...]) -> NDArray[np.float64]:
     import numpy as np
 
-    return replace(scan, values=np.broadcast_to(np.nan, scan.shape))
+    return np.broadcast_to(np.nan, shape)  # which takes no memory
 
 
 def _placed(thing: object, frame: Frame) -> object:

@@ -240,8 +240,8 @@ class Run:
         yield from packets(self._query, self.folder, since_ns, messages, tell)
 
     def messages(self, messages: Sequence[str] | None = None) -> Iterator[tuple[Packet, str, Any]]:
-        """Yield packets, the names of their messages, and what is in them, without reading files: scans have NaN for
-        values, lines of running scans are left out."""
+        """Yield packets, the names of their messages, and what is in them, without reading files: scans and spectra
+        have NaN for values, lines of running scans are left out."""
         yield from without_reading_files(self._query, self.frame, messages)
 
     def overview(self, messages: Sequence[str] | None = None, problems: ProblemNames | None = None) -> Overview:

@@ -9,7 +9,7 @@ from collections import OrderedDict
 from pathlib import Path
 
 from afspm.errors import AfspmError
-from afspm.model import ProblemNames, Region, Scan
+from afspm.model import ProblemNames, Region, Scan, Spectrum
 from afspm.plain_data import Plain
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.overview import Overview
@@ -70,6 +70,18 @@ class Archive:
                 while len(self._read) > KEPT:
                     self._read.popitem(last=False)
             return frame
+
+    def spectrum(self, time_ns: int) -> Spectrum | None:
+        """Return a spectrum by its time; None if it is not in the record, or there is none."""
+        if self._folder is None:
+            return None
+        try:
+            with open_run(self._folder) as run:
+                row = next((row for row in reversed(run.spectra) if row.time_ns == time_ns), None)
+                return None if row is None else run.spectrum(row)
+        except (AfspmError, ImportError) as error:
+            self._log.debug("a spectrum can't be read: %s", error)
+            return None
 
 
 def allowed_region(folder: Path) -> Region | None:

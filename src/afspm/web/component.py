@@ -10,7 +10,7 @@ from afspm.errors import ConfigError
 from afspm.process.priority import step_back
 from afspm.record.run_lock import cut_off_message
 from afspm.web.archive import Archive
-from afspm.web.server import WebServer, listening, url_of
+from afspm.web.server import STALLED_S, WebServer, listening, url_of
 from afspm.web.watch import Watch
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ class WebComponent(Component):
     Attributes:
         served: the name of what is served, in log lines and errors.
         usual_port: if none is given.
+        stalled_s: as of `WebServer`.
 
     Args:
         host: the address to listen at.
@@ -40,6 +41,7 @@ class WebComponent(Component):
     usual_port: ClassVar[int]
     has_people = True
     listens = ("",)
+    stalled_s: ClassVar[float] = STALLED_S
     longest_step_s = 60.0  # the first import of everything, on a busy computer
 
     def __init__(self, host: str, port: int | None, certificate: Path | None, certificate_key: Path | None) -> None:
@@ -81,8 +83,9 @@ class WebComponent(Component):
     def serve(self, app: AsgiApp, bound: socket.socket, *, most_connections: int | None = None) -> None:
         """Start to serve, and note where."""
         self._server = WebServer(
-            app, bound, self._certificate, self._certificate_key, most_connections=most_connections
-        )
+            app, bound, self._certificate, self._certificate_key,
+            most_connections=most_connections, stalled_s=self.stalled_s,
+        )  # fmt: skip
         self._server.start()
         port = bound.getsockname()[1]
         url = url_of(self._host, port, encrypted=self.encrypted)

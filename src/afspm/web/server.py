@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import ipaddress
 import logging
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 USUAL_PORT = 8080
 _STOPPED_S = 3.0
+STALLED_S = 60.0
+"""A client that takes nothing of what is sent to it for so long is disconnected."""
 
 
 def listening(
@@ -68,12 +71,32 @@ def url_of(host: str, port: int, *, encrypted: bool) -> str:
     return f"{'https' if encrypted else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"
 
 
+def _impatient(stalled_s: float) -> type[asyncio.Protocol]:
+    """Return uvicorn's protocol, which disconnects clients that stall: they would keep their connections for ever."""
+    from uvicorn.protocols.http.auto import AutoHTTPProtocol
+
+    class ImpatientProtocol(AutoHTTPProtocol):  # type: ignore[valid-type, misc]
+        _stalled: asyncio.TimerHandle | None = None
+
+        def pause_writing(self) -> None:
+            super().pause_writing()
+            self._stalled = asyncio.get_running_loop().call_later(stalled_s, self.transport.abort)
+
+        def resume_writing(self) -> None:
+            if self._stalled is not None:
+                self._stalled.cancel()
+            super().resume_writing()
+
+    return ImpatientProtocol
+
+
 class WebServer:
     """Serves an ASGI application until it is stopped.
 
     Args:
         certificate, key: PEM files, for https; None: http.
         most_connections: at a time; those beyond hear 503. None: any number.
+        stalled_s: real; see `STALLED_S`.
 
     Raises:
         ConfigError: the files are no certificate and its key.
@@ -87,6 +110,7 @@ class WebServer:
         key: Path | None,
         *,
         most_connections: int | None = None,
+        stalled_s: float = STALLED_S,
     ) -> None:
         import uvicorn
 
@@ -99,6 +123,7 @@ class WebServer:
             proxy_headers=False,  # what a request says of its origin is anybody's word, and passwords are tried by it
             timeout_graceful_shutdown=1,
             limit_concurrency=most_connections,
+            http=_impatient(stalled_s),
             ssl_certfile=certificate,
             ssl_keyfile=key,
         )

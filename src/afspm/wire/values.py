@@ -57,6 +57,14 @@ def with_values(message: str, head: bytes, values: NDArray[np.float64]) -> bytes
     return rest + nested(data, _DATA_OF_SPECTRUM)
 
 
+def with_nan(head: bytes) -> bytes:
+    """Return a spectrum that `without_values` made, with NaN for its values. Raises WireError: it is none."""
+    import numpy as np
+
+    data = parse(spectroscopy_pb2.Spec1d, head).data
+    return with_values("Spec1d", head, np.full((data.data_per_variable, data.num_variables), np.nan))
+
+
 def encode_place(place: Region | ProbePosition) -> bytes:
     """Return a place as the part of a message that says it: a SpatialAspects, or a ProbePosition."""
     if isinstance(place, Region):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import base64
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from http.client import HTTPConnection
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 from urllib.parse import urlsplit
 
 from afspm_process import DEADLINE_S, AfspmProcess
@@ -111,15 +111,23 @@ class Client:
             assert time.monotonic() < end_s, found
         return found
 
-    def events(self, path: str = "/events", last: str = "") -> Iterator[Event]:
+    def events(self, path: str = "/events", last: str = "") -> Generator[Event]:
         """What is streamed, until the gateway closes or vanishes."""
         connection = HTTPConnection(self.address, timeout=DEADLINE_S)
         connection.request("GET", f"/v1{path}", headers={**self.headers, **({"Last-Event-ID": last} if last else {})})
-        stream, parts = connection.getresponse(), dict[str, str]()
+        stream = connection.getresponse()
         assert stream.status == 200, stream.read()
         try:
+            yield from self.read_events(stream)
+        finally:
+            connection.close()
+
+    def read_events(self, stream: IO[bytes]) -> Iterator[Event]:
+        """The events in a stream, up to the last whole one."""
+        parts = dict[str, str]()
+        try:
             while line := stream.readline().decode():
-                name, _, value = line.rstrip("\n").partition(": ")
+                name, _, value = line.rstrip("\r\n").partition(": ")
                 if name:
                     parts[name] = value
                 elif "event" in parts:
@@ -127,8 +135,6 @@ class Client:
                     parts = {}
         except (OSError, ValueError):
             pass  # cut off
-        finally:
-            connection.close()
 
 
 class GatewayRun(AfspmProcess):

@@ -6,18 +6,23 @@ import base64
 import io
 import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from http.client import HTTPConnection
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
-from gateway_lab import REGION, SERIES, Client, Event, GatewayRun
+from afspm_process import DEADLINE_S
+from gateway_lab import EXPERIMENT, REGION, SERIES, Client, Event, GatewayRun
 
 import afspm
+from afspm.gateway.stream import MOST_STREAMS
 
 Started = Callable[..., GatewayRun]
 
@@ -134,6 +139,73 @@ def test_a_killed_gateway_goes_on_with_its_scans_and_its_clients_with_their_even
     states = [event.data["data"]["state"] for event in seen if event.kind == "state"]
     assert "SCANNING" in states
     ada.done("POST", "/end")
+
+
+def test_spectra_from_before_a_restart_are_served_from_the_record(started: Started) -> None:
+    run = started("[cache]\nhistory = { Spec1d = 1 }\n")  # of which the scheduler would replay only the last
+    ada = run.client("ada")
+    ada.done("POST", "/control", {"lease_s": 60})
+    for number in range(3):
+        ada.done("POST", "/spectra", {"position_m": [number * 1e-7, 0], "key": f"curve-{number}"})
+        assert ada.until_measured(f"curve-{number}")["state"] == "done"
+    listed = ada.get("/spectra")
+    before = [ada.get(f"/spectra/{one['id']}/values") for one in listed]
+    assert len({bytes(one) for one in before}) == 3
+    os.kill(run.pid("gateway"), signal.SIGKILL)
+    run.wait_for("the gateway is at ", count=2)
+    assert ada.get("/spectra") == listed
+    assert [ada.get(f"/spectra/{one['id']}/values") for one in listed] == before
+    assert ada.get("/spectra/newest/values") == before[-1]
+    assert ada.ask("GET", "/spectra/1/values").code == "not-found"
+    ada.done("POST", "/end")
+
+
+def test_a_reader_that_stalls_is_dropped_and_goes_on_without_loss(started: Started, tmp_path: Path) -> None:
+    (tmp_path / "impatient.py").write_text(
+        "from afspm.gateway.gateway import Gateway\n\n\nclass Impatient(Gateway):\n    stalled_s = 1.0\n",
+        encoding="utf-8",
+    )
+    file = tmp_path / "experiment.toml"
+    plain = EXPERIMENT.format(speed=20.0, settings="")
+    file.write_text(plain.replace('"Gateway"', '"impatient.Impatient"'), encoding="utf-8")
+    run = started(file=file)
+    ada, notes = run.client("ada"), [f"{number} " + 900 * "\N{MICROSCOPE}" for number in range(600)]
+    for text in notes:  # more than the network keeps for a reader
+        ada.done("POST", "/notes", {"text": text})
+    with ExitStack() as stack:
+        for _ in range(MOST_STREAMS - 1):
+            stack.enter_context(_streaming(run, "/v1/events"))
+        stalled = stack.enter_context(_streaming(run, "/v1/events?kinds=note&after=0"))
+        assert ada.ask("GET", "/events").code == "too-many"
+        _wait_until_dropped(psutil.Process(run.pid("gateway")), stalled.getsockname()[1])
+        with stalled.makefile("rb") as stream:
+            got = list(ada.read_events(stream))
+        assert len(got) < len(notes)
+        rest = ada.events("/events?kinds=note", last=got[-1].id if got else "0")  # its place is free
+        got += [next(rest) for _ in range(len(notes) - len(got))]
+        rest.close()
+    assert [event.data["data"]["text"] for event in got] == notes
+    ada.done("POST", "/end")
+
+
+def _wait_until_dropped(process: psutil.Process, port: int) -> None:
+    """Wait until a process has no connection any more with a client at a port."""
+    end_s = time.monotonic() + DEADLINE_S
+    while any(one.raddr and one.raddr.port == port for one in process.net_connections()):
+        assert time.monotonic() < end_s, "it keeps its connection"
+        time.sleep(0.1)
+
+
+def _streaming(run: GatewayRun, path: str) -> socket.socket:
+    """A connection by which events are streamed, of which little is taken unless it is read."""
+    host, _, port = Client(run.url).address.partition(":")
+    connection = socket.socket()
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    connection.settimeout(DEADLINE_S)
+    connection.connect((host, int(port)))
+    connection.sendall(f"GET {path} HTTP/1.0\r\nHost: {host}:{port}\r\n\r\n".encode())
+    assert connection.recv(12).endswith(b" 200")
+    return connection
 
 
 def test_twenty_clients_at_a_time_are_not_noticed_by_the_experiment(started: Started) -> None:

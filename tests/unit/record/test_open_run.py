@@ -17,7 +17,7 @@ from record_lab import ABOUT, Night
 
 import afspm
 from afspm.errors import FileError
-from afspm.model import ScopeState
+from afspm.model import ScopeState, Spectrum
 from afspm.record.journal import JOURNAL_FILE, open_to_write, read_only
 from afspm.record.run import Run
 from afspm.record.store import RecordStore
@@ -265,9 +265,12 @@ def test_tables_become_arrays_and_datasets(night: Night, store: RecordStore, tmp
 
 
 def test_the_overview_comes_without_reading_files(night: Night, store: RecordStore, tmp_path: Path) -> None:
-    store.take([night.control("series", (4,)), *night.whole_scan(1)])
+    curve = Spectrum((1e-9, 2e-9), "IV", ("Bias", "Current"), ("V", "A"), np.ones((5, 2)), 3)
+    store.take([night.control("series", (4,)), *night.whole_scan(1), night.packet(curve, "Spec1d_IV")])
     run = afspm.open_run(tmp_path)
-    (tmp_path / run.scans[0].file).unlink()
+    for row in (run.scans[0], run.spectra[0]):
+        (tmp_path / row.file).unlink()
     overview = run.overview()
+    assert [(one.kind, one.position_m, one.names) for one in overview.spectra] == [("IV", (1e-9, 2e-9), curve.names)]
     assert [(scan.channel, scan.shape) for scan in overview.scans] == [("Height", (6, 8)), ("Height Retrace", (6, 8))]
     assert [row.name for row in run.problems] == ["thermal-drift"]
