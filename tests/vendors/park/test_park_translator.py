@@ -240,3 +240,21 @@ def test_a_curve_that_smartscan_refuses_is_no_result(bench: Make) -> None:
     heard = peer.until(FREE)
     assert states(heard)[-2:] == ["INTERRUPTED", "FREE"]
     made.until_said("busy with a calibration")
+
+
+def test_a_gain_is_set_and_leaves_the_others(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    assert peer.set(names.ZCTRL_IGAIN, 0.25).ok
+    assert (peer.get(names.ZCTRL_IGAIN), peer.get(names.ZCTRL_PGAIN)) == ("0.25", "0.5")
+    feedback = made.emulator.rig.setup.feedback
+    assert (feedback.proportional_gain, feedback.integral_gain) == pytest.approx((0.1, 750.0))
+    assert peer.set(names.ZCTRL_PGAIN, 1000.0).code == ControlResponse.PARAM_ERROR
+
+
+def test_gains_that_smartscan_does_not_tell_are_not_supported(bench: Make) -> None:
+    made = bench(tells_gains=False)
+    peer = small(made)
+    assert peer.get_response(names.ZCTRL_IGAIN).code == ControlResponse.PARAM_NOT_SUPPORTED
+    assert scanned(peer)
+    made.until_said("does not tell the gains")

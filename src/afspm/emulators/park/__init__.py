@@ -27,6 +27,7 @@ class ParkEmulator(ScriptedEmulator):
         values: a value is told as "text", or as it is ("native").
         replies: to a script that waits for the instrument, "at-end" of it, or "at-once" and without a value.
         scan_words: what it says to whether it scans: yes, no.
+        tells_gains: whether the gains of the feedback can be read, or only set.
         start_s: how long the ramp to the first line takes, experiment time.
         file_s: how long after the end a file begins to appear; the other half of it comes as much later.
         seed, faults, and all of the simulated world: as of every emulator.
@@ -44,19 +45,21 @@ class ParkEmulator(ScriptedEmulator):
         values: Literal["text", "native"] = "text",
         replies: Literal["at-end", "at-once"] = "at-end",
         scan_words: Sequence[str] = ("true", "false"),
+        tells_gains: bool = True,
         start_s: Duration = 0.2,
         file_s: Duration = 0.1,
         **settings: Any,
     ) -> None:
         super().__init__(**settings)
         self._errors, self._values, self._replies = errors, values, replies
-        self._scan_words = scan_words
+        self._scan_words, self._tells_gains = scan_words, tells_gains
         self._times = {"start_s": start_s, "file_s": file_s}
 
     def make_program(self) -> MakerProgram:
         """Make SmartScan."""
         self._scripts: dict[Script, bool] = {}  # and whether its reply was sent already
         self._smartscan = SmartScanProgram(self.rig, self.faults, self.folder, self.log, **self._times)
+        self._smartscan.tells_gains = self._tells_gains
         return self._smartscan
 
     def open_wire(self, port: int, on_request: OnRequest) -> ScriptWire:

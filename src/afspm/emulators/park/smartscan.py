@@ -32,6 +32,9 @@ _CURVES: Final = {"fd": "force", "iv": "IV"}
 _LOCATION: Final = {"subDir": "", "fileName": "SIMULATED", "fileSuffix": "", "direction": "auto", "jpegSave": False}
 _RETRACTED_UM, _EXTENDED_UM = 7.5, -7.5
 _SETPOINT, _ENABLE, _RATE, _BIAS = "zservo.setpoint.value", "zservo.enable", "scan.rate", "bias.tip"
+_GAIN: Final = "zservo.gain"
+_PROPORTIONAL, _INTEGRAL = 0.2, 3000.0
+"""What SmartScan's gains of 1 are to the simulated feedback; the second in 1/s."""
 _BOUNDS: Final = {_SETPOINT: (-10.0, 10.0), _RATE: (1e-4, 1e5), _BIAS: (-10.0, 10.0), "bias.sample": (-10.0, 10.0)}
 
 
@@ -40,6 +43,7 @@ class SmartScanProgram(MakerProgram):
 
     Attributes:
         geometry: the frame.
+        tells_gains: whether the gains of the feedback can be read, or only set.
     """
 
     def __init__(self, *given: Any, **settings: Any) -> None:
@@ -54,7 +58,7 @@ class SmartScanProgram(MakerProgram):
             "bias.sample": 0.0,
             "zservo.setpoint.normalized": False,
             "zservo.setpoint.normValue": 1.0,
-            "zservo.gain": {"p": 0.5, "i": 0.5, "z+": 1, "z-": 1},
+            _GAIN: {"p": 0.5, "i": 0.5, "z+": 1.0, "z-": 1.0},
             "scan.options": {"twoWay": False, "overScan": {"enable": False, "percent": 5}},
             "dataLocation": {"baseDir": str(self.folder), **_LOCATION},
         }
@@ -82,6 +86,7 @@ class SmartScanProgram(MakerProgram):
             "xyscanner.moveTo": self._move,
             "readChannel": self._read_channel,
         }
+        self.tells_gains = True
         self.stage_um = [0.0, 0.0, 0.0]
         self._saved = 0
         self._apply()
@@ -102,6 +107,8 @@ class SmartScanProgram(MakerProgram):
         if kind == "set":
             self._set(path, given[0])
             return None
+        if path == _GAIN and not self.tells_gains:
+            return None
         return self._told[path]() if path in self._told else self._values[path]
 
     # -- methods
@@ -117,6 +124,8 @@ class SmartScanProgram(MakerProgram):
             if not isinstance(value, dict):
                 raise InvalidValue(f"{path}: {value!r} is no object")
             value = {**present, **value}
+            for member, number in value.items() if path == _GAIN else ():
+                _number(f"{path}.{member}", number, 0.0, 100.0)
         elif isinstance(value, bool) is not isinstance(present, bool):
             raise InvalidValue(f"{path}: {value!r}")
         self._values[path] = value
@@ -201,7 +210,14 @@ class SmartScanProgram(MakerProgram):
 
     def _apply(self) -> None:
         setup = self.rig.setup
-        setup.feedback = replace(setup.feedback, setpoint=self._values[_SETPOINT], on=self._values[_ENABLE])
+        gain = self._values[_GAIN]
+        setup.feedback = replace(
+            setup.feedback,
+            setpoint=self._values[_SETPOINT],
+            on=self._values[_ENABLE],
+            proportional_gain=_PROPORTIONAL * gain["p"],
+            integral_gain=_INTEGRAL * gain["i"],
+        )
         setup.bias_v = self._values[_BIAS]
 
 

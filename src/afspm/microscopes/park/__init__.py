@@ -11,7 +11,7 @@ from afspm.microscopes.park.activity import STOP, STOP_CURVE, Activity
 from afspm.microscopes.park.link import Link, SmartScanError
 from afspm.microscopes.park.result_files import SETTLE_S, ParkFiles
 from afspm.microscopes.park.session import FALSE, TRUE, LongCall, Session
-from afspm.microscopes.park.settings import MICROMETRE, FrameSettings, TipPlace
+from afspm.microscopes.park.settings import MICROMETRE, FrameSettings, Gains, TipPlace
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
 from afspm.plain_data import PlainMapping
 from afspm.translator.driver import ControllerLost, Driver, action
@@ -38,7 +38,7 @@ class Park(Driver):
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
-    translated = (*FrameSettings.names, *POSITION, *_AT_FIRST, names.CONTROLLER)
+    translated = (*FrameSettings.names, *Gains.names, *POSITION, *_AT_FIRST, names.CONTROLLER)
     maker: ClassVar[str] = "Park Systems"
     software: ClassVar[str] = "SmartScan"
     max_pixels: ClassVar[int] = 8192 * 8192
@@ -70,7 +70,9 @@ class Park(Driver):
         self._activity: Activity | None = None
         self._place = TipPlace(self._smartscan, self._begun)
         self._kept = KeptSettings(_AT_FIRST)
-        self.groups = (self._kept, FrameSettings(self._smartscan), self._place)
+        self._gains = Gains(self._smartscan)
+        self.groups = (self._kept, FrameSettings(self._smartscan), self._gains, self._place)
+        self._whole_table = self.table
 
     @classmethod
     def technique(cls, settings: PlainMapping) -> str:
@@ -80,6 +82,10 @@ class Park(Driver):
         self.close()
         session = self._session = Session(self._open_link, self._scanning, self._idle)
         self.prove()
+        self.table = self._whole_table
+        if not self._gains.are_told():
+            self.log.warning("SmartScan does not tell the gains of its feedback: they are not supported")
+            self.table = self.table.without(Gains.names)
         for group in (self._kept, self._place):
             group.kept_in(self.memory)
         folder = self._folder()

@@ -56,10 +56,23 @@ class Session:
             raise ControllerLost(f"SmartScan replied {told} for {', '.join(paths)}")
         return dict(zip(paths, told, strict=True))
 
+    def is_number(self, path: str) -> bool:
+        """Return True if there is a number at a path below `spm`. Raises ControllerLost."""
+        try:
+            return bool(self._link.run(f"typeof spm.{path}") == "number")
+        except SmartScanError:
+            return False
+
     def put(self, values: Mapping[str, Value]) -> None:
         """Set values by their paths below `spm`. Raises Refused: SmartScan does not take one."""
         given = ", ".join(f"spm.{path} = {json.dumps(value)}" for path, value in values.items())
         self._do(given, ", ".join(values), ControlResponse.PARAM_ERROR)
+
+    def put_members(self, path: str, members: Mapping[str, Value]) -> None:
+        """Set members of a value that is an object, which is set as a whole only. Raises Refused."""
+        given = "".join(f"all[{json.dumps(name)}] = {json.dumps(value)}; " for name, value in members.items())
+        changed = f"spm.{path} = (function (all) {{ {given}return all; }})(spm.{path})"
+        self._do(changed, path, ControlResponse.PARAM_ERROR)
 
     def do(self, command: str) -> None:
         """Call a command, e.g. "scan.stop()". Raises Refused: SmartScan would not."""

@@ -1,4 +1,4 @@
-"""The frame, the speed and the place of the tip as SmartScan has them, and as everybody else.
+"""The frame, the speed, the gains and the place of the tip as SmartScan has them, and as everybody else.
 
 SmartScan has the centre of a frame in micrometres, its angle in degrees, and lines per second; a line is there and
 back (!).
@@ -20,6 +20,8 @@ from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, Setti
 MICROMETRE: Final = 1e-6
 MOVE: Final = "move"
 _RATE: Final = "scan.rate"
+_GAIN: Final = "zservo.gain"
+_GAINS: Final = {names.ZCTRL_PGAIN: f"{_GAIN}.p", names.ZCTRL_IGAIN: f"{_GAIN}.i"}
 _SPEED_PATH: Final = 2.0
 """Widths of the frame that the tip travels in a line."""
 
@@ -60,6 +62,28 @@ class FrameSettings(SettingsGroup):
             }
         )
         self._session().put({_RATE: speed_m_s / (_SPEED_PATH * width)})
+
+
+class Gains(SettingsGroup):
+    """The gains of the feedback: two of the four members of one value, which may not be one to be read (!)."""
+
+    names = tuple(_GAINS)
+
+    def __init__(self, session: Callable[[], Session]) -> None:
+        self._session = session
+
+    def read(self) -> dict[str, Value]:
+        told = self._session().values(list(_GAINS.values()))
+        return {name: float(told[path]) for name, path in _GAINS.items()}
+
+    def are_told(self) -> bool:
+        """Return True if SmartScan tells them. Raises ControllerLost."""
+        return all(map(self._session().is_number, _GAINS.values()))
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        self._session().put_members(
+            _GAIN, {_GAINS[name].rpartition(".")[2]: float(value) for name, value in values.items()}
+        )
 
 
 class TipPlace(KeptSettings):
