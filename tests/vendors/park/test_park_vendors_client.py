@@ -6,6 +6,8 @@ import importlib.util
 import json
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -85,6 +87,26 @@ print(json.dumps({"value": remote.run(script)["value"], "ended": ended, "frame":
     assert scan is not None
     assert (scan.shape, scan.region.size_m) == ((12, 24), pytest.approx((2e-7, 1e-7)))
     assert scan.region.center_m == pytest.approx((3e-7, -1e-7))
+
+
+def test_it_takes_curves_where_it_moved_the_tip(tmp_path: Path, client: Run) -> None:
+    made = Emulated(seed=2, file_s=0.01, force={"duration_s": 0.1}, iv={"duration_s": 0.1})
+    with made.running(tmp_path / "data") as address:
+        told = client(
+            address,
+            """
+remote.run("spm.xyscanner.moveTo(0.2, -0.1)")
+print(json.dumps({mode: remote.run(f"spm.spect.start('{mode}', 'here')")["result"] for mode in ("fd", "iv")}))
+""",
+        )
+        assert told == {"fd": "Done", "iv": "Done"}
+        deadline_s = time.monotonic() + DEADLINE_S
+        while len(found := list((tmp_path / "data").glob("*.tiff"))) < 2:
+            assert time.monotonic() < deadline_s
+            threading.Event().wait(0.05)
+    assert sorted(one.name.rpartition("_")[2] for one in found) == ["IV.tiff", "force.tiff"]
+    assert made.rig.spectrum is not None
+    assert made.rig.spectrum.position_m == pytest.approx((2e-7, -1e-7))
 
 
 def test_what_is_computed_needs_no_instrument(tmp_path: Path, client: Run) -> None:
