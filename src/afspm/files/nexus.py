@@ -1,18 +1,24 @@
-"""HDF5 files that follow NeXus' NXspm as the record writes them (`record.nexus`), read back without loss."""
+"""HDF5 files that follow NeXus' NXspm as the record writes them (`record.nexus`), read back without loss.
+
+The spectra of a grid in one file (`record.export.nexus`), too: of several at one point it has the mean.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
 from datetime import tzinfo
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from afspm.errors import FileError
 from afspm.files import hdf5, nsid
 from afspm.files.content import FileContent
 from afspm.model import Frame, Region, Scan, Spectrum
+from afspm.model.spectrum_grid import PointGrid
 from afspm.plain_data import Plain
 
 if TYPE_CHECKING:
@@ -23,6 +29,8 @@ BIAS_SPECTRUM = "NXsts"
 """The definition that a spectrum over the bias of a tunnelling microscope follows."""
 ABOUT = "afspm"
 """The group with what NeXus has no name for."""
+GRID = "grid"
+"""The content of a file with the spectra of a grid."""
 VENDOR = "vendor"
 """The group with what the controller's own file said."""
 
@@ -33,6 +41,8 @@ def read_hdf5(path: Path, zone: tzinfo | None) -> FileContent:
         if not _is_ours(file):
             return nsid.read_nsid(path, zone)
         about = about_of(file)
+        if about["content"] == GRID:
+            return FileContent("", spectra=tuple(_grid(file, about)), header=about)
         scans = tuple(_scans(file, about)) if about["content"] == "scan" else ()
         spectra = (_spectrum(file, about),) if about["content"] == "spectrum" else ()
         return FileContent(
@@ -61,7 +71,7 @@ def vendor_header(file: h5py.File) -> dict[str, object]:
 
 def _is_ours(file: h5py.File) -> bool:
     entry = file.get("entry")
-    return entry is not None and ABOUT in entry and hdf5.text(entry["definition"][()]) in (DEFINITION, BIAS_SPECTRUM)
+    return entry is not None and ABOUT in entry
 
 
 def _scans(file: h5py.File, about: Plain) -> list[Scan]:
@@ -94,3 +104,30 @@ def _spectrum(file: h5py.File, about: Plain) -> Spectrum:
         about["filename"],
         Frame(about["frame"]),
     )
+
+
+def _grid(file: h5py.File, about: Plain) -> Iterator[Spectrum]:
+    """Yield the spectra that were measured, row by row."""
+    entry, swept, columns = file["entry"], about["swept"], about["columns"]
+    data = [[hdf5.array(entry[way][one["field"]]) for way in one["ways"]] for one in columns]
+    forward = entry[columns[0]["ways"][0]]
+    points = PointGrid(hdf5.array(forward["x"]), hdf5.array(forward["y"]), tuple(about["center_m"]), about["angle_rad"])
+    sweep = _there_and_back([hdf5.array(forward[swept["field"]])] * max(len(one["ways"]) for one in columns))
+    times = np.asarray(entry[ABOUT]["time_ns"][()]).astype("datetime64[ns]")
+    for row, column in np.ndindex(times.shape):
+        curves = [_there_and_back([way[row, column] for way in ways]) for ways in data]
+        if np.isnan(curves).all():
+            continue
+        yield Spectrum(
+            points.position_m(row, column),
+            about["kind"],
+            (swept["name"], *(one["name"] for one in columns)),
+            (swept["unit"], *(one["unit"] for one in columns)),
+            np.column_stack([sweep, *curves]),
+            None if np.isnat(times[row, column]) else int(times[row, column].astype(np.int64)),
+            frame=Frame(about["frame"]),
+        )
+
+
+def _there_and_back(ways: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    return np.concatenate([ways[0], *(way[::-1] for way in ways[1:])])

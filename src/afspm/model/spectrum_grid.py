@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,7 +38,14 @@ class PointGrid:
     y_m: Floats
     center_m: XY
     angle_rad: float
-    cells: tuple[tuple[int, int], ...]
+    cells: tuple[tuple[int, int], ...] = ()
+
+    def position_m(self, row: int, column: int) -> XY:
+        """Return where a point of the grid is."""
+        x, y = self.center_m
+        along, across = float(self.x_m[column]) - x, float(self.y_m[row]) - y
+        cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
+        return x + cos * along - sin * across, y + sin * along + cos * across
 
 
 def grid(positions_m: Sequence[XY]) -> PointGrid:
@@ -135,16 +143,22 @@ def alike(spectra: Sequence[Spectrum], *, swept_alike: bool) -> Spectrum:
 
 def ways(spectrum: Spectrum) -> tuple[Floats, list[dict[str, Floats]]]:
     """Return the swept values, and the curves of each variable by direction: forward, and backward if there is one."""
-    swept = spectrum.values[:, 0]
-    curves = {name: spectrum.values[:, number] for number, name in enumerate(spectrum.names) if number}
-    if (half := _turning_point(swept)) is not None:
-        there = {name: values[:half] for name, values in curves.items()}
-        return swept[:half], [there, {name: values[half:][::-1] for name, values in curves.items()}]
-    plain = {_FORWARD.sub("", name) or name: values for name, values in curves.items() if not _BACKWARD.search(name)}
-    back = {_BACKWARD.sub("", name): values for name, values in curves.items() if _BACKWARD.search(name)}
-    if not back.keys() <= plain.keys():  # a way back without its way there: they stay under their own names
-        return swept, [curves]
-    return swept, [plain, back] if back else [plain]
+    swept, columns = spectrum.values[:, 0], columns_of(spectrum)
+    curves = [{name: spectrum[column] for name, column in one.items()} for one in columns]
+    if (half := _turning_point(swept)) is None:
+        return swept, curves
+    there = {name: values[:half] for name, values in curves[0].items()}
+    return swept[:half], [there, {name: values[half:][::-1] for name, values in curves[0].items()}]
+
+
+def columns_of(spectrum: Spectrum) -> list[dict[str, str]]:
+    """Return the column of each variable by direction; one direction where a sweep goes there and back in one."""
+    names = spectrum.names[1:]
+    plain = {_FORWARD.sub("", name) or name: name for name in names if not _BACKWARD.search(name)}
+    back = {_BACKWARD.sub("", name): name for name in names if _BACKWARD.search(name)}
+    if _turning_point(spectrum.values[:, 0]) is not None or not back.keys() <= plain.keys():
+        return [{name: name for name in names}]  # a way back without its way there stays under its own name
+    return [plain, back] if back else [plain]
 
 
 def common_sweep(sweeps: Sequence[Floats]) -> Floats:

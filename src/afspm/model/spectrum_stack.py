@@ -14,7 +14,18 @@ from afspm.errors import InvalidValue
 from afspm.model.geometry import Frame, Region
 from afspm.model.scan import Scan
 from afspm.model.spectrum import Spectrum
-from afspm.model.spectrum_grid import DIRECTIONS, Floats, PointGrid, alike, at, common_sweep, grid, repeats, ways
+from afspm.model.spectrum_grid import (
+    DIRECTIONS,
+    Floats,
+    PointGrid,
+    alike,
+    at,
+    columns_of,
+    common_sweep,
+    grid,
+    repeats,
+    ways,
+)
 
 if TYPE_CHECKING:
     import xarray
@@ -34,6 +45,8 @@ class SpectrumStack:
         directions: "forward", and "backward" if the sweep went both ways.
         curves: by variable, shape (y, x, repeat, direction, z); NaN where nothing was measured.
         units: by variable.
+        names: the columns of each spectrum as it was measured, without the first, which was swept.
+        columns: of each variable, by direction; one where a sweep went there and back in one.
         times: when each was measured, shape (y, x, repeat); NaT where that is not known.
     """
 
@@ -46,6 +59,8 @@ class SpectrumStack:
     directions: tuple[str, ...]
     curves: Mapping[str, Floats]
     units: Mapping[str, str]
+    names: tuple[str, ...]
+    columns: Sequence[Mapping[str, str]]
     times: NDArray[np.datetime64]
 
     def to_xarray(self) -> xarray.Dataset:
@@ -92,7 +107,7 @@ def stacked(spectra: Sequence[Spectrum], *, interpolate: bool = False) -> Spectr
                 arrays[name][(*cell, repeat, direction)] = at(swept, own, curve) if interpolate else curve
         if spectrum.time_ns is not None:
             times[(*cell, repeat)] = np.datetime64(spectrum.time_ns, "ns")
-    units = dict(zip(first.names, first.units, strict=True))
+    columns = columns_of(first)
     return SpectrumStack(
         first.kind,
         first.frame,
@@ -102,7 +117,9 @@ def stacked(spectra: Sequence[Spectrum], *, interpolate: bool = False) -> Spectr
         first.units[0],
         directions,
         arrays,
-        {name: units.get(name, "") for name in arrays},
+        {name: _unit(first, column) for name, column in columns[0].items()},
+        first.names[1:],
+        columns,
         times,
     )
 

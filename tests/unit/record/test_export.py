@@ -154,6 +154,34 @@ def test_spectra_of_a_grid_are_one_nexus_file(night: Night, store: RecordStore, 
         assert data["x"][:].tolist() == pytest.approx([0.0, 2e-9, 4e-9])
 
 
+ONE_WAY = np.linspace(-1.0, 2.0, 30)
+THERE_AND_BACK = np.concatenate([np.arange(15.0), np.arange(15.0)[::-1]])
+COLUMNS = [("Current", "Current Retrace"), ("I [fwd]", "I [bwd]"), ("Force",), ("Force Retrace",)]
+
+
+@pytest.mark.parametrize("columns", COLUMNS)
+@pytest.mark.parametrize("swept", [ONE_WAY, THERE_AND_BACK])
+def test_the_file_of_a_grid_is_read_as_the_spectra_of_the_run(
+    night: Night, store: RecordStore, tmp_path: Path, columns: tuple[str, ...], swept: np.ndarray
+) -> None:
+    for number in (0, 1, 2, 3, 5):  # of two rows of three that are turned, one is missing
+        x, y = number % 3 * 2e-9, number // 3 * 3e-9
+        place = (0.8 * x - 0.6 * y, 0.6 * x + 0.8 * y)
+        values = np.column_stack((swept, *((number + way) * swept**2 for way, _ in enumerate(columns))))
+        units = ("V", *("A" for _ in columns))
+        taken = Spectrum(place, "IV", ("Bias", *columns), units, values, night.now_ns)
+        store.take([night.state(ScopeState.SPEC), night.packet(taken, "Spec1d_IV"), night.state(ScopeState.FREE)])
+    run = afspm.open_run(tmp_path)
+    *_, file = export(run, "h5", tmp_path / "out")
+    found = afspm.read(file).spectra
+    assert len(found) == 5
+    for row, one in zip(run.spectra, found, strict=True):
+        own = run.spectrum(row)
+        assert (one.kind, one.names, one.units, one.frame) == (own.kind, own.names, own.units, own.frame)
+        assert (one.time_ns, one.position_m) == (own.time_ns, pytest.approx(own.position_m, abs=1e-15))
+        assert one.values == pytest.approx(own.values)
+
+
 def test_a_spectrum_that_is_damaged_is_missing_in_the_grid(night: Night, store: RecordStore, tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")
     run = spectra_of_a_grid(night, store, tmp_path)

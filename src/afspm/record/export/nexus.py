@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 from collections.abc import Iterator, Mapping
 
+import numpy as np
+
 from afspm.clock import iso_utc
+from afspm.files.nexus import ABOUT, GRID
 from afspm.model.spectrum_stack import SpectrumStack, mean_over_repeats
 from afspm.record.nexus import field_names
 from afspm.record.nxspm import group, values
@@ -35,7 +39,30 @@ def grid_file(stack: SpectrumStack, metadata: Mapping[str, str]) -> bytes:
             values(data, swept, stack.swept, stack.swept_unit, stack.swept_name)
             for field, (name, curves) in zip(fields, stack.curves.items(), strict=True):
                 values(data, field, mean_over_repeats(curves)[:, :, number], stack.units[name], name)
+        collection = group(entry, ABOUT, "NXcollection")
+        collection["about"] = json.dumps(_about_grid(stack, swept, dict(zip(stack.curves, fields, strict=True))))
+        collection["time_ns"] = stack.times[:, :, 0].astype(np.int64)
     return content.getvalue()
+
+
+def _about_grid(stack: SpectrumStack, swept: str, fields: Mapping[str, str]) -> dict[str, object]:
+    """Return what `afspm.read` makes the spectra from; `ways`: the directions that a column is in."""
+    columns = {
+        column: {"name": column, "unit": stack.units[name], "field": fields[name], "ways": [direction]}
+        for direction, one in zip(stack.directions, stack.columns, strict=False)
+        for name, column in one.items()
+    }
+    if len(stack.columns) < len(stack.directions):
+        columns = {name: column | {"ways": stack.directions} for name, column in columns.items()}
+    return {
+        "content": GRID,
+        "kind": stack.kind,
+        "frame": stack.frame.value,
+        "center_m": stack.points.center_m,
+        "angle_rad": stack.points.angle_rad,
+        "swept": {"name": stack.swept_name, "unit": stack.swept_unit, "field": swept},
+        "columns": [columns[name] for name in stack.names],
+    }
 
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
