@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from afspm.emulators.nanonis import NanonisEmulator
 from afspm.microscopes.asylum import Asylum
 from afspm.microscopes.gxsm import Gxsm
 from afspm.microscopes.nanonis import Nanonis
@@ -65,3 +66,12 @@ for vendor in (Nanonis, Asylum, Gxsm, Nanosurf, Park):
     for fault in (MirroredY, OtherWay, LateEnd):
         name = fault.__name__ + vendor.__name__
         globals()[name] = type(name, (fault, vendor), {"__module__": __name__})
+
+
+class CoarseNanonisEmulator(NanonisEmulator):
+    """A panel with few pixels: its frame is a pixel wider than from the first to the last."""
+
+    def open(self) -> str:
+        address = super().open()
+        self.software.scans.pixels = self.software.scans.lines = 32
+        return address

@@ -141,6 +141,16 @@ def test_a_panel_that_shows_something_else_is_a_mismatch(
     assert said in found.line
 
 
+def test_a_panel_that_shows_the_width_of_whole_pixels_is_right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    person = Person({"of the frame": "1 um", "pixels in a line": "32", "scanner can't reach it": False})
+    result = commissioned(tmp_path, "spoiled.CoarseNanonis", person, "Nanonis")
+    panel = result.progress.results["panel"]
+    assert (panel.outcome, panel.line) == (StepOutcome.PASSED, "3 values are those of the panel")
+    assert any("afspm reads 968.75 nm: the same" in line for line in person.shown)
+
+
 def test_nothing_is_moved_before_it_is_confirmed(tmp_path: Path) -> None:
     result = commissioned(tmp_path, "Nanonis", Person({"scanner can't reach it": False}))
     exchanges = [one for one in read_trace(result.folder / FILE) if isinstance(one, TracedExchange)]

@@ -69,7 +69,8 @@ def _controller(guide: Guide) -> str:
 @_step(
     "The panel",
     "Choose at the controller's panel a frame that is not in the middle, not square and turned by some 20 degrees. "
-    "Then type what the panel shows. An empty line: it is not shown there.",
+    "Then type what the panel shows. An empty line: it is not shown there. afspm's width and height are from the first "
+    "pixel to the last; a panel that shows those of whole pixels has one pixel more.",
     "Note both values and units. If a factor or a sign is wrong, change that row: [translator] parameters.",
     after=("controller",),
     moves=False,
@@ -91,9 +92,10 @@ def _compare_frame(guide: Guide, frame: FrameSetting) -> int:
     slack_nm = 0.01 * max(region.size_m) * 1e9
     x_nm, y_nm = (value * 1e9 for value in region.center_m)
     width_nm, height_nm = (value * 1e9 for value in region.size_m)
+    pixel_nm, line_nm = (1.1 * size / max(n - 1, 1) for size, n in ((width_nm, columns), (height_nm, rows)))
     seen = [
-        guide.compare("width of the frame (x)", width_nm, "nm"),
-        guide.compare("height of the frame (y)", height_nm, "nm"),
+        guide.compare("width of the frame (x)", width_nm, "nm", pixel_nm),
+        guide.compare("height of the frame (y)", height_nm, "nm", line_nm),
         guide.compare("x of its centre", x_nm, "nm", slack_nm),
         guide.compare("y of its centre", y_nm, "nm", slack_nm),
     ]
