@@ -135,6 +135,17 @@ class TcpConnection:
             traced.is_whole = True
             return found
 
+    def has_answer(self) -> bool:
+        """Return True if an answer has begun to come, or the connection is lost, as `receive` will say."""
+        try:
+            self._socket.settimeout(0.0)
+            self._socket.recv(1, socket.MSG_PEEK)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+        return True
+
     def _guarded(self, what: str, timeout_s: float, do: Callable[[], T]) -> T:
         try:
             return do()

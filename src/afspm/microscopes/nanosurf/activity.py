@@ -10,12 +10,13 @@ from typing import Final
 from afspm.clock import Clock
 from afspm.errors import Refused
 from afspm.microscopes.nanosurf import commands
-from afspm.microscopes.nanosurf.link import LongCall, StudioError
+from afspm.microscopes.nanosurf.link import StudioError
 from afspm.microscopes.nanosurf.session import Session
 from afspm.microscopes.nanosurf.settings import TipPlace
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.translator.driver import ControllerLost
 from afspm.translator.folder_files import FolderFiles
+from afspm.translator.long_call import LongCall
 from afspm.translator.result_files import SCAN, FilePrecision, as_list
 
 FORCE: Final = "force"
@@ -36,7 +37,6 @@ class Activity:
     Args:
         folder: gives the folder of Studio's files as seen from here.
         frame_in_force: as it was set.
-        wake: has the state looked at.
     """
 
     def __init__(
@@ -48,11 +48,10 @@ class Activity:
         frame_in_force: Callable[[], Region],
         clock: Clock,
         log: logging.Logger,
-        wake: Callable[[], None],
     ) -> None:
         self._session, self._files, self._place = session, files, place
         self._folder, self._frame_in_force = folder, frame_in_force
-        self._clock, self._log, self._wake = clock, log, wake
+        self._clock, self._log = clock, log
         self._call: LongCall | None = None
         self._stopping = self._failed = self._takes_on_arrival = False
 
@@ -117,18 +116,18 @@ class Activity:
 
     def _take_curve(self) -> None:
         self._files.begin(FORCE, self._folder(), {"position": list(self._place.xy_m())})
-        self._call = self._session.begin(FORCE, commands.TAKE_CURVE, self._wake)
+        self._call = self._session.begin(FORCE, commands.TAKE_CURVE)
 
     def approach(self) -> None:
         """Bring the tip to the sample."""
-        self._call = self._session.begin("approach", commands.APPROACH, self._wake)
+        self._call = self._session.begin("approach", commands.APPROACH)
 
     def withdraw(self) -> None:
         """Take the tip away, whatever is going on."""
         self.stopped()
         self.close()
         try:
-            self._call = self._session.begin("withdrawal", commands.WITHDRAW, self._wake, commands.STOP_ALL)
+            self._call = self._session.begin("withdrawal", commands.WITHDRAW, commands.STOP_ALL)
         except ControllerLost as lost:
             self._log.warning("there is no further connection (%s): the tip is withdrawn by the first", lost)
             self._session.run(f"{commands.STOP_ALL} {commands.WORKFLOW}.{commands.WITHDRAW}() return 0")
@@ -147,17 +146,17 @@ class Activity:
     def _end_call(self) -> None:
         """Take notice of the end of what takes long. Raises ControllerLost."""
         call = self._call
-        if call is None or call.running:
+        if call is None:
             return
-        self._call = None
         try:
-            told = call.result()
+            if call.running():
+                return
         except StudioError as error:
             self._log.error("the %s failed: %s", call.what, error)
             self._failed = True
             if call.what == FORCE:
                 self._files.forget()
-            return
-        message = told[0].get("message") if told and isinstance(told[0], dict) else None
+        self.close()
+        message = call.value[0].get("message") if call.value and isinstance(call.value[0], dict) else None
         if message:
             self._log.info("the %s has ended: %s", call.what, message)

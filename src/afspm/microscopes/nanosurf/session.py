@@ -10,10 +10,11 @@ from typing import Any, Final
 from afspm.errors import ConfigError, Refused
 from afspm.microscopes.nanosurf import commands
 from afspm.microscopes.nanosurf.commands import WORKFLOW
-from afspm.microscopes.nanosurf.link import Link, LongCall, StudioError
+from afspm.microscopes.nanosurf.link import Link, StudioError
 from afspm.microscopes.nanosurf.lua_values import written
 from afspm.model import ControlResponse
 from afspm.translator.driver import ControllerLost
+from afspm.translator.long_call import LongCall
 from afspm.translator.parameters import Value
 
 ENUMS: Final = frozenset({"imaging.scan_mode", "imaging.slow_axis_scan_direction", "data.storage.nhf_auto_store_mode"})
@@ -112,15 +113,16 @@ class Session:
             raise ControllerLost(f"Studio replied {told} to whether it scans")
         return Scanning(*told)
 
-    def begin(self, what: str, command: str, done: Callable[[], None], first: str = "") -> LongCall:
-        """Begin what takes long, after the script `first`; `done` is called, from another thread, at its end."""
+    def begin(self, what: str, command: str, first: str = "") -> LongCall:
+        """Begin what takes long, after the script `first`, on a connection of its own. Raises ControllerLost."""
         link = self._open_link()
         try:
             self._select(link)
+            link.begin(f"{first} return {WORKFLOW}.{command}()")
         except BaseException:
             link.close()
             raise
-        return LongCall(what, link, f"{first} return {WORKFLOW}.{command}()", done)
+        return LongCall(what, link)
 
     def close(self) -> None:
         """Let go of it."""

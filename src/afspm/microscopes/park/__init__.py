@@ -10,11 +10,12 @@ from afspm.errors import ConfigError, Refused
 from afspm.microscopes.park.activity import STOP, STOP_CURVE, Activity
 from afspm.microscopes.park.link import Link, SmartScanError
 from afspm.microscopes.park.result_files import SETTLE_S, ParkFiles
-from afspm.microscopes.park.session import FALSE, TRUE, LongCall, Session
+from afspm.microscopes.park.session import FALSE, TRUE, Session
 from afspm.microscopes.park.settings import MICROMETRE, FrameSettings, Gains, TipPlace
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
 from afspm.plain_data import PlainMapping
 from afspm.translator.driver import ControllerLost, Driver, action
+from afspm.translator.long_call import LongCall
 from afspm.translator.parameters import Value
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
 from afspm.units import Duration, Length

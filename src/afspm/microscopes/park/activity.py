@@ -11,9 +11,10 @@ from afspm.clock import Clock
 from afspm.errors import Refused
 from afspm.microscopes.park.link import SmartScanError
 from afspm.microscopes.park.result_files import ParkFiles
-from afspm.microscopes.park.session import LongCall, Session
+from afspm.microscopes.park.session import Session
 from afspm.microscopes.park.settings import MOVE, way_to
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
+from afspm.translator.long_call import LongCall
 from afspm.translator.result_files import SCAN, XY, as_list
 
 START, STOP, STOP_CURVE = "scan.triggerImageScan()", "scan.stop()", "spect.stop()"
@@ -134,15 +135,17 @@ class Activity:
     def _watched_call(self) -> LongCall | None:
         """Return the script that takes long, while it does. Raises ControllerLost."""
         call, place_m = self._call, self._curve_at
+        if call is None:
+            return None
         try:
-            if call is not None and not call.running():
-                self.close()
-                if place_m is not None:
-                    self._take_curve(call.what, place_m)
+            if call.running():
+                return call
         except SmartScanError as error:
-            self._log.error("the %s failed: %s", call.what if call else "", error)
-            self._failed = True
-            if call is not None and call.what == self._files.what:
+            self._log.error("the %s failed: %s", call.what, error)
+            self._failed, place_m = True, None
+            if call.what == self._files.what:
                 self._files.forget()
-            self.close()
+        self.close()
+        if place_m is not None:
+            self._take_curve(call.what, place_m)
         return self._call

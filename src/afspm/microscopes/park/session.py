@@ -19,6 +19,7 @@ from afspm.microscopes.park.link import (
 )
 from afspm.model import ControlResponse
 from afspm.translator.driver import ControllerLost
+from afspm.translator.long_call import LongCall
 from afspm.translator.parameters import Value
 
 TRUE, FALSE = frozenset({"true", "1"}), frozenset({"false", "0"})
@@ -100,14 +101,18 @@ class Session:
         return self._word(SCRIPT_RUNS, TRUE, FALSE, "report it, with a trace")
 
     def begin(self, what: str, expression: str) -> LongCall:
-        """Begin what takes long, on a connection of its own. Raises ControllerLost."""
+        """Begin what takes long, on a connection of its own. Raises ControllerLost.
+
+        Whether its reply comes at its end, or at once and without a value, is not known: in the second case SmartScan
+        is asked whether a script runs.
+        """
         link = self._open_link()
         try:
             link.begin(expression)
         except BaseException:
             link.close()
             raise
-        return LongCall(what, link, self.script_runs)
+        return LongCall(what, link, lambda value: value is None and self.script_runs())
 
     def close(self) -> None:
         """Let go of it."""
@@ -133,30 +138,6 @@ class Session:
             known = ", ".join(sorted({*yes, *no}))
             raise ControllerLost(f"SmartScan replied {told!r} to {method}, and not one of {known}", hint=hint)
         return told in yes
-
-
-class LongCall:
-    """A script that runs until the instrument is done.
-
-    Whether its reply comes then, or at once and without a value, is not known: in the second case SmartScan is asked
-    whether a script runs.
-    """
-
-    def __init__(self, what: str, link: Link, script_runs: Callable[[], bool]) -> None:
-        self.what = what
-        self._link, self._script_runs = link, script_runs
-        self._came = False
-        self._value: object = None
-
-    def running(self) -> bool:
-        """Return whether it goes on. Raises SmartScanError: it failed. ControllerLost."""
-        if not self._came:
-            self._came, self._value = self._link.reply(self.what)
-        return not self._came or (self._value is None and self._script_runs())
-
-    def close(self) -> None:
-        """Wait for it no longer."""
-        self._link.close()
 
 
 def _is_value(told: object) -> bool:

@@ -11,8 +11,9 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from afspm.errors import InvalidValue
-from afspm.microscopes.park.session import LongCall, Session
+from afspm.microscopes.park.session import Session
 from afspm.model import Region, names
+from afspm.translator.long_call import LongCall
 from afspm.translator.parameters import Value
 from afspm.translator.result_files import XY
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, SettingsGroup, frame, frame_values
