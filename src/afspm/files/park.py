@@ -42,6 +42,7 @@ from afspm.files.park_header import (
     text,
 )
 from afspm.model import Region, Scan, Spectrum
+from afspm.model.geometry import XY
 
 _DATE: Final = "%Y:%m:%d %H:%M:%S"
 Tags = dict[int, Any]
@@ -126,11 +127,13 @@ def _curves(tags: Tags, path: Path, *, newer: bool) -> tuple[Spectrum, ...]:
     )
 
 
-def _places(raw: bytes, count: int) -> list[tuple[float, float] | None]:
+def _places(raw: bytes, count: int) -> list[XY | None]:
+    """Return where each curve was taken; None: that is not told."""
     if len(raw) < count * POINT.itemsize:
         return [None] * count
     points = np.frombuffer(raw, POINT, count)
-    return [(float(one["x_um"]) * MICROMETRE, float(one["y_um"]) * MICROMETRE) for one in points]
+    places = [(float(one["x_um"]) * MICROMETRE, float(one["y_um"]) * MICROMETRE) for one in points]
+    return [place if all(map(math.isfinite, place)) else None for place in places]
 
 
 def _numbers(

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
 
-from afspm.model import Region, Spectrum
+from afspm.emulators.activities import ScanActivity, SpectrumActivity
+from afspm.emulators.park import files as park
+from afspm.model import Feedback, Region, Spectrum
 from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
@@ -213,6 +216,24 @@ def nid() -> bytes:
     return head.encode() + b"#!" + values + np.arange(8, dtype="<i4").tobytes()
 
 
+def park_image() -> bytes:
+    drawn: Future[DrawnScan] = Future()
+    drawn.set_result(DrawnScan())
+    scan = ScanActivity(1, REGION, (NY, NX), 0.0, 0.5, True, Feedback(setpoint=0.7), 0.2, _drawn=drawn)
+    return next(content for _, content in park.images(scan, END_NS / 1e9, "NCM"))
+
+
+def park_curve() -> bytes:
+    values = np.stack([np.arange(5.0) * 1e-7, np.arange(5.0) * 1e-9], axis=1)
+    taken = SpectrumActivity(1, "force", REGION.center_m, 0.0, 1.0, ("Z", "Force"), ("m", "N"), values)
+    return park.curve(taken, END_NS / 1e9, "NCM")
+
+
+class DrawnScan:
+    def channels(self, until_s: float | None = None) -> dict[str, tuple[str, np.ndarray]]:
+        return {"Z Height": ("m", HEIGHT_M)}
+
+
 def written(content: Callable[[], bytes]) -> Callable[[Path], None]:
     return lambda path: (path.write_bytes(content()), None)[1]
 
@@ -233,4 +254,6 @@ WHOLE: dict[str, Callable[[Path], None]] = {
     "nsid.h5": nsid,
     "image.nhf": nhf,
     "image.nid": written(nid),
+    "image.tiff": written(park_image),
+    "curve.tiff": written(park_curve),
 }

@@ -96,12 +96,12 @@ def test_a_number_that_can_not_be_is_refused_or_makes_sense(name: str, data: st.
     numbers = list(re.finditer(rb"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?", content[:HEAD]))
     found = data.draw(st.sampled_from(numbers))
     text = data.draw(st.sampled_from(TEXTS))
-    if name.endswith((".ibw", ".nc", ".h5", ".nhf")):
+    if name.endswith((".ibw", ".nc", ".h5", ".nhf", ".tiff")):
         text = text[: len(found[0])].ljust(len(found[0]))
     require_sense(content[: found.start()] + text + content[found.end() :], name)
 
 
-BINARY = [name for name in [*WHOLE, *REAL] if name.endswith((".ibw", ".nc", ".h5", ".nhf"))]
+BINARY = [name for name in [*WHOLE, *REAL] if name.endswith((".ibw", ".nc", ".h5", ".nhf", ".tiff"))]
 
 
 def mended(content: bytes, name: str) -> bytes:
