@@ -1,5 +1,5 @@
 # Two commands: `make demo` runs the main job, `make test` passes the tests. Both set up .venv by themselves:
-# 360 MB for the demonstrations, 620 MB for the tests (780 with those of the page), 880 with the tools of `make check`.
+# 360 MB for the demonstrations, 640 MB for the tests (800 with those of the page), 900 with the tools of `make check`.
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -8,7 +8,7 @@ TEST := .venv/.test
 SETUP := .venv/.made
 
 .PHONY: demo demo-drift test mutants test-samples test-ui test-gateway test-translators test-clients test-windows test-hosts
-.PHONY: test-nexus test-tiled test-bluesky check bench bench-drift soak chaos simulate power-cut docs clean
+.PHONY: test-nexus test-tiled check bench bench-drift soak chaos simulate power-cut docs clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -19,12 +19,12 @@ $(DEMO): $(SOURCES)
 	@touch $@
 
 $(TEST): $(SOURCES)
-	@echo "Setting up .venv for the tests: 620 MB, with a chromium 780 MB …"
+	@echo "Setting up .venv for the tests: 640 MB, with a chromium 800 MB …"
 	@$(PYTHON) tools/bootstrap.py test
 	@touch $(DEMO) $@
 
 $(SETUP): $(SOURCES)
-	@echo "Setting up .venv with all tools: 880 MB …"
+	@echo "Setting up .venv with all tools: 900 MB …"
 	@$(PYTHON) tools/bootstrap.py all
 	@touch $(DEMO) $(TEST) $@
 
@@ -98,11 +98,6 @@ test-nexus: $(TEST)
 ## the folder of a run, as Tiled serves it
 test-tiled: test-nexus
 	@$(PYTHON) tools/serve_with_tiled.py
-
-## the microscope in plans of Bluesky, and documents of a run, in an environment of its own (316 MB)
-test-bluesky: $(TEST)
-	@$(PYTHON) tools/bootstrap.py bluesky
-	@build/bluesky-env/bin/python -m pytest -q tests/system/bluesky
 
 ## style, types, and who may import whom
 check: $(SETUP)

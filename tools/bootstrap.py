@@ -2,7 +2,6 @@
 
 Run by the Makefile: `python3 tools/bootstrap.py demo` (what a plain install holds), `test` (and what the tests need) or
 `all` (and the tools of `make check`), or `gateway` (what judges the gateway). Each adds to what is there.
-`bluesky` makes an environment apart.
 """
 
 from __future__ import annotations
@@ -17,18 +16,13 @@ ROOT = Path(__file__).resolve().parents[1]
 VENV = ROOT / ".venv"
 TOOLS = ROOT / "build" / "tools"
 UV_VERSION = "uv>=0.5,<1"
-EXTRAS = ("dashboard", "features", "gateway", "messages", "nanosurf", "park", "study", "testing", "xarray")
+EXTRAS = ("bluesky", "dashboard", "features", "gateway", "messages", "nanosurf", "park", "study", "testing", "xarray")
 """What the tests use; Jupyter they install where they need it."""
-APART = {"bluesky": ("--group=test", "--extra=bluesky")}
-"""What has an environment of its own, build/<name>-env: too heavy for all others."""
 
 
 def main(wanted: str) -> None:
     if sys.version_info < (3, 11):  # noqa: UP036  (it is run by whatever python3 there is)
         sys.exit(f"afspm needs Python 3.11 or later, this is {sys.version.split()[0]}")
-    if wanted in APART:
-        _sync(*APART[wanted], folder=ROOT / "build" / f"{wanted}-env")
-        return
     is_new = not VENV.exists()
     _sync("--group=pip")
     if is_new or wanted == "demo":
@@ -39,9 +33,9 @@ def main(wanted: str) -> None:
         _sync(*(f"--group={group}" for group in ["pip", *groups]), *(f"--extra={extra}" for extra in EXTRAS))
 
 
-def _sync(*options: str, folder: Path = VENV) -> None:
+def _sync(*options: str) -> None:
     uv = find_uv()
-    environment = {**os.environ, "UV_PROJECT_ENVIRONMENT": str(folder), "UV_PYTHON_DOWNLOADS": "never"}
+    environment = {**os.environ, "UV_PROJECT_ENVIRONMENT": str(VENV), "UV_PYTHON_DOWNLOADS": "never"}
     environment.pop("VIRTUAL_ENV", None)
     command = [uv, "sync", "--frozen", "--inexact", "--python", sys.executable, "--quiet", "--no-default-groups"]
     if subprocess.run([*command, *options], cwd=ROOT, env=environment).returncode != 0:

@@ -34,6 +34,7 @@ from ophyd_async.core import (
 )
 
 from afspm.client.connect import connect
+from afspm.client.parameter_values import Value
 from afspm.client.scope import Scope
 from afspm.clock import NS_PER_S
 from afspm.model import Region, names
@@ -116,7 +117,7 @@ class _ParameterBackend(SignalBackend[float]):
         if callback is not None:
             callback(self._reading)
 
-    def _take(self, told: Reading[object]) -> Reading[float]:
+    def _take(self, told: Reading[Value]) -> Reading[float]:
         self._reading = Reading(value=float(told["value"]), timestamp=told["timestamp"])
         if self._told is not None:
             self._told(self._reading)
@@ -252,5 +253,5 @@ class Microscope(StandardReadable):
         await self._session.call(lambda _: self._held.close())
 
 
-def _timed(value: object) -> Reading[object]:
+def _timed(value: T) -> Reading[T]:
     return Reading(value=value, timestamp=time.time())

@@ -1,7 +1,4 @@
-"""The microscope in plans of Bluesky, with its RunEngine, and documents of a run, judged by its event model.
-
-Bluesky takes a hundred megabytes: `make test-bluesky` installs it; elsewhere these tests are skipped.
-"""
+"""The microscope in plans of Bluesky, with its RunEngine, and documents of a run, judged by its event model."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ import pytest
 import afspm
 from afspm.model import ScopeState
 
-pytest.importorskip("ophyd_async", reason="Bluesky is not installed: make test-bluesky")
+pytest.importorskip("ophyd_async", reason="Bluesky is not installed")
 
 import bluesky.plan_stubs as bps
 import bluesky.plans as bp
