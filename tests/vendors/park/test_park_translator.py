@@ -258,3 +258,17 @@ def test_gains_that_smartscan_does_not_tell_are_not_supported(bench: Make) -> No
     assert peer.get_response(names.ZCTRL_IGAIN).code == ControlResponse.PARAM_NOT_SUPPORTED
     assert scanned(peer)
     made.until_said("does not tell the gains")
+
+
+@pytest.mark.parametrize("kind", ["spectrum-refused", "no-file"])
+def test_a_curve_without_a_file_is_told_to_be_missing(bench: Make, kind: str) -> None:
+    made = bench()
+    peer = small(made, result_timeout_s=2.0)
+    made.strike(kind)
+    assert peer.act(names.START_SPEC).ok
+    heard = peer.until(FREE)
+    assert not any(isinstance(one, Spectrum) for one in heard)
+    assert "INTERRUPTED" in states(heard)
+    made.strike("late-file", duration_s=100.0)
+    assert peer.act(names.START_SPEC).ok
+    assert [one.kind for one in peer.until(FREE) if isinstance(one, Spectrum)] == ["force"]
