@@ -35,8 +35,8 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     """The scans and spectra of a file.
 
     Asylum (.ibw, NSID .h5), Nanonis (.sxm, .dat), GXSM (.nc, .vpdata), Nanosurf (.nhf, .nid), Park (.tiff),
-    Gwyddion's simple fields (.gsf) and those of the simulated microscope (.nc). Of channels of one name,
-    the second is "name #2".
+    Gwyddion's simple fields (.gsf), those of the simulated microscope (.nc), and afspm's own: of the record, and of a
+    grid of spectra that was exported (.h5). Of channels of one name, the second is "name #2".
 
     Args:
         zone: of the clock of the controller, which most write without saying which it was; None: that of this computer.
