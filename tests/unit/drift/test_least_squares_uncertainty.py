@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from afspm.drift.estimators.alignment import conditioned, shear_model
+from afspm.drift.estimators.images import without_scars
 from afspm.drift.estimators.least_squares import LeastSquares
 from afspm.drift.estimators.noise import denoised
+from afspm.drift.estimators.nuisances import Shear, averaged
 from afspm.drift.estimators.search import shear_by_drift
-from afspm.drift.estimators.warp import derivative
+from afspm.drift.estimators.warp import COUNT, derivative
 from afspm.drift.registration import DriftScan, Prior
 from afspm.model import Region
 
@@ -116,16 +117,50 @@ def test_a_difference_of_velocities_says_nothing_of_scans_taken_differently(
     assert sd is None
 
 
+def told(shift: float, shear: float) -> tuple[NDArray[np.float64], ...]:
+    """Of images that tell the sum of a shift along x and ten times a shear to 0.1 px, and all else very well."""
+    information = 1e8 * np.eye(COUNT)
+    information[np.ix_([0, 3], [0, 3])] = np.outer((10.0, 100.0), (10.0, 100.0))
+    theta = np.zeros(COUNT)
+    theta[[0, 3]] = shift, shear
+    return information, information @ theta, 1e-4 * np.eye(COUNT)
+
+
 def test_what_shear_is_plausible_decides_where_shift_and_shear_are_alike() -> None:
-    """A shift of 1 px and a shear of 0.1 found, each uncertain by as much, and one for the other."""
-    theta = np.array([1.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0])
-    covariance = np.diag([1.01, 1e-4, 1e-6, 0.0101, 1e-6, 1e-6, 1e-4, 1e-4])
-    covariance[0, 3] = covariance[3, 0] = 0.1
-    still, total = conditioned(theta, covariance, np.zeros(4), shear_model(1e-6, 1.0))
-    assert abs(still[0]) < 0.1
-    assert total[0, 0] < 0.1
-    drifting, _ = conditioned(theta, covariance, np.zeros(4), shear_model(1.0, 1.0))
-    assert drifting[0] == pytest.approx(1.0, abs=0.05)
+    still, total = averaged(*told(0.5, 0.05), Shear(sds=(1e-5,)))
+    assert still[0] == pytest.approx(1.0, abs=0.01), "all of it is a shift"
+    assert math.sqrt(total[0, 0]) == pytest.approx(0.1, rel=0.05)
+    sheared, _ = averaged(*told(0.5, 0.05), Shear(mean=np.array([[0.0, 0.08], [0.0, 0.0]]), sds=(1e-5,)))
+    assert sheared[[0, 3]] == pytest.approx([0.2, 0.08], abs=0.01), "as was expected"
+    _, unsure = averaged(*told(0.5, 0.05), Shear(sds=(0.05,)))
+    assert math.sqrt(unsure[0, 0]) > 0.3, "it may be either"
+
+
+def test_creep_that_the_images_show_is_freed_and_what_they_do_not_show_is_none() -> None:
+    information = np.diag([1.0, 1.0, *[1e8] * 4, 1e4, *[1.0] * (COUNT - 7)])
+    theta = np.zeros(COUNT)
+    theta[6] = 0.5
+    seen, total = averaged(information, information @ theta, 1e-4 * np.eye(COUNT), Shear())
+    assert seen[6] == pytest.approx(0.5, abs=0.01)
+    assert abs(seen[8:10]).max() < 1e-3, "at the other end there is none"
+    none, without = averaged(information, np.zeros(COUNT), 1e-4 * np.eye(COUNT), Shear())
+    assert none == pytest.approx(np.zeros(COUNT), abs=1e-12)
+    assert without[6, 6] < total[6, 6] / 4
+
+
+def test_a_stretch_of_a_row_that_stands_out_is_mended_and_features_are_left() -> None:
+    y, x = np.mgrid[:64, :64].astype(float)
+    random = np.random.default_rng(8)
+    surface = (
+        np.exp(-((x - 20) ** 2 + (y - 40) ** 2) / 8)
+        + np.tanh((x + y - 60) / 6)
+        + 0.02 * random.standard_normal(x.shape)
+    )
+    scarred = surface.copy()
+    scarred[10, 12:40] += 0.7
+    scarred[30, 5:30] -= 0.5
+    assert without_scars(surface) == pytest.approx(surface)
+    assert abs(without_scars(scarred) - surface).max() < 0.15
 
 
 def test_what_noise_is_left_in_a_shrunk_image_is_known_from_other_noise() -> None:

@@ -212,26 +212,3 @@ def covariance(fit: Fit, believed: Believed) -> tuple[Array, Doubt]:
     total: Array = doubt.spread * model
     total[:2, :2] += FLOOR_PX**2 * np.eye(2)
     return total, doubt
-
-
-BESIDES = 0.01  # of each element of a linear map: creep, a sample that turns, another calibration
-
-
-def shear_model(drift: float, aspect: float) -> Array:
-    """Return the covariance of (axx, axy, ayx, ayy) of pixel coordinates when drift during the scans shears them: each
-    row is displaced against the one before, so what depends on y varies more.
-
-    Args:
-        drift: standard deviation of the displacement per length along y.
-        aspect: height of a pixel over its width.
-    """
-    to_px = np.diag([1.0, aspect, 1.0 / aspect, 1.0])
-    model: Array = to_px @ (np.diag([0.0, drift**2, 0.0, drift**2]) + BESIDES**2 * np.eye(4)) @ to_px
-    return model
-
-
-def conditioned(theta: Array, covariance: Array, mean: Array, model: Array) -> tuple[Array, Array]:
-    """Return theta and its covariance, given that its linear map is normal about `mean` with the covariance `model`:
-    where features are few, shift and shear are nearly the same thing, and what shear is plausible decides the shift."""
-    gain = covariance[:, LINEAR] @ np.linalg.inv(covariance[LINEAR, LINEAR] + model)
-    return theta - gain @ (theta[LINEAR] - mean), covariance - gain @ covariance[LINEAR]

@@ -36,7 +36,7 @@ class Image:
 
 
 def prepare(values: Array) -> Image:
-    """Flatten the rows, cut off what sticks out, scale to a standard deviation of 1.
+    """Flatten the rows, cut off what sticks out, mend scars, scale to a standard deviation of 1.
 
     Raises:
         Unusable: less than half of the rows measured, constant, saturated, or without topography (a crashed tip).
@@ -56,7 +56,7 @@ def prepare(values: Array) -> Image:
     scaled = (_filled(values, known) - lowest) / (highest - lowest)
     flat = flatten_rows(scaled, known)
     low, high = np.percentile(flat[known], (0.1, 99.9))
-    flat = np.clip(flat, low - 0.25 * (high - low), high + 0.25 * (high - low))
+    flat = without_scars(np.clip(flat, low - 0.25 * (high - low), high + 0.25 * (high - low)))
     spread = flat[known].std()
     if spread < 1e-9:
         raise Unusable("the rows hold nothing but an offset and a tilt")
@@ -83,6 +83,47 @@ def flatten_rows(values: Array, known: Mask) -> Array:
         scale = 1.4826 * np.median(np.abs(residual[known]))
         weight = known / (1.0 + (residual / max(2.0 * scale, 1e-12)) ** 2)
     return values - line
+
+
+SCAR_PX = 15
+SCAR_SD = 1.5  # beyond the rows on both sides of it, in standard deviations of a pixel from their mean
+
+
+def without_scars(values: Array) -> Array:
+    """Return an image with the mean of the rows beside them in place of scars.
+
+    A scar is where most of `SCAR_PX` pixels of a row are above both of its neighbours, or below both. Nothing on a
+    surface is as thin as a row and much longer.
+    """
+    from scipy.ndimage import binary_dilation
+
+    step = np.diff(values, axis=0)
+    step -= np.median(step, axis=1, keepdims=True)
+    up, down = step[:-1], -step[1:]
+    beyond = np.where(up * down > 0.0, np.copysign(np.minimum(abs(up), abs(down)), up), 0.0)
+    apart = (up + down) / 2
+    least = SCAR_SD * 1.4826 * float(np.median(abs(apart - np.median(apart))))
+    scar = np.zeros(values.shape, dtype=bool)
+    scar[1:-1] = _mostly(beyond > least) | _mostly(beyond < -least)
+    if not scar.any():
+        return values
+    scar = binary_dilation(scar, np.ones((1, 9), dtype=bool))
+    rows, columns = np.arange(len(values))[:, None], np.arange(values.shape[1])
+    before = np.maximum.accumulate(np.where(scar, 0, rows), axis=0)
+    after = np.minimum.accumulate(np.where(scar, len(values) - 1, rows)[::-1], axis=0)[::-1]
+    beside = values.copy()
+    beside[1:-1] = (values[before[:-2], columns] + values[after[2:], columns]) / 2
+    for row in np.flatnonzero(scar.any(axis=1) & ~scar.all(axis=1)):
+        beside[row] += np.median((values[row] - beside[row])[~scar[row]])
+    return np.where(scar, beside, values)
+
+
+def _mostly(which: Mask) -> Mask:
+    """Where most of the pixels of a row about this one are."""
+    from scipy.ndimage import uniform_filter1d
+
+    share: Array = uniform_filter1d(which.astype(np.float64), SCAR_PX, axis=1, mode="constant")
+    return share > 0.5
 
 
 def _unfinished(values: Array) -> Mask:

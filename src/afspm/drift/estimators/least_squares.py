@@ -10,27 +10,26 @@ from numpy.typing import NDArray
 from afspm.drift.estimators.acceptance import MatchEvidence, above_repeats, agreement
 from afspm.drift.estimators.alignment import (
     COARSE,
+    FLOOR_PX,
     SHIFT,
     Believed,
     Doubt,
-    conditioned,
     covariance,
     generalised_least_squares,
     least_squares,
-    shear_model,
 )
 from afspm.drift.estimators.coefficients import WRONG_AT_MOST
 from afspm.drift.estimators.images import CommonGrid, Unusable, onto_common_grid, prepare
 from afspm.drift.estimators.noise import FineFilter, without_lines
+from afspm.drift.estimators.nuisances import CREEP_SD_PX, Shear, averaged
 from afspm.drift.estimators.search import ExpectedShift, MaskedCorrelation, Scorer, candidates, shear_by_drift
-from afspm.drift.estimators.warp import COUNT, CREEP, LINEAR, OverlapBox, Scene, WarpedPair
+from afspm.drift.estimators.warp import COUNT, CREEP, LINEAR, SLOPES, OverlapBox, Scene, WarpedPair
 from afspm.drift.registration import DriftScan, LinearSeen, Prior, Registration
 from afspm.errors import ConfigError
 
 Array = NDArray[np.float64]
 
 WIDEST = (0.01, 0.03)  # of what shear and turn are thought possible at first, by x and by y
-CREEP_SD_PX = 0.5  # of each part
 GAIN_SD = 1.0  # of the logarithm
 BEND_SD = 0.15
 BORDER_PX = 1  # where a filter and a spline have to guess what lies beyond
@@ -44,8 +43,8 @@ class LeastSquares:
     1. `prepare`: rows flattened, outliers cut; scans that hold nothing refused. `grid`: a common pixel.
     2. `search` and `score`: candidates by normalised cross-correlation, the likeliest of them.
     3. `align`: Gauss-Newton, coarse to fine; the fine stage through the filter of `spectra`, weighted by `rows`.
-    4. `covariance`: what the noise leaves uncertain, and more where there is doubt; `conditioned`: given the shear that
-       drift makes, where that is known.
+    4. `covariance`: what the noise leaves uncertain, and more where there is doubt; `nuisances`: averaged over what
+       shear, turn, calibration and creep there may be.
     5. `acceptance`: is it a match at all?
 
     Args:
@@ -120,9 +119,9 @@ def _coarse(scene: Scene, expected: ExpectedShift | None) -> tuple[Array, float,
 
 
 def _fine(
-    scene: Scene, box: OverlapBox, theta: Array, expected: ExpectedShift | None, shear: tuple[Array, Array] | None
+    scene: Scene, box: OverlapBox, theta: Array, expected: ExpectedShift | None, shear: Shear
 ) -> tuple[Array, Array, LinearSeen, Doubt]:
-    """theta and its covariance, its linear map before the shear that is expected was reckoned with, and doubts."""
+    """theta and its covariance, its linear map as the images alone tell it, and doubts."""
     fine = FineFilter.of(scene.first.values, scene.second.values)
     values = fine.applied(scene.first.values), fine.applied(scene.second.values)
     pair = WarpedPair(*scene.splines(values, order=5), box.without_border(BORDER_PX), theta[:2])
@@ -130,8 +129,14 @@ def _fine(
     fit = generalised_least_squares(pair, theta, believed, fine)
     spread, doubt = covariance(fit, believed)
     seen = LinearSeen(fit.theta[LINEAR].reshape(2, 2), spread[LINEAR, LINEAR])
-    theta, spread = (fit.theta, spread) if shear is None else conditioned(fit.theta, spread, *shear)
-    return theta, spread, seen, doubt
+    curvature = fit.curvature.sum(axis=0)
+    information = (curvature + curvature.T) / (2.0 * doubt.spread)
+    pull = information @ fit.theta + believed.precision @ (fit.theta - believed.mean) / doubt.spread
+    free = believed.precision.copy()
+    free[2:SLOPES] = 0.0
+    theta, total = averaged(information, pull + free @ believed.mean, free, shear)
+    total[:2, :2] += FLOOR_PX**2 * np.eye(2)
+    return theta, total, seen, doubt
 
 
 def _in_m(seen: LinearSeen, grid: CommonGrid) -> LinearSeen:
@@ -156,18 +161,15 @@ def _believed(expected: ExpectedShift | None) -> Believed:
     return Believed(mean, precision)
 
 
-def _expected_shear(
-    prior: Prior | None, reference: DriftScan, scan: DriftScan, grid: CommonGrid
-) -> tuple[Array, Array] | None:
-    """Mean and covariance of the linear map of pixels, (axx, axy, ayx, ayy), where the velocity of drift is known."""
+def _expected_shear(prior: Prior | None, reference: DriftScan, scan: DriftScan, grid: CommonGrid) -> Shear:
+    """The linear map of pixels that drift makes, where its velocity is known."""
     mean_m, sd = shear_by_drift(prior, reference, scan)
+    width, height = np.hypot(*grid.to_m)
     if sd is None:
-        return None
+        return Shear(float(height / width))
     angle = reference.region.angle_rad
     slow = np.array([-np.sin(angle), np.cos(angle)])
-    width, height = np.hypot(*grid.to_m)
-    mean: Array = np.linalg.inv(grid.to_m) @ np.outer(mean_m, slow) @ grid.to_m
-    return mean.ravel(), shear_model(sd, float(height / width))
+    return Shear(float(height / width), np.linalg.inv(grid.to_m) @ np.outer(mean_m, slow) @ grid.to_m, (sd,))
 
 
 def _evidence(
