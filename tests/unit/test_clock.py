@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from contextlib import ExitStack
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -13,12 +14,15 @@ import pytest
 from afspm.clock import NS_PER_S, ExperimentClock, _shown_ns
 from afspm.errors import ConfigError
 
+ROUNDING_S = 1e-6
+"""A float of the seconds since 1970 is known to 0.2 µs, which shows where the system's clock goes in larger steps."""
+
 
 def test_real_time_by_default() -> None:
     clock = ExperimentClock.real()
     # a busy computer may do something else between any two looks, and wall clocks are set a little now and then
     times_s = [time.time() - 1.0, clock.now_s(), clock.now_ns() / 1e9, clock.now_s(), time.time() + 1.0]
-    assert times_s == sorted(times_s)
+    assert min(after_s - before_s for before_s, after_s in pairwise(times_s)) > -ROUNDING_S
     assert clock.real_s(5.0) == 5.0
 
 
@@ -92,7 +96,7 @@ def test_time_goes_no_faster_than_real_time_while_somebody_is_late(tmp_path: Pat
         while time.monotonic() < real_s + 0.05:
             pass
         passed_s, lasted_s = other.now_s() - began_s, time.monotonic() - real_s
-        assert 0.05 <= passed_s <= 10.0 * lasted_s  # a busy computer does something else between two looks
+        assert 0.05 - ROUNDING_S <= passed_s <= 10.0 * lasted_s  # a busy computer does something else between two looks
     began_s, real_s = other.now_s(), time.monotonic()
     while time.monotonic() < real_s + 0.05:
         pass

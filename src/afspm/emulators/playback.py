@@ -58,6 +58,7 @@ class Playback:
         self._recorded = [[entry for entry in numbered if entry[1].connection == number] for number in connections]
         self._looks = {_compared(one.asked) for _, one in numbered if not one.command and one.asked is not None}
         self._cursors: list[_Cursor] = []
+        self._last_line = numbered[-1][0] if numbered else 0
         self._reached = 0
 
     @property
@@ -92,8 +93,11 @@ class Playback:
             raise Deviation(self._difference(cursor, content))
         index, (line, exchange) = found
         if index >= cursor.next:
+            self._reached = max(self._reached, _line_before(cursor, index))
             if exchange.after < line - 1 and not self._has_passed(connection, exchange.after, line):
                 return None
+            if exchange.lost and line == self._last_line:
+                return None  # by the end of the recording, and not by the controller
             cursor.next = index + 1
             self._reached = max(self._reached, line)
         if exchange.lost and not exchange.answered:
@@ -153,6 +157,11 @@ class Playback:
         line, exchange = rest[0]
         recorded = f"{exchange.what} {_shown(exchange.asked or b'')} (of {exchange.command or 'no request'})"
         return f"line {line}: recorded {recorded}; asked {_shown(content)}"
+
+
+def _line_before(cursor: _Cursor, index: int) -> int:
+    """Return the line of the exchange before one. The client is past it, though it may have looked less often."""
+    return cursor.exchanges[index - 1][0] if index else 0
 
 
 def _compared(asked: bytes | None) -> bytes:

@@ -25,8 +25,8 @@ start = {start}
 [controller]
 component = true
 class = "TraceReplay"
-trace = "{trace}"
-files = "{files}"
+trace = {trace}
+files = {files}
 
 [microscope]
 component = true
@@ -55,8 +55,14 @@ from afspm import Component
 
 
 class Ender(Component):
+    has_begun = False  # a controller that starts late is a problem as well
+
+    def on_scan_parameters(self, parameters):
+        self.has_begun = True
+
     def on_problem(self, problem, flagged):
-        self.scope.end_experiment()
+        if self.has_begun:
+            self.scope.end_experiment()
 """
 
 
@@ -68,7 +74,9 @@ def run(folder: Path, command: str, *files: Path) -> tuple[subprocess.CompletedP
         timeout=90.0 * PATIENCE,
         check=False,
     )
-    return done, max((folder / "runs").glob("*-*"))
+    runs = sorted((folder / "runs").glob("*-*"))
+    assert runs, done.stdout + done.stderr
+    return done, runs[-1]
 
 
 @pytest.fixture(scope="module", params=["nanonis", "asylum", "gxsm", "gxsm-shm", "nanosurf", "park"])
@@ -87,15 +95,13 @@ def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     header = read_trace(trace)[0]
     assert isinstance(header, TraceHeader)
     start = (datetime.fromisoformat(header.began) - timedelta(minutes=10)).isoformat()
-    here, files = json.dumps(str(folder / "files")), folder / "files"
-    before = str(ran / "controller").replace("/", ":")  # as Igor writes folders
+    files = folder / "files"
+    here, before = json.dumps(str(files)), str(ran / "controller").replace("/", ":")  # as Igor writes folders
     where = WHERE[vendor]
     there = f"{{ {json.dumps(before)} = {here} }}" if vendor == "asylum" else here
+    names = {"start": start, "trace": json.dumps(str(trace)), "files": here, "driver": header.driver}
     file = folder / "replay.toml"
-    file.write_text(
-        REPLAY.format(start=start, trace=trace, files=files, driver=header.driver, where=where, files_here=there),
-        encoding="utf-8",
-    )
+    file.write_text(REPLAY.format(**names, where=where, files_here=there), encoding="utf-8")
     files.mkdir()
     shutil.rmtree(ran)  # nothing of it is left to be found
     return vendor, trace, file
