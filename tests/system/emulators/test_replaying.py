@@ -67,13 +67,11 @@ class Ender(Component):
 
 
 def run(folder: Path, command: str, *files: Path) -> tuple[subprocess.CompletedProcess[str], Path]:
-    done = subprocess.run(
-        [*AFSPM, command, *map(str, files), "--runs", str(folder / "runs")],
-        capture_output=True,
-        encoding="utf-8",
-        timeout=90.0 * PATIENCE,
-        check=False,
-    )
+    arguments = [*AFSPM, command, *map(str, files), "--runs", str(folder / "runs")]
+    try:
+        done = subprocess.run(arguments, capture_output=True, encoding="utf-8", timeout=90.0 * PATIENCE, check=False)
+    except subprocess.TimeoutExpired as error:
+        pytest.fail(f"{error}:\n{error.stdout}\n{error.stderr}")
     runs = sorted((folder / "runs").glob("*-*"))
     assert runs, done.stdout + done.stderr
     return done, runs[-1]

@@ -31,7 +31,7 @@ def served() -> Iterator[str]:
 
 
 def test_the_page_shows_each_new_scan(started: Started, browser: Any, served: str) -> None:
-    run = started(SERIES.format(every="2 min", scans=3), speed=60.0, settings=f'origins = ["{served}"]')
+    run = started(SERIES.format(every="2 min", scans=1000), speed=60.0, settings=f'origins = ["{served}"]')
     page = browser.new_page()
     page.goto(f"{served}/page.html?gateway={run.url}")
     page.wait_for_function("document.querySelector('#scan').naturalWidth == 32", timeout=30_000)
