@@ -26,7 +26,8 @@ class Connection:
         on_lost: called when the loss is to be published.
 
     Attributes:
-        stands: True while the controller is connected.
+        is_reached: True while the driver is connected.
+        stands: True while it is, and its state is looked at.
         why_lost: the reason of the last loss.
     """
 
@@ -43,7 +44,7 @@ class Connection:
         self._clock = clock
         self._log = log
         self._on_lost = on_lost
-        self.stands = False
+        self.stands = self.is_reached = False
         self.why_lost = self._logged = ""
         self._ever_stood = self._loss_published = False
         self._retry_at_s = 0.0
@@ -62,12 +63,13 @@ class Connection:
 
     def reach(self) -> None:
         """Connect at once, unless connected. Raises what says that the controller is lost."""
-        if self.stands:
+        if self.is_reached:
             return
         if self._controller is None:
             self._driver.connect()
         else:
             self._controller.reach(self._driver)
+        self.is_reached = True
 
     def require(self) -> None:
         """Raise ControllerLost unless connected."""
@@ -103,9 +105,11 @@ class Connection:
         now_s = self._clock.monotonic_s()
         starts = isinstance(error, LOST) and not self._ever_stood and now_s - self._began_s < _STARTUP_S
         self._retry_at_s = now_s + (_STARTUP_RETRY_S if starts else RETRY_S)
-        stood, self.stands = self.stands, False
+        stood, self.stands, self.is_reached = self.stands, False, False
         self.why_lost = str(error) if isinstance(error, AfspmError | OSError) else f"{type(error).__name__}: {error}"
-        if not starts and (stood or self.why_lost != self._logged):
+        if starts:
+            self._log.debug("not connected yet: %s", self.why_lost)
+        elif stood or self.why_lost != self._logged:
             self._logged = self.why_lost
             self._log.error("lost contact with the controller: %s; retrying", self._logged)
         if stood or not self._loss_published:

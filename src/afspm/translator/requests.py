@@ -99,7 +99,7 @@ class RequestHandler:
         try:
             self._carry_out(request)
         except LOST as error:
-            if self._connection.stands:
+            if self._connection.is_reached:
                 self._connection.lose(error)
             reason, detail = f"the controller can't be reached: {error}", ResponseDetail.OUTCOME_UNKNOWN
             if self._acting is not request:

@@ -99,10 +99,12 @@ class FakeMicroscope(Driver):
         self.fails: Exception | None = None
         self.confused: Exception | None = None
         self.got = 0
+        self.connected = 0
 
     def connect(self) -> None:
         if self.lost:
             raise ConnectionError("unplugged")
+        self.connected += 1
 
     def status(self) -> ScopeStatus:
         if self.lost:

@@ -180,6 +180,35 @@ def test_the_way_out_is_open_whatever_else_is_wrong(bench: Any, monkeypatch: pyt
     assert bench.microscope.done == ["retract"]
 
 
+def test_what_has_connected_to_retract_the_tip_does_not_connect_twice(bench: Any) -> None:
+    microscope = bench.microscope
+    microscope.lost = True
+    bench.look()
+    microscope.lost, microscope.connected = False, 0
+    assert bench.ask(ACTION, names.RETRACT).code == OK
+    bench.look(after_s=2.0)
+    assert microscope.connected == 1
+    assert bench.heard()[-1] == "FREE"
+
+
+def test_the_way_out_is_tried_on_a_new_connection_after_one_that_was_lost_on_it(
+    bench: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    microscope = bench.microscope
+    microscope.lost = True
+    bench.look()
+    microscope.lost, microscope.connected = False, 0
+    with monkeypatch.context() as patched:
+        patched.setattr(bench.translator.requests.commands, "do", lost)
+        assert bench.ask(ACTION, names.RETRACT).code == ControlResponse.NO_RESPONSE
+    assert bench.ask(ACTION, names.RETRACT).code == OK
+    assert (microscope.connected, microscope.done) == (2, ["retract"])
+
+
+def lost(*_: Any) -> Any:
+    raise ConnectionError("unplugged")
+
+
 @pytest.mark.parametrize("lost", [False, True])
 def test_a_controller_that_is_lost_or_refuses_when_the_run_is_stopped_is_asked_again(
     bench: Any, caplog: pytest.LogCaptureFixture, lost: bool
