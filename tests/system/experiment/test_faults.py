@@ -59,7 +59,7 @@ def test_a_frozen_process_is_replaced_and_every_scan_is_there_once(run: Run) -> 
     for name in ("microscope", "scheduler", "series"):
         one.wait_for_next(" witness ", "state SCANNING")
         one.freeze(name)
-        one.wait_for(f" {name} ", "no heartbeat")
+        one.wait_for(f" {name} ", "no heartbeat|it is frozen")
         one.wait_up(name, times=2)
     assert one.end() == 0, one.output
     require_each_once(one, 10)
