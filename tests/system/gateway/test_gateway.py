@@ -113,9 +113,9 @@ def test_a_client_that_vanishes_in_a_scan_loses_control_and_the_scan_is_stopped(
 
 
 def test_a_killed_gateway_goes_on_with_its_scans_and_its_clients_with_their_events(started: Started) -> None:
-    run = started(speed=20.0)
+    run = started('[control]\ngrace = "60 s"\n', speed=20.0)
     ada = run.client("ada")
-    ada.done("POST", "/control", {"lease_s": 3600})
+    ada.done("POST", "/control", {"lease_s": 60})
     asked = {"region": REGION, "shape": [32, 32], "key": "survives"}
     seen: list[Event] = []
     reader = threading.Thread(target=lambda: seen.extend(ada.events("/events?after=0")))
@@ -125,7 +125,7 @@ def test_a_killed_gateway_goes_on_with_its_scans_and_its_clients_with_their_even
     reader.join(20.0)
     run.wait_for("the gateway is at ", count=2)
     assert run.said("the gateway is at ")[1].endswith(run.url), "clients find it where it was"
-    ada.done("PUT", "/control", {"lease_s": 3600})
+    ada.done("PUT", "/control", {"lease_s": 60})
     assert ada.until_measured("survives")["state"] == "done"
     assert ada.done("POST", "/scans", asked)["state"] == "done"
     assert len(ada.get("/scans")) == 1
