@@ -107,9 +107,7 @@ class Connection:
         self._retry_at_s = now_s + (_STARTUP_RETRY_S if starts else RETRY_S)
         stood, self.stands, self.is_reached = self.stands, False, False
         self.why_lost = str(error) if isinstance(error, AfspmError | OSError) else f"{type(error).__name__}: {error}"
-        if starts:
-            self._log.debug("not connected yet: %s", self.why_lost)
-        elif stood or self.why_lost != self._logged:
+        if not starts and (stood or self.why_lost != self._logged):
             self._logged = self.why_lost
             self._log.error("lost contact with the controller: %s; retrying", self._logged)
         if stood or not self._loss_published:
