@@ -50,7 +50,7 @@ def test_a_correct_client_passes_with_1000_requests_whose_replies_get_lost(tmp_p
         ("no-marker", "replay/marker", "a subscription to a marker"),
         ("all-anew", "replay/reconnect", "newer than"),
         ("new-ids", "requests/repeat", "repetitions with the id of the first"),
-        ("new-ids", "requests/lost-replies", r"each executed once; came (?!1000 )\d+ that were executed"),
+        ("new-ids", "requests/lost-replies", r"each executed once; came (1[1-9]|[2-9]\d)\d\d that were executed"),
         ("any-answer", "requests/other-answers", "the success that has the request's id"),
         ("same-life", "requests/restart", "its id was used for another request before"),
         ("drops-units", "measure/parameters", "expected"),

@@ -134,7 +134,8 @@ def test_on_a_sample_that_turns_and_expands_a_similarity_keeps_corners_in_place(
     tracker = f'{{ class = "bank", transform = "{transform}", compared = 2 }}'
     sample = "rotation_rad_per_s = 1.8e-6, expansion_per_s = 0.7e-6, about_m = [-1.6e-6, -1.2e-6]"
     options = f'tracker = {tracker}, rescan = {{ rule = "never" }}'
-    run = rig.start(options, scans=7, speed=1200.0, sample=sample, pause_s=1200.0)
+    # a slow computer would let the sample turn far while the first worker starts
+    run = rig.start(options, scans=7, speed=1200.0 / PATIENCE, sample=sample, pause_s=1200.0)
     assert run.end() == 0, run.output
     found = surveyed(run)
     assert away_m(found.drift_m[-1:], found.drift_m[:1])[0] > 20e-9
@@ -143,11 +144,10 @@ def test_on_a_sample_that_turns_and_expands_a_similarity_keeps_corners_in_place(
     mistaken_m = away_m(found.corners_said_m, found.corners_true_m).T.max(axis=1)
     misplaced_m = away_m(found.corners_true_m, wanted_m).T.max(axis=1)
     if transform == "similarity":
-        # the second: on a slow computer the sample has turned far when the first worker has started
-        assert (mistaken_m < [1e-9, 6e-9, *[1e-9] * 5]).all(), mistaken_m
-        assert (misplaced_m[3:] < 6e-9).all(), misplaced_m
+        assert (mistaken_m < 1e-9).all(), mistaken_m
+        assert (misplaced_m[2:] < 6e-9).all(), misplaced_m
         # till then nothing is known
-        assert (away_m(found.spectra_said_m, found.spectra_true_m)[2:] < 1.5e-9).all(), found
+        assert (away_m(found.spectra_said_m, found.spectra_true_m)[1:] < 1.5e-9).all(), found
     else:
         assert mistaken_m[-1] > 8e-9, mistaken_m
         assert misplaced_m[-1] > 8e-9, misplaced_m

@@ -73,10 +73,16 @@ def test_what_is_read_once_is_not_waited_for_without_end() -> None:
 
 
 @pytest.fixture
-def synced(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The files that were synced, by number, those of what earlier tests have left running too."""
+def synced(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[int]:
+    """The files of the test that were synced, by number. What earlier tests have left running may sync others."""
     found: list[int] = []
-    monkeypatch.setattr(disk, "sync_data", lambda descriptor: found.append(os.fstat(descriptor).st_ino))
+
+    def note(descriptor: int) -> None:
+        number = os.fstat(descriptor).st_ino
+        if number in {path.stat().st_ino for path in (tmp_path, *tmp_path.iterdir())}:
+            found.append(number)
+
+    monkeypatch.setattr(disk, "sync_data", note)
     return found
 
 
@@ -89,7 +95,7 @@ def test_what_was_written_is_on_the_disk_a_moment_later_though_it_was_closed(tmp
     syncer.folder_soon(tmp_path)
     folder = () if sys.platform == "win32" else (tmp_path,)  # Windows syncs no folders
     wanted = {path.stat().st_ino for path in (tmp_path / "a", tmp_path / "b", *folder)}
-    while not wanted <= set(synced) and not done.wait(0.01):
+    while set(synced) != wanted and not done.wait(0.01):
         pass
 
 
@@ -100,7 +106,7 @@ def test_what_is_wanted_now_is_on_the_disk_now(tmp_path: Path, synced: list[int]
         file.write(b"x")
         syncer.soon(file.fileno())
         syncer.now(DEADLINE_S)
-        assert os.fstat(file.fileno()).st_ino in synced
+        assert synced == [os.fstat(file.fileno()).st_ino]
 
 
 def test_a_disk_that_does_not_sync_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -199,13 +199,13 @@ def test_the_way_out_is_tried_on_a_new_connection_after_one_that_was_lost_on_it(
     bench.look()
     microscope.lost, microscope.connected = False, 0
     with monkeypatch.context() as patched:
-        patched.setattr(bench.translator.requests.commands, "do", lost)
+        patched.setattr(bench.translator.requests.commands, "do", unplugged)
         assert bench.ask(ACTION, names.RETRACT).code == ControlResponse.NO_RESPONSE
     assert bench.ask(ACTION, names.RETRACT).code == OK
     assert (microscope.connected, microscope.done) == (2, ["retract"])
 
 
-def lost(*_: Any) -> Any:
+def unplugged(*_: Any) -> Any:
     raise ConnectionError("unplugged")
 
 
