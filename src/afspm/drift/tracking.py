@@ -16,7 +16,7 @@ from afspm.plain_data import Plain, PlainMapping
 
 Array = NDArray[np.float64]
 
-FORECAST_VERSION = 1
+FORECAST_VERSION = 2
 """Of all kinds of forecast as plain data."""
 
 

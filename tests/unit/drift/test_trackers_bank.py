@@ -22,12 +22,12 @@ NM = 1e-9
 STEADY = steady((0.05 * NM, -0.03 * NM))
 
 
-def night(seed: int) -> Drift:
-    """Relaxations of hours and of half an hour, a day's wave, and a random walk of 1 nm in 15 minutes."""
+def night(seed: int, walk_m: float = NM) -> Drift:
+    """Relaxations of hours and of half an hour, a day's wave, and a random walk of so much in 15 minutes."""
     random = np.random.default_rng(seed)
     slow, fast, daily = (v / np.linalg.norm(v) for v in random.standard_normal((3, 2)))
     times_s = np.arange(0.0, 120 * INTERVAL_S, 60.0)
-    walk = np.cumsum(random.standard_normal((len(times_s), 2)), axis=0) * NM * np.sqrt(60.0 / 900.0)
+    walk = np.cumsum(random.standard_normal((len(times_s), 2)), axis=0) * walk_m * np.sqrt(60.0 / 900.0)
 
     def drift(time_s: float) -> Array:
         relaxed = 1500 * NM * slow * (1 - np.exp(-time_s / 10800)) + 300 * NM * fast * (1 - np.exp(-time_s / 1800))
@@ -75,6 +75,31 @@ def test_it_knows_how_well_it_knows(nights: list[tuple[World, list[Update]]]) ->
                 chi2.append(error @ np.linalg.solve(known.covariance_m2, error) / 2)
     assert 0.1 < np.mean(before) < 1.2
     assert 0.1 < np.mean(after) < 2.5
+
+
+class WorldByRows(World):
+    """A scan shows the sample where it was in the mean of its rows."""
+
+    def _seen(self, scan: DriftScan, position_m: Array) -> Array:
+        return super()._seen(scan, position_m) + self.shown_m(scan) - self.drift_m(scan.mid_s)
+
+    def shown_m(self, scan: DriftScan) -> Array:
+        """(2,) the mean of the displacement over the rows."""
+        times_s = np.linspace(scan.start_s, scan.end_s, 65)
+        return np.asarray(np.mean([self.drift_m(float(t)) for t in times_s], axis=0))
+
+
+@pytest.mark.parametrize("walk_m", [1 * NM, 4 * NM])
+def test_it_knows_what_the_sample_wanders_during_a_scan(walk_m: float) -> None:
+    """Told after a scan is where the sample was in the middle of it, but the scan shows the mean of its rows."""
+    chi2 = []
+    for seed in range(6):
+        world = WorldByRows(night(seed, walk_m), noise_m=0.05 * NM, seed=seed)
+        wandered_m = world.shown_m(scan_at(FRAME_S)) - world.drift_m(FRAME_S)  # in the first, all are counted from it
+        for update in follow(BankTracker(world), 40)[8:]:
+            error = error_m(world, update.after) + wandered_m
+            chi2.append(error @ np.linalg.solve(update.after.covariance_m2, error) / 2)
+    assert 0.1 < np.mean(chi2) < 2.0
 
 
 def test_errors_do_not_accumulate() -> None:
@@ -558,7 +583,7 @@ def test_an_older_scan_is_refused_and_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    "settings", [{"forgett": 1.0}, {"densities_m2_s3": []}, {"inflation": 1.0}, {"walk_m2_s": 0.0}, {"forget": "x"}]
+    "settings", [{"forgett": 1.0}, {"densities_m2_s3": []}, {"inflation": 1.0}, {"walks_m2_s": [0.0]}, {"forget": "x"}]
 )
 def test_settings_without_a_meaning_are_refused(settings: dict[str, object]) -> None:
     with pytest.raises(ConfigError):

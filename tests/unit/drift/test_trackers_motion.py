@@ -11,7 +11,7 @@ from afspm.drift.trackers.filters import Models
 from afspm.drift.trackers.forecast import Compensation
 from afspm.model.snapshot import from_plain, to_plain
 
-MODELS = Models(np.full(4, 2e-24), np.array([0.0, 1 / 10800.0, 1 / 2700.0, 1 / 30.0]), 5e-22)
+MODELS = Models(np.full(4, 2e-24), np.array([0.0, 1 / 10800.0, 1 / 2700.0, 1 / 30.0]), np.full(4, 5e-22))
 
 
 @pytest.mark.parametrize(("first_s", "second_s"), [(900.0, 900.0), (20.0, 1.0), (0.001, 26.999), (3600.0, 0.1)])
@@ -44,6 +44,18 @@ def test_what_is_gained_is_a_covariance(step_s: float) -> None:
     _, q = MODELS.over(step_s)
     scale = np.sqrt(np.einsum("nii->ni", q)) + 1e-300
     assert np.linalg.eigvalsh(q / scale[:, :, None] / scale[:, None, :]).min() > -1e-9
+
+
+def test_what_a_scan_shows_differs_from_its_middle_by_what_it_wandered() -> None:
+    """Against the covariances of a walk and of an integrated random acceleration (Wiener processes), row by row."""
+    duration_s, rows = 256.0, 512
+    t = duration_s * ((np.arange(rows // 2) + 0.5) / rows)  # from the middle on: both halves are alike
+    early, late = np.minimum.outer(t, t), np.maximum.outer(t, t)
+    mean = np.full(t.size, 1.0 / rows)
+    walk = 2 * mean @ early @ mean
+    accelerated = 2 * mean @ (early**2 * (3 * late - early) / 6) @ mean
+    expected = MODELS.walk_m2_s * walk + MODELS.density_m2_s3 * accelerated
+    assert MODELS.wandered_m2(duration_s) == pytest.approx(expected, rel=0.01)
 
 
 def test_a_controller_follows_in_steps() -> None:

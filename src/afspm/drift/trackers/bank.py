@@ -23,7 +23,7 @@ from afspm.plain_data import Plain, PlainMapping
 
 Array = NDArray[np.float64]
 
-VERSION = 3
+VERSION = 4
 _LIKE = 1.2  # a second surprise may differ from the first by so much of it: a new velocity doubles it
 
 
@@ -181,8 +181,7 @@ class BankTracker:
     def _first(self, scan: DriftScan) -> Update:
         state = self._state
         before, settings = self.forecast.at(scan.mid_s), self._settings
-        position_sd_m = settings.start_px * min(scan.pixel_m)
-        state.filters = Filters.start(settings.models(), scan.mid_s, position_sd_m, settings.start_velocity_sd_m_s)
+        state.filters = settings.filters(scan)
         state.matched_s = scan.mid_s
         if settings.transform == "similarity":
             state.similarity = Similarity.at_start(scan)
@@ -268,9 +267,9 @@ class BankTracker:
             filters = self._cut_off(filters, scan)
         noise = np.eye(2) * settings.jitter_m**2
         if used is None:
-            state.filters = filters.with_scan(noise)
+            state.filters = filters.with_scan(noise, scan.duration_s)
         else:
-            filters = filters.with_scan(noise + used.scan_noise_m2)
+            filters = filters.with_scan(noise + used.scan_noise_m2, scan.duration_s)
             rows, values, pair_noise = used.rows(filters.mean.shape[1])
             state.filters = filters.updated(rows, values, pair_noise, forget=settings.forget, rarest=settings.rarest)
         if placed:

@@ -26,12 +26,17 @@ class Models:
     Attributes:
         density_m2_s3: (n,) q, spectral density of the acceleration.
         fading_per_s: (n,) 1 / tau; 0 for a velocity that stays.
-        walk_m2_s: variance that the position gains in a second by itself.
+        walk_m2_s: (n,) variance that the position gains in a second by itself.
     """
 
     density_m2_s3: Array
     fading_per_s: Array
-    walk_m2_s: float
+    walk_m2_s: Array
+
+    def wandered_m2(self, duration_s: float) -> Array:
+        """(n,) variance between where a scan shows the sample, the mean over its rows, and where it is in its middle:
+        what a walk and a random acceleration integrate to."""
+        return np.asarray(self.walk_m2_s * duration_s / 12 + self.density_m2_s3 * duration_s**3 / 320)
 
     def over(self, step_s: float) -> tuple[Array, Array]:
         """Return what a time does to a state (x, y, v_x, v_y): transition (n, 4, 4) and covariance gained (n, 4, 4).
@@ -94,19 +99,23 @@ class Filters:
     log_weight: Array
 
     @classmethod
-    def start(cls, models: Models, time_s: float, position_sd_m: float, velocity_sd_m_s: float) -> Filters:
+    def start(
+        cls, models: Models, time_s: float, position_sd_m: float, velocity_sd_m_s: float, duration_s: float
+    ) -> Filters:
         """With the first scan, from which positions are counted: what it shows is where it is, exactly.
 
         Args:
             position_sd_m: of where the sample is when the scan shows it at zero: its location error.
+            duration_s: of the scan, through which the sample wandered.
         """
         n = len(models.density_m2_s3)
-        variances = [position_sd_m**2] * 2 + [velocity_sd_m_s**2] * 2
-        covariance = np.tile(np.diag(variances), (n, 1, 1))
-        start = cls(models, time_s, np.zeros((n, 4)), covariance, np.full(n, -np.log(n))).with_scan(np.zeros((2, 2)))
-        covariance = start.covariance.copy()
-        covariance[:, 4:6, :] = covariance[:, :, 4:6] = 0.0
-        return replace(start, covariance=covariance)
+        position = position_sd_m**2 + models.wandered_m2(duration_s)[:, None, None]
+        covariance = np.zeros((n, 8, 8))
+        covariance[:, :2, :2] = position * np.eye(2)
+        for one in (2, 6):  # the velocity now, and during the scan
+            for other in (2, 6):
+                covariance[:, one : one + 2, other : other + 2] = velocity_sd_m_s**2 * np.eye(2)
+        return cls(models, time_s, np.zeros((n, 8)), covariance, np.full(n, -np.log(n)))
 
     @property
     def weight(self) -> Array:
@@ -136,12 +145,13 @@ class Filters:
             covariance[:, 2 + axis, 2 + axis] += velocity_sd_m_s**2
         return replace(self, covariance=covariance)
 
-    def with_scan(self, noise_m2: Array) -> Filters:
-        """With a scan of now that shows the sample where it is, but for a location error of a covariance (2, 2)."""
+    def with_scan(self, noise_m2: Array, duration_s: float) -> Filters:
+        """With a scan of now that shows the sample where it is, but for a location error of a covariance (2, 2) and for
+        what it wandered while it was scanned."""
         mean = np.concatenate([self.mean, self.mean[:, :4]], axis=1)
         rows = np.concatenate([self.covariance, self.covariance[:, :4, :]], axis=1)
         covariance = np.concatenate([rows, rows[:, :, :4]], axis=2)
-        covariance[:, -4:-2, -4:-2] += noise_m2
+        covariance[:, -4:-2, -4:-2] += noise_m2 + self.models.wandered_m2(duration_s)[:, None, None] * np.eye(2)
         return replace(self, mean=mean, covariance=covariance)
 
     def without_scan(self, number: int) -> Filters:

@@ -82,7 +82,7 @@ class BankForecast:
     @classmethod
     def at_start(cls) -> BankForecast:
         """Before the first scan: it will be what positions are counted from."""
-        nothing = Models(np.zeros(1), np.zeros(1), 0.0)
+        nothing = Models(np.zeros(1), np.zeros(1), np.zeros(1))
         return cls(0.0, nothing, np.ones(1), np.zeros((1, 4)), np.zeros((1, 4, 4)), Compensation())
 
     @classmethod
@@ -92,7 +92,7 @@ class BankForecast:
         models = filters.models
         return cls(
             filters.time_s,
-            Models(models.density_m2_s3[likely], models.fading_per_s[likely], models.walk_m2_s),
+            Models(models.density_m2_s3[likely], models.fading_per_s[likely], models.walk_m2_s[likely]),
             filters.weight[likely] / filters.weight[likely].sum(),
             filters.mean[likely, :4],
             filters.covariance[likely, :4, :4],

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import itertools
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from afspm.drift.trackers.filters import Models
+from afspm.drift.registration import DriftScan
+from afspm.drift.trackers.filters import Filters, Models
 from afspm.drift.trackers.references import Choice
 from afspm.errors import ConfigError
 from afspm.plain_data import Plain
@@ -23,8 +25,9 @@ class BankSettings:
 
     Attributes:
         densities_m2_s3: of the acceleration: how fast the velocity of drift wanders.
-        fadings_s: after which a velocity is gone to 1/e; inf for one that stays. There is a filter for each pair.
-        walk_m2_s: variance that positions gain in a second besides.
+        fadings_s: after which a velocity is gone to 1/e; inf for one that stays.
+        walks_m2_s: variance that positions gain in a second besides. There is a filter for each density, fading and
+            walk.
         jitter_m: standard deviation of the position of a scan that no registration sees.
         start_velocity_sd_m_s: what may be before anything is known.
         start_px: standard deviation of where the sample is found in the first scan, in its pixels.
@@ -42,7 +45,7 @@ class BankSettings:
 
     densities_m2_s3: tuple[float, ...] = (1e-26, 1e-25, 1e-24, 1e-23, 1e-22, 1e-21)
     fadings_s: tuple[float, ...] = (math.inf, 10800.0, 2700.0)
-    walk_m2_s: float = 0.5e-18 / 900.0
+    walks_m2_s: tuple[float, ...] = (0.5e-18 / 900.0, 3e-18 / 900.0, 16e-18 / 900.0)
     jitter_m: float = 0.05e-9
     start_velocity_sd_m_s: float = 3e-10
     start_px: float = 0.02
@@ -57,16 +60,17 @@ class BankSettings:
     linear_walk_per_s: float = 2.8e-10
 
     def __post_init__(self) -> None:
-        numbers = (self.walk_m2_s, self.jitter_m, self.start_velocity_sd_m_s, self.start_px, self.rarest, self.doubt)
+        numbers = (self.jitter_m, self.start_velocity_sd_m_s, self.start_px, self.rarest, self.doubt)
         if self.transform not in TRANSFORMS:
             raise ConfigError(
                 f"the bank knows no transform {self.transform!r}",
                 where="transform",
                 hint=f"one of {', '.join(TRANSFORMS)}",
             )
-        if not (self.densities_m2_s3 and self.fadings_s):
-            raise ConfigError("the bank has no filters", where="densities_m2_s3, fadings_s")
-        if not min(*numbers, self.linear_walk_per_s, *self.densities_m2_s3, *self.fadings_s) > 0.0:
+        several = (self.densities_m2_s3, self.fadings_s, self.walks_m2_s)
+        if not all(several):
+            raise ConfigError("the bank has no filters", where="densities_m2_s3, fadings_s, walks_m2_s")
+        if not min(*numbers, self.linear_walk_per_s, *itertools.chain(*several)) > 0.0:
             raise ConfigError("all settings of the bank must be above 0")
         if not (0.0 < self.forget <= 1.0 and self.rarest < 1.0):
             raise ConfigError("weights: forget up to 1, rarest below it", where="forget, rarest")
@@ -96,6 +100,11 @@ class BankSettings:
             raise ConfigError(f"the settings of the tracker: {error}") from error
 
     def models(self) -> Models:
-        """A filter for each density and fading."""
-        densities, fadings = np.meshgrid(self.densities_m2_s3, self.fadings_s, indexing="ij")
-        return Models(densities.ravel(), 1.0 / fadings.ravel(), self.walk_m2_s)
+        """How a filter moves for each density, fading and walk."""
+        densities, fadings, walks = np.meshgrid(self.densities_m2_s3, self.fadings_s, self.walks_m2_s, indexing="ij")
+        return Models(densities.ravel(), 1.0 / fadings.ravel(), walks.ravel())
+
+    def filters(self, first: DriftScan) -> Filters:
+        """All filters with the first scan."""
+        position_sd_m = self.start_px * min(first.pixel_m)
+        return Filters.start(self.models(), first.mid_s, position_sd_m, self.start_velocity_sd_m_s, first.duration_s)
