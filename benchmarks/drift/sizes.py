@@ -21,7 +21,7 @@ SIZES = {512: 3, 256: 8, 64: 16}  # pixels, and pairs of each surface
 MIXED = {"256 at 0.5": (256, 0.5), "256 at 1": (256, 1.0), "160 at 0.8": (160, 0.8), "64 at 2": (64, 2.0),
          "128 at 0.5": (128, 0.5)}  # fmt: skip
 MIXED_PAIRS = 5
-COSTS = {128: (3, 100), 256: (2, 300), 512: (1, 1300)}  # pixels: runs of each surface, ms at most
+COSTS = {128: (3, 100), 256: (2, 250), 512: (1, 1100)}  # pixels: runs of each surface, ms at most
 MEMORY_MB = 500
 
 

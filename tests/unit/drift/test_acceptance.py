@@ -66,7 +66,7 @@ def test_ellipses_are_as_large_as_errors_are_and_grow_with_the_doubt_that_tells(
     for seed in range(8000):
         shared, varied = random.uniform(0.0, 1.0, 2)
         chi2 = 2.0 * math.exp(1.5 * shared) * random.exponential(2.0)
-        doubts = {"varied": varied, "shared": shared, "unclear": 0.0, "spread": 1.0}
+        doubts = {"varied": varied, "shared": shared, "unclear": 0.0, "leverage": 0.0, "spread": 1.0}
         outcomes.append(_outcome(seed, GOOD, wrong=False, chi2=chi2, **doubts))
     spread = fit._spread(outcomes)
     assert spread["shared"] == pytest.approx(1.5, abs=0.2)
@@ -77,7 +77,7 @@ def test_ellipses_are_as_large_as_errors_are_and_grow_with_the_doubt_that_tells(
 def test_a_fit_that_was_stopped_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ran: list[int] = []
     monkeypatch.setattr(fit, "KEPT", tmp_path)
-    monkeypatch.setattr(fit, "trials", lambda half, seeds, names: [_Job(seed, ran) for seed in seeds["real"]])
+    monkeypatch.setattr(fit, "trials", lambda half, seeds, names: [_Job(seed, ran) for seed in seeds.get("real", [])])
     assert len(fit.gathered("fitted", 2, 1)) == 2
     assert len(fit.gathered("fitted", 3, 1)) == 3
     assert ran == [fit.SEED, fit.SEED + 1, fit.SEED + 2]
@@ -96,7 +96,7 @@ class _Job:
 
 
 def _outcome(seed: int, found: MatchEvidence, *, wrong: bool, chi2: float = 3.0, **doubts: float) -> Outcome:
-    quality = {**asdict(found), "varied": 0.0, "shared": 0.0, "unclear": 0.0, "spread": 1.0, **doubts}
+    quality = {**asdict(found), "varied": 0.0, "shared": 0.0, "unclear": 0.0, "leverage": 0.0, "spread": 1.0, **doubts}
     error = (5.0, 0.0) if wrong else (0.01, 0.0)
     return Outcome(
         cell="real", surface="rough", estimator="", seed=seed, accepted=True, reason="", error_px=error, chi2=chi2,

@@ -57,7 +57,7 @@ def least_squares(pair: WarpedPair, theta: Array, believed: Believed, free: Inde
         mean = (one + two) / 2
         columns = pair.columns(derivative(mean, 1), derivative(mean, 0), mean, two - one, free)
         columns_q = seen(columns, known.astype(np.float64), None)
-        normal = np.tensordot(columns_q, columns, ((0, 2), (0, 2)))
+        normal = np.tensordot(columns_q, columns, ((0, 2), (0, 2))).astype(np.float64)
         normal *= max(known.sum(), 1) / max(normal[-1, -1], LEAST_NOISE * known.sum(), LEAST_NOISE)
         theta, moved = _stepped(theta, normal[:-1, :-1], normal[:-1, -1], believed, free)
         if moved < 0.01:
@@ -100,7 +100,7 @@ def _round(pair: WarpedPair, theta: Array, believed: Believed, seen_through: Fin
     through_q = seen(pair.slopes(*noise_through), weight, metric)
     curvature[:, :SLOPES, :SLOPES] -= scale * products(through_q, pair.slopes(*noise))
     curvature = _no_less(curvature, spread)
-    slope = products(columns_q, residual[:, None])[:, :, 0]
+    slope = products(columns_q, residual[:, None].astype(columns_q.dtype))[:, :, 0]
     after, _ = _stepped(theta, curvature.sum(axis=0), slope.sum(axis=0), believed, ALL)
     return Fit(after, curvature, spread, slope + curvature @ (after - theta))
 
@@ -152,6 +152,7 @@ def _row_weights(residual: Array, known: NDArray[np.bool_]) -> Array:
 
 FLOOR_PX = 1e-3
 CLEAR_PX = 0.02  # a shift known better than this is as certain as its model says
+EVEN = 0.2  # a share of what is known that one block of rows may well hold
 
 
 @dataclass(frozen=True)
@@ -164,11 +165,15 @@ class Doubt:
             contrast do to an image that the model knows nothing of goes to the shift as well.
         sd_px: the largest standard deviation by the model: the weaker the features are beside the noise, the more do
             disturbances count.
+        leverage: the largest share that one block of rows holds of all that is known of the shift in some direction
+            (MacKinnon, Nielsen and Webb, J. Econometrics 235, 2001, 2023): what disturbs these rows has nothing beside
+            it that it would average with, nor any that would show it.
     """
 
     varied: float
     shared: float
     sd_px: float
+    leverage: float
 
     def features(self) -> dict[str, float]:
         """The same as logarithms, 0 for no doubt."""
@@ -176,6 +181,7 @@ class Doubt:
             "varied": math.log(max(self.varied, 1.0)),
             "shared": math.log(max(self.shared, 1.0)),
             "unclear": math.log(max(self.sd_px / CLEAR_PX, 1.0)),
+            "leverage": math.log(max(self.leverage / EVEN, 1.0)),
         }
 
     @property
@@ -208,7 +214,14 @@ def covariance(fit: Fit, believed: Believed) -> tuple[Array, Doubt]:
         varied=float(np.trace(np.linalg.solve(shift, varied[:2, :2]))) / 2,
         shared=abs(float(np.linalg.det(shift) * np.linalg.det(alone))) ** 0.25,
         sd_px=math.sqrt(float(np.linalg.eigvalsh(shift)[-1])),
+        leverage=_leverage(fit.curvature[:, :2, :2]),
     )
     total: Array = doubt.spread * model
     total[:2, :2] += FLOOR_PX**2 * np.eye(2)
     return total, doubt
+
+
+def _leverage(curvature: Array) -> float:
+    """The largest eigenvalue of what a block, (2, 2), is of the sum of all (n, 2, 2)."""
+    shares = np.linalg.solve(curvature.sum(axis=0), curvature)
+    return float(np.linalg.eigvals(shares).real.max())

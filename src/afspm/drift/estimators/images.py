@@ -68,21 +68,23 @@ def prepare(values: Array) -> Image:
 
 def flatten_rows(values: Array, known: Mask) -> Array:
     """Minus a straight line in each row, by two rounds of weighted least squares that trust outliers less."""
+    flat = _less_lines(values, known.astype(np.float64))
+    for _ in range(2):
+        scale = 1.4826 * np.median(np.abs(flat[known]), overwrite_input=True)
+        flat = _less_lines(values, known / (1.0 + (flat / max(2.0 * scale, 1e-12)) ** 2))
+    return flat
+
+
+def _less_lines(values: Array, weight: Array) -> Array:
     x = np.linspace(-1.0, 1.0, values.shape[1])
     powers = np.stack([np.ones_like(x), x, x * x], axis=1)
-    weight = known.astype(np.float64)
-    line = np.zeros_like(values)
-    for _ in range(3):
-        w, wx, wxx = (weight @ powers).T
-        b, bx = ((weight * values) @ powers[:, :2]).T
-        determinant = w * wxx - wx * wx
-        determinant = np.where(determinant > 1e-12, determinant, np.inf)
-        offset, slope = (wxx * b - wx * bx) / determinant, (w * bx - wx * b) / determinant
-        line = offset[:, None] + slope[:, None] * x
-        residual = values - line
-        scale = 1.4826 * np.median(np.abs(residual[known]))
-        weight = known / (1.0 + (residual / max(2.0 * scale, 1e-12)) ** 2)
-    return values - line
+    w, wx, wxx = (weight @ powers).T
+    b, bx = ((weight * values) @ powers[:, :2]).T
+    determinant = w * wxx - wx * wx
+    determinant = np.where(determinant > 1e-12, determinant, np.inf)
+    offset, slope = (wxx * b - wx * bx) / determinant, (w * bx - wx * b) / determinant
+    flat: Array = values - (offset[:, None] + slope[:, None] * x)
+    return flat
 
 
 SCAR_PX = 15

@@ -35,6 +35,9 @@ BEND_SD = 0.15
 BORDER_PX = 1  # where a filter and a spline have to guess what lies beyond
 FARTHEST_PX = 8.0  # from where the search has found it
 ELSEWHERE_PX = 32  # the farthest shift that a match is compared with
+DISTRUST = 4.0
+"""By which the variance of the noise is taken for larger than its model says, where the images are weighed against what
+else displaces them. The factor of the ellipses, which grows with doubt, would let the images tell too little there."""
 
 
 class LeastSquares:
@@ -130,11 +133,12 @@ def _fine(
     spread, doubt = covariance(fit, believed)
     seen = LinearSeen(fit.theta[LINEAR].reshape(2, 2), spread[LINEAR, LINEAR])
     curvature = fit.curvature.sum(axis=0)
-    information = (curvature + curvature.T) / (2.0 * doubt.spread)
-    pull = information @ fit.theta + believed.precision @ (fit.theta - believed.mean) / doubt.spread
+    information = (curvature + curvature.T) / (2.0 * DISTRUST)
+    pull = information @ fit.theta + believed.precision @ (fit.theta - believed.mean) / DISTRUST
     free = believed.precision.copy()
     free[2:SLOPES] = 0.0
     theta, total = averaged(information, pull + free @ believed.mean, free, shear)
+    total *= doubt.spread / DISTRUST
     total[:2, :2] += FLOOR_PX**2 * np.eye(2)
     return theta, total, seen, doubt
 

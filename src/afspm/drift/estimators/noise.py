@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Real = TypeVar("Real", np.float32, np.float64)
 
 MEDIAN_POWER = 0.4549  # median of the square of a normal value of unit variance
 BLUR_PX = 0.45  # takes what interpolation would alias
@@ -94,7 +97,7 @@ LEAST_NOISE = 1e-8
 HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it the filter leaves little of them
 
 
-def seen(columns: Array, weight: Array, metric: Array | None) -> Array:
+def seen(columns: NDArray[Real], weight: Array, metric: Array | None) -> NDArray[Real]:
     """Return Q f less what parabolas explain of it: the product with another image g is f'Qg free of both of theirs.
 
     Generalised least squares row by row: each row has a parabola of its own, and noise with a memory. A row is scanned
@@ -113,13 +116,14 @@ def seen(columns: Array, weight: Array, metric: Array | None) -> Array:
         Like `columns`; the root of the weight of g is in it.
     """
     if metric is None and weight.min() == 1.0 == weight.max():
-        parabolas = _parabolas(columns.shape[2])
-        return columns - (columns @ parabolas) @ parabolas.T
+        parabolas: NDArray[Real] = _parabolas(columns.shape[2]).astype(columns.dtype)
+        return np.asarray(columns - (columns @ parabolas) @ parabolas.T, dtype=columns.dtype)
     found = np.empty_like(columns)
+    metric_there = None if metric is None else metric.astype(columns.dtype)
     at_once = max(1, CACHED // columns[0].size)
     for first in range(0, len(columns), at_once):
         some = slice(first, first + at_once)
-        found[some] = _seen(columns[some], weight[some], metric)
+        found[some] = _seen(columns[some], weight[some], metric_there)
     return found
 
 
@@ -130,20 +134,21 @@ def _parabolas(width: int) -> Array:
     return np.linalg.qr(np.stack([np.ones(width), x, x**2], axis=1))[0]
 
 
-def _seen(columns: Array, weight: Array, metric: Array | None) -> Array:
+def _seen(columns: NDArray[Real], weight: Array, metric: NDArray[Real] | None) -> NDArray[Real]:
     """Of rows that fit into the processor's cache, which halves the time."""
-    root = np.sqrt(weight)[:, None, :]
-    x = np.linspace(-1.0, 1.0, columns.shape[2])
+    root = np.sqrt(weight).astype(columns.dtype)[:, None, :]
+    x = np.linspace(-1.0, 1.0, columns.shape[2], dtype=columns.dtype)
     rows, lines = columns * root, np.concatenate([root, root * x, root * x**2], axis=1)
     rows_q, lines_q = (rows, lines) if metric is None else (_along_rows(rows, metric), _along_rows(lines, metric))
-    gram = lines @ lines_q.transpose(0, 2, 1) + 1e-9 * np.eye(3)  # there may be rows of which nothing is known
+    # of some rows less is known than a parabola has
+    gram = lines @ lines_q.transpose(0, 2, 1) + 1e-5 * np.eye(3, dtype=columns.dtype)
     fitted = np.linalg.solve(gram, lines_q @ rows.transpose(0, 2, 1)).transpose(0, 2, 1)
     rows_q -= fitted @ lines_q
     rows_q *= root
-    return rows_q
+    return np.asarray(rows_q, dtype=columns.dtype)
 
 
-def _along_rows(columns: Array, metric: Array) -> Array:
+def _along_rows(columns: NDArray[Real], metric: NDArray[Real]) -> NDArray[Real]:
     """Q f of each column: one large product takes a quarter of the time of one for each row."""
     return (columns.reshape(-1, metric.shape[0]) @ metric).reshape(columns.shape)
 
@@ -153,11 +158,11 @@ def without_lines(values: Array, known: NDArray[np.bool_]) -> Array:
     return seen(values[:, None], known.astype(np.float64), None)[:, 0]
 
 
-def products(one: Array, two: Array, block_rows: int = BLOCK_ROWS) -> Array:
+def products(one: NDArray[Real], two: NDArray[Real], block_rows: int = BLOCK_ROWS) -> Array:
     """Sums of the products of columns, [y, column, x] each, over blocks of rows: (block, columns of one, columns
     of two). Where `one` is `seen` of something the lines of `two` cancel, but in whole rows only."""
     starts = np.arange(0, one.shape[0], block_rows)
-    sums: Array = np.add.reduceat(one @ two.transpose(0, 2, 1), starts, axis=0)
+    sums: Array = np.add.reduceat(one @ two.transpose(0, 2, 1), starts, axis=0, dtype=np.float64)
     return sums
 
 
@@ -197,6 +202,7 @@ Small = NDArray[np.float32]
 
 PATCH_PX, STEP_PX = 8, 4
 TINY = np.finfo(np.float32).tiny
+ENOUGH_PATCHES = 1500
 CERTAIN = 9.0  # times its noise power must a coefficient have to be kept for its own sake
 
 
@@ -219,7 +225,8 @@ def denoised(image: Array, noise: Array) -> tuple[Array, Array]:
         with a noise of one's own: Ramani, Blu and Unser, IEEE Trans. Image Process. 17, 1540, 2008).
     """
     c, n = _coefficients(image), _coefficients(noise)  # in 32 bits: half the time, and precise enough for a weight
-    apart = PATCH_PX // STEP_PX  # patches that don't overlap hold as much
+    # those that don't overlap hold as much, and of many some tell as much of all
+    apart = max(PATCH_PX // STEP_PX, math.isqrt(c[..., 0].size // ENOUGH_PATCHES))
     power = _typical(n[::apart, ::apart] ** 2) + TINY
     texture = np.maximum(_typical(c[::apart, ::apart] ** 2) - power, 0.0)
     garrote, wiener = 1.0 - CERTAIN * power / np.maximum(c**2, TINY), texture / (texture + power)

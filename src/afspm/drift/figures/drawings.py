@@ -306,8 +306,8 @@ def _known(ax: Axes, record: DriftRecord, truth_m: Array, hours: Array) -> None:
     error_m = record.drift_m - record.drift_m[:1] - truth_m
     unit, factor = unit_of(error_m)
     for axis, (name, colour) in enumerate((("x", BLUE), ("y", ORANGE))):
-        sd = record.sd_m[:, axis] * factor
-        ax.fill_between(hours, -2 * sd, 2 * sd, color=colour, alpha=0.15, linewidth=0, label=f"± 2 sd, {name}")
+        sd = record.sd_m[1:, axis] * factor  # the first is what displacements are counted from
+        ax.fill_between(hours[1:], -2 * sd, 2 * sd, color=colour, alpha=0.15, linewidth=0, label=f"± 2 sd, {name}")
         ax.plot(hours, error_m[:, axis] * factor, color=colour, linewidth=0.9, label=f"{name}, believed - true")
     ax.axhline(0.0, color=GREY, linewidth=0.4)
     ax.set_ylabel(f"error of the estimate / {unit}")
