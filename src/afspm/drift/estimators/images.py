@@ -28,7 +28,7 @@ class Image:
 
     Attributes:
         values: [y, x], finite everywhere: what was not measured is filled from the nearest row.
-        known: [y, x], where something was measured.
+        known: [y, x], where something was measured, or a single row is missing between two that were.
     """
 
     values: Array
@@ -54,7 +54,7 @@ def prepare(values: Array) -> Image:
     if max(np.mean(measured == lowest), np.mean(measured == highest)) > MOST_SATURATED:
         raise Unusable("most pixels have the same value (saturated): check whether the tip crashed")
     scaled = (_filled(values, known) - lowest) / (highest - lowest)
-    flat = flatten_rows(scaled, known)
+    flat, known = _without_gaps(flatten_rows(scaled, known), known)
     low, high = np.percentile(flat[known], (0.1, 99.9))
     flat = without_scars(np.clip(flat, low - 0.25 * (high - low), high + 0.25 * (high - low)))
     spread = flat[known].std()
@@ -146,6 +146,19 @@ def _filled(values: Array, known: Mask) -> Array:
     nearest = distance_transform_edt(~known, sampling=(1.0, 2.0), return_distances=False, return_indices=True)
     filled: Array = values[tuple(nearest)]
     return filled
+
+
+def _without_gaps(values: Array, known: Mask) -> tuple[Array, Mask]:
+    """With the mean of the rows beside it in place of a row that is missing alone, and known there: where nothing is,
+    the rows beside it are lost as well, since filters and splines reach across."""
+    missing: Mask = ~np.any(known, axis=1)
+    alone = 1 + np.flatnonzero(missing[1:-1] & ~missing[:-2] & ~missing[2:])
+    if not alone.size:
+        return values, known
+    values, known = values.copy(), known.copy()
+    values[alone] = (values[alone - 1] + values[alone + 1]) / 2
+    known[alone] = known[alone - 1] & known[alone + 1]
+    return values, known
 
 
 def _topography(values: Array, rows: Mask) -> float:

@@ -23,6 +23,7 @@ from afspm.drift.estimators.images import CommonGrid, Unusable, onto_common_grid
 from afspm.drift.estimators.noise import FineFilter, without_lines
 from afspm.drift.estimators.nuisances import CREEP_SD_PX, Shear, averaged
 from afspm.drift.estimators.search import ExpectedShift, MaskedCorrelation, Scorer, candidates, shear_by_drift
+from afspm.drift.estimators.spikes import without_spikes
 from afspm.drift.estimators.warp import COUNT, CREEP, LINEAR, SLOPES, OverlapBox, Scene, WarpedPair
 from afspm.drift.registration import DriftScan, LinearSeen, Prior, Registration
 from afspm.errors import ConfigError
@@ -45,7 +46,8 @@ class LeastSquares:
 
     1. `prepare`: rows flattened, outliers cut; scans that hold nothing refused. `grid`: a common pixel.
     2. `search` and `score`: candidates by normalised cross-correlation, the likeliest of them.
-    3. `align`: Gauss-Newton, coarse to fine; the fine stage through the filter of `spectra`, weighted by `rows`.
+    3. `alignment`: Gauss-Newton, coarse to fine; the fine stage without `spikes`, through a filter and weighted by rows
+       as their `noise` asks.
     4. `covariance`: what the noise leaves uncertain, and more where there is doubt; `nuisances`: averaged over what
        shear, turn, calibration and creep there may be.
     5. `acceptance`: is it a match at all?
@@ -125,6 +127,7 @@ def _fine(
     scene: Scene, box: OverlapBox, theta: Array, expected: ExpectedShift | None, shear: Shear
 ) -> tuple[Array, Array, LinearSeen, Doubt]:
     """theta and its covariance, its linear map as the images alone tell it, and doubts."""
+    scene = without_spikes(scene, theta)
     fine = FineFilter.of(scene.first.values, scene.second.values)
     values = fine.applied(scene.first.values), fine.applied(scene.second.values)
     pair = WarpedPair(*scene.splines(values, order=5), box.without_border(BORDER_PX), theta[:2])
