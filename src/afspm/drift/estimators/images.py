@@ -88,7 +88,7 @@ def _less_lines(values: Array, weight: Array) -> Array:
 
 
 SCAR_PX = 15
-SCAR_SD = 1.5  # beyond the rows on both sides of it, in standard deviations of a pixel from their mean
+SCAR_SD = 2.5  # beyond the rows on both sides of it, in standard deviations of a pixel from their mean
 
 
 def without_scars(values: Array) -> Array:
