@@ -30,8 +30,8 @@ RIGHT = {
 }
 """The median of right matches."""
 
-WRONG_AT_MOST = 0.1
-"""The largest probability with which at most 0.45% of those accepted were wrong."""
+WRONG_AT_MOST = 0.07
+"""The largest probability with which at most 0.35% of those accepted were wrong."""
 
 SPREAD = {
     "all": 1.5103,
