@@ -78,7 +78,10 @@ def cut(condition: str, seed: int, half: Half, prior_sd_px: float | None = None)
     for k, (frame, (there, at)) in enumerate(zip(frames, places, strict=True)):
         where = at[:, None, None] + step * frame.sample_px(frame.offsets_px())
         values = ndimage.map_coordinates(there, where[::-1], order=3, mode="mirror")
-        seen = measured(values / values.std(), how, random, gain if k else 1.0) + level * _noise(half, random)
+        noise = _noise(half, random)
+        if k:  # turned round: both may be of one frame, and noise that is the same in both would be a feature
+            noise = noise[::-1, ::-1]
+        seen = measured(values / values.std(), how, random, gain if k else 1.0) + level * noise
         region = Region(tuple(centers_m[k]), tuple(frame.width_px * PIXEL_M))
         start_s = 900.0 * k
         upwards = not (k and how.turned_round)
