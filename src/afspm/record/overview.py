@@ -256,7 +256,7 @@ class Overview:
         silent_ns = self.newest_ns - self.processes_told_ns.get(name, self.newest_ns)
         return silent_ns if silent_ns > OLD_S * speed * NS_PER_S else None
 
-    def take(self, message: str, thing: Any, time_ns: int, envelope: str = "") -> None:
+    def take(self, message: str, thing: object, time_ns: int, envelope: str = "") -> None:
         """Take in what was published.
 
         Args:

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 from afspm import wire
 from afspm.errors import WireError
@@ -39,6 +39,8 @@ from afspm.record.measured_files import MeasuredFiles, insert_packet
 from afspm.record.scan_assembler import Assembled, ScanAssembler
 from afspm.storage.disk import sync_file, sync_folder
 from afspm.wire.values import without_values
+
+Image = TypeVar("Image", Scan, ScanLines)
 
 _log = logging.getLogger("afspm.record")
 NOTE = "note"
@@ -176,13 +178,13 @@ class RecordStore:
             case ScanLines() if self._about.measured:
                 self._write(self._gathering.lines(packet, self._placed(thing)))
             case Spectrum() if self._about.measured:
-                self._write(self._gathering.spectrum(packet, self._placed(thing)))
+                self._write(self._gathering.spectrum(packet, replace(thing, frame=self._about.frame)))
             case _:
                 self._add(packet, message, source, thing)
         if source == SCHEDULER:
             self._newest_ns = max(self._newest_ns, packet.time_ns or 0)
 
-    def _add(self, packet: Packet, message: str, source: str, thing: Any) -> None:
+    def _add(self, packet: Packet, message: str, source: str, thing: object) -> None:
         """Add a packet that is kept in the journal alone."""
         payload = without_values(message, packet.payload) if message else bytes(packet.payload)
         insert_packet(self._journal, packet, message, payload, source=source)
@@ -217,13 +219,10 @@ class RecordStore:
         for packet in taken.packets():
             insert_packet(self._journal, packet, wire.message_of(packet.envelope), bytes(packet.payload))
 
-    def _placed(self, thing: Any) -> Any:
+    def _placed(self, image: Image) -> Image:
         """Return it in its frame, which the wire does not say."""
-        if self._about.frame is Frame.TIP:
-            return thing
-        if isinstance(thing, Spectrum):
-            return replace(thing, frame=self._about.frame)
-        return replace(thing, region=replace(thing.region, frame=self._about.frame))
+        frame = self._about.frame
+        return image if frame is Frame.TIP else replace(image, region=replace(image.region, frame=frame))
 
     def _add_entries(self, entries: JournalEntries) -> None:
         self._journal.executemany(
