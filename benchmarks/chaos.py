@@ -70,12 +70,12 @@ MOMENTS = (
     # (a line of the log, how late after it at most, how often this moment is drawn)
     (r"processes, into", 3.0, 2),
     (r"processes, into", 25.0, 6),
-    (r" series .*scan {scan} of {scans}", 1.0, 6),
+    (r" series .*scan {scan} of \d+ at", 1.0, 6),
     (r"flagged tip-shape-changed", 1.5, 3),
     (r"tip_corrector is in control", 1.0, 3),
     (r"; restarting", 0.6, 3),
-    (r" series .*scan {scans} of {scans}", 0.3, 2),
-    (r"all {scans} scans are taken", 0.1, 3),
+    (r" series .*scan (\d+) of \1 at", 0.3, 2),
+    (r"all \d+ scans are taken", 0.1, 3),
     (r"ended the experiment", 0.6, 4),
 )
 
@@ -100,7 +100,7 @@ def blows(seed: int) -> list[Blow]:
     drawn = []
     for _ in range(chance.randint(1, 9)):
         pattern, at_most_s, _ = chance.choices(MOMENTS, [often for *_, often in MOMENTS])[0]
-        after = pattern.format(scan=chance.randint(1, SCANS), scans=SCANS)
+        after = pattern.format(scan=chance.randint(1, SCANS))
         whom = chance.sample(ROLES, chance.choice((1, 1, 1, 1, 2, 2, len(ROLES))))
         frozen_s = chance.choice((0.0, 0.0, 0.0, chance.uniform(0.01, 1.0), chance.uniform(1.0, 4.0)))
         drawn.append(Blow(after, round(chance.uniform(0.0, at_most_s), 3), tuple(whom), round(frozen_s, 3)))
@@ -214,7 +214,7 @@ def _send(pid: int, number: signal.Signals) -> bool:
 def found_wrong(folder: Path) -> Iterator[str]:
     """What should not be so in the folder of a run that has ended."""
     with (folder / "metadata.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+        rows = [row for row in csv.DictReader(file) if row["measurement"] == "scan"]
     several = {key: n for key, n in Counter((row["filename"], row["channel"]) for row in rows).items() if n > 1}
     if several:
         yield f"rows more than once: {several}"
@@ -238,15 +238,18 @@ def found_wrong(folder: Path) -> Iterator[str]:
 
 def _wrong_with_series(folder: Path, heights: list[dict[str, str]]) -> Iterator[str]:
     state = Memory(folder / "state" / "series.json")
-    if state.get("done") != SCANS:
-        yield f"the series has {state.get('done')} of {SCANS} scans"
-    surely = sum(row["in_control"] == "series" for row in heights)
+    # where the computer takes longer than a period for the first round, some are left out, and the series says so
+    wanted = SCANS - (int(state.get("missed", 0)) if state.get("is_slow") else 0)
+    if state.get("done") != wanted:
+        yield f"the series has {state.get('done')} of {wanted} scans"
+    # a last test scan, elsewhere, may be asked for before the corrector loses control and begin after
+    surely = sum(row["in_control"] == "series" and float(row["center_y"]) == 0.0 for row in heights)
     # where the table was not being written when a scan began, it does not say who was in control
     perhaps = surely + sum(not row["in_control"] for row in heights)
-    if not surely <= SCANS <= perhaps:
-        yield f"{surely} to {perhaps} scans of the series in the table instead of {SCANS}"
+    if not surely <= wanted <= perhaps:
+        yield f"{surely} to {perhaps} scans of the series in the table instead of {wanted}"
     log = (folder / "log.txt").read_text(encoding="utf-8")
-    told = re.findall(rf" series +scan (\d+) of {SCANS} at (\S+ \S+) UTC", log)
+    told = re.findall(r" series +scan (\d+) of \d+ at (\S+ \S+) UTC", log)
     times = {row["time"][:19].replace("T", " ") for row in heights}
     if len(set(told)) != len({number for number, _ in told}) or len({time for _, time in told}) != len(set(told)):
         yield f"a scan of the series stands for two: {told}"

@@ -124,7 +124,7 @@ class PlannedScans(Component):
         return is_left
 
     def _on_missed(self, rounds: int) -> None:
-        """Do as wanted about rounds that were due while control was lost, and tell log and record."""
+        """Do as wanted about rounds that were due while control was lost or nothing ran, and tell log and record."""
         if not rounds:
             return
         if self.missed == "skip":
@@ -132,7 +132,7 @@ class PlannedScans(Component):
         elif self.missed == "catch-up":
             self._add("owed", rounds)
         count = rounds * len(self.plan.regions)
-        told = f"missed {count} scan{'s' if count > 1 else ''} while control was lost; {_MISSED[self.missed]}"
+        told = f"missed {count} scan{'s' if count > 1 else ''} while it could not scan; {_MISSED[self.missed]}"
         self.log.warning("%s", told)
         with suppress(RequestError):  # a scheduler of version 1 knows no notes
             self.scope.note(told)

@@ -86,9 +86,9 @@ def at_times(series: ScanSeries, lab: Lab) -> list[int]:
 @pytest.mark.parametrize(
     ("missed", "begun", "told"),
     [
-        ("extend", [0, 3, 4, 5, 6], "missed 2 scans while control was lost; to be taken at the end"),
-        ("catch-up", [0, 3, 3, 3, 4], "missed 2 scans while control was lost; to be taken now, one after the other"),
-        ("skip", [0, 3, 4], "missed 2 scans while control was lost; skipped"),
+        ("extend", [0, 3, 4, 5, 6], "missed 2 scans while it could not scan; to be taken at the end"),
+        ("catch-up", [0, 3, 3, 3, 4], "missed 2 scans while it could not scan; to be taken now, one after the other"),
+        ("skip", [0, 3, 4], "missed 2 scans while it could not scan; skipped"),
     ],
 )
 @pytest.mark.parametrize("make", [lambda **p: series(5, **p), lambda **p: lasting(4 * 900.0, 900.0, **p)])
@@ -136,7 +136,7 @@ def test_one_missed_scan_is_told_as_one(caplog: pytest.LogCaptureFixture) -> Non
     lab.at(2000.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
     with caplog.at_level("WARNING"):
         run(series(), lab)
-    assert "missed 1 scan while control was lost; to be taken at the end" in caplog.text
+    assert "missed 1 scan while it could not scan; to be taken at the end" in caplog.text
 
 
 def _killed_at(call: int, make: type[Component] | object, state_dir: Path, *, is_late: bool) -> Lab:
