@@ -19,9 +19,13 @@ from afspm.errors import ExperimentEnded, MeasurementFailed, NoResponse, Refused
 from afspm.formatting import day_and_time
 from afspm.logic.sessions import KEYED
 from afspm.model import ControlRequest, ControlResponse, Packet, Response
+from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
 
-BEGUN_WITHIN_S = 5.0  # from the success of the action to the state that says so
+BEGUN_WITHIN_S = 2 * CUT_OFF_SHOWS_WITHIN_S
+"""From the success of the action to the state that says so. A connection may be cut just between the two. As long as
+that may not have shown, silence does not tell that nothing was begun: what is asked for anew would be taken twice."""
 STOPPED_WITHIN_S = 10.0  # when the user interrupts
+IDLE_AFTER_S = 5.0  # when the user interrupts what is not seen to have begun
 MOST_FAILURES = 5  # in a row, that nothing explains: then a person should look
 
 
@@ -247,7 +251,7 @@ class MeasurementRunner:
         if not response.ok:
             return False
         # an action that was never answered may not have been begun at all
-        may_be_idle = not self._link.wait(lambda: watch.cycle.begun, self._link.earlier(BEGUN_WITHIN_S, until_s))
+        may_be_idle = not self._link.wait(lambda: watch.cycle.begun, self._link.earlier(IDLE_AFTER_S, until_s))
         return may_be_idle or self._link.wait(watch.is_over, until_s)
 
     def _get_over(self, response: Response, states: int, until_s: float | None, *, is_new: bool) -> None:

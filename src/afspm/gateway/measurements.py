@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from afspm.client.cycle import Cycle, CycleOutcome
+from afspm.client.measurement import BEGUN_WITHIN_S
 from afspm.client.targets import ScanTarget, Target, target_from
 from afspm.gateway.models import MeasurementModel, MeasurementState
 from afspm.gateway.problems import RefusalCode, RefusalModel, RefusedRequest, refused
@@ -24,7 +25,6 @@ from afspm.web.person_commands import PersonCommands
 from afspm.web.watch import Watch
 
 MOST_KEPT = 1000
-BEGUN_WITHIN_S = 10.0  # real, from the success of the action to the state that says so
 _RUNNING, _DONE, _FAILED = (one.value for one in MeasurementState)
 _WHY = {
     CycleOutcome.INTERRUPTED: (RefusalCode.INTERRUPTED, "it was stopped before its end"),

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import zmq
 
 from afspm.errors import ConfigError, TransportError
+from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
 from afspm.transport.tcp_guard import TcpGuard
 
 if TYPE_CHECKING:
@@ -29,7 +30,8 @@ QUEUE_LENGTH = 4000
 
 _LINGER_MS = 200
 # A peer that is frozen or cut off is found within seconds and not when the system gives up on it after hours.
-_ALIVE_CHECK_MS, _ALIVE_TIMEOUT_MS = 2_000, 8_000
+_ALIVE_CHECK_MS = 2_000
+_ALIVE_TIMEOUT_MS = round(CUT_OFF_SHOWS_WITHIN_S * 1e3) - _ALIVE_CHECK_MS
 # libzmq 4.3.5 aborts the process (`Assertion failed: !_io_error`) if it sends or answers a heartbeat of ZMTP on a
 # connection that was lost while its receive queue was full. So the queues of sockets with heartbeats have no length in
 # messages: `tcp_guard` bounds them in bytes. All others rely on the heartbeats of TCP.

@@ -13,6 +13,9 @@ from typing import Protocol
 from afspm.clock import Clock
 from afspm.model import Packet, Response
 
+CUT_OFF_SHOWS_WITHIN_S = 10.0
+"""Until then a connection to a scheduler that is cut off may look as it was: nothing is heard, and nobody knows why."""
+
 # Packets, replies and requests come by the thousand, and would take twice as long to make if they were frozen.
 
 

@@ -16,6 +16,7 @@ from afspm.model import (
     ControlMode,
     ControlRequest,
     ControlResponse,
+    Packet,
     Problem,
     Region,
     Response,
@@ -24,6 +25,7 @@ from afspm.model import (
     ScopeStatus,
 )
 from afspm.process.parent import StopRequested
+from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
 
 TIP = Problem.TIP_SHAPE_CHANGED
 
@@ -205,6 +207,33 @@ def test_a_scan_whose_beginning_was_lost_with_the_connection_is_recognised(lab: 
     lab.at(2.0, lambda: lab.publish_scan(REGION))
     lab.at(2.1, lambda: lose(ScopeState.FREE))
     scope.scan(REGION)
+    assert lab.begun_scans == 1
+
+
+def test_a_scan_is_not_taken_twice_where_the_connection_is_cut_before_its_beginning_is_heard(
+    lab: Lab, scope: Scope
+) -> None:
+    publish = lab.publish
+
+    def withhold(thing: object, envelope: str | None = None) -> Packet:
+        heard = list(lab._inbox)
+        packet = publish(thing, envelope)
+        lab._inbox[:] = heard
+        return packet
+
+    def cut(request: model.Request) -> str:
+        if request.subject == "start-scan" and not lab.begun_scans:
+            lab.publish = withhold  # type: ignore[method-assign]
+            lab.at(CUT_OFF_SHOWS_WITHIN_S, lab.disconnect)
+            lab.at(30.0, connect)
+        return "go on"
+
+    def connect() -> None:
+        lab.publish = publish  # type: ignore[method-assign]
+        lab._inbox += lab.replay()
+
+    lab.intercept = cut
+    assert scope.scan(REGION).region == REGION
     assert lab.begun_scans == 1
 
 

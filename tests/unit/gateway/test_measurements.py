@@ -9,9 +9,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from afspm.client.measurement import BEGUN_WITHIN_S
 from afspm.client.targets import ScanTarget
 from afspm.clock import ExperimentClock
-from afspm.gateway.measurements import BEGUN_WITHIN_S, Measurement, Measurements
+from afspm.gateway.measurements import Measurement, Measurements
 from afspm.gateway.problems import RefusalCode, RefusedRequest
 from afspm.model import ControlResponse, Frame, Region, Response, Scan, ScopeState, ScopeStatus
 from afspm.web.person_commands import PersonCommands
