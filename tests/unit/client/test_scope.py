@@ -225,7 +225,7 @@ def test_a_scan_is_not_taken_twice_where_the_connection_is_cut_before_its_beginn
         if request.subject == "start-scan" and not lab.begun_scans:
             lab.publish = withhold  # type: ignore[method-assign]
             lab.at(CUT_OFF_SHOWS_WITHIN_S, lab.disconnect)
-            lab.at(30.0, connect)
+            lab.at(2 * SCAN_S, connect)
         return "go on"
 
     def connect() -> None:
