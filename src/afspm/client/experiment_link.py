@@ -40,7 +40,8 @@ from afspm.transport.port import (
 LONGER_THAN_THE_SCHEDULER = 1.2
 """Factor on the time that the scheduler waits for the microscope: what it says then is an answer, and a component that
 asks again instead makes the connection anew, as if the scheduler were gone."""
-CAUGHT_UP_WITHIN_S = 2.0  # a scheduler of version 1 replays without saying when it is done
+CAUGHT_UP_WITHIN_S = 2.0
+"""A scheduler of version 1 replays without saying when it is done: after that long it is taken to be."""
 Listener = Callable[[Packet, bool], None]
 
 
@@ -154,10 +155,20 @@ class ExperimentLink:
     def wait_caught_up(self, until_s: float | None = None) -> None:
         """Wait until everything the scheduler has cached is here; once that is so, returns at once.
 
-        A scheduler that is away is waited for: its cache may show that we have been measured already.
+        A scheduler that is away, or whose publisher is not heard, is waited for: its cache may show that we have
+        measured already.
+
+        Raises:
+            NoResponse: it is connected and does not answer.
         """
-        if not self.wait_connected(self.is_caught_up, CAUGHT_UP_WITHIN_S, until_s) and self.connected:
-            self._caught_up.add(self._source or "")  # it is of version 1, and does not say
+        while not self.wait_connected(self.is_caught_up, CAUGHT_UP_WITHIN_S, until_s):
+            if until_s is not None and self.clock.monotonic_s() >= until_s:
+                return
+            if self.version is wire.Version.UNKNOWN:
+                self.log.info("the scheduler answers, but nothing is heard of what it publishes; waiting for that")
+                self.request(ControlRequest.ACTION_SUPPORT, wire.VERSION_2_ACTION, until_s=until_s)
+            if self.version is wire.Version.ONE:
+                self._caught_up.add(self._source or "")
 
     def is_caught_up(self) -> bool:
         return self._source in self._caught_up if self._source else bool(self._caught_up)

@@ -17,7 +17,17 @@ from afspm.wire.frames import (
 )
 from afspm.wire.mapping import decode_orders, encode_orders
 from afspm.wire.messages import known_messages, message_of, message_type, messages_of_the_experiment, register
-from afspm.wire.protocol import BEAT, CLOSE, CLOSING, KILL, PROTOCOL_VERSION, Topic, Version, version_of
+from afspm.wire.protocol import (
+    BEAT,
+    CLOSE,
+    CLOSING,
+    KILL,
+    PROTOCOL_VERSION,
+    VERSION_2_ACTION,
+    Topic,
+    Version,
+    version_of,
+)
 from afspm.wire.split import Buffer
 from afspm.wire.values import encode_place, place_in, relocated
 
@@ -27,6 +37,7 @@ __all__ = [
     "CLOSING",
     "KILL",
     "PROTOCOL_VERSION",
+    "VERSION_2_ACTION",
     "Buffer",
     "Topic",
     "Version",

@@ -64,9 +64,11 @@ class Version(Enum):
     OURS = auto()
 
 
-_ACTION = control_pb2.ActionMsg(action="x-version-2").SerializeToString()
+VERSION_2_ACTION: Final = "x-version-2"
+"""An action that ours alone have."""
+_ACTION = control_pb2.ActionMsg(action=VERSION_2_ACTION).SerializeToString()
 QUESTION: Final = (bytes([ControlRequest.ACTION_SUPPORT]), _ACTION)
-"""The request of version 1 that tells ours apart: whether the peer supports an action that ours alone have."""
+"""The request of version 1 that tells ours apart: whether the peer supports that action."""
 ANSWER: Final = (bytes([ControlResponse.SUCCESS]), _ACTION)
 """The answer of ours, which no peer of version 1 gives: its object is the action."""
 _WITHOUT_OBJECT = (ControlRequest.RELEASE_CTRL, ControlRequest.END_EXPERIMENT)

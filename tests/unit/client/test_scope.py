@@ -25,7 +25,7 @@ from afspm.model import (
     ScopeStatus,
 )
 from afspm.process.parent import StopRequested
-from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
+from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S, CaughtUp
 
 TIP = Problem.TIP_SHAPE_CHANGED
 
@@ -434,6 +434,28 @@ def test_a_version_1_scheduler_is_asked_to_clear_only_what_is_flagged(lab: Lab, 
     assert not lab.control.problems
 
 
+def test_a_version_1_scheduler_that_never_says_that_it_has_replayed_is_not_waited_for(lab: Lab, scope: Scope) -> None:
+    lab._inbox.remove(CaughtUp(SOURCE))
+    lab.echoes_ids = False
+    scope.scan(REGION)
+    assert lab.clock.passed_s == pytest.approx(SCAN_S, abs=5.0)
+
+
+def test_nothing_is_measured_before_what_a_scheduler_of_ours_publishes_is_heard(lab: Lab, scope: Scope) -> None:
+    """It may tell that we have measured already."""
+    lab._inbox.remove(CaughtUp(SOURCE))
+    lab.at(100.0, lambda: lab._inbox.append(CaughtUp(SOURCE)))
+    scope.scan(REGION)
+    assert lab.clock.passed_s == pytest.approx(100.0 + SCAN_S, abs=5.0)
+
+
+def test_a_measurement_that_nothing_is_heard_for_ends_when_its_time_is_over(lab: Lab, scope: Scope) -> None:
+    lab._inbox.remove(CaughtUp(SOURCE))
+    with pytest.raises(NoResponse):
+        scope.scan(REGION, timeout_s=10.0)
+    assert lab.begun_scans == 0
+
+
 def test_a_scheduler_of_ours_is_asked_to_clear_what_may_be_flagged_unheard(lab: Lab, scope: Scope) -> None:
     scope.flag(Problem.THERMAL_DRIFT)
     scope.clear(TIP)
@@ -710,6 +732,7 @@ def test_sleeping_passes_the_time_of_the_experiment(lab: Lab, scope: Scope) -> N
 def test_a_microscope_that_says_nothing_of_itself_can_still_be_asked() -> None:
     lab = Lab()
     lab._inbox = lab._inbox[:1]  # connected, and neither states nor the end of the replay: a scheduler of version 1
+    lab.echoes_ids = False
     scope = Scope(ExperimentLink(LabPort(lab), lab.name, source=SOURCE))
     assert scope.scan(REGION).region == REGION
 
