@@ -47,12 +47,13 @@ class ZmqConnection:
         self._socket.setsockopt(zmq.IMMEDIATE, 1)
         self._socket.setsockopt(zmq.RECONNECT_IVL, _NEVER)
         self._socket.setsockopt(zmq.SNDTIMEO, max(1, round(timeout_s * 1000)))
+        monitor = self._socket.get_monitor_socket(_OUTCOMES)  # before connecting, else the outcome may come unseen
         try:
             self._socket.connect(address)
         except zmq.ZMQError as error:
             self.close()
             raise ConfigError(f"{address!r} is not an address: {error}", where="address", hint=hints[0]) from error
-        self._await_connection()
+        self._await_connection(monitor)
         self._trace = TRACE.connection(ZEROMQ)
 
     def ask(self, what: str, message: bytes, parse: Callable[[bytes], T | None]) -> T:
@@ -99,11 +100,11 @@ class ZmqConnection:
         """Let go of it."""
         self._context.destroy(linger=0)
 
-    def _await_connection(self) -> None:
+    def _await_connection(self, monitor: zmq.Socket[bytes]) -> None:
         """Return once the connection stands. Raises ControllerLost."""
-        monitor = self._socket.get_monitor_socket(_OUTCOMES)
-        came = monitor.poll(max(1, round(self._timeout_s * 1000)))
-        stands = bool(came) and recv_monitor_message(monitor)["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED
+        with monitor:
+            came = monitor.poll(max(1, round(self._timeout_s * 1000)))
+            stands = bool(came) and recv_monitor_message(monitor)["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED
         self._socket.disable_monitor()
         if not stands:
             self.close()

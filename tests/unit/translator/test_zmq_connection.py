@@ -1,0 +1,56 @@
+"""The ZeroMQ connection to a controller, over real sockets."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import pytest
+import zmq
+
+from afspm.errors import ConfigError
+from afspm.translator.driver import ControllerLost
+from afspm.translator.zmq_connection import ZmqConnection
+
+HINTS = ("an address", "does it listen?", "does it answer?")
+
+
+@pytest.fixture
+def controller() -> Iterator[zmq.Socket[bytes]]:
+    context = zmq.Context()
+    socket = context.socket(zmq.ROUTER)
+    socket.bind("tcp://127.0.0.1:0")
+    yield socket
+    context.destroy(linger=0)
+
+
+def address(controller: zmq.Socket[bytes]) -> str:
+    return controller.getsockopt_string(zmq.LAST_ENDPOINT).rstrip("\0")
+
+
+def test_a_connection_that_stands_before_anybody_looks_is_seen(
+    controller: zmq.Socket[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a busy computer the handshake is over before `connect` has returned."""
+    seen = controller.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED)
+    connect = zmq.Socket.connect
+
+    def slow(socket: zmq.Socket[bytes], where: str) -> object:
+        done = connect(socket, where)
+        if where == address(controller):
+            assert seen.poll(5_000)
+        return done
+
+    monkeypatch.setattr(zmq.Socket, "connect", slow)
+    with seen:
+        ZmqConnection(address(controller), 0.2, time.monotonic, HINTS).close()
+
+
+def test_an_address_where_nobody_listens_is_said() -> None:
+    with pytest.raises(ControllerLost, match="nothing listens"):
+        ZmqConnection("tcp://127.0.0.1:1", 5.0, time.monotonic, HINTS)
+
+
+def test_what_is_no_address_is_said() -> None:
+    with pytest.raises(ConfigError, match="is not an address"):
+        ZmqConnection("nonsense", 5.0, time.monotonic, HINTS)
