@@ -542,6 +542,21 @@ def test_the_clock_of_its_computer_may_be_another_and_be_set_meanwhile(bench: Ma
         assert len(scanned(peer)) == 4
 
 
+def test_a_scan_that_begins_sooner_after_it_was_asked_for_than_the_one_before_is_new(bench: Make) -> None:
+    """At a hundred times the speed a busy computer takes half a minute to begin one."""
+    made = bench()
+    peer = made.start()
+    ready(peer, shape=(64, 32))
+    late_s = 30.0
+    made.at_panel(lambda emulator: setattr(emulator.program, "behind_s", -late_s))
+    assert len(scanned(peer)) == 4
+    made.at_panel(lambda emulator: setattr(emulator.program, "behind_s", 0.0))
+    last = made.emulator.program.last
+    assert last is not None
+    assert made.clock.now_s() > last.start_s + late_s, "else the clock seems to have been set back"
+    assert len(scanned(peer)) == 4
+
+
 def test_what_a_redpitaya_measures_at_its_panel_does_not_publish_the_scan_before_again(bench: Make) -> None:
     """It does not tell a spectrum from a scan, and what is in its memory is saved again when it is over."""
     made = bench(speed=5.0, card="RPSPMC")

@@ -22,7 +22,7 @@ from afspm.microscopes.gxsm.hardware import (
     recognised,
 )
 from afspm.microscopes.gxsm.link import Address, Asking, open_link
-from afspm.microscopes.gxsm.result_files import SOON_S, GxsmFiles
+from afspm.microscopes.gxsm.result_files import LATE_S, SOON_S, GxsmFiles
 from afspm.microscopes.gxsm.scan_memory import new_lines
 from afspm.microscopes.gxsm.settings import (
     REFNAMES,
@@ -127,8 +127,14 @@ class Gxsm(Driver):
             ask.call("action", AUTOSAVE_OFF)
             self.log.info("GXSM's Auto Save of scans was switched off and stays off (see the setting saving)")
         self._kept.kept_in(self.memory)
-        waits_s = (self.patience_s(self.result_timeout_s / 2), self.patience_s(SOON_S))
-        self._files = GxsmFiles(self.memory, *waits_s, self.log, rewritten=not self._saving.by_us)
+        self._files = GxsmFiles(
+            self.memory,
+            self.log,
+            patience_s=self.patience_s(self.result_timeout_s / 2),
+            soon_s=self.patience_s(SOON_S),
+            late_s=self.patience_s(LATE_S),
+            rewritten=not self._saving.by_us,
+        )
         self._activity = Activity(
             ask,
             hardware,

@@ -28,7 +28,7 @@ _NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+\.nc)$")
 _PRECISION: Final = FilePrecision(part=1e-5, angle_rad=1e-6)
 _CLOCK_NS: Final = 2 * NS_PER_S
 """Files tell the second in which a scan began."""
-_LATE_NS: Final = 20 * NS_PER_S
+LATE_S: Final = 20.0
 """One scan may begin so much later after it was asked for than another."""
 SOON_S: Final = 1.0
 """After so long a channel that did not come before will not come; 0.3 s were measured."""
@@ -38,15 +38,26 @@ class GxsmFiles(ResultFiles):
     """The measurement that is running or has just ended, and the results.
 
     Args:
-        patience_s: how long all files may take, in experiment time.
+        patience_s: how long all files may take, in experiment time like the others.
         soon_s: how long those of channels may that did not come before.
+        late_s: how much later than another a scan may begin, after it was asked for.
         rewritten: files may be there before the scan is over, and be written again.
     """
 
-    def __init__(self, kept: Entry, patience_s: float, soon_s: float, log: logging.Logger, *, rewritten: bool) -> None:
+    def __init__(
+        self,
+        kept: Entry,
+        log: logging.Logger,
+        *,
+        patience_s: float,
+        soon_s: float,
+        late_s: float,
+        rewritten: bool,
+    ) -> None:
         super().__init__(kept, log)
         self._patience_s = patience_s
         self._soon_s = soon_s
+        self._late_ns = round(late_s * NS_PER_S)
         self._rewritten = rewritten
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._before: set[int] = set()
@@ -191,7 +202,7 @@ class GxsmFiles(ResultFiles):
         elif known and start_ns < max(known):
             is_of_before = False  # the clock was set back
         else:
-            is_of_before = start_ns < begun_ns - self._kept["behind_ns"] - (_LATE_NS if known else _CLOCK_NS)
+            is_of_before = start_ns < begun_ns - self._kept["behind_ns"] - (self._late_ns if known else _CLOCK_NS)
         if is_of_before:
             self._before.add(start_ns)
         return is_of_before
