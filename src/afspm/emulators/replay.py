@@ -80,9 +80,8 @@ class TraceReplay(Emulator):
             self._serve_zeromq(timeout_s)
         else:
             self._serve_tcp(timeout_s)
-        for client in self._clients:
-            if client.received:
-                self._answer(client)
+        while any(self._answer(client) for client in self._clients):
+            pass  # an answer to one may be what another one's waits for
         self._write_files()
 
     def _serve_tcp(self, timeout_s: float) -> None:
@@ -116,7 +115,10 @@ class TraceReplay(Emulator):
             self._clients.append(client)
         client.received[:] = frames[-1]
 
-    def _answer(self, client: ReplayClient) -> None:
+    def _answer(self, client: ReplayClient) -> bool:
+        """Answer what a client has asked, or end its connection; False: there is nothing to answer yet."""
+        if not client.received:
+            return False
         try:
             answer = self.playback.ask(client.number, bytes(client.received))
         except Deviation as deviation:
@@ -124,9 +126,9 @@ class TraceReplay(Emulator):
                 self.deviation = str(deviation)
                 self.log.error("REPLAY differs from the recording at %s", deviation)
             self._drop(client)
-            return
+            return True
         if answer is None:
-            return
+            return False
         client.received.clear()
         if answer.content is None:
             self._drop(client)
@@ -134,6 +136,7 @@ class TraceReplay(Emulator):
             client.tcp.sendall(answer.content)
         else:
             self._router.send_multipart([client.identity, b"", answer.content])
+        return True
 
     def _drop(self, client: ReplayClient) -> None:
         """End a connection. Of ZeroMQ there is none to end: the client gets no answer."""
