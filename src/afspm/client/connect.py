@@ -25,6 +25,7 @@ GUEST = "guest"
 GUEST_KEYS = "guest.keys"
 """The file beside what the run keeps with the keys of those who join it; see `supervisor.key_ring`."""
 JOINED_WITHIN_S = 5.0
+HEARD_WITHIN_S = 30.0  # what is cached may be many large scans
 
 
 def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
@@ -41,7 +42,7 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
     Raises:
         FileError: there is no such run.
         ConfigError: it has nobody to connect to.
-        NoResponse: its scheduler is not running.
+        NoResponse: its scheduler is not running, or nothing is heard of what it publishes.
         ExperimentEnded: it has just ended.
     """
     folder = find_run(Path(where))
@@ -54,7 +55,7 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
         if not link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S)):
             hint = cut_off_message(folder) or "is the experiment still running?"
             raise NoResponse("the scheduler does not answer", where=str(folder), hint=hint)
-        link.wait_caught_up(link.until(JOINED_WITHIN_S))  # so that the first look at the scope tells its state
+        link.wait_caught_up(link.until(HEARD_WITHIN_S))  # so that the first look at the scope tells its state
         frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
         scope = Scope(link, ProblemNames(launch.problems), folder / STATE_DIR, frame=frame)
     except BaseException:  # Ctrl-C in a notebook, too: a connection that is left would keep the name

@@ -42,6 +42,7 @@ LONGER_THAN_THE_SCHEDULER = 1.2
 asks again instead makes the connection anew, as if the scheduler were gone."""
 CAUGHT_UP_WITHIN_S = 2.0
 """A scheduler of version 1 replays without saying when it is done: after that long it is taken to be."""
+UNHEARD = "the scheduler is there, but nothing is heard of what it publishes"
 Listener = Callable[[Packet, bool], None]
 
 
@@ -159,16 +160,19 @@ class ExperimentLink:
         measured already.
 
         Raises:
-            NoResponse: it is connected and does not answer.
+            NoResponse: not until `until_s` (monotonic), or it is connected and does not answer.
         """
+        is_told = False
         while not self.wait_connected(self.is_caught_up, CAUGHT_UP_WITHIN_S, until_s):
             if until_s is not None and self.clock.monotonic_s() >= until_s:
-                return
+                raise NoResponse(UNHEARD, where=self._source or self.name, hint="does a firewall block this address?")
             if self.version is wire.Version.UNKNOWN:
-                self.log.info("the scheduler answers, but nothing is heard of what it publishes; waiting for that")
                 self.request(ControlRequest.ACTION_SUPPORT, wire.VERSION_2_ACTION, until_s=until_s)
             if self.version is wire.Version.ONE:
                 self._caught_up.add(self._source or "")
+            elif not is_told:
+                is_told = True
+                self.log.warning("%s; waiting for that (%s)", UNHEARD, self._source or "any address")
 
     def is_caught_up(self) -> bool:
         return self._source in self._caught_up if self._source else bool(self._caught_up)

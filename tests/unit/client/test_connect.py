@@ -14,13 +14,15 @@ from afspm.client.connect import GUEST, find_run, guest_facts
 from afspm.clock import Clock, ExperimentClock
 from afspm.errors import FileError
 from afspm.launch import Launch, Sockets
-from afspm.transport.port import ControlConnected, Incoming
+from afspm.transport.port import CaughtUp, ControlConnected, Incoming
+
+PUBLISHER = "tcp://127.0.0.1:1"
 
 
 class Port:
-    """Brings one thing, or is interrupted."""
+    """Brings the same each time, or is interrupted."""
 
-    def __init__(self, brings: Incoming | None) -> None:
+    def __init__(self, *brings: Incoming) -> None:
         self.clock: Clock = ExperimentClock.real()
         self.is_closed = False
         self._brings = brings
@@ -29,9 +31,9 @@ class Port:
         pass
 
     def poll(self, timeout_s: float | None) -> list[Incoming]:
-        if self._brings is None:
+        if not self._brings:
             raise KeyboardInterrupt
-        return [self._brings]
+        return list(self._brings)
 
     def wakeup_fileno(self) -> int:
         return -1
@@ -43,7 +45,7 @@ class Port:
 def run_folder(runs: Path, name: str, origin_s: float = 0.0) -> Path:
     folder = runs / name
     (folder / "state").mkdir(parents=True)
-    launch = Launch("scheduler", sockets=Sockets(subscribe=("tcp://127.0.0.1:1",), control="tcp://127.0.0.1:2"))
+    launch = Launch("scheduler", sockets=Sockets(subscribe=(PUBLISHER,), control="tcp://127.0.0.1:2"))
     facts = {"name": "night", "clock": {"origin_s": origin_s}, GUEST: guest_facts(launch)}
     (folder / "run.json").write_text(json.dumps(facts), encoding="utf-8")
     return folder
@@ -77,7 +79,7 @@ def test_a_run_is_found_by_a_file_that_begins_as_editors_of_windows_let_it(
 def test_who_is_interrupted_while_joining_leaves_no_connection_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    port = Port(None)
+    port = Port()
     monkeypatch.setattr(connect, "open_port", lambda launch, clock: port)
     with pytest.raises(KeyboardInterrupt):
         afspm.connect(run_folder(tmp_path, "night"))
@@ -87,7 +89,7 @@ def test_who_is_interrupted_while_joining_leaves_no_connection_behind(
 def test_who_can_not_read_what_it_kept_leaves_no_connection_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    port, folder = Port(ControlConnected()), run_folder(tmp_path, "night")
+    port, folder = Port(ControlConnected(), CaughtUp(PUBLISHER)), run_folder(tmp_path, "night")
     monkeypatch.setattr(connect, "open_port", lambda launch, clock: port)
     (folder / "state" / "notebook.scope.json").write_text("nonsense", encoding="utf-8")
     with pytest.raises(FileError):

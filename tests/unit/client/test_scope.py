@@ -451,7 +451,7 @@ def test_nothing_is_measured_before_what_a_scheduler_of_ours_publishes_is_heard(
 
 def test_a_measurement_that_nothing_is_heard_for_ends_when_its_time_is_over(lab: Lab, scope: Scope) -> None:
     lab._inbox.remove(CaughtUp(SOURCE))
-    with pytest.raises(NoResponse):
+    with pytest.raises(NoResponse, match="nothing is heard of what it publishes"):
         scope.scan(REGION, timeout_s=10.0)
     assert lab.begun_scans == 0
 
