@@ -14,6 +14,7 @@ from afspm.translator.driver import LOST
 from afspm.translator.state import Kept, TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
 
+_LOOK_S = 0.1
 _TIP_S = 8.0
 """Real time in which the tip is tried to be retracted when the run is stopped: a controller may be lost just then, or
 refuse. A little less than `runtime.parent` leaves."""
@@ -112,20 +113,42 @@ class SafeExit:
         if self._connection.stands:
             self._connection.guarded(self._temporary.end)
         until_s = self._clock.monotonic_s() + _TIP_S
-        while self.is_owed():
-            off = "off" if self._feedback.is_off else "perhaps off"
-            why_not = self._retracted() if off == "off" else f"the controller is lost: {self._connection.why_lost}"
+        is_told = False
+        while is_told or self.is_owed():
+            is_off = is_told or self._feedback.is_off
+            why_not = self._why_not_told() if is_off else f"the controller is lost: {self._connection.why_lost}"
+            if not why_not:
+                is_told = True
+                why_not = self._why_not_away(wait, until_s)
             if not why_not:
                 self._log.warning("the run is stopping with the feedback off: the tip was retracted")
                 return
             if self._clock.monotonic_s() >= until_s:
-                told = "the run is stopping with the feedback %s, and the tip can't be retracted: %s"
-                self._log.critical(told, off, why_not)
+                off = "off" if is_off else "perhaps off"
+                so = "it is not certain that the tip was retracted" if is_told else "the tip can't be retracted"
+                self._log.critical("the run is stopping with the feedback %s, and %s: %s", off, so, why_not)
                 return
             wait(RETRY_S)
 
-    def _retracted(self) -> str:
-        """Return why the tip can't be retracted; empty: it is."""
+    def _why_not_away(self, wait: Callable[[float], None], until_s: float) -> str:
+        """Return why the tip that was told to retract may not be away; empty: it is seen to be.
+
+        A controller may not have heard yet what it was told, and would not any more without our connection.
+        """
+        sets_out = False
+        while (state := self._state.sequence.said.state) is not ScopeState.FREE:
+            sets_out = sets_out or state is ScopeState.COARSE_MOTOR
+            if not self._connection.stands:
+                return f"the controller is lost: {self._connection.why_lost}"
+            if sets_out and state is ScopeState.INTERRUPTED:
+                return "it was broken off"
+            if self._clock.monotonic_s() >= until_s:
+                return f"it was told to, and is still {state.name}"
+            wait(_LOOK_S)
+        return ""
+
+    def _why_not_told(self) -> str:
+        """Return why the tip can't be told to retract; empty: it was."""
         answered: list[Response] = []
         self._connection.guarded(lambda: answered.append(self._retract()))
         if not answered:

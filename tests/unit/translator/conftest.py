@@ -95,6 +95,7 @@ class FakeMicroscope(Driver):
         self.done: list[str] = []
         self.set_calls = 0
         self.lost = False
+        self.retracts_slowly = False
         self.stuck: dict[str, Value] = {}
         self.fails: Exception | None = None
         self.confused: Exception | None = None
@@ -163,6 +164,8 @@ class FakeMicroscope(Driver):
         if self.lost:
             raise ConnectionError("unplugged")
         self.done.append("retract")
+        if self.retracts_slowly:
+            self.state = ScopeState.COARSE_MOTOR
 
     def command(self, text: str) -> None:
         self.done.append(text)

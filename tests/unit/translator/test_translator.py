@@ -226,6 +226,25 @@ def test_a_controller_that_is_lost_or_refuses_when_the_run_is_stopped_is_asked_a
     assert "CRITICAL" not in caplog.text
 
 
+@pytest.mark.parametrize("ends", [ScopeState.FREE, ScopeState.INTERRUPTED, ScopeState.COARSE_MOTOR])
+def test_a_run_that_is_stopped_ends_when_the_tip_is_seen_to_be_away(
+    bench: Any, caplog: pytest.LogCaptureFixture, ends: ScopeState
+) -> None:
+    """What a controller was told it may not have heard yet."""
+    bench.microscope.retracts_slowly = True
+    switched(bench, "false")
+
+    def is_there() -> None:
+        bench.microscope.state = ends
+
+    begun_s = bench.clock.t_s
+    assert bench.run_to_the_end(ParentGone(), after_s=(3.0, is_there)) == ExitCode.ORPHAN
+    assert bench.clock.t_s - begun_s >= 3.0
+    is_away = ends is ScopeState.FREE
+    assert ("the feedback off: the tip was retracted" in caplog.text) == is_away
+    assert ("it is not certain that the tip was retracted" in caplog.text) == (not is_away)
+
+
 def test_the_tip_stays_where_the_feedback_is_on_or_was_switched_off_by_others(bench: Any) -> None:
     def left() -> list[str]:
         assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN

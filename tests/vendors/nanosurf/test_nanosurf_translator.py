@@ -11,6 +11,7 @@ import pytest
 from nanosurf_bench import Bench
 from vendor_bench import FLAT, TURNED, moved, ready, scanned, scans, small, states
 
+from afspm.emulators.program import MakerProgram
 from afspm.exit_codes import ExitCode
 from afspm.model import Region, Scan, ScanLines, ScopeState, Spectrum, names
 
@@ -119,6 +120,29 @@ def test_a_force_curve_can_be_stopped(bench: Make) -> None:
     assert peer.act(names.STOP_SPEC).ok
     heard = peer.until(FREE)
     assert not any(isinstance(one, Spectrum) for one in heard)
+
+
+def test_a_stop_that_overtakes_the_start_of_its_curve_is_told_again(
+    bench: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They go by two connections."""
+    stops: list[MakerProgram] = []
+    stop_curve = MakerProgram.stop_curve
+
+    def stop(program: MakerProgram) -> None:
+        stops.append(program)
+        if len(stops) > 1:
+            stop_curve(program)
+
+    monkeypatch.setattr(MakerProgram, "stop_curve", stop)
+    made = bench(speed=1.0, force={"duration_s": 20.0})
+    peer = small(made)
+    assert peer.act(names.START_SPEC).ok
+    peer.until(ScopeState.SPEC)
+    made.at_panel(lambda emulator: None)
+    assert peer.act(names.STOP_SPEC).ok
+    assert not any(isinstance(one, Spectrum) for one in peer.until(FREE))
+    assert len(stops) > 1
 
 
 def test_the_tip_is_withdrawn_at_any_time_and_brought_back(bench: Make) -> None:

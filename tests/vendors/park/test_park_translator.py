@@ -208,6 +208,25 @@ def test_a_curve_can_be_stopped(bench: Make) -> None:
     assert not any(isinstance(one, Spectrum) for one in heard)
 
 
+def test_a_stop_that_overtakes_the_start_of_its_curve_is_told_again(bench: Make) -> None:
+    """They go by two connections."""
+    made = bench(speed=1.0, force={"duration_s": 20.0})
+    peer = small(made)
+    stops: list[float] = []
+
+    def stop() -> None:
+        stops.append(made.clock.now_s())
+        if len(stops) > 1:
+            made.emulator.program.stop_curve()
+
+    made.at_panel(lambda emulator: emulator.program._methods.update({"spect.stop": stop}))
+    assert peer.act(names.START_SPEC).ok
+    peer.until(ScopeState.SPEC)
+    assert peer.act(names.STOP_SPEC).ok
+    assert not any(isinstance(one, Spectrum) for one in peer.until(FREE))
+    assert len(stops) > 1
+
+
 def test_a_curve_that_is_stopped_on_the_way_to_it_is_not_taken(bench: Make) -> None:
     made = bench()
     peer = made.start()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -60,7 +61,11 @@ class Activity:
         scanning = self._session.scanning().running
         self._end_call()
         what = SCAN if scanning else "" if self._call is None else self._call.what
-        self._stopping = self._stopping and scanning
+        curve = self._call is not None and what == FORCE
+        self._stopping = self._stopping and (scanning or curve)
+        if self._stopping and curve:
+            with suppress(Refused):
+                self._session.do(commands.STOP_CURVE)  # the first may have overtaken the start: see `Session.begin`
         if self._files.what not in ("", what):
             self._files.end(self._clock.now_ns())
         if scanning and not self._stopping and self._files.what != SCAN:
@@ -111,6 +116,7 @@ class Activity:
 
     def start_curve(self) -> None:
         """Take a force curve where the tip was sent: after a scan, it goes there first. Raises Refused."""
+        self._stopping = False
         self._place.go()
         self._takes_on_arrival = True
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -56,7 +57,10 @@ class Activity:
         call = self._watched_call()
         curve = call is not None and call.what in CURVES  # it may count as a scan, too (!)
         scanning = not curve and self._session.scanning()
-        self._stopping = self._stopping and scanning
+        self._stopping = self._stopping and (scanning or curve)
+        if self._stopping and curve:
+            with suppress(Refused):
+                self._session.do(STOP_CURVE)  # the first may have overtaken the script, which has another connection
         if self._files.what and not scanning and not curve:
             self._files.end(self._clock.now_ns())
         if scanning and not self._stopping and not self._files.what:
@@ -81,6 +85,7 @@ class Activity:
 
     def start_curve(self, kind: str, place_m: XY) -> None:
         """Take a curve where the tip was sent: after a scan, it goes there first."""
+        self._stopping = False
         self.begun(self._session.begin(kind, way_to(place_m)))
         self._curve_at = place_m
 
