@@ -166,8 +166,8 @@ class Client:
         self._doorbell, self._bell = self._pair()
         self._dealer = self._connected_dealer(launch["sockets"]["control"])
         self._subscriptions = [Subscription(self, address) for address in launch["sockets"]["subscribe"]]
-        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._serve, self._beat)]
-        for thread in self._threads:
+        self._beating = threading.Thread(target=self._beat, daemon=True)
+        for thread in (self._beating, threading.Thread(target=self._serve, daemon=True)):
             thread.start()
 
     # --- the thread that owns the sockets ---
@@ -259,8 +259,9 @@ class Client:
 
     def _beat(self):
         address, token = self.launch["sockets"]["heartbeat"], self.launch["beat_token"].encode()
-        socket = self._context.socket(zmq.PUB)
-        socket.linger = 200
+        context = zmq.Context()
+        socket = context.socket(zmq.PUB)
+        socket.linger = 500
         if address:
             socket.connect(address)
         while not self.stopped:
@@ -268,6 +269,7 @@ class Client:
             self.wait(lambda: self.stopped, self.launch["beat_period_s"])
         socket.send_multipart([b"\1", b"0", b"", token])
         socket.close()
+        context.term()  # waits until the last beat is on its way: os._exit waits for nothing
 
     def leave(self, code, why=""):
         """End the program: the last beat says that it closes on purpose."""
@@ -276,8 +278,7 @@ class Client:
         with self.changed:
             self.stopped = True
             self.changed.notify_all()
-        self._threads[1].join(0.5)
-        time.sleep(0.1)  # so that the last beat is on its way: os._exit waits for nothing
+        self._beating.join(1.0)
         os._exit(code)
 
     # --- asking ---

@@ -18,6 +18,11 @@ _MOST_BEATS_APART = 4.0
 """Periods: three missed ones count as dead, and the computer may be busy."""
 
 
+def await_beat(beats: BeatRecorder, pump: Pump) -> None:
+    """Wait for the first beat: only then it is sure that the last one would be heard, too."""
+    pump(lambda: bool(beats.beats), _MOST_BEATS_APART * BEAT_S)
+
+
 def require_beats(beats: BeatRecorder, since_s: float) -> None:
     """Raise Failed if the heartbeats have not been regular since then."""
     pause_s = beats.longest_pause_s(since_s)
@@ -36,7 +41,8 @@ def require_end(program: ClientProgram, beats: BeatRecorder, pump: Pump, codes: 
     """Raise Failed unless the program ends in time, with one of these exit codes and after a closing beat."""
     require_exit(program, codes)
     pump(lambda: any(beat.closing for beat in beats.beats), 1.0)
-    expect(beats.beats and beats.beats[-1].closing, "a last heartbeat that says closing (1)", "none")
+    came = f"{len(beats.beats)} that do not" if beats.beats else "no heartbeat at all"
+    expect(beats.beats and beats.beats[-1].closing, "a last heartbeat that says closing (1)", came)
 
 
 @client_check(
@@ -69,6 +75,7 @@ def stdin(bench: ClientBench) -> None:
     with bench.scripted() as run:
         run.client.begin("wait", prefix="Scan2d_never", timeout_s=60.0)
         run.scheduler.serve(0.2)
+        await_beat(run.beats, run.scheduler.pump)
         run.client.close_stdin()
         require_end(run.client, run.beats, run.scheduler.pump, (ExitCode.DONE, ExitCode.ORPHAN))
     with bench.scripted(ready=False) as run:  # without a scheduler, too
@@ -89,11 +96,13 @@ def end(bench: ClientBench) -> None:
         with bench.scripted(envelopes=envelopes) as run:
             run.client.begin("wait", prefix="Scan2d_never", timeout_s=60.0)
             run.scheduler.serve(0.2)
+            await_beat(run.beats, run.scheduler.pump)
             run.scheduler.publish(KILL)
             require_end(run.client, run.beats, run.scheduler.pump, (ExitCode.ENDED,))
     experiment = bench.new_experiment()
     try:
         with bench.client(experiment) as client:
+            await_beat(client.beats, experiment.pump)
             client.program.begin("end")
             require_end(client.program, client.beats, experiment.pump, (ExitCode.ENDED,))
     finally:
