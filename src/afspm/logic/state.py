@@ -38,6 +38,7 @@ class SavedState:
         granted_to: the token of the life of the holder that was granted control.
         lease_s: that the holder asked for.
         sessions: the token of each session that was connected.
+        forgotten: see `idempotency_cache.Floors`.
         last_ns: the time of the newest packet.
         recent: (translator's time, ours) of the packets published last.
         frame: of a scheduler whose components have other coordinates, as JSON.
@@ -48,6 +49,7 @@ class SavedState:
     lease_s: float | None = None
     sessions: Mapping[str, str] = field(default_factory=dict)
     sent_actions: tuple[SentAction, ...] = ()
+    forgotten: Mapping[str, int] = field(default_factory=dict)
     limits: LimitState = field(default_factory=LimitState)
     tip: RetractState = field(default_factory=RetractState)
     tip_risk: TipRisk = field(default_factory=TipRisk)
@@ -212,6 +214,7 @@ def saved_state(state: SchedulerState, env: Environment) -> SavedState:
         lease_s=state.lease.asked_s,
         sessions=state.sessions.tokens(),
         sent_actions=state.idempotency.sent_actions,
+        forgotten=state.idempotency.floors.numbers,
         limits=state.limits.state,
         tip=state.watchdog.tip,
         tip_risk=state.microscope.risk,
@@ -230,7 +233,7 @@ def restored_state(saved: SavedState, settings: SchedulerSettings) -> SchedulerS
         control=saved.control,
         lease=replace(state.lease, token=saved.granted_to),
         sessions=state.sessions.restored(saved.sessions),
-        idempotency=state.idempotency.restored(saved.sent_actions),
+        idempotency=state.idempotency.restored(saved.sent_actions, saved.forgotten),
         limits=replace(state.limits, state=saved.limits),
         watchdog=state.watchdog.restored(saved.tip),
         microscope=replace(state.microscope, risk=saved.tip_risk),
