@@ -12,10 +12,14 @@ from afspm.model import (
     ControlRequest,
     ControlResponse,
     Parameter,
+    ProbePosition,
     Problem,
     ProcessState,
     ProcessStates,
+    Region,
+    RegionChange,
     RelayedMessage,
+    ScanParameters,
     ScopeState,
     names,
 )
@@ -173,6 +177,85 @@ class Careless(Experiment):
             yield from self.ask(ControlRequest.PARAM, Parameter(names.FEEDBACK_ON, "on"))
             yield from self.ask(ControlRequest.RELEASE_CTRL)
             yield from self.sleep(self.some(600.0))
+
+
+class Burster(Experiment):
+    """Sends its commands without waiting for answers, as a program of its own may; all within reach of the limits."""
+
+    def behave(self) -> Doing:
+        while True:
+            if not (yield from self.regain(Problem.NONE)):
+                continue
+            for _ in range(self.timeline.random.randint(1, 20)):
+                yield from self.until(lambda: self.scope is ScopeState.FREE, 5.0)
+                for _ in range(self.timeline.random.randint(2, 7)):
+                    self.tell(*self._wish())
+                yield from self.sleep(2.0 * self.timeline.random.random())
+                self.tell(ControlRequest.ACTION, names.STOP_SCAN)
+            yield from self.ask(ControlRequest.RELEASE_CTRL)
+            yield from self.sleep(self.some(1200.0))
+
+    def _wish(self) -> tuple[int, Any]:
+        """Return a request for the microscope: sizes and corners of up to twice what fits, and all the rest."""
+        chance = self.timeline.random
+        at_m, size_m = chance.uniform(-5e-6, 5e-6), chance.uniform(0.2e-6, 8e-6)
+        small = Region((at_m / 3, chance.uniform(-1e-6, 1e-6)), (1e-6, 1e-6))
+        return chance.choice(
+            (
+                _setting(names.SCAN_SIZE_X, size_m),
+                _setting(names.SCAN_SIZE_Y, size_m),
+                _setting(names.SCAN_TOP_LEFT_X, at_m),
+                _setting(names.SCAN_TOP_LEFT_Y, at_m),
+                _setting(names.SCAN_ANGLE, chance.uniform(-1.5, 1.5)),
+                (ControlRequest.SET_SCAN_PARAMS, ScanParameters(small)),
+                (ControlRequest.SET_SCAN_PARAMS, ScanParameters(RegionChange(left_m=at_m, width_m=size_m))),
+                (ControlRequest.SET_PROBE_POS, ProbePosition((at_m, 0.0))),
+                _setting(names.PROBE_POS_X, at_m),
+                _setting(names.PROBE_POS_Y, at_m),
+                _setting(names.ZCTRL_SETPOINT, chance.uniform(0.5, 2.0)),
+                _setting(names.ZCTRL_SETPOINT, chance.uniform(0.5, 2.0)),
+                _setting(names.MOVE_SPEED, chance.uniform(0.5e-6, 2e-6)),
+                _setting(names.MOVE_SPEED, chance.uniform(0.5e-6, 2e-6)),
+                (ControlRequest.ACTION, names.START_SCAN),
+                (ControlRequest.ACTION, names.START_SCAN),
+            )
+        )
+
+
+def _setting(name: str, value: float) -> tuple[int, Any]:
+    return ControlRequest.PARAM, Parameter(name, repr(value), "rad" if name == names.SCAN_ANGLE else None)
+
+
+class Adjuster(Client):
+    """A person who turns one knob again and again, beside the component in control."""
+
+    def behave(self) -> Doing:
+        while True:
+            yield from self.sleep(self.some(300.0))
+            for _ in range(self.timeline.random.randint(1, 4)):
+                value = repr(self.timeline.random.uniform(0.5, 2.0))
+                self.tell(ControlRequest.PARAM, Parameter(names.ZCTRL_SETPOINT, value))
+
+
+class Forgetful(Experiment):
+    """Uses the id of an action again when it has asked for so much since that nobody remembers it."""
+
+    def behave(self) -> Doing:
+        while True:
+            if not (yield from self.regain(Problem.NONE)):
+                continue
+            yield from self.until(lambda: self.scope is ScopeState.FREE, 5.0)
+            key = f"{self.identity}/{self.name}-{self.life}/{self._requests + 1}"
+            yield from self.ask(ControlRequest.ACTION, names.START_SCAN)
+            yield from self.ask(ControlRequest.ACTION, names.STOP_SCAN)
+            for _ in range(350):
+                if not self._holds():
+                    break
+                yield from self.ask(ControlRequest.PARAM, Parameter(names.ZCTRL_PGAIN, "1.0"))
+            yield from self.ask(ControlRequest.ACTION, names.START_SCAN, key)
+            yield from self.ask(ControlRequest.ACTION, names.STOP_SCAN)
+            yield from self.ask(ControlRequest.RELEASE_CTRL)
+            yield from self.sleep(self.some(7200.0))
 
 
 class Impostor(Client):

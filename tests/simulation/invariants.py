@@ -40,6 +40,7 @@ from tests.simulation.microscope import FakeMicroscope
 from tests.simulation.scheduler import SchedulerHost
 from tests.simulation.timeline import Timeline
 from tests.simulation.tip_safety import TipSafety
+from tests.simulation.within_limits import WithinLimits
 from tests.simulation.written import Written
 
 _SUCCESS, _NO_RESPONSE = int(ControlResponse.SUCCESS), int(ControlResponse.NO_RESPONSE)
@@ -67,6 +68,7 @@ class Invariants:
         self._timeline = timeline
         self._settings = settings
         self.tip = TipSafety(timeline, settings, microscope, self._must)
+        self.limits = WithinLimits(timeline, settings, microscope, self._must)
         self._microscope = microscope
         self._scheduler_since_s = 0.0
         self.components: list[Client] = []
@@ -94,7 +96,7 @@ class Invariants:
     def forgets(self) -> None:
         """The scheduler may be killed before it could write down what it knows."""
         self.times_are_certain = self.memory_is_certain = False
-        self.written.is_certain = self.tip.memory_is_certain = False
+        self.written.is_certain = self.tip.memory_is_certain = self.limits.memory_is_certain = False
 
     # --- the scheduler ---
 
@@ -247,9 +249,11 @@ class Invariants:
         request = effect.request
         name = request.id.split("/")[0]
         if request.kind in _FORWARDED and request.id and not _is_get(request):
-            self._must(
-                name == host.core.control.holder, f"a command of {name} is sent, {host.core.control.holder} holds"
-            )
+            holder, rules = host.core.control.holder, self._settings.rules
+            adjusts = isinstance(request.subject, Parameter) and request.subject.name in rules.adjustable
+            may = name == holder or (adjusts and name in (rules.roles.operate or ()))
+            self._must(may, f"a command of {name} is sent, {holder} holds")
+            self.limits.sent(request)
             self._used_ns = self._timeline.now_ns()
             value = request.subject.value if isinstance(request.subject, Parameter) else None
             self._must(value != "nan", "a NaN is sent to the microscope")
@@ -257,6 +261,7 @@ class Invariants:
     def executed(self, request: Request) -> None:
         """The microscope carries out a command."""
         self.tip.executed(request)
+        self.limits.executed(request)
         if request.id:
             count = self._microscope.executed[request.id, request.kind]
             once = count == 1 or request.kind != ControlRequest.ACTION or not self.memory_is_certain

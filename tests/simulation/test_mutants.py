@@ -9,14 +9,15 @@ from typing import Any
 
 import pytest
 
-from afspm.logic import answers, arbitration, control_change, event_log, scheduler_core
+from afspm.logic import answers, arbitration, control_change, event_log, request_pipeline, scheduler_core
 from afspm.logic.arbitration import ArbitrationEvent, ControlChange, Transition
 from afspm.logic.cache import PacketCache
+from afspm.logic.coordinate_frame import MappedRequest
 from afspm.logic.event_log import EventLog
-from afspm.logic.events import Effect, SaveState
-from afspm.logic.forwarder import Forwarder
+from afspm.logic.events import Effect, RequestIn, SaveState
+from afspm.logic.forwarder import ForwardedRequest, Forwarder
 from afspm.logic.holder_timeout import HolderTimeout, Lease
-from afspm.logic.idempotency_cache import IdempotencyCache
+from afspm.logic.idempotency_cache import Floors, IdempotencyCache
 from afspm.logic.lifecycle import ExperimentEnd
 from afspm.logic.limit_checker import LimitChecker
 from afspm.logic.microscope_status import MicroscopeStatus
@@ -24,6 +25,7 @@ from afspm.logic.sessions import Hearing, SessionTable
 from afspm.logic.state import SchedulerState, StateDraft
 from afspm.logic.watchdog import Watchdog
 from afspm.model import JournalEntries, JournalEntry
+from tests.simulation.drift_night import DriftNight
 from tests.simulation.invariants import InvariantViolated
 from tests.simulation.night import Fault, Night, Plan, plan
 
@@ -43,6 +45,9 @@ def _bad_night(seed: int) -> Plan:
     if seed % 4 == 1:  # one whose tip is often in danger, at a microscope that can't always withdraw it
         cast = (*_FEW, "careless", "stranger")
         drawn = replace(drawn, cast=cast, ends=True, retracts=seed != 13, speed=60.0)
+    if seed % 4 == 2:  # those that do not wait for answers, with ids that are used again
+        drawn = replace(drawn, cast=(*_FEW, "burster", "adjuster", "forgetful"))
+        away += [Fault("storm", "experiment", 0.2, 100.0)]  # packets arrive after answers to later requests
     there = ("scheduler", "translator", *drawn.cast)
     faults = (*(fault for fault in drawn.faults if fault.whom in there), *away)
     slow = replace(drawn, speed=drawn.speed / 2.0)  # in more real time more connections come and go
@@ -254,7 +259,42 @@ def the_end_never_comes(patch: Patch) -> None:
 
 
 def limits_are_not_checked(patch: Patch) -> None:
-    patch.setattr(LimitChecker, "check", lambda self, *args: None)
+    patch.setattr(LimitChecker, "check", lambda self, *args, **how: None)
+
+
+def limits_are_decided_at_arrival(patch: Patch) -> None:
+    """As it was: what waits in the queue is sent as it was decided when it arrived."""
+    real, decided = request_pipeline.enqueue, dict[str, MappedRequest | None]()
+
+    def enqueue(draft: StateDraft, event: RequestIn) -> None:
+        job = ForwardedRequest.of(event, command=not request_pipeline.reads(event.request))
+        frame = draft.env.frame
+        mapped = None if frame is None else frame.outgoing(job.client, job.request, draft.now_ns)
+        if job.command and isinstance(mapped, MappedRequest | None):
+            names = None if mapped is None else mapped.names
+            sent = job.request if mapped is None else mapped.request
+            refusal = draft.limits.check(job.client, sent, draft.now_ns, names) or draft.limits.check_place(job.request)
+            if refusal is not None:
+                answers.answer_unsent(draft, job, refusal)
+                return
+            decided[job.request.id] = mapped
+        real(draft, event)
+
+    def send(draft: StateDraft, job: ForwardedRequest) -> None:
+        request_pipeline._send(draft, job, decided.get(job.request.id))
+
+    patch.setattr(request_pipeline, "enqueue", enqueue)
+    patch.setattr(request_pipeline, "_decide", send)
+
+
+def what_was_set_or_published_last_is_taken_to_be_in_force(patch: Patch) -> None:
+    patch.setattr(LimitChecker, "depends_on", lambda self, request, **how: [])
+    patch.setattr(LimitChecker, "unknown", lambda self, request: self)
+    patch.setattr(LimitChecker, "published", LimitChecker.in_force)
+
+
+def forgotten_ids_are_new(patch: Patch) -> None:
+    patch.setattr(Floors, "is_below", lambda self, client, request_id: False)
 
 
 def everybody_has_every_role(patch: Patch) -> None:
@@ -269,6 +309,8 @@ MUTANTS = [
     the_end_does_not_wait_for_the_tip,
     the_end_never_comes,
     limits_are_not_checked,
+    limits_are_decided_at_arrival,
+    forgotten_ids_are_new,
     everybody_has_every_role,
     answers_are_written_down_once_more,
     every_fiftieth_answer_is_not_written_down,
@@ -306,6 +348,11 @@ def _nights() -> None:
         Night(_bad_night(seed)).run()
 
 
+def _drift_nights() -> None:
+    for seed in (2, 10, 18, 34):
+        DriftNight(_bad_night(seed)).run()
+
+
 def test_without_a_mutant_nothing_is_found() -> None:
     _nights()
 
@@ -315,3 +362,13 @@ def test_a_broken_scheduler_is_found(mutant: Callable[[Patch], None], monkeypatc
     mutant(monkeypatch)
     with pytest.raises(InvariantViolated):
         _nights()
+
+
+@pytest.mark.parametrize(
+    "mutant", [limits_are_decided_at_arrival, what_was_set_or_published_last_is_taken_to_be_in_force]
+)
+def test_a_broken_scheduler_is_found_in_sample_coordinates(mutant: Callable[[Patch], None], monkeypatch: Patch) -> None:
+    _drift_nights()
+    mutant(monkeypatch)
+    with pytest.raises(InvariantViolated):
+        _drift_nights()

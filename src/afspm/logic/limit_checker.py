@@ -20,7 +20,14 @@ from afspm.logic.frozen import replace
 from afspm.logic.limit_state import LastUse, LimitState, Usage
 from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.logic.parameter_values import ParameterValue, ParameterValueError, numbers, values_of
-from afspm.logic.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES, changes_by, moved
+from afspm.logic.positions import (
+    PROBE_CHANGES,
+    REGION_CHANGES,
+    SHAPE_CHANGES,
+    KnownPosition,
+    changes_by,
+    moved,
+)
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -199,8 +206,16 @@ class LimitChecker:
             checker = checker.in_force(said, now_ns)
         return checker
 
+    def published(self, subject: object, now_ns: int) -> LimitChecker:
+        """Take what the translator published. Of values it only counts when they change: they are read before use."""
+        usage = self.state.usage
+        for name, value in numbers(self._sensible(subject)):
+            if name in self.limits.rated:
+                usage = usage.learn(name, value, now_ns)
+        return self._with(usage, self.state.position.learn(subject))
+
     def in_force(self, subject: object, now_ns: int, *, was_read: bool = False) -> LimitChecker:
-        """Take what the translator said is in force, or what was set: a ScanParameters, Feedback, Parameter …"""
+        """Take what was set, or was read: a ScanParameters, Feedback, Parameter …"""
         values, usage, position = numbers(self._sensible(subject)), self.state.usage, self.state.position
         if isinstance(subject, Parameter):
             if not values:  # what a microscope tells is not ours to judge
@@ -209,7 +224,9 @@ class LimitChecker:
         for name, value in values:
             if name in self.limits.bounded:
                 usage = usage.learn(name, value, now_ns, was_read=was_read)
-        position = position.learn(subject)
+        return self._with(usage, position.learn(subject))
+
+    def _with(self, usage: Usage, position: KnownPosition) -> LimitChecker:
         if usage is self.state.usage and position is self.state.position:
             return self
         return replace(self, state=LimitState(usage, position))

@@ -83,7 +83,7 @@ def _learn(draft: StateDraft, told: object) -> None:
         if draft.microscope.risk != before.risk:
             safety_commands.send(draft)
     if isinstance(told, Feedback | ScanParameters | ProbePosition):
-        draft.limits = draft.limits.in_force(told, draft.now_ns)
+        draft.limits = draft.limits.published(told, draft.now_ns)
 
 
 def _take_state(draft: StateDraft, state: ScopeState) -> None:

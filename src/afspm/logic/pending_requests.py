@@ -117,10 +117,10 @@ class PendingRequests:
         """Return the names for which both connections go on: they are two."""
         return [name for name, (_, until_s) in self.unclear.items() if now_s >= until_s]
 
-    def due_s(self) -> float | None:
+    def due_s(self, *, line_is_free: bool) -> float | None:
         """Return when, in real time, there is something to do; before that the forwarder watches over the move."""
         dues = [until_s for _, until_s in self.unclear.values()]
-        if self.move is not None and self.move.settled_at_s is not None:
+        if line_is_free and self.move is not None and self.move.settled_at_s is not None:
             dues.append(self.move.settled_at_s)
         return min(dues, default=None)
 

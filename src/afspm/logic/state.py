@@ -121,7 +121,7 @@ class SchedulerState:
             self.forwarder.deadline_s(),
             self.barrier.due_s(),
             self.end.by_s,
-            self.pending.due_s(),
+            self.pending.due_s(line_is_free=self.forwarder.is_free),
             self.watchdog.due_s,
         )
         return min((due_s for due_s in dues if due_s is not None), default=None)
