@@ -136,8 +136,8 @@ def nothing_expires(patch: Patch) -> None:
 def any_answer_will_do(patch: Patch) -> None:
     real = Forwarder.answered
 
-    def answered(self: Forwarder, number: int, response: Any, now_s: float) -> Any:
-        return real(self, self.flight.number if self.flight else number, response, now_s)
+    def answered(self: Forwarder, number: int, response: Any) -> Any:
+        return real(self, self.flight.number if self.flight else number, response)
 
     patch.setattr(Forwarder, "answered", answered)
 

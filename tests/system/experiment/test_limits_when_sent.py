@@ -23,7 +23,7 @@ component = false
 
 [burst]
 component = true
-command = ["python", "burst.py"]
+command = ["python", "SCRIPT"]
 heartbeats = false
 
 [limits]
@@ -97,9 +97,9 @@ sys.stdin.read()
 
 @pytest.mark.parametrize("microscope", ["simulator", "nanonis", "asylum", "nanosurf", "park"])
 def test_a_burst_of_requests_does_not_take_the_scan_out_of_the_region(microscope: str, tmp_path: Path) -> None:
-    overlay = tmp_path / "overlay.toml"
-    overlay.write_text(LIMITED, encoding="utf-8")
-    (tmp_path / "burst.py").write_text(BURST, encoding="utf-8")
+    overlay, script = tmp_path / "overlay.toml", tmp_path / "burst.py"
+    overlay.write_text(LIMITED.replace("SCRIPT", script.as_posix()), encoding="utf-8")
+    script.write_text(BURST, encoding="utf-8")
     second = microscope if microscope == "simulator" else f"emulated_{microscope}"
     files = [str(FILES / "experiment.toml"), str(FILES / f"{second}.toml"), str(overlay)]
     done = subprocess.run(
