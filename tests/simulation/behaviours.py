@@ -26,6 +26,7 @@ from afspm.model import (
 from tests.simulation.client import Client, Doing
 
 _OK = int(ControlResponse.SUCCESS)
+_IN_THE_MIDDLE = Region((0.0, 0.0), (1e-6, 1e-6))
 
 
 class Experiment(Client):
@@ -66,6 +67,8 @@ class Experiment(Client):
             yield from self.sleep(self.some(20.0))
             return
         begun = yield from self.ask(ControlRequest.ACTION, names.START_SCAN)
+        if begun.code == ControlResponse.ACTION_ERROR:  # the place has drifted out of the region that is allowed
+            yield from self.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(_IN_THE_MIDDLE))
         if begun.code != _OK:
             yield from self.sleep(self.some(20.0))
             return
@@ -188,8 +191,9 @@ class Burster(Experiment):
                 continue
             for _ in range(self.timeline.random.randint(1, 20)):
                 yield from self.until(lambda: self.scope is ScopeState.FREE, 5.0)
-                for _ in range(self.timeline.random.randint(2, 7)):
-                    self.tell(*self._wish())
+                # of two that are the same, the record could not tell one from the other
+                for kind, subject in dict.fromkeys(self._wish() for _ in range(self.timeline.random.randint(2, 7))):
+                    self.tell(kind, subject)
                 yield from self.sleep(2.0 * self.timeline.random.random())
                 self.tell(ControlRequest.ACTION, names.STOP_SCAN)
             yield from self.ask(ControlRequest.RELEASE_CTRL)

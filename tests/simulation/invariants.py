@@ -115,7 +115,8 @@ class Invariants:
             self._publish(effect)
         elif isinstance(effect, Forward):
             self._forward(host, effect)
-        if isinstance(effect, Reply | Publish):
+        # a scan of the translator's says nothing of control, and may go out before a change of it is saved
+        if isinstance(effect, Reply) or (isinstance(effect, Publish) and effect.source_ns is None):
             self._saved(host)
 
     def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:

@@ -66,6 +66,8 @@ _TROUBLE = ("greedy", "crasher", "impostor", "operator", "stranger", "careless",
 _ALWAYS = ("experiment", "classifier", "corrector", "feedback", "person")
 _PEOPLE = ("operator", "person", "dawn")
 _JOURNAL_S = 0.1
+_SLOWEST_S = 8.0
+"""What is published before the journal is written has to be among the packets that a restart remembers."""
 _LONGEST_SILENCE_S = 8.0
 """Heartbeats of the network find a half-open connection by then."""
 
@@ -302,7 +304,7 @@ class Night:
         elif fault.what == "full disk":
             self._full_disk(fault.for_s)
         elif fault.what == "slow disk":
-            self.scheduler.journal_s = fault.for_s
+            self.scheduler.journal_s = min(fault.for_s, _SLOWEST_S)
             self.timeline.after(fault.for_s, setattr, self.scheduler, "journal_s", _JOURNAL_S)
         elif fault.what == "clock":
             self.invariants.times_are_certain = False

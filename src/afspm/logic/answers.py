@@ -42,12 +42,6 @@ def refuse_peer(draft: StateDraft, event: RequestIn, why: str, code: int = Contr
     reply(draft, event, Response(int(code), b"", why, event.request.id), tells_why=True)
 
 
-def refuse(draft: StateDraft, job: ForwardedRequest, refusal: Response) -> None:
-    """Refuse a request that is not sent."""
-    draft.log("WARNING", f"refused {job.client}: {refusal.reason}")
-    answer_unsent(draft, job, refusal)
-
-
 def answer_unsent(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
     """Answer a request that is not sent. Of a repeated one it stays unknown whether it was carried out before."""
     unknown = ResponseDetail.OUTCOME_UNKNOWN

@@ -115,7 +115,8 @@ class IdempotencyCache:
 
     def sent(self, client: str, request: Request) -> IdempotencyCache:
         """Remember an action over a restart."""
-        actions = (*self.sent_actions, (client, request.id, fingerprint(request)))
+        others = (one for one in self.sent_actions if one[:2] != (client, request.id))
+        actions = (*others, (client, request.id, fingerprint(request)))
         floors = self.floors
         for former, request_id, _ in actions[:-_SENT_REMEMBERED]:
             floors = floors.forgetting(former, [request_id])

@@ -229,16 +229,20 @@ def enqueue(draft: StateDraft, event: RequestIn) -> None:
 
 def send_next(draft: StateDraft) -> None:
     """Send what waits for the translator, each request once it is decided, until the line is taken."""
-    while draft.forwarder.is_free:
-        forwarder, turn = draft.forwarder, draft.pending.turn
-        if turn is not None and forwarder.waiting(turn.number) is None:
-            draft.pending = replace(draft.pending, turn=None)  # it was called back, or its time was up
-        elif forwarder.own:
-            draft.forwarder = forwarder.sent(forwarder.own[0], draft.now_s)
-        elif (job := _next_job(draft)) is not None:
-            _decide(draft, job)
-        else:
-            return
+    turn = draft.pending.turn
+    if turn is not None and draft.forwarder.waiting(turn.number) is None:
+        draft.pending = replace(draft.pending, turn=None)  # it was called back, or its time was up
+    send_own(draft)
+    while draft.forwarder.is_free and (job := _next_job(draft)) is not None:
+        _decide(draft, job)
+        send_own(draft)
+
+
+def send_own(draft: StateDraft) -> None:
+    """Send the first of the scheduler's own requests, which are decided already."""
+    forwarder = draft.forwarder
+    if forwarder.is_free and forwarder.own:
+        draft.forwarder = forwarder.sent(forwarder.own[0], draft.now_s)
 
 
 def _next_job(draft: StateDraft) -> ForwardedRequest | None:

@@ -117,7 +117,7 @@ class SchedulerCore:
             draft.effects += ended(response, draft.now_s, draft.now_ns)
 
         draft.forwarder, _ = draft.forwarder.ask_own(request, now_s, on_answer)
-        request_pipeline.send_next(draft)
+        request_pipeline.send_own(draft)
         return self._finish(draft)
 
     def _finish(self, draft: StateDraft) -> list[Effect]:
