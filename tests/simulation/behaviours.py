@@ -200,7 +200,7 @@ class Burster(Experiment):
             yield from self.sleep(self.some(1200.0))
 
     def _wish(self) -> tuple[int, Any]:
-        """Return a request for the microscope: sizes and corners of up to twice what fits, and all the rest."""
+        """Return a random request; sizes and corners are up to twice as large as fits."""
         chance = self.timeline.random
         at_m, size_m = chance.uniform(-5e-6, 5e-6), chance.uniform(0.2e-6, 8e-6)
         small = Region((at_m / 3, chance.uniform(-1e-6, 1e-6)), (1e-6, 1e-6))
@@ -242,7 +242,7 @@ class Adjuster(Client):
 
 
 class Forgetful(Experiment):
-    """Uses the id of an action again when it has asked for so much since that nobody remembers it."""
+    """Repeats the id of an action after more requests than scheduler and translator remember."""
 
     def behave(self) -> Doing:
         while True:

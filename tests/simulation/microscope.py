@@ -237,7 +237,6 @@ class FakeMicroscope(Process):
         return ControlResponse.SUCCESS
 
     def _set(self, subject: object) -> ControlResponse:
-        """Set what is a part of the place, or a number."""
         x_m, y_m = self.probe_m
         match subject:
             case ScanParameters(region=Region() | RegionChange() as region):

@@ -67,7 +67,7 @@ _ALWAYS = ("experiment", "classifier", "corrector", "feedback", "person")
 _PEOPLE = ("operator", "person", "dawn")
 _JOURNAL_S = 0.1
 _SLOWEST_S = 8.0
-"""What is published before the journal is written has to be among the packets that a restart remembers."""
+"""Packets that are published before the journal is written must be few enough for a restart to remember."""
 _LONGEST_SILENCE_S = 8.0
 """Heartbeats of the network find a half-open connection by then."""
 

@@ -45,7 +45,7 @@ def _bad_night(seed: int) -> Plan:
     if seed % 4 == 1:  # one whose tip is often in danger, at a microscope that can't always withdraw it
         cast = (*_FEW, "careless", "stranger")
         drawn = replace(drawn, cast=cast, ends=True, retracts=seed != 13, speed=60.0)
-    if seed % 4 == 2:  # those that do not wait for answers, with ids that are used again
+    if seed % 4 == 2:  # clients that do not wait for answers, and one that repeats ids
         drawn = replace(drawn, cast=(*_FEW, "burster", "adjuster", "forgetful"))
         away += [Fault("storm", "experiment", 0.2, 100.0)]  # packets arrive after answers to later requests
     there = ("scheduler", "translator", *drawn.cast)
@@ -263,7 +263,7 @@ def limits_are_not_checked(patch: Patch) -> None:
 
 
 def limits_are_decided_at_arrival(patch: Patch) -> None:
-    """As it was: what waits in the queue is sent as it was decided when it arrived."""
+    """As before decision 0060: a queued request is sent as it was decided at its arrival."""
     real, decided = request_pipeline.enqueue, dict[str, MappedRequest | None]()
 
     def enqueue(draft: StateDraft, event: RequestIn) -> None:

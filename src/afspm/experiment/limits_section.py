@@ -145,14 +145,13 @@ class LimitsReader:
         return Limit(low, high, step, rate, read.every, read.only, unit, str(self.document.place(*path)))
 
     def _unit(self, name: str, read: ParameterLimit, path: tuple[str, ...]) -> str | None:
-        """Return the unit of a limit: the microscope's where that is known, else the SI unit of what is given."""
         known = self.parameters.get(name)
         if known is not None or all(value is None for value in (read.min, read.max, read.step, read.rate)):
             return known
         given = _unit_given(read)
         if given is None:
             if name in names.BASE_PARAMETERS:
-                what = f"[limits.{name}] has no unit, and that of the microscope is not known before it runs"
+                what = f"[limits.{name}] has no unit, and the microscope's own unit is not known before it runs"
                 self.document.error(what, *path, hint='give one, as in "500 pA"')
             return ""
         what = f"[limits.{name}] counts in {given}, as the microscope's own unit is not known before it runs"
@@ -227,7 +226,6 @@ class LimitsReader:
 
 
 def _unit_given(read: ParameterLimit) -> str | None:
-    """Return the SI unit of the first value that has one."""
     for key, value in (("min", read.min), ("max", read.max), ("step", read.step), ("rate", read.rate)):
         if isinstance(value, str):
             with contextlib.suppress(AfspmError):  # reported when the value is read

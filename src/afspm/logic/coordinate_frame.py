@@ -35,7 +35,7 @@ class CoordinateFrame(Protocol):
         ...
 
     def in_force(self, place: Region | ProbePosition, now_ns: int) -> None:
-        """Take a place that was read from the microscope: what is asked for next is a part of it."""
+        """Take a place that was read from the microscope; the next part of a place is put onto it."""
         ...
 
     def outgoing(self, who: str, request: Request, now_ns: int) -> MappedRequest | Response | None:

@@ -39,7 +39,7 @@ class ForwardedRequest(NamedTuple):
         mapped: what is sent in place of `request`, where the microscope has other coordinates.
         heard_s: when it was asked, real.
         sent_ns: when it was sent, experiment time; None: it was not.
-        is_repeated: it was sent before under its id, and the outcome of that is unknown.
+        is_repeated: it was sent before under its id, with an unknown outcome.
         on_answer: takes the answer to one of the scheduler's own.
     """
 
@@ -100,7 +100,7 @@ class Forwarder:
         longest_queue: how many may wait.
         up: the translator is connected.
         flight: the request that is with the translator.
-        own, queue: those that wait, in their order: of the scheduler, which go first, and of clients.
+        own, queue: waiting requests in their order: of the scheduler, which go first, and of clients.
         overdue: those whose answer may still come, by number.
         outbox: to be sent now; the caller empties it.
     """
@@ -165,7 +165,7 @@ class Forwarder:
         )
 
     def without(self, number: int) -> Forwarder:
-        """Take a request out of those that wait."""
+        """Remove a waiting request."""
         own, queue = (tuple(job for job in jobs if job.number != number) for jobs in (self.own, self.queue))
         return replace(self, own=own, queue=queue)
 

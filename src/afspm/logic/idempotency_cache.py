@@ -1,9 +1,9 @@
 """The idempotency cache: the outcome of each request id, so that a repeated request is not carried out twice.
 
-Memory is bounded, so outcomes are forgotten. What was forgotten is not carried out again: numbers rise within a
-session, and below the highest number that was forgotten of it (its floor) an id that is not remembered is refused. Ids
-without a number (those of a measurement's attempts, with or without a key, and a client's own) are remembered apart, so
-that any number of other requests does not displace them.
+Memory is bounded, so outcomes are forgotten. A forgotten request is not carried out again: numbers rise within a
+session, and an unknown id is refused at and below the highest forgotten number of its session (its floor). Ids without
+a rising number (attempts at a measurement, and a client's own forms) are remembered apart, so that other requests do
+not displace them.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Floors:
     numbers: Mapping[str, int] = field(default_factory=dict)
 
     def forgetting(self, client: str, request_ids: Iterable[str]) -> Floors:
-        """Raise the floors to the numbers of ids that are not remembered any more."""
+        """Raise the floors to the numbers of forgotten ids."""
         raised = dict(self.numbers)
         for request_id in request_ids:
             if (numbered := number_of(request_id)) is not None:
@@ -78,7 +78,7 @@ class IdempotencyCache:
     Attributes:
         per_client: most ids remembered of a client, with numbers and without.
         table: of each client the older ids and the latest.
-        floors: of what was forgotten; kept over a restart, as far as it was saved.
+        floors: kept over a restart, as far as they were saved.
         clients: most clients.
         sent_actions: those that only we know of, kept over a restart. A translator of version 1 would do them again;
             one of ours would not, but for an action that was done already the microscope must not be moved.

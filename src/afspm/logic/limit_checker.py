@@ -110,8 +110,8 @@ class LimitChecker:
     def depends_on(self, request: Request, *, is_mapped: bool = False) -> list[str]:
         """Return the parameters to be read before a request is checked: it is measured from their values.
 
-        What was published or set last is not enough: a request of unknown outcome, or a person at the panel, may have
-        changed it, and a packet of before may arrive after the answer to a request.
+        The value set or published last is not enough: a request of unknown outcome or a person at the panel may have
+        changed it, and an old packet may arrive after the answer to a newer request.
 
         Args:
             is_mapped: a place is mapped and sent as a whole, whichever part of it was asked for.
@@ -161,7 +161,7 @@ class LimitChecker:
     def sending(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> LimitChecker:
         """Count what a request uses: it was checked, and is about to be sent.
 
-        Where a rate is limited, nothing is known of when the value changes until the request has settled.
+        The time of a change is unknown until the request has settled, so a limited rate is not measured from it.
         """
         usage = self.state.usage
         for name in self._uses(request, used):
@@ -171,7 +171,7 @@ class LimitChecker:
         return self._using(usage)
 
     def counts(self, request: Request) -> bool:
-        """Return whether a request is of those that may be made every so often only."""
+        """Return whether the interval between two such requests is limited."""
         return bool(self._uses(request, None))
 
     def not_done(self, who: str, request: Request, used: Collection[str] | None = None) -> LimitChecker:
@@ -207,7 +207,7 @@ class LimitChecker:
         return checker
 
     def published(self, subject: object, now_ns: int) -> LimitChecker:
-        """Take what the translator published. Of values it only counts when they change: they are read before use."""
+        """Learn places, and the times at which values with a limited rate change, from a published message."""
         usage = self.state.usage
         for name, value in numbers(self._sensible(subject)):
             if name in self.limits.rated:
@@ -215,7 +215,7 @@ class LimitChecker:
         return self._with(usage, self.state.position.learn(subject))
 
     def in_force(self, subject: object, now_ns: int, *, was_read: bool = False) -> LimitChecker:
-        """Take what was set, or was read: a ScanParameters, Feedback, Parameter …"""
+        """Learn values that were set or read: a ScanParameters, Feedback, Parameter …"""
         values, usage, position = numbers(self._sensible(subject)), self.state.usage, self.state.position
         if isinstance(subject, Parameter):
             if not values:  # what a microscope tells is not ours to judge

@@ -35,7 +35,7 @@ class LastUse:
     request_id: str
 
     def is_of(self, repeated: tuple[str, str] | None) -> bool:
-        """Return whether it is that of a repeated request (client, id)."""
+        """Return whether a repeated request (client, id) made this use."""
         return repeated is not None and bool(self.request_id) and (self.who, self.request_id) == repeated
 
 

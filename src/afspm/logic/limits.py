@@ -72,7 +72,7 @@ class ExperimentLimits:
 
     @cached_property
     def rated(self) -> frozenset[str]:
-        """The parameters of which it matters when their values changed."""
+        """The parameters with a limited rate."""
         return frozenset(name for name, limit in self.parameters.items() if limit.rate_per_s is not None)
 
     @cached_property

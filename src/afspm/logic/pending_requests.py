@@ -1,4 +1,4 @@
-"""The request whose turn it is, while something must come before it; and requests of connections that are unclear."""
+"""The request whose turn it is, while reads or a move come before it; and requests of unclear connections."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ class PrePositioner:
 
 @dataclass(frozen=True)
 class Turn:
-    """The turn of one request: what has come before it, and what is still to come.
+    """The turn of one request: values are read, and the microscope is moved, before it is sent.
 
     Attributes:
         number: of the request, in the forwarder's queue.
-        awaited: parameters that are being read; None: it was not asked yet what is in force.
-        values: those that were read; None where the microscope answered no value.
+        awaited: parameters that are being read; None: the reading has not begun.
+        values: by parameter; None where the microscope answered no value.
         move: the move before an action; None: there was none.
     """
 
@@ -77,7 +77,7 @@ class Turn:
         return replace(self, awaited=(self.awaited or frozenset()) - {name})
 
     def moving(self, move: PrePositioner) -> Turn:
-        """Wait for a move; what is in force has to be read again after it."""
+        """Wait for a move, after which values are read again."""
         return Turn(self.number, move=move)
 
     def is_ready(self, microscope: MicroscopeStatus, now_s: float) -> bool:
@@ -90,7 +90,7 @@ class PendingRequests:
     """All that waits.
 
     Attributes:
-        turn: of the request at the head of the queue, once something has to come before it.
+        turn: of the request that waits for reads or a move.
         unclear: requests from a second connection under a name, by that name, and until when they are not answered.
         refused: connections that were refused, which is logged once for each.
     """

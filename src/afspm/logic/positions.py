@@ -29,7 +29,7 @@ REGION_CHANGES: dict[str, Callable[[float], RegionChange]] = {
 
 _CORNER_AND_SIZE = REGION_CHANGES.keys() - {names.SCAN_ANGLE}
 _ANYWHERE = Region((0.0, 0.0), (1.0, 1.0))
-"""A frame of which every part is about to be replaced."""
+"""A placeholder, every part of which is replaced at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ class KnownPosition:
         return known
 
     def without(self, names_: Collection[str]) -> KnownPosition:
-        """Forget the places of which a parameter is not known any more."""
+        """Forget the places of unknown parameters."""
         return KnownPosition(
             None if REGION_CHANGES.keys() & names_ else self.region,
             None if SHAPE_CHANGES.keys() & names_ else self.shape,

@@ -10,14 +10,14 @@
 
 Nothing is done twice, and every request gets an answer.
 
-**Why limits are decided at the fourth stage.** Limits compare a request with what is in force, and requests before it
-in the queue change that. So a request is decided as its turn comes: no other command is on its way, all before it have
-settled, and `send_next` first reads from the microscope what the decision depends on. A request of unknown outcome
-needs no special case: what it may have changed is read before the next request that depends on it, or that is refused.
-An overdue request may still be carried out after its time; as the translator serves one after the other, a value that
-it answered later is one of afterwards. Each request takes up to three steps in its turn: values are read, the
-microscope is moved to where the sample has drifted, values are read again. Meanwhile requests that only read pass, and
-the scheduler's own (`safety_commands`) always go first.
+**Why limits are decided at the fourth stage.** Limits compare a request with values in force, and requests before it
+in the queue change these. So a request is decided as its turn comes: no other command is on its way, all earlier ones
+have settled, and the scheduler first reads the values from the microscope. A request of unknown outcome needs no
+special case: the values that it may have changed are read before the next request that depends on them, or that one is
+refused. An overdue request may still be carried out; since the translator serves one request after the other, a value
+that it answers later is newer. A turn takes up to three steps: values are read, the microscope is moved to where the
+sample has drifted, values are read again. Meanwhile requests that only read pass, and the scheduler's own
+(`safety_commands`) always go first.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ def _tell_time(draft: StateDraft, event: RequestIn) -> None:
 
 
 def enqueue(draft: StateDraft, event: RequestIn) -> None:
-    """Have a request wait for its turn, unless nothing can be sent now."""
+    """Queue a request, or refuse it if nothing can be sent now."""
     name, request, is_command = event.name, event.request, not reads(event.request)
     if is_command and (why := _tip_comes_first(draft)) is not None:
         answers.answer(draft, event, ControlResponse.NOT_FREE, why)
@@ -228,7 +228,7 @@ def enqueue(draft: StateDraft, event: RequestIn) -> None:
 
 
 def send_next(draft: StateDraft) -> None:
-    """Send what waits for the translator, each request once it is decided, until the line is taken."""
+    """Decide and send waiting requests in their order, until one is in flight."""
     turn = draft.pending.turn
     if turn is not None and draft.forwarder.waiting(turn.number) is None:
         draft.pending = replace(draft.pending, turn=None)  # it was called back, or its time was up
@@ -255,7 +255,6 @@ def _next_job(draft: StateDraft) -> ForwardedRequest | None:
 
 
 def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
-    """Send a request whose turn has come, refuse it, or begin what has to come before it."""
     if not job.command:
         if not isinstance(mapped := _mapped(draft, job), Response):
             _send(draft, job, mapped)
@@ -280,7 +279,6 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
 
 
 def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None) -> None:
-    """Send a request, once what it uses of the limits is counted, and saved."""
     name, request = job.client, job.request
     job = job._replace(mapped=mapped, states_seen=draft.microscope.states_seen, sent_ns=draft.now_ns)
     if job.command:
@@ -316,7 +314,6 @@ def _use_lease(draft: StateDraft, client: str) -> None:
 
 
 def _not_allowed_now(draft: StateDraft, job: ForwardedRequest) -> Response | None:
-    """Return why a command that was authorised when it arrived is not any more; None: it is."""
     rules = draft.env.settings.rules
     ask = ControlInput(_microscope_event(job.request, rules), job.client)
     row = row_for(draft.control, ask, rules)
@@ -345,13 +342,12 @@ def _tip_comes_first(draft: StateDraft) -> str | None:
 
 
 def _mapped(draft: StateDraft, job: ForwardedRequest) -> MappedRequest | Response | None:
-    """Return a request in the coordinates of the microscope; None: it goes as it is; a refusal was given already."""
     if draft.env.frame is None:
         return None
     outgoing = draft.env.frame.outgoing(job.client, job.request, draft.now_ns)
     if isinstance(outgoing, Response):
         _refuse(draft, job, outgoing)
-    return outgoing
+    return outgoing  # None: it is sent as it is
 
 
 def _is_within_limits(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None) -> bool:
@@ -368,7 +364,6 @@ def _is_within_limits(draft: StateDraft, job: ForwardedRequest, mapped: MappedRe
 
 
 def _reads_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
-    """Return whether the microscope has to be asked what is in force; then it is."""
     frame = draft.env.frame
     is_mapped = frame is not None and frame.maps(draft.now_ns)
     needed = draft.limits.depends_on(job.request, is_mapped=is_mapped)
@@ -396,7 +391,7 @@ def _was_read(number: int, name: str, draft: StateDraft, response: Response) -> 
 
 
 def _take_values(draft: StateDraft, turn: Turn) -> None:
-    """Take what was read right now, whatever was published meanwhile."""
+    # only now: packets that arrived while the values were read may be older than these
     if not turn.values:
         return
     draft.limits = draft.limits.was_read(turn.values, draft.now_ns)
@@ -430,7 +425,6 @@ def _forget_unread(name: str, draft: StateDraft, response: Response) -> None:
 
 
 def _moves_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
-    """Return whether the microscope has to be moved before an action; then it is, or the action is refused."""
     frame = draft.env.frame
     if frame is None or draft.idempotency.was_sent(job.client, job.request):
         return False

@@ -96,7 +96,7 @@ sys.stdin.read()
 
 
 @pytest.mark.parametrize("microscope", ["simulator", "nanonis", "asylum", "nanosurf", "park"])
-def test_a_burst_of_requests_does_not_take_the_scan_out_of_the_region(microscope: str, tmp_path: Path) -> None:
+def test_burst_of_requests_stays_in_the_region(microscope: str, tmp_path: Path) -> None:
     overlay, script = tmp_path / "overlay.toml", tmp_path / "burst.py"
     overlay.write_text(LIMITED.replace("SCRIPT", script.as_posix()), encoding="utf-8")
     script.write_text(BURST, encoding="utf-8")

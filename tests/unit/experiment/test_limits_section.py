@@ -134,7 +134,7 @@ def test_a_limit_of_unknown_dimension_is_in_si_and_says_so(
 
 
 @pytest.mark.parametrize("text", ["max = 500\n", "rate = 1\n", 'step = "0.1"\n'])
-def test_a_limit_whose_unit_nobody_knows_is_an_error(write: Write, text: str) -> None:
+def test_a_limit_of_unknown_unit_is_an_error(write: Write, text: str) -> None:
     assert "has no unit" in only_error(write(SETPOINT + text)).what
     assert not errors(write(SETPOINT + 'every = "1 s"\n'))
 
@@ -146,7 +146,7 @@ def test_a_limit_whose_unit_nobody_knows_is_an_error(write: Write, text: str) ->
         ("[limits.x-laser]", ""),
     ],
 )
-def test_a_parameter_without_a_unit_has_no_limit_with_one(write: Write, name: str, said: str) -> None:
+def test_a_dimensionless_parameter_takes_no_limit_with_a_unit(write: Write, name: str, said: str) -> None:
     experiment = write(f'{name}\nmax = "3 V"\n')
     assert (said in only_error(experiment).what) if said else not errors(experiment)
 
@@ -167,9 +167,7 @@ def test_a_parameter_without_a_unit_has_no_limit_with_one(write: Write, name: st
         (Parameter("x-number", "2", "A"), False),
     ],
 )
-def test_numbers_without_a_unit_are_compared_in_si_where_the_microscope_is_a_program(
-    write: Write, subject: object, fits: bool
-) -> None:
+def test_plain_numbers_are_compared_in_si_with_a_foreign_translator(write: Write, subject: object, fits: bool) -> None:
     limited = SETPOINT + 'max = "500 pA"\n[limits.x-laser]\nmax = "500 pA"\n[limits.x-number]\nmax = 3\n'
     limits = LimitChecker(write(limited).resolved.limits)
     kind = ControlRequest.PARAM if isinstance(subject, Parameter) else ControlRequest.SET_ZCTRL_PARAMS

@@ -184,7 +184,7 @@ def numbered(n: int) -> Request:
     return Request(1, "x-pulse", b"p", f"exp/a/{n}")
 
 
-def test_an_id_that_was_forgotten_is_never_new_again() -> None:
+def test_forgotten_id_is_never_new_again() -> None:
     once = Held(IdempotencyCache())
     for n in range(1, 400):
         once.noted("exp", numbered(n), OK)
@@ -194,7 +194,7 @@ def test_an_id_that_was_forgotten_is_never_new_again() -> None:
     assert once.look_up("exp", Request(1, id="exp/b/1")) is None  # another life of it
 
 
-def test_ids_of_a_client_that_was_forgotten_are_not_new_either() -> None:
+def test_ids_of_a_forgotten_client_are_not_new() -> None:
     once = Held(IdempotencyCache(clients=3))
     once.noted("exp", numbered(7), OK)
     for n in range(10):
@@ -204,7 +204,7 @@ def test_ids_of_a_client_that_was_forgotten_are_not_new_either() -> None:
 
 
 @pytest.mark.parametrize("id_", ["exp/key/tile-17/0", "exp/a/17/0", "pulse-1", "exp/key/5"])
-def test_ids_without_a_rising_number_are_not_displaced_by_others(id_: str) -> None:
+def test_unnumbered_id_is_not_displaced_by_numbered_ones(id_: str) -> None:
     once = Held(IdempotencyCache())
     once.noted("exp", Request(1, id=id_), OK)
     for n in range(1, 400):
@@ -212,7 +212,7 @@ def test_ids_without_a_rising_number_are_not_displaced_by_others(id_: str) -> No
     assert once.look_up("exp", Request(1, id=id_)) is OK
 
 
-def test_what_was_forgotten_is_known_after_a_restart() -> None:
+def test_forgotten_ids_are_known_after_a_restart() -> None:
     before = Held(IdempotencyCache())
     for n in range(1, 400):
         before.sent("exp", numbered(n))

@@ -482,7 +482,7 @@ def depends(g: Held[LimitChecker], request: Request, *, is_mapped: bool = False)
     return set(g.depends_on(request, is_mapped=is_mapped))
 
 
-def test_a_request_depends_on_the_values_from_which_its_steps_and_rates_are_measured() -> None:
+def test_request_depends_on_values_with_a_limited_step_or_rate() -> None:
     limits = {BIAS: Limit(step=0.5), "zctrl-setpoint": Limit(rate_per_s=1.0), "scan-speed": Limit(high=1.0)}
     g = checker(ExperimentLimits(limits, sets=HIGH))
     assert depends(g, set_("1", "V")) == depends(g, act("x-high")) == {BIAS}
@@ -491,7 +491,7 @@ def test_a_request_depends_on_the_values_from_which_its_steps_and_rates_are_meas
     assert depends(g, set_("1e-6", "m/s", "scan-speed")) == set()
 
 
-def test_a_part_of_a_place_and_an_action_there_depend_on_the_place() -> None:
+def test_part_of_a_place_and_action_there_depend_on_the_place() -> None:
     g = checker(ExperimentLimits(region=STAGE))
     assert depends(g, set_("1", "um", "scan-size-x")) == depends(g, scan(RegionChange(left_m=0.0))) == FRAME
     assert depends(g, act("start-scan")) == FRAME
@@ -504,7 +504,7 @@ def test_a_part_of_a_place_and_an_action_there_depend_on_the_place() -> None:
     assert depends(g, scan(shape=(64, 64))) == set()
 
 
-def test_without_a_region_a_place_matters_only_where_it_is_mapped() -> None:
+def test_place_without_a_region_limit_matters_only_if_mapped() -> None:
     g = checker()
     for request, place in ((act("start-scan"), FRAME), (set_("1", "um", "probe-pos-x"), PROBE)):
         assert depends(g, request) == set()
@@ -516,7 +516,7 @@ def read_place(g: Held[LimitChecker], **values: str | None) -> None:
     g.was_read({name: None if v is None else Parameter(name, v, "um") for name, v in told.items()}, 0)
 
 
-def test_what_was_read_counts_and_not_what_was_published_before() -> None:
+def test_read_place_replaces_the_published_one() -> None:
     g = checker(ExperimentLimits(region=STAGE))
     g.in_force(ScanParameters(Region((0, 0), (1e-6, 1e-6)), (8, 8)), 0)
     read_place(g, scan_top_left_x="4.9", scan_top_left_y="0", scan_size_x="1", scan_size_y="1")
@@ -526,14 +526,14 @@ def test_what_was_read_counts_and_not_what_was_published_before() -> None:
 
 
 @pytest.mark.parametrize("wrong", [None, "nan", "0"])
-def test_a_place_of_which_a_part_is_not_answered_is_not_known(wrong: str | None) -> None:
+def test_place_with_an_unreadable_part_is_unknown(wrong: str | None) -> None:
     g = checker(ExperimentLimits(region=STAGE))
     g.in_force(ScanParameters(Region((0, 0), (1e-6, 1e-6)), (8, 8)), 0)
     read_place(g, scan_top_left_x="0", scan_top_left_y="0", scan_size_x=wrong, scan_size_y="1")
     assert "not reported" in here(g, "start-scan")
 
 
-def test_a_place_that_a_request_of_unknown_outcome_meant_is_unknown_until_it_is_read() -> None:
+def test_place_is_unknown_after_an_unknown_outcome_until_it_is_read() -> None:
     g = checker(ExperimentLimits(region=STAGE))
     g.in_force(ScanParameters(Region((0, 0), (1e-6, 1e-6), 0.5), (8, 8)), 0)
     g.in_force(ProbePosition((0.0, 0.0)), 0)
@@ -548,7 +548,7 @@ def test_a_place_that_a_request_of_unknown_outcome_meant_is_unknown_until_it_is_
     assert "outside the region" in here(g, "x-pulse")
 
 
-def test_pixels_of_unknown_outcome_are_read_together() -> None:
+def test_pixels_are_read_together_after_an_unknown_outcome() -> None:
     g = checker(ExperimentLimits(most_pixels=1000))
     g.in_force(ScanParameters(STAGE, (10, 10)), 0)
     g.unknown(set_("900", "px", "scan-resolution-y"))
@@ -560,7 +560,7 @@ def test_pixels_of_unknown_outcome_are_read_together() -> None:
     assert "12 x 90" in why(g, set_("12", "px", "scan-resolution-x"))
 
 
-def test_a_rate_is_measured_from_the_reading_where_the_outcome_of_the_change_before_is_unknown() -> None:
+def test_rate_counts_from_the_reading_after_an_unknown_outcome() -> None:
     g = guard(tip_bias_voltage=Limit(rate_per_s=0.1))
     g.carried_out(set_("1", "V"), 0)
     g.sending("experiment", set_("2", "V"), 20 * NS)
@@ -572,7 +572,7 @@ def test_a_rate_is_measured_from_the_reading_where_the_outcome_of_the_change_bef
         assert not why(one, set_("2.1", "V"), now_ns=31 * NS)
 
 
-def test_a_rate_is_measured_as_before_where_the_change_was_refused() -> None:
+def test_rate_counts_as_before_after_a_refused_change() -> None:
     g = guard(tip_bias_voltage=Limit(rate_per_s=0.1))
     g.carried_out(set_("1", "V"), 0)
     g.sending("experiment", set_("2", "V"), 20 * NS)

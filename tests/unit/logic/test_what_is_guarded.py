@@ -46,7 +46,7 @@ def test_what_was_moved_out_of_the_region_at_the_panel_is_refused_when_it_is_to_
     assert sent(lab.answer_reads(scan_top_left_x="1e-6", probe_pos_x="1e-6", **HERE)) == [action]
 
 
-def test_a_place_that_the_microscope_can_not_be_asked_for_is_the_published_one() -> None:
+def test_published_place_counts_if_the_microscope_has_no_such_parameter() -> None:
     lab = in_control(REGION)
     lab.publish("ScanParameters2d", ScanParameters(Region((0.0, 0.0), (1e-6, 1e-6)), (32, 32)))
     lab.ask("experiment", ACTION, "start-scan", "experiment/a/1")
@@ -61,7 +61,7 @@ def set_(name: str, value: str, number: int) -> tuple[ControlRequest, Parameter,
     return PARAM, Parameter(name, value), f"experiment/a/{number}"
 
 
-def test_what_is_sent_without_waiting_is_checked_against_all_that_was_sent_before() -> None:
+def test_request_sent_without_waiting_is_checked_against_all_earlier_ones() -> None:
     """The frame would be wider, and then moved, and both fit into the region by themselves."""
     lab = in_control(REGION)
     lab.publish("ScanParameters2d", ScanParameters(Region((0.0, 0.0), (1e-6, 1e-6)), (32, 32)))
@@ -77,7 +77,7 @@ def test_what_is_sent_without_waiting_is_checked_against_all_that_was_sent_befor
     assert codes["experiment/a/2"] == ControlResponse.PARAM_ERROR
 
 
-def test_a_packet_of_before_does_not_take_the_place_of_what_was_read() -> None:
+def test_old_packet_does_not_replace_read_values() -> None:
     lab = in_control(REGION)
     lab.ask("experiment", *set_("scan-top-left-x", "1.9e-6", 1))
     reads = {"scan_top_left_x": "-0.5e-6"} | HERE | {"scan_size_x": "3.4e-6"}
@@ -90,7 +90,7 @@ def test_a_packet_of_before_does_not_take_the_place_of_what_was_read() -> None:
     assert "outside the region" in reply.response.reason
 
 
-def test_what_an_unanswered_request_may_have_set_is_read_before_the_next() -> None:
+def test_value_is_read_again_after_an_unanswered_change() -> None:
     lab = in_control(STEPS)
     lab.ask("experiment", PARAM, Parameter(BIAS, "0.1", "V"), "experiment/a/1")
     told(lab, "0")
@@ -101,7 +101,7 @@ def test_what_an_unanswered_request_may_have_set_is_read_before_the_next() -> No
     assert "a step of 0.2 V" in reply.response.reason
 
 
-def test_requests_that_read_pass_while_the_microscope_is_asked_for_another() -> None:
+def test_reading_request_is_sent_after_the_turn_of_a_command() -> None:
     lab = in_control(STEPS)
     lab.ask("experiment", PARAM, Parameter(BIAS, "0.1", "V"), "experiment/a/1")
     lab.ask("other", PARAM, Parameter("scan-speed"), "other/a/1")
@@ -109,7 +109,7 @@ def test_requests_that_read_pass_while_the_microscope_is_asked_for_another() -> 
     assert sent(lab.answer(lab.forwarded[-1])) == [Parameter("scan-speed")]
 
 
-def test_an_adjustment_that_waits_while_a_problem_is_flagged_is_not_sent() -> None:
+def test_queued_adjustment_is_refused_once_a_problem_is_flagged() -> None:
     rules = Rules(RoleTable(operate=("ada",)), adjustable=frozenset({BIAS}))
     lab = in_control(SchedulerSettings(rules=rules))
     lab.ask("experiment", ACTION, "start-scan", "experiment/a/1")
@@ -121,7 +121,7 @@ def test_an_adjustment_that_waits_while_a_problem_is_flagged_is_not_sent() -> No
     assert [one.response.code for one in replies(lab.effects) if one.name == "ada"] == [ControlResponse.NOT_IN_CONTROL]
 
 
-def test_an_interval_is_not_passed_by_an_id_that_was_forgotten() -> None:
+def test_interval_holds_for_a_forgotten_id() -> None:
     lab = in_control(PULSES)
     lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
     lab.answer(lab.forwarded[-1])
@@ -136,7 +136,7 @@ def test_an_interval_is_not_passed_by_an_id_that_was_forgotten() -> None:
 
 
 @pytest.mark.parametrize("id_", ["pulse", "experiment/key/pulse/0"])
-def test_an_interval_is_not_passed_by_any_id_that_is_used_again(id_: str) -> None:
+def test_interval_holds_for_a_repeated_unnumbered_id(id_: str) -> None:
     lab = in_control(PULSES)
     lab.ask("experiment", ACTION, "x-pulse", id_)
     lab.answer(lab.forwarded[-1])
@@ -148,7 +148,7 @@ def test_an_interval_is_not_passed_by_any_id_that_is_used_again(id_: str) -> Non
     assert reply.response.code in (ControlResponse.SUCCESS, ControlResponse.ACTION_ERROR)
 
 
-def test_a_repetition_that_is_refused_says_that_its_outcome_is_unknown() -> None:
+def test_refused_repetition_is_answered_as_unknown_outcome() -> None:
     lab = in_control(STEPS)
     lab.ask("experiment", PARAM, Parameter(BIAS, "0.1", "V"), "experiment/a/1")
     told(lab, "0")

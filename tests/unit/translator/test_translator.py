@@ -803,7 +803,7 @@ def test_a_repeated_id_is_answered_and_not_carried_out_again(bench: Any) -> None
     assert bench.microscope.set_calls == 1
 
 
-def test_an_id_that_was_forgotten_is_not_carried_out_again(bench: Any) -> None:
+def test_forgotten_id_is_not_carried_out_again(bench: Any) -> None:
     assert bench.ask(ACTION, names.RETRACT, "me/1/1").code == OK
     assert bench.ask(ACTION, names.RETRACT, "me/key/tip/0").code == OK
     for n in range(2, 332):
