@@ -83,6 +83,8 @@ class Invariants:
         self._published: dict[int, tuple[str, bytes | memoryview]] = {}
         self._by_source: dict[int, int] = {}
         self._actions: dict[tuple[str, str], str] = {}
+        self._parameters: dict[tuple[str, str], str] = {}
+        self._codec = codec
         self.times_are_certain = self.memory_is_certain = True
         self._open: dict[tuple[str, str], tuple[float, int]] = {}
         self._definite: dict[tuple[str, str], int] = {}
@@ -214,6 +216,8 @@ class Invariants:
         key = (event.name, event.request.id)
         if event.request.kind == ControlRequest.ACTION:
             self._actions[key] = str(event.request.subject)
+        if isinstance(event.request.subject, Parameter):
+            self._parameters[key] = event.request.subject.name
         replied = any(isinstance(e, Reply) and e.response.id == event.request.id for e in effects)
         if event.request.id and not replied:
             self._open.setdefault(key, (self._timeline.monotonic_s(), event.connection))
@@ -225,6 +229,10 @@ class Invariants:
         response = reply.response
         key = (reply.name, response.id)
         self._open.pop(key, None)
+        name = self._parameters.get(key)
+        if name is not None and response.id and response.code == _SUCCESS:
+            told = self._codec.decode_parameter(response.payload)
+            self._must(told is not None and told.name == name, f"{key} asked for {name}, and was answered {told}")
         if response.id and response.code != _NO_RESPONSE and NAME_TAKEN not in response.reason:
             before = self._definite.setdefault(key, response.code)
             self._must(before == response.code, f"{key} was answered {before}, and now {response.code}")

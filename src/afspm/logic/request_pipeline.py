@@ -60,6 +60,8 @@ from afspm.model import (
 _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 _ANOTHER_RUN = "this is the scheduler of another run: two experiments have the same address"
 _TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of its own"
+_LACKING = (ControlResponse.PARAM_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED)
+"""The answers of a translator that has no such parameter, or none at all."""
 _CONTROL_EVENTS = {
     int(ControlRequest.REQUEST_CTRL): ArbitrationEvent.REQUEST_CONTROL,
     int(ControlRequest.RELEASE_CTRL): ArbitrationEvent.RELEASE_CONTROL,
@@ -381,7 +383,7 @@ def _was_read(number: int, name: str, draft: StateDraft, response: Response) -> 
         return  # it was called back
     if response.code == ControlResponse.NO_RESPONSE:
         _answer_unsent(draft, job, _failed_before(response))
-    elif response.code == ControlResponse.PARAM_NOT_SUPPORTED:
+    elif response.code in _LACKING:
         draft.limits = draft.limits.forget(name)
         draft.pending = replace(draft.pending, turn=turn.lacks(name))
     else:

@@ -119,10 +119,13 @@ class Lab:
         response = Response(int(code), payload, reason, forward.request.id, detail)
         return self.step(TranslatorReply(forward.number, response))
 
-    def answer_reads(self, **values: str) -> list[Effect]:
-        """The microscope answers what it is asked for next, in SI, as long as it is asked for values.
+    def answer_reads(
+        self, lacking: ControlResponse = ControlResponse.PARAM_NOT_SUPPORTED, **values: str
+    ) -> list[Effect]:
+        """The microscope answers reads, in SI, until another request is sent.
 
         Args:
+            lacking: its answer for a parameter that it does not have.
             values: by name, with underscores; it does not have the others.
         """
         effects: list[Effect] = []
@@ -130,7 +133,7 @@ class Lab:
             name = asked.request.subject.name
             value = values.get(name.replace("-", "_"))
             payload = b"" if value is None else self.codec.encode(Parameter(name, value, BASE_PARAMETERS.get(name)))
-            code = ControlResponse.PARAM_NOT_SUPPORTED if value is None else ControlResponse.SUCCESS
+            code = lacking if value is None else ControlResponse.SUCCESS
             effects = self.answer(asked, code, payload)
         return effects
 

@@ -46,14 +46,15 @@ def test_what_was_moved_out_of_the_region_at_the_panel_is_refused_when_it_is_to_
     assert sent(lab.answer_reads(scan_top_left_x="1e-6", probe_pos_x="1e-6", **HERE)) == [action]
 
 
-def test_published_place_counts_if_the_microscope_has_no_such_parameter() -> None:
+@pytest.mark.parametrize("lacking", [ControlResponse.PARAM_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED])
+def test_published_place_counts_if_the_microscope_has_no_such_parameter(lacking: ControlResponse) -> None:
     lab = in_control(REGION)
     lab.publish("ScanParameters2d", ScanParameters(Region((0.0, 0.0), (1e-6, 1e-6)), (32, 32)))
     lab.ask("experiment", ACTION, "start-scan", "experiment/a/1")
-    assert sent(lab.answer_reads()) == ["start-scan"]
+    assert sent(lab.answer_reads(lacking)) == ["start-scan"]
     lab.answer(lab.forwarded[-1])
     lab.ask("experiment", PARAM, Parameter("scan-size-x", "9e-6"), "experiment/a/2")
-    (reply,) = replies(lab.answer_reads())
+    (reply,) = replies(lab.answer_reads(lacking))
     assert "outside the region" in reply.response.reason
 
 
