@@ -231,8 +231,8 @@ class Invariants:
         self._open.pop(key, None)
         name = self._parameters.get(key)
         if name is not None and response.id and response.code == _SUCCESS:
-            told = self._codec.decode_parameter(response.payload)
-            self._must(told is not None and told.name == name, f"{key} asked for {name}, and was answered {told}")
+            value = self._codec.decode_parameter(response.payload)
+            self._must(value is not None and value.name == name, f"{key} asked for {name}, and was answered {value}")
         if response.id and response.code != _NO_RESPONSE and NAME_TAKEN not in response.reason:
             before = self._definite.setdefault(key, response.code)
             self._must(before == response.code, f"{key} was answered {before}, and now {response.code}")
