@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -76,6 +77,30 @@ def test_request_sent_without_waiting_is_checked_against_all_earlier_ones() -> N
     assert sent(effects) == ["start-scan"]
     codes = {reply.response.id: reply.response.code for reply in replies(lab.effects)}
     assert codes["experiment/a/2"] == ControlResponse.PARAM_ERROR
+
+
+def test_probe_stays_in_a_turned_region_along_both_axes() -> None:
+    diamond = Region((0.0, 0.0), (2e-6, 2e-6), math.pi / 4)
+    lab = in_control(SchedulerSettings(limits=ExperimentLimits(region=diamond)))
+    lab.ask("experiment", *set_("probe-pos-x", "1e-6", 1))
+    lab.ask("experiment", *set_("probe-pos-y", "1e-6", 2))
+    assert sent(lab.answer_reads(probe_pos_x="0", probe_pos_y="0")) == [Parameter("probe-pos-x", "1e-6")]
+    lab.answer(lab.forwarded[-1])
+    (reply,) = replies(lab.answer_reads(probe_pos_x="1e-6", probe_pos_y="0"))
+    assert (reply.response.id, reply.response.code) == ("experiment/a/2", ControlResponse.PARAM_ERROR)
+
+
+def test_rate_holds_for_changes_sent_at_once() -> None:
+    lab = in_control(SchedulerSettings(limits=ExperimentLimits({BIAS: Limit(rate_per_s=0.1)})))
+    told(lab, "0")  # read ahead
+    lab.later(experiment_s=10.0)
+    for n in range(1, 6):
+        lab.ask("experiment", PARAM, Parameter(BIAS, f"{n * 0.9}", "V"), f"experiment/a/{n}")
+    told(lab, "0")
+    lab.answer(lab.forwarded[-1])
+    for _ in range(2, 6):
+        (reply,) = replies(told(lab, "0.9"))
+        assert "per second" in reply.response.reason
 
 
 def test_old_packet_does_not_replace_read_values() -> None:
