@@ -126,9 +126,9 @@ def _unit(raw: _Raw) -> tuple[str, float]:
     ZSrcUnit is the name of the unit in GXSM's own list, where a second millivolt is "mV1". The unit itself is var_unit
     in Gxsm4, which has that name in `unit`, and `unit` in Gxsm3. A length is in ångström by either.
     """
-    told = raw.attributes
-    named = told.get("ZSrcUnit", "")
-    unit = told.get("var_unit") or told.get("unit", "") or named
+    given = raw.attributes
+    named = given.get("ZSrcUnit", "")
+    unit = given.get("var_unit") or given.get("unit", "") or named
     return ("m" if {unit, named} & set(_ANGSTROM) else unit), raw.numbers["dz"]
 
 

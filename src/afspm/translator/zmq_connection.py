@@ -87,7 +87,7 @@ class ZmqConnection:
             raise self._lost(what, error) from error
 
     def wait(self, within_s: float) -> None:
-        """Wait up to so many real seconds for the reply to what was begun. Raises ControllerLost."""
+        """Wait for the reply to `begin`, in real time. Raises ControllerLost."""
         try:
             self._socket.poll(max(0, round(within_s * 1000.0)))
         except zmq.ZMQError as error:

@@ -34,8 +34,7 @@ class Wait:
 
 
 Ask = Callable[[str, str, list[Any]], object]
-"""Does what a script asks for: "get", "set" or "call", a path below `spm`, and what is given; "now", the time in ms.
-Raises AfspmError."""
+"""Answers a script: "get", "set" or "call", a path below `spm`, arguments; "now" gives ms. Raises AfspmError."""
 
 
 class Script:
@@ -112,7 +111,7 @@ class Script:
             context.eval(_PRELUDE.read_text(encoding="utf-8"))
             context.set("__source", source)
             self._asks.put(("done", context.eval("__run(__source)")))
-        # whatever else the engine raises ends this script, for which the emulator would wait otherwise
+        # an engine that fails in any other way must end its script, too: the emulator waits for it
         except Exception as error:
             self._asks.put(("failed", str(error).partition("\n")[0]))
 

@@ -63,7 +63,7 @@ class Link:
         self._connection.begin(shown(expression), _request(RUN_SCRIPT, wrapped(expression)))
 
     def wait(self, within_s: float) -> None:
-        """Wait up to so many real seconds for the reply to what was begun. Raises ControllerLost."""
+        """Wait for the reply to `begin`, in real time. Raises ControllerLost."""
         self._connection.wait(within_s)
 
     def reply(self, what: str) -> tuple[bool, Any]:

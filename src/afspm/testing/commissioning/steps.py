@@ -222,8 +222,8 @@ def _watched(guide: Guide) -> tuple[Taken, float | None]:
     mark = client.observations.mark()
     kit.act(names.START_SCAN)
     client.wait_state(ScopeState.SCANNING, mark)
-    said = guide.at_panel("Enter when the panel shows that the scan has ended (u: you can't see it)")
-    panel_s = None if said is None or said.strip() else client.clock.now_s()
+    answer = guide.at_panel("Enter when the panel shows that the scan has ended (u: you can't see it)")
+    panel_s = None if answer is None or answer.strip() else client.clock.now_s()
     limit_s = 1200.0 if expected_s is None else 5.0 * expected_s + 60.0
     client.wait_state(ScopeState.FREE, mark, client.real_s(limit_s))
     heard = client.settled(mark)
