@@ -237,6 +237,9 @@ def test_the_command_asks_and_reports(tmp_path: Path) -> None:
     report = InstrumentReport.read(tmp_path / "experiment-commissioning.toml")
     assert report.operations["scan"] == "passed"
     assert report.operations["axes"] == "blocked"
+    for step in ("panel", "stop-at-panel"):
+        assert report.steps[step] == {"outcome": "skipped", "line": "a simulated microscope has no panel"}
+    assert "Where to, in the panel's picture? – skipped: a simulated microscope has no panel" in done.stdout
 
 
 def test_the_end_of_the_answers_ends_it_safely(tmp_path: Path) -> None:
@@ -267,7 +270,7 @@ def test_ctrl_c_at_a_question_ends_it_with_the_report_written(tmp_path: Path) ->
         process.stdin.write("y\n")
         process.stdin.flush()
         said = ""
-        while not said.endswith("Press Enter when the frame is set: "):
+        while not said.endswith("scanner can't reach it? [y/N] "):
             said += (one := process.stdout.read(1))
             assert one, said
         interrupt(process)

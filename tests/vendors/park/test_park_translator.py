@@ -111,6 +111,7 @@ def test_withdrawing_ends_a_scan_and_lifts_the_stage(bench: Make) -> None:
     peer.until(FREE)
     assert not made.emulator.rig.engaged
     assert made.emulator.program.stage_um[2] == pytest.approx(250.0)  # type: ignore[attr-defined]
+    assert not made.emulator.rig.world.sample.marks, "it went up"
 
 
 @pytest.mark.parametrize("scanning", [True, False])
