@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import json
+import re
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -201,3 +203,18 @@ def test_the_readme_describes_the_proofs_of_the_bridge() -> None:
     readme = (Path(bridge.__file__).parent / "README.md").read_text(encoding="utf-8")
     for words in ("HMAC-SHA256", '["challenge", nonce]', '["response", proof]', bridge.WELCOME):
         assert words in readme
+
+
+def test_messages_that_the_readme_explains_are_in_the_code() -> None:
+    folder = Path(bridge.__file__).parent
+    traps = (folder / "README.md").read_text(encoding="utf-8").partition("## Traps")[2].partition("\n## ")[0]
+    code = "\n".join(file.read_text(encoding="utf-8") for file in sorted(folder.glob("*.py")))
+    code += (folder.parents[1] / "translator" / "tcp.py").read_text(encoding="utf-8")
+    strings = [node.value for node in ast.walk(ast.parse(code.replace("from __future__ import annotations", "")))
+               if isinstance(node, ast.Constant) and isinstance(node.value, str)]  # fmt: skip
+    written = "\0".join(strings)
+    quoted = re.findall(r"\*\*`(.*?)`\*\*", traps)
+    assert len(quoted) > 10
+    for message in quoted:
+        for part in re.split(r"…|'400,0 Å'|Xp-|folder \. ", message):
+            assert part.strip() in written, message

@@ -50,7 +50,8 @@ def test_files_appear_after_the_end_one_by_one_the_last_first_and_in_parts(tmp_p
 def test_the_next_number_is_the_first_that_no_file_has(tmp_path: Path) -> None:
     saving = GxsmFileWriter(tmp_path, Faults([], FAULT_KINDS, START_S))
     (tmp_path / "scan001-Xp-a.nc").touch()
-    paths = [saving.free(ending) for ending in ("Xp-a.nc", "Xp-b.nc")]
+    number = saving.next_number()
+    paths = [saving.free(ending, number) for ending in ("Xp-a.nc", "Xp-b.nc")]
     assert [path.name for path in paths] == ["scan002-Xp-a.nc", "scan001-Xp-b.nc"]
     saving.counted(paths)
     assert saving.named("Xp-a.nc", saving.counter).name == "scan003-Xp-a.nc"

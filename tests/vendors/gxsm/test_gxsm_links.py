@@ -24,6 +24,7 @@ from vendor_bench import answering
 
 from afspm.errors import ConfigError
 from afspm.microscopes.gxsm import bridge, pickles
+from afspm.microscopes.gxsm.activity import LineWatch
 from afspm.microscopes.gxsm.bridge_client import BridgeLink
 from afspm.microscopes.gxsm.errors import BadReply, GxsmError
 from afspm.microscopes.gxsm.hardware import Doing, Hardware, decoded, recognised
@@ -409,3 +410,23 @@ def test_bits_are_read_as_the_hardware_means_them() -> None:
 def test_memory_that_nobody_has_written_is_no_set_of_bits(slots: list[float]) -> None:
     with pytest.raises(BadReply):
         decoded(Hardware.SRANGER, slots)
+
+
+# --- lines ---
+
+
+@pytest.mark.parametrize(
+    ("lines", "turns"),
+    [
+        ([119, -296, 0, 1, 5, 30, 59], 0),
+        ([119, 0, 1, 30, 59, 59, 0], 1),
+        ([30, 31, 40, 3, 7, 50, 2], 2),
+        ([0, 59, 58, 30, 1, 0], 0),
+        ([0, 59, 58, 30, 57, 40], 1),
+        ([12] * 5, 0),
+    ],
+    ids=["down", "down-again", "found-running", "up", "up-again", "still"],
+)
+def test_lines_against_their_direction_belong_to_another_scan(lines: list[int], turns: int) -> None:
+    watch = LineWatch(lines[0])
+    assert sum(watch.turned(line, 60) for line in lines[1:]) == turns

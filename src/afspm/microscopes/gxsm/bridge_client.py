@@ -128,6 +128,11 @@ def value_line(value: object) -> bytes:
     return json.dumps({"value": value}, default=_packed).encode() + b"\n"
 
 
+def value_of(line: bytes) -> object:
+    """Return the value of such a line. Raises BadReply: it has none."""
+    return _reply(line)["value"]
+
+
 def _packed(value: object) -> object:
     if isinstance(value, np.ndarray):
         shown = base64.b64encode(value.tobytes()).decode()
