@@ -6,6 +6,7 @@ import ast
 import json
 import re
 import socket
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -203,6 +204,14 @@ def test_the_readme_describes_the_proofs_of_the_bridge() -> None:
     readme = (Path(bridge.__file__).parent / "README.md").read_text(encoding="utf-8")
     for words in ("HMAC-SHA256", '["challenge", nonce]', '["response", proof]', bridge.WELCOME):
         assert words in readme
+
+
+def test_the_script_needs_nothing_but_the_python_within_gxsm() -> None:
+    """Neither another package, nor a newer Python than systems with Gxsm3 have."""
+    tree = ast.parse(Path(bridge.__file__).read_text(encoding="utf-8"), feature_version=(3, 8))
+    imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    imported |= {one.name for node in ast.walk(tree) if isinstance(node, ast.Import) for one in node.names}
+    assert {str(name) for name in imported} <= sys.stdlib_module_names | {"gxsm"}
 
 
 def test_messages_that_the_readme_explains_are_in_the_code() -> None:

@@ -82,6 +82,27 @@ def written(folder: Path, version: int, label: str, real: Path) -> Path:
     return path
 
 
+@pytest.mark.parametrize(
+    ("label", "name", "channel"),
+    [
+        ("I", "Xp-ADC0mITunnel", "ADC0-ITunnel"),
+        ("I", "Xm-ADC0mITunnel", "ADC0-ITunnel Backward"),
+        ("Z", "M-Xp-Topo", "Topo"),
+        ("Hz", "Xp-dFreq", "dFreq"),
+        ("U", "Xp-AmplPLL", "AmplPLL"),
+    ],
+)
+def test_the_dash_in_the_name_of_a_channel_is_restored(tmp_path: Path, label: str, name: str, channel: str) -> None:
+    """Gxsm3 has the name in that of the file only, with an "m" for each dash."""
+    path = tmp_path / f"scan001-{name}.nc"
+    image, frame = np.ones((3, 4), np.float32), (0.0, 0.0, 100.0, 100.0, 0.0)
+    saved = files.GxsmScanFile(
+        str(path), label, image, 1.0, ("nA", "nA"), frame, START_S, START_S + 9, "SPM-SIM:SPM", 1.0
+    )
+    path.write_bytes(files.netcdf3(saved))
+    assert [scan.channel for scan in read(path).scans] == [channel]
+
+
 @needs_data
 @pytest.mark.parametrize(("version", "label"), BOTH)
 def test_a_scan_written_by_the_emulator_reads_as_the_real_one(tmp_path: Path, version: int, label: str) -> None:
