@@ -32,7 +32,7 @@ pytestmark = pytest.mark.skipif(not TRACES.is_dir(), reason="the recordings of t
 class RecordedGxsm:
     """A link to a GXSM that answers each question as the real one did: at this time, or next.
 
-    What is not in the recording is there as a function of the time.
+    Answers that the recording lacks are functions of the time (`made_up`).
     """
 
     def __init__(

@@ -50,8 +50,8 @@ class Gxsm(Driver):
     Args:
         address: "HOST:PORT" of `bridge.py` in GXSM's console; "shm" for the shared memory of a Gxsm4 on this computer,
             "shm:BLOCK@PROCESS" if that or its process is not called as usual.
-        saving: "afspm": while a scan of this translator runs, GXSM's Auto Save is off, and GXSM is told to save once at
-            its end; else Auto Save is on. "gxsm": Auto Save is left on, and its files are waited for.
+        saving: "afspm": while a scan of this translator runs, GXSM's Auto Save is off, and the translator has GXSM save
+            once at its end; else Auto Save is on. "gxsm": Auto Save is left on, and its files are waited for.
         hardware: "SRanger", "RPSPMC" or "simulator", if the kind that is found is wrong.
         scan_dir, probe_dir: where scans and spectra are saved, if not where GXSM says that it saves channels.
         feedback_actions: GXSM's actions that switch the feedback on and off, where its hardware has such.

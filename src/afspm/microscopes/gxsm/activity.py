@@ -32,7 +32,7 @@ class Saving:
     """The way that scans and spectra are saved.
 
     Attributes:
-        by_us: True if GXSM is told to save a scan of the translator's at its end. It saves all others by itself.
+        by_us: True if the translator has GXSM save its own scans at their end. GXSM saves all others by itself.
         scan_dir, probe_dir: where files are, if not where GXSM says that it saves channels.
     """
 
@@ -226,7 +226,7 @@ class Activity:
             return self._measuring(doing)
         self._looked_ns = self._clock.now_ns()
         moving = doing.moving or now_s < self._arrives_s
-        # what is stopped may be a spectrum that was to be taken at the end of the way
+        # a stopped spectrum may still be at the tip's way to it
         if self._stopping and (moving or (self._autosave is False and not self._is_settled(now_s))):
             return ScopeStatus(ScopeState.INTERRUPTED)
         self._stopping = False
@@ -271,7 +271,7 @@ class Activity:
         self._scan.name = name
         # once GXSM has saved, it reports another number in place of one that was taken
         is_another = bool(before) and name != before and not self._files.is_written(Path(self._absolute(name)))
-        if self._files.is_own:  # GXSM was told not to repeat it
+        if self._files.is_own:  # Repeat was switched off for it
             return is_another
         line, watch = int(self._ask.number("y_current")), self._scan.watch
         if watch is None:
@@ -316,7 +316,7 @@ class Activity:
         return only(rows, last) if abs(line - last) > 1 else None
 
     def _switch_autosave(self, *, on: bool) -> None:
-        """Switch GXSM's Auto Save: on for what is begun at its panel, off while a scan of ours may be stopped."""
+        """Switch GXSM's Auto Save: on for scans of its panel, off while a scan of the translator's may be stopped."""
         if self._switches_autosave and self._autosave is not on:
             self._ask.call("action", AUTOSAVE[on])
             self._autosave = on
@@ -372,7 +372,7 @@ class Activity:
         self._files.end(self._scan.ended_ns, self._clock.now_ns(), channels, folder, is_whole=is_whole)
 
     def _is_whole(self) -> bool | None:
-        """Return whether the scan that has ended came to its end, as far as GXSM's memory tells.
+        """Return whether the scan that has ended came to its end, as far as GXSM's memory shows.
 
         None: it followed another one at once, and was seen too late to know what it found there.
         """

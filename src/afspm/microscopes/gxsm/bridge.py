@@ -131,7 +131,7 @@ class Client:
     Attributes:
         until_s: when it is dropped, unless it has proven itself, or taken its answer, by then.
         active_s: when it last sent something.
-        is_open: False once it is to be dropped.
+        is_open: False from when it should be dropped.
     """
 
     def __init__(self, connection: socket.socket, known: bytes, now_s: float) -> None:
@@ -157,7 +157,7 @@ class Client:
         return selectors.EVENT_WRITE if self._unsent else selectors.EVENT_READ
 
     def exchange(self, now_s: float) -> None:
-        """Send what is left of an answer, or take what has come. Too long a line ends the connection."""
+        """Send the rest of an answer, or receive. Too long a line ends the connection."""
         if self._unsent:
             self.send("", now_s)
         elif not self.has_line:
