@@ -106,7 +106,10 @@ class Observer:
         if is_over:
             self._polling.over(self._clock.monotonic_s())
         with self._clock.late() if is_over else nullcontext():
-            steps = self._state.sequence.observe(status, self._outbox.look(), self._clock.now_s())
+            results = self._outbox.look()
+            is_whole = self._driver.followed()
+            steps = [] if is_whole is None else self._state.sequence.follow(is_whole=is_whole)
+            steps += self._state.sequence.observe(status, results and not steps, self._clock.now_s())
             if steps:
                 self._state.save()  # before anything is out: a restarted process must not tell an older story
                 self.play(steps)
