@@ -183,7 +183,7 @@ class StudioProgram(MakerProgram):
         return self._files(lambda: files.image(scan, now_s, self.values["mode.name"]), now_s)
 
     def curve_files(self, curve: SpectrumActivity, now_s: float) -> Sequence[NamedFile]:
-        return self._files(lambda: files.curve(curve, now_s, self.values["mode.name"]), now_s)
+        return self._files(lambda: files.curves([curve], (1, 1), now_s, self.values["mode.name"]), now_s)
 
     def _files(self, made: Callable[[], bytes], now_s: float) -> Sequence[NamedFile]:
         values = self.values
