@@ -130,3 +130,23 @@ def test_a_file_that_ends_early_is_refused(tmp_path: Path) -> None:
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(FileError, match="ends within DataSet-"):
         afspm.read(path)
+
+
+@pytest.mark.filterwarnings("ignore")  # of the maker's reader, about pandas
+def test_heights_of_a_real_studio_are_those_that_nsfopen_reads() -> None:
+    """Of format 1; its channels have a range about zero, as those of the emulator."""
+    nanosurf = importlib.util.find_spec("nanosurf")
+    folder = Path(nanosurf.origin if nanosurf is not None and nanosurf.origin else "/").parent
+    path = folder / "apps" / "wavemode_nma_analysis" / "example_data" / "SBS-PS_example_data.nhf"
+    if not path.is_file():
+        pytest.skip("nanosurf-apps, with a file of a real Studio, is not installed")
+    import h5py
+
+    with h5py.File(path) as file:
+        stored = file["measurement_0/segment_0/dataset_0"]
+        low, high = (float(stored.attrs[f"base_calibration_{end}"]) for end in ("min", "max"))
+        heights = stored[:].reshape(100, 100) * ((high - low) / 2 / (2**31 - 1))  # as in NSFopen 2.2.4
+    assert low == -high
+    (ours,) = [scan for scan in afspm.read(path).scans if scan.channel == "Topography Forward"]
+    np.testing.assert_allclose(ours.values, heights, atol=1e-14)
+    assert (ours.unit, ours.region.size_m) == ("m", (1e-5, 1e-5))
