@@ -200,7 +200,7 @@ def measure(course: Course, tips: TipTimes, setup: Setup, random: np.random.Gene
 def at_rest(course: Course, felt_m: Felt, tip: TipShape, setup: Setup, random: np.random.Generator) -> dict[str, float]:
     """Measure at the single pixel of a course, where the tip stands and the feedback has settled.
 
-    What sticks to a contaminated tip never settles: the tunnelling current flickers.
+    Debris on a contaminated tip never settles: the tunnelling current flickers.
     """
     loop = setup.loop
     height = felt_m.height_m[0] + _tilt(course, (setup.scanner.tilt_x, setup.scanner.tilt_y))

@@ -111,7 +111,7 @@ def test_a_force_curve_is_taken_where_the_tip_was_sent(bench: Make) -> None:
     assert len(curve["Deflection"]) == 2 * len(taken.values)
 
 
-def test_a_force_curve_is_one_where_the_tip_was_sent_whatever_grid_the_panel_has(bench: Make) -> None:
+def test_a_force_curve_is_a_single_one_at_the_tip_with_any_grid_on_the_panel(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)

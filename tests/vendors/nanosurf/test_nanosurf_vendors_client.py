@@ -181,7 +181,7 @@ print(json.dumps({{
     np.testing.assert_allclose(frames[-6:], queued, atol=1e-12)
 
 
-def test_limits_and_units_of_values_are_told_and_set(tmp_path: Path, client: Run) -> None:
+def test_values_have_limits_and_the_setpoint_has_units(tmp_path: Path, client: Run) -> None:
     with emulated().running(tmp_path / "gallery") as address:
         told = client(
             address,
@@ -203,6 +203,7 @@ for call in (
     lambda: session.workflow.workspace.load_from_file("../../outside.txt"),
     lambda: session.workflow.workspace.load_from_file("C:\\temp\\none.xml"),
     lambda: session.workflow.automation.add_to_queue("none"),
+    lambda: session.workflow.workspace.add_point("x" * 1000, 0, 0),
 ):
     try:
         call()
@@ -216,7 +217,7 @@ print(json.dumps({**found, "said": said}))
     assert told["m"] == pytest.approx([0.7 * sensitivity, -10.0 * sensitivity, 10.0 * sensitivity])
     assert told["after"] == pytest.approx(30e-9 / sensitivity)
     assert told["units"] == ["V", "m"]
-    assert len(told["said"]) == 8  # type: ignore[arg-type]
+    assert len(told["said"]) == 9  # type: ignore[arg-type]
 
 
 def test_an_error_of_a_script_is_an_error_of_the_client(tmp_path: Path, client: Run) -> None:

@@ -84,7 +84,7 @@ def dat(header: Mapping[str, str], columns: Sequence[str], values: np.ndarray) -
 
 @dataclass(frozen=True)
 class DatContent:
-    """What a spectrum's file holds: the lines of its header, split at tabs, and values [points, columns]."""
+    """The content of a spectrum's file: lines of the header, split at tabs, and values [points, columns]."""
 
     header: Sequence[Sequence[str]]
     columns: Sequence[str]

@@ -153,7 +153,7 @@ class Signals:
 
     @answers("PLL.AmpCtrlGainGet", "PLL.PhasCtrlGainGet")
     def _gain(self, name: str, modulator: int) -> Answer:
-        """Return P, T and I = P / T, of which P and T are set."""
+        """Return P and T, which can be set, and I = P / T."""
         proportional, time_s, _ = self._registers.got(name, [modulator])
         return proportional, time_s, proportional / time_s if time_s else 0.0
 

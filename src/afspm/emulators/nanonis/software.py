@@ -144,7 +144,7 @@ class Utilities:
 
     @answers("File.datLoad")
     def _load(self, path: str, header_only: int) -> Answer:
-        """Return what a file of the session folder holds; (!) a row of the data is taken to be a channel."""
+        """Return the content of a file in the session folder; (!) each row of the data is taken to be a channel."""
         try:
             found = read_dat(self._core.session.read(path))
         except (OSError, ValueError) as error:

@@ -21,9 +21,9 @@ from afspm.plain_data import Plain
 _INTEGRAL_GAIN: Final = 0.5
 """What Studio's integral gain of 1 is to the simulated feedback, in 1/s."""
 _GAIN_SHARE: Final = 0.4
-"""Of the integral gain at which the simulated feedback oscillates: what the Gain Finder finds."""
+"""The gain that the Gain Finder finds, as a share of the one at which the simulated feedback oscillates."""
 _NOMINAL: Final = 1.2
-"""By how much the cantilever's maker is wrong."""
+"""The maker's values of the cantilever, as a multiple of the true ones."""
 _REACH_M: Final = 50e-6
 _MOST_PIXELS: Final = 8192
 _MOST_GAIN: Final = 100000
@@ -116,7 +116,7 @@ FRAMES: Final = {
     "grid": tuple(f"spectroscopy.grid_{name}" for name in
                   ("center_offset_x", "center_offset_y", "width", "height", "columns", "rows", "rotation")),
 }  # fmt: skip
-"""Where a frame or grid of curves is on the panels: centre, size, number of columns and rows, rotation."""
+"""Paths of the values of a frame or grid of curves: centre, size, number of columns and rows, rotation."""
 
 PROCEDURES_S: Final = {
     "laser.alignment.align_all": 20.0,
@@ -128,13 +128,13 @@ PROCEDURES_S: Final = {
     "probe.frequency_sweep.run": 5.0,
     "z_control.gain_finder.run": 10.0,
 }
-"""How long each takes, experiment time."""
+"""Duration of each procedure, experiment time."""
 
 MODES: Final = {
     "static_mode": ("load",),
     **dict.fromkeys(("dynamic_mode", "wavemode", "wavemode_nma"), ("load", "update")),
 }
-"""The modes of measurement, and what can be done with each; (!) all measure as the mode of the emulator does."""
+"""The modes of measurement with the commands of each; (!) all measure as the mode of the emulator does."""
 
 CYCLES: Final = ("force_distance_z_z",)
 """The ids of the cycles of spectroscopy."""
@@ -142,10 +142,10 @@ CYCLES: Final = ("force_distance_z_z",)
 
 @dataclass
 class CurveGrid:
-    """A grid of curves that is being measured: where the others are still to be taken, and those that were.
+    """A running measurement of a grid of curves: the points that are left, and the curves taken.
 
     Attributes:
-        at_point: the tip is where the next one is taken.
+        at_point: the tip is at the point of the next curve, or on its way there.
     """
 
     shape: tuple[int, int]
@@ -161,7 +161,7 @@ class StudioProgram(MakerProgram):
         values: of the panels, by path.
         on_signal: called with "scanning_started" and "scanning_finished".
         when_advanced: called after each advance; returns whether it has begun to measure something.
-        setpoint_unit: that the setpoint is told and set in; `values` has it in V.
+        setpoint_unit: in which `get` and `put` have the setpoint; `values` has it in V.
     """
 
     def __init__(self, *given: Any, **settings: Any) -> None:
@@ -190,15 +190,15 @@ class StudioProgram(MakerProgram):
 
     @property
     def setpoint_units(self) -> Mapping[str, float]:
-        """The units of the setpoint, and how many there are of each in 1 V."""
+        """Return the possible units of the setpoint, with the value of 1 V in each."""
         return {"V": 1.0, "m": float(self.values["probe.current_deflection_sensitivity"])}
 
     def scale(self, path: str) -> float:
-        """Return by how much a value is larger in the unit that it is told in."""
+        """Return the factor from a value of `values` to the one that `get` returns."""
         return self.setpoint_units[self.setpoint_unit] if path == SETPOINT else 1.0
 
     def set_setpoint_unit(self, unit: str) -> None:
-        """Have the setpoint told in another unit. Raises InvalidValue."""
+        """Change the unit of the setpoint for `get` and `put`. Raises InvalidValue."""
         if unit not in self.setpoint_units:
             raise InvalidValue(f"{SETPOINT} has no unit {unit!r}", hint=f"one of {', '.join(self.setpoint_units)}")
         self.setpoint_unit = unit
@@ -292,7 +292,7 @@ class StudioProgram(MakerProgram):
             self.values["z_control.i_gain"] = min(round(highest), _MOST_GAIN)
 
     def apply_calibration(self) -> None:
-        """Put what the calibration has found in force. Raises InvalidValue: there was none."""
+        """Use the results of the calibration from now on. Raises InvalidValue: there was no calibration."""
         if not self._calibrated:
             raise InvalidValue("the cantilever has not been calibrated: run the calibration first")
         self.values |= self._cantilever

@@ -88,7 +88,7 @@ class CommandTree:
 
     @contextmanager
     def _bounded(self) -> Iterator[None]:
-        """Let a script use up the memory alone: what scripts have kept of it is given up where too little is left."""
+        """Bound the memory of a script; make a new Lua if scripts have kept too much of it. Raises ScriptFailed."""
         from lupa import lua54
 
         try:

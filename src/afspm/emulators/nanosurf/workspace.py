@@ -16,6 +16,7 @@ from afspm.errors import AfspmError, InvalidValue
 
 NO_ITEM: Final = str(uuid.UUID(int=0))
 _MOST_ITEMS: Final = 1000
+_LONGEST_NAME: Final = 200
 _MOST_REPETITIONS: Final = 1000
 _FIRST: Final = "Image Pos 1"
 _UNFIT_FOR_NAMES: Final = frozenset('\\/:*?"<>|') | {chr(number) for number in range(32)}
@@ -39,9 +40,13 @@ class WorkspaceItem:
     rows: int = 1
     rotation_deg: float = 0.0
 
+    def __post_init__(self) -> None:
+        if len(self.name) > _LONGEST_NAME:
+            raise InvalidValue(f"a name of {len(self.name)} characters", hint=f"at most {_LONGEST_NAME}")
+
 
 class Workspace:
-    """The items by their ids. A path of a file is one on Studio's computer: here it is its name, in the gallery."""
+    """The items by their ids. Files are in the gallery: of their paths on Studio's computer the name counts."""
 
     def __init__(self, program: StudioProgram) -> None:
         self._program = program
@@ -102,7 +107,7 @@ class Workspace:
             raise InvalidValue(f"{path!r} can't be written: {error}") from error
 
     def load(self, path: str) -> None:
-        """Have the items of a file that was saved. Raises InvalidValue: there is none, or it holds something else."""
+        """Replace the items by those of a saved file. Raises InvalidValue: it is missing, or has another content."""
         kinds = {
             field.name: {"str": str, "int": int, "float": float}[str(field.type)] for field in fields(WorkspaceItem)
         }
@@ -118,7 +123,7 @@ class Workspace:
 
     def _file(self, path: str) -> Path:
         name = PureWindowsPath(path).name
-        if not name.endswith(".xml") or not _UNFIT_FOR_NAMES.isdisjoint(name) or len(name) > 200:
+        if not name.endswith(".xml") or not _UNFIT_FOR_NAMES.isdisjoint(name) or len(name) > _LONGEST_NAME:
             raise InvalidValue(f"{path!r} is no path of an .xml file")
         return self._program.folder / name
 
