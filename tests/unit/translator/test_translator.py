@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import logging
 import math
 from dataclasses import replace
@@ -10,6 +12,7 @@ from typing import Any
 import pytest
 
 from afspm import wire
+from afspm.client.cycle import Cycle, CycleOutcome
 from afspm.errors import ConfigError, WireError
 from afspm.exit_codes import ExitCode
 from afspm.model import (
@@ -23,8 +26,10 @@ from afspm.model import (
     ResponseDetail,
     ScanParameters,
     ScopeState,
+    ScopeStatus,
     names,
 )
+from afspm.process.memory import Memory
 from afspm.process.parent import TIP_WITHIN_S
 from afspm.transport.port import ParentGone, RequestReceived, SubscriberJoined
 from afspm.wire.generated import feedback_pb2, scan_pb2
@@ -855,6 +860,55 @@ def test_after_a_kill_the_last_results_are_published_again_at_the_same_times(ben
     after = [time_ns for name, _, time_ns in bench.port.packets if name == "Scan2d"]
     assert len(before) == 2
     assert after == before
+
+
+class Killed(BaseException):
+    """A kill -9: nothing of the process goes on."""
+
+
+POINTS_TO_DIE_AT = 4
+"""One write and three packets; it is killed no more at the point after."""
+
+
+@pytest.mark.parametrize("at", range(POINTS_TO_DIE_AT + 1))
+def test_finished_scan_is_complete_and_once_wherever_the_translator_is_killed(
+    bench: Any, scan: Any, monkeypatch: pytest.MonkeyPatch, at: int
+) -> None:
+    """Killed after each write to the disk, and before each packet, from the end of a scan to its publication."""
+    cycle, published = Cycle(ScopeState.SCANNING, lambda result: True), dict[int, str]()
+    reached = itertools.count()
+
+    def take_in() -> None:
+        for name, thing, time_ns in bench.port.packets:
+            if isinstance(thing, ScopeStatus):
+                cycle.on_state(thing.state, time_ns)
+            elif name == "Scan2d" and time_ns not in published:
+                published[time_ns] = thing.channel
+                cycle.on_result(thing, time_ns)
+        bench.port.packets.clear()
+
+    def die_here(*_: Any, **__: Any) -> None:
+        if next(reached) == at:
+            raise Killed
+
+    bench.ask(ACTION, names.START_SCAN, "me/key/tile-1/1")
+    take_in()
+    bench.microscope.files["a"] = [scan("Height"), scan("Phase")]
+    bench.microscope.state = ScopeState.FREE
+    with monkeypatch.context() as patched:
+        save, publish = Memory.save, bench.port.publish
+        patched.setattr(Memory, "save", lambda self: (save(self), die_here())[0])
+        patched.setattr(bench.port, "publish", lambda *packet, **how: (die_here(), publish(*packet, **how))[1])
+        with contextlib.suppress(Killed):
+            bench.look()
+    take_in()
+    bench.clock.t_s += 5.0
+    bench.start()
+    bench.look()
+    take_in()
+    assert cycle.outcome is CycleOutcome.COMPLETED
+    assert sorted(published.values()) == ["Height", "Phase"]
+    assert (next(reached) > at) is (at < POINTS_TO_DIE_AT), "there are other points than those tried"
 
 
 def test_a_scan_that_did_not_survive_is_told_as_interrupted(bench: Any) -> None:
