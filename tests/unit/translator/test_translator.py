@@ -862,10 +862,6 @@ def test_after_a_kill_the_last_results_are_published_again_at_the_same_times(ben
     assert after == before
 
 
-class Killed(BaseException):
-    """A kill -9: nothing of the process goes on."""
-
-
 POINTS_TO_DIE_AT = 4
 """One write and three packets; it is killed no more at the point after."""
 
