@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal, TextIO
 from afspm.clock import NS_PER_S, Clock, ExperimentClock
 from afspm.formatting import day_and_time, time_of_day
 from afspm.logic.supervisor_registry import LOGGED_AS
-from afspm.storage.disk import DEADLINE_S
+from afspm.storage.disk import DEADLINE_S, SYNCER
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -170,10 +170,12 @@ class _Shown:
 def _into(path: Path) -> tuple[Show, Callable[[], None]]:
     """Raises OSError: the file can't be opened."""
     file = path.open("a", encoding="utf-8", errors="replace")
+    SYNCER.folder_soon(path.parent)
 
     def show(stamp: str, name: str, level: int, text: str) -> None:
         file.write(f"{stamp} {logging.getLevelName(level):8} {name} {text}\n")
         file.flush()
+        SYNCER.soon(file.fileno())  # a power cut leaves what was before the last moment
 
     return show, file.close
 
