@@ -186,7 +186,7 @@ class Supervisor:
             self._step(replace(exited, last_error=self._lines[exited.name].last_error, fault=fault))
 
     def _look(self) -> None:
-        """Look at the clock on the wall, and from outside at processes whose beat is late."""
+        """Look at the clock on the wall, and from outside at processes whose beat is late, or that are to end."""
         if warning := self._clock_check.warning():
             self._log.write(LOGGED_AS, logging.WARNING, warning)
         now_s = self._clock.monotonic_s()
@@ -195,7 +195,7 @@ class Supervisor:
             name: self._monitors.get(name) or ActivityMonitor(pid, lately_s) for name, pid in overdue.items()
         }
         for name, monitor in self._monitors.items():
-            self._step(ActivitySeen(name, monitor.work(now_s)))
+            self._step(ActivitySeen(name, monitor.work(now_s), monitor.processor_s))
 
     def _report(self) -> None:
         """Hand the states of all processes to the reporter, now and then."""

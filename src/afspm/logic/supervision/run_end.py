@@ -15,7 +15,7 @@ OWN_PACE_S = 1.5  # after the end of the experiment: everybody has heard it, and
 AGAIN_S = 0.25  # somebody is busy with a step that it may take: ask later
 FAREWELL_S = 60.0  # but not for ever
 KILL_AFTER_S = 1.5  # after being asked, or after having finished what may be finished then
-TIP_S = 15.0  # after being asked: a process that retracts the tip ends by itself before
+TIP_S = 15.0  # after being asked: a process that retracts the tip, or works on its end, ends by itself before
 LEAVE_AFTER_S = 3.0  # after being killed
 
 
@@ -103,7 +103,8 @@ class RunEnd:
 
         Args:
             busy: somebody still works on a step, within what it declared: before they are asked, a component (a picture
-                of the night, say), and then a translator, which does not leave before the tip is safe.
+                of the night, say), and then a translator, which does not leave before the tip is safe, or any process
+                that is seen to work on its end.
         """
         deadline_s = self.deadline_s()
         seen = replace(self, busy_s=now_s) if busy and self.last is EndStep.ASK else self
@@ -131,6 +132,8 @@ def unfinished(
     for name, child in children.items():
         is_busy = child.life is not None and child.life.is_busy(now_s, liveness)
         may_finish = has_ended and child.may_still_finish(now_s, liveness, can_hear=can_hear)
-        if (is_busy or may_finish) if not is_asked else (is_busy and child.spec.role is Role.TRANSLATOR):
+        sees_to_tip = is_busy and child.spec.role is Role.TRANSLATOR
+        is_ending = child.life is not None and child.life.is_ending
+        if (sees_to_tip or is_ending) if is_asked else (is_busy or may_finish):
             found.append(name)
     return found

@@ -89,9 +89,8 @@ class SupervisorCore:
                 self._apply(child, child.watch.start_failed(why, now_s))
             case Beaten(name, report):
                 self._on_beat(self.children[name], report)
-            case ActivitySeen(name, works):
-                if (life := self.children[name].life) is not None:
-                    life.works = works
+            case ActivitySeen():
+                self._on_activity(self.children[event.name], event)
             case Exited():
                 self._on_exit(self.children[event.name], event)
             case EndSignal() if self.ending is None:
@@ -124,12 +123,16 @@ class SupervisorCore:
         return min((s for s in found if s is not None), default=None)
 
     def overdue(self, now_s: float) -> tuple[dict[str, int], float]:
-        """Return the processes whose beat is late, with their ids, and over which time to judge whether they work."""
+        """Return the processes to be looked at from outside, with their ids, and the time over which to judge them.
+
+        Those are whose beat is late, at the end of a run also those that start, and all that were asked to end.
+        """
         overdue: dict[str, int] = {}
         for name, child in self.children.items():
             if child.life is None:
                 continue
-            if child.life.is_overdue(now_s, self._liveness):
+            is_late_to_finish = self.ending is not None and (self._is_asked or child.life.beat is None)
+            if is_late_to_finish or child.life.is_overdue(now_s, self._liveness):
                 overdue[name] = child.life.pid
             else:
                 child.life.works = None
@@ -144,10 +147,22 @@ class SupervisorCore:
 
     # --- events ---
 
+    @property
+    def _is_asked(self) -> bool:
+        return self.ending is not None and self.ending.last is EndStep.ASK
+
+    def _on_activity(self, child: SupervisedChild, seen: ActivitySeen) -> None:
+        if child.life is None:
+            return
+        child.life.works, child.life.processor_s = seen.works, seen.processor_s
+        if self._is_asked and child.life.asked_processor_s is None:
+            child.life.asked_processor_s = seen.processor_s
+
     def _on_beat(self, child: SupervisedChild, report: HeartbeatReport) -> None:
         if child.life is not None:
             if child.life.beat is None:
                 self._log(child.spec.name, "DEBUG", "is up")
+                child.life.first_beat_s = self._now_s
             child.life.beat, child.life.beat_s = report, self._now_s
         self._apply(child, child.watch.beat(report, self._now_s))
 

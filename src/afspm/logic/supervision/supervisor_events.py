@@ -42,10 +42,15 @@ class Beaten:
 
 @dataclass(frozen=True, slots=True)
 class ActivitySeen:
-    """The operating system was asked whether a process that does not beat works; None: it can't tell."""
+    """The operating system was asked whether a process that does not beat works; None: it can't tell.
+
+    Attributes:
+        processor_s: the processor time that it has used in its life; None: that is not known.
+    """
 
     name: str
     works: bool | None
+    processor_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
