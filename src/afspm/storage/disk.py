@@ -26,6 +26,8 @@ SYNC_PERIOD_S = 0.1
 MOST_BYTES = 256 << 20
 """So much may wait for a disk that hangs; what comes beyond is not written."""
 MOST_TASKS = 10_000
+FULL_BYTES = 1 << 20
+"""With less room a disk counts as full: it takes no scan any more."""
 _log = logging.getLogger("afspm.disk")
 
 
@@ -215,6 +217,16 @@ class Syncer:
             _log.critical("what was written in the last moment may not outlive a power cut: %s", failures[0])
         elif was_failing and not failures:
             _log.info("the disk syncs again")
+
+
+def is_full(folder: Path) -> bool:
+    """Return whether a disk has no room for a file any more; False also if that can't be told."""
+    import shutil  # imported late: it is asked when something has failed
+
+    try:
+        return shutil.disk_usage(folder).free < FULL_BYTES
+    except OSError:
+        return False
 
 
 SYNCER = Syncer()

@@ -12,6 +12,7 @@ from afspm import wire
 from afspm.clock import NS_PER_S
 from afspm.errors import AfspmError
 from afspm.model import ScopeState, ScopeStatus, names
+from afspm.storage.disk import is_full
 from afspm.translator import setting_groups
 from afspm.translator.driver import LOST, MEASURING, Driver
 from afspm.translator.outbox import Outbox, Outgoing
@@ -126,7 +127,8 @@ class Observer:
             elif isinstance(step, DiscardResults):
                 self._outbox.discard()
             elif isinstance(step, LogError):
-                self._log.error("%s", step.text)
+                why = f"; the disk of {self._driver.run_dir} is full" if is_full(self._driver.run_dir) else ""
+                self._log.error("%s%s", step.text, why)
         self._state.save()
         for packet in packets:
             self._port.publish(*packet)

@@ -143,3 +143,10 @@ def test_sync_that_the_disk_refuses_is_raised_to_the_next_that_waits_and_logged_
         ("CRITICAL", "what was written in the last moment may not outlive a power cut: [Errno 5] Input/output error"),
         ("INFO", "the disk syncs again"),
     ]
+
+
+def test_disk_is_full_when_no_scan_has_room_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not disk.is_full(tmp_path)
+    assert not disk.is_full(tmp_path / "gone")
+    monkeypatch.setattr(disk, "FULL_BYTES", 1 << 62)
+    assert disk.is_full(tmp_path)

@@ -9,6 +9,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from afspm import wire
@@ -905,6 +906,31 @@ def test_finished_scan_is_complete_and_once_wherever_the_translator_is_killed(
     assert cycle.outcome is CycleOutcome.COMPLETED
     assert sorted(published.values()) == ["Height", "Phase"]
     assert (next(reached) > at) is (at < POINTS_TO_DIE_AT), "there are other points than those tried"
+
+
+@pytest.mark.parametrize("is_full", [True, False])
+def test_scan_without_a_file_is_logged_with_a_disk_that_is_full(
+    bench: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, is_full: bool
+) -> None:
+    monkeypatch.setattr("afspm.translator.observer.is_full", lambda folder: is_full)
+    bench.ask(ACTION, names.START_SCAN)
+    bench.microscope.state = ScopeState.FREE
+    bench.look()
+    bench.look(after_s=20)
+    assert "ended without a result" in caplog.text
+    assert ("is full" in caplog.text) is is_full
+
+
+def test_scan_of_nothing_but_nan_is_published_and_logged(
+    bench: Any, scan: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    bench.ask(ACTION, names.START_SCAN)
+    blank = replace(scan("Phase"), values=np.full((2, 3), np.nan))
+    bench.microscope.files["a"] = [scan("Height"), blank]
+    bench.microscope.state = ScopeState.FREE
+    bench.look()
+    assert bench.heard()[-3:] == ["Scan2d", "Scan2d", "FREE"]
+    assert "a has no value in Phase: NaN alone" in caplog.text
 
 
 def test_a_scan_that_did_not_survive_is_told_as_interrupted(bench: Any) -> None:
