@@ -294,7 +294,7 @@ class MeasurementRunner:
         """Return whether the result is complete; else note why not, before the next attempt."""
         target = task.target
         missing = self._channels.get(target.what, frozenset()) - frozenset(map(target.name_of, cycle.results))
-        blank = [target.name_of(one) for one in cycle.results if isinstance(one, Scan) and one.is_blank]
+        blank = [one.channel for one in cycle.results if isinstance(one, Scan) and one.is_blank]
         is_blank = bool(blank) and len(blank) == len(cycle.results)
         if cycle.outcome is CycleOutcome.COMPLETED and not missing and not is_blank:
             if blank:
