@@ -110,7 +110,7 @@ class Written:
             self._started.setdefault(request.id.partition("/")[0], set()).add(request.id)
 
     def has_all_starts(self) -> None:
-        """Each measurement that was begun has the entry of its start, whatever was killed in between."""
+        """Each measurement that was begun has the entry of its start, also where a process was killed in between."""
         for who, begun in self._started.items():
             written = len(self._starts.get(who, ()))
             self._must(written >= len(begun) or not self.is_certain, f"{who}: {len(begun)} begun, {written} written")

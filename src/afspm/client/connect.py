@@ -40,7 +40,7 @@ def connect(where: str | Path = "runs", name: str = "notebook", *, messages: Seq
             run is meant, in the folder `runs` here or beside it).
         name: what others see as the holder of control. Two that join need different names.
         messages: modules and .proto files with message types of your own, as in the experiment file. They are imported
-            here; those that the run names are not, since its folder may come from somebody else.
+            here; those that the run names are not, since its folder may come from another person.
 
     Raises:
         FileError: there is no such run.

@@ -42,8 +42,8 @@ def opened(path: Path) -> h5py.File:
 
 
 def _check_links(file: h5py.File, path: Path) -> None:
-    """Values that are in other files are refused: the library would read any file of this computer, and a scan of
-    somebody else, drawn or exported, would show what is in it."""
+    # values in other files: the library would read any file of this computer, and a scan that comes from elsewhere,
+    # drawn or exported, would show its content
     import h5py
 
     def is_elsewhere(name: bytes, info: h5py.h5l.LinkInfo) -> bytes | None:

@@ -135,7 +135,6 @@ class SchedulerCore:
         return effects
 
     def _entries_since(self, starts: Sequence[SentStart]) -> Iterator[JournalEntry]:
-        """Yield the entries in the cache that may be about `starts`."""
         oldest_ns = min((start.sent_ns for start in starts), default=0)
         for packet, *_ in self._env.cache if starts else ():
             if packet.envelope == ENTRIES and (packet.time_ns or 0) >= oldest_ns:

@@ -106,7 +106,7 @@ def measured_file(folder: Path, file: str) -> Path:
     """Return the file of a scan or spectrum, which the journal names relative to its folder.
 
     Raises:
-        FileError: it is elsewhere. A folder may come from somebody else, and what it names is read and exported.
+        FileError: it is elsewhere. The folder may come from another person, and its files are read and exported.
     """
     path = folder / file
     if not path.resolve().is_relative_to(folder.resolve()):

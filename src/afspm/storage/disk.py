@@ -157,7 +157,7 @@ class Syncer:
         self._written: dict[tuple[int, int], int] = {}
         self._urgent = False
         self._asked = self._done = 0
-        self._failure: OSError | None = None  # that nobody has waited for yet
+        self._failure: OSError | None = None  # not raised yet
         self._is_failing = False
         self._thread: threading.Thread | None = None
 

@@ -19,8 +19,8 @@ _COST = {"n": 2**14, "r": 8, "p": 1}
 _NAME = re.compile(r"[\w][\w .'-]*", re.UNICODE)
 _TRIES, _TRIES_WITHIN_S = 5, 60.0
 AGAIN_S = 3.0
-"""After so many wrong tries one more is looked at as often as this: refusing all would lock out the owner of the right
-password, for whom anyone on the same computer could be wrong five times a minute."""
+"""Real time between two tries that are looked at, after too many wrong ones. To refuse all would lock out the owner of
+the right password: anyone on the same computer could be wrong five times a minute in the same name."""
 _MOST_REMEMBERED = 1000
 
 

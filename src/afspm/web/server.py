@@ -20,10 +20,9 @@ if TYPE_CHECKING:
 USUAL_PORT = 8080
 _STOPPED_S = 3.0
 STALLED_S = 60.0
-"""A client that takes nothing of what is sent to it for so long, or whose request takes so long to come, is
-disconnected."""
+"""Real time after which a client is disconnected that takes nothing of an answer, or sends no more of a body."""
 HEAD_S = 10.0
-"""Within so long, in real time, the head of a request must have come: before it, no password can be asked for."""
+"""Real time that a client has for the head of a request: before that is there, no password can be asked for."""
 MOST_HEAD_BYTES = 64 << 10
 MOST_UNFINISHED = 200
 """Connections whose request has not come yet; with one more, the oldest is closed."""
@@ -78,11 +77,10 @@ def url_of(host: str, port: int, *, encrypted: bool) -> str:
 
 
 def _impatient(stalled_s: float, head_s: float) -> type[asyncio.Protocol]:
-    """Return uvicorn's protocol, with a limit to how long a client may keep a connection by doing nothing.
-
-    The one that is written in Python: it bounds the head of a request, which its C sibling takes in without end.
-    """
+    """Return uvicorn's protocol, which disconnects clients that stall: they would keep their connections for ever."""
     import h11
+
+    # the one that is written in Python: it bounds the head of a request, which its C sibling takes in without end
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
     waiting: dict[ImpatientProtocol, None] = {}
@@ -119,7 +117,7 @@ def _impatient(stalled_s: float, head_s: float) -> type[asyncio.Protocol]:
             super().resume_writing()
 
         def _await(self, state: object) -> None:
-            """Wait for the rest of a head (IDLE) or of a body (SEND_BODY); None: for nothing."""
+            # IDLE: the rest of a head; SEND_BODY: that of a body; None: nothing
             self._awaited = state
             if self._unfinished is not None:
                 self._unfinished.cancel()
@@ -138,10 +136,7 @@ def _impatient(stalled_s: float, head_s: float) -> type[asyncio.Protocol]:
 
 
 def _limited(app: AsgiApp, most: int) -> AsgiApp:
-    """Return an application that answers 503 while so many requests are being answered.
-
-    Connections that have asked for nothing yet do not count: anybody could open them, and keep all others out.
-    """
+    # connections that have asked for nothing yet do not count: anybody could open them, and keep all others out
     running = 0
 
     async def limited(scope: Message, receive: Receive, send: Send) -> None:
