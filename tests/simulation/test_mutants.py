@@ -27,6 +27,7 @@ from afspm.model import JournalEntries, JournalEntry
 from tests.simulation.invariants import InvariantViolated
 from tests.simulation.night import Fault, Night, Plan, plan
 
+pytestmark = pytest.mark.slow
 NIGHTS = 16
 Patch = pytest.MonkeyPatch
 

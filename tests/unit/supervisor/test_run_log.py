@@ -106,12 +106,12 @@ def test_a_terminal_that_takes_nothing_more_holds_up_nobody(tmp_path: Path, monk
 @pytest.mark.skipif(sys.platform == "win32", reason="a pipe that nobody reads stands in for a disk that hangs")
 def test_a_disk_that_hangs_holds_up_nobody_and_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("afspm.supervisor.log.SHOWN_WITHIN_S", 0.01)
-    monkeypatch.setattr("afspm.supervisor.log.DEADLINE_S", 0.05)
+    monkeypatch.setattr("afspm.supervisor.log.SLOW_S", 0.05)
     file, told = tmp_path / "log.txt", threading.Event()
     os.mkfifo(file)
     reader = os.open(file, os.O_RDONLY | os.O_NONBLOCK)
     log = RunLog(file, ExperimentClock.real(), terminal=io.StringIO())
-    log.listener = lambda name, level, text: told.set() if level == logging.CRITICAL else None
+    log.listener = lambda name, level, text: told.set() if level == logging.WARNING else None
 
     def write() -> None:
         while not told.wait(0.01):
