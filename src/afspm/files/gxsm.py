@@ -121,9 +121,15 @@ def _ns(numbers: dict[str, float], key: str) -> int | None:
 
 
 def _unit(raw: _Raw) -> tuple[str, float]:
-    """Of the values times dz, and dz; ångström is told as m."""
-    unit = raw.attributes.get("ZSrcUnit") or raw.attributes.get("unit", "")
-    return ("m" if unit in _ANGSTROM else unit), raw.numbers["dz"]
+    """Return the unit of the values times dz, and dz; ångström is given as m.
+
+    ZSrcUnit is the name of the unit in GXSM's own list, where a second millivolt is "mV1". The unit itself is var_unit
+    in Gxsm4, which has that name in `unit`, and `unit` in Gxsm3. A length is in ångström by either.
+    """
+    given = raw.attributes
+    named = given.get("ZSrcUnit", "")
+    unit = given.get("var_unit") or given.get("unit", "") or named
+    return ("m" if {unit, named} & set(_ANGSTROM) else unit), raw.numbers["dz"]
 
 
 def _channel(raw: _Raw, path: Path) -> str:

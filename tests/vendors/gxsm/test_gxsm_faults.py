@@ -166,6 +166,16 @@ def test_a_script_that_was_stopped_is_missed_until_it_runs_again(bench: Make) ->
     assert scanned(peer)
 
 
+def test_script_that_has_ended_is_run_again_from_outside(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    made.strike("script-stopped")
+    peer.until(UNDEFINED)
+    (made.data / "delete-to-run-the-script-again.txt").unlink()
+    peer.until(FREE)
+    assert scanned(peer)
+
+
 def test_a_decimal_comma_is_refused_before_anything_is_set(bench: Make) -> None:
     made = bench(decimal_comma=True)
     peer = made.start()
