@@ -318,9 +318,9 @@ class MeasurementRunner:
     def _why_failed(self, target: Target, cycle: Cycle) -> str:
         if not self._control.held:
             return f"control was lost: {self._control.why_lost}"
+        if cycle.outcome is not CycleOutcome.ANOTHER and self._results.disk_is_full:
+            return "it has no result, and the disk of the run is full"
         if cycle.outcome is CycleOutcome.INTERRUPTED:
-            if self._results.disk_is_full:
-                return "it has no result, and the disk of the run is full"
             return "it was stopped at the microscope, or its file is missing; the log of the translator says which"
         if cycle.outcome is CycleOutcome.ANOTHER:
             other = target.describe(cycle.other)

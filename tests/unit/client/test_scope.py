@@ -199,15 +199,23 @@ def test_channel_of_nothing_but_nan_is_logged(lab: Lab, scope: Scope, caplog: py
     assert "scan without any value in Phase: NaN alone" in caplog.text
 
 
-@pytest.mark.parametrize("is_full", [True, False])
+@pytest.mark.parametrize(
+    ("how", "is_full", "said"),
+    [
+        ("stop", True, "the disk of the run is full"),
+        ("stop", False, "stopped at the microscope, or its file is missing"),
+        ("restart_translator", True, "the disk of the run is full"),
+        ("restart_translator", False, "was it restarted"),
+    ],
+)
 def test_scan_without_a_result_on_a_full_disk_says_so(
-    lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_full: bool
+    lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str, is_full: bool, said: str
 ) -> None:
     monkeypatch.setattr("afspm.client.keyed_results.is_full", lambda folder: is_full)
     scope = Scope(ExperimentLink(LabPort(lab), lab.name, source=SOURCE), state_dir=tmp_path)
     for i in range(20):
-        lab.at(50.0 * (i + 1), lab.stop)
-    with pytest.raises(MeasurementFailed, match="the disk of the run is full" if is_full else "stopped at the micr"):
+        lab.at(50.0 * (i + 1), getattr(lab, how))
+    with pytest.raises(MeasurementFailed, match=said):
         scope.scan(REGION)
 
 
