@@ -371,12 +371,14 @@ def act_when_moved(draft: StateDraft) -> None:
 def forward(draft: StateDraft, job: ForwardedRequest) -> None:
     """Send a request to the translator, once it is remembered."""
     name, request = job.client, job.request
-    draft.forwarder, refused = draft.forwarder.ask(job._replace(sent_ns=draft.now_ns), draft.now_s)
+    sent_ns = draft.event_log.sent_ns(name, request, draft.now_ns)
+    draft.forwarder, refused = draft.forwarder.ask(job._replace(sent_ns=sent_ns), draft.now_s)
     if refused is not None:
         draft.idempotency = draft.idempotency.forgotten(name, request)
         event = RequestIn(job.connection, name, request, heard_s=job.heard_s)
         answers.reply(draft, event, refused.response)
         return
+    draft.event_log = draft.event_log.sending(name, request, sent_ns)
     if job.command:
         draft.limits = draft.limits.sending(name, job.outgoing, draft.now_ns, _names_meant(job))
     if not request.id:

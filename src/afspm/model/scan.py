@@ -146,6 +146,11 @@ class Scan:
 
         return int(np.isnan(self.values).all(axis=1).sum())
 
+    @property
+    def is_blank(self) -> bool:
+        """Return whether all values are NaN: nothing was measured. False where no values came."""
+        return bool(self.values.size) and self.lines_missing == self.shape[0]
+
     def undistorted(self, velocity_m_s: XY, duration_s: float, *, upwards: bool = True) -> Scan:
         """Return the scan as at the middle of its acquisition, without the drift meanwhile.
 

@@ -17,6 +17,7 @@ from afspm.clock import NS_PER_S
 from afspm.errors import FileError, InvalidValue
 from afspm.formatting import counted
 from afspm.plain_data import Plain
+from afspm.record.journal import not_a_table
 from afspm.record.run import Run, open_run
 from afspm.record.run_json import RUN_FILE
 from afspm.record.run_lock import describe_state
@@ -166,6 +167,8 @@ def _prepared(index: sqlite3.Connection) -> sqlite3.Connection:
         (version,) = index.execute("PRAGMA user_version").fetchone()
         if version not in (0, _FORMAT):
             raise ValueError("of another version")
+        if not_a_table(index):
+            raise ValueError("not made by afspm")
         index.execute("CREATE TABLE IF NOT EXISTS runs (folder TEXT PRIMARY KEY, stamp TEXT NOT NULL, about TEXT)")
         index.execute(f"PRAGMA user_version = {_FORMAT}")
     except BaseException:

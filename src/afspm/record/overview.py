@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -315,10 +316,11 @@ class Overview:
         )  # fmt: skip
 
     def _add_scan(self, taken: ScanSummary) -> None:
+        last = next(reversed(self._scans.values()), None)
+        taken = _sharing(taken, last)
         key = (taken.time_ns, taken.channel, taken.region, taken.interrupted)
         if key in self._scans:
             return
-        last = next(reversed(self._scans.values()), None)
         before = 0 if last is None else last.number
         number = before if last is not None and taken.is_of_scan(last) else before + 1
         setpoint = self.running.setpoint if self.running else None
@@ -432,6 +434,26 @@ class Overview:
 
     def _take_position(self, position: ProbePosition, time_ns: int) -> None:
         self.probe_position = position
+
+
+def _sharing(taken: ScanSummary, last: ScanSummary | None) -> ScanSummary:
+    # a page keeps up to a hundred thousand: equal parts of channels and scans are kept once
+    channel, unit = sys.intern(taken.channel), sys.intern(taken.unit)
+    if last is None:
+        return replace(taken, channel=channel, unit=unit)
+    return replace(
+        taken,
+        channel=channel,
+        unit=unit,
+        time_ns=_one(last.time_ns, taken.time_ns),
+        region=_one(last.region, taken.region),
+        shape=_one(last.shape, taken.shape),
+        filename=_one(last.filename, taken.filename),
+    )
+
+
+def _one(before: V, now: V) -> V:
+    return before if before == now else now
 
 
 def _flags(entry: JournalEntry, number: int) -> bool:

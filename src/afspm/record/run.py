@@ -359,7 +359,7 @@ class Run:
 
         if not file:
             raise FileError(f"{what} was interrupted before anything of it was seen", where=str(self.folder))
-        return read(self.folder / file)
+        return read(journal.measured_file(self.folder, file))
 
     @staticmethod
     def _decoded(message: str, payload: bytes) -> object:

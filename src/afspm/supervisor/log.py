@@ -17,6 +17,7 @@ from afspm.clock import NS_PER_S, Clock, ExperimentClock
 from afspm.formatting import day_and_time, time_of_day
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.storage.atomic import SLOW_S
+from afspm.storage.disk import SYNCER
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -170,10 +171,12 @@ class _Shown:
 def _into(path: Path) -> tuple[Show, Callable[[], None]]:
     """Raises OSError: the file can't be opened."""
     file = path.open("a", encoding="utf-8", errors="replace")
+    SYNCER.folder_soon(path.parent)
 
     def show(stamp: str, name: str, level: int, text: str) -> None:
         file.write(f"{stamp} {logging.getLevelName(level):8} {name} {text}\n")
         file.flush()
+        SYNCER.soon(file.fileno())  # a power cut leaves what was before the last moment
 
     return show, file.close
 

@@ -518,7 +518,7 @@ def test_an_operator_commands_in_manual() -> None:
     lab.translator()
     assert lab.says("console", ACTION, "start-scan") is NOT_IN_CONTROL
     lab.mode("console", ControlMode.MANUAL)
-    assert kinds(lab.ask("console", ACTION, "start-scan")) == ["Forward"]
+    assert kinds(lab.ask("console", ACTION, "start-scan")) == ["SaveState", "Forward"]
 
 
 def test_only_what_the_file_names_is_adjusted_beside_the_holder() -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from afspm.clock import ExperimentClock
+from afspm.storage import disk
 from afspm.supervisor.log import COLOURS, LineReader, RunLog, colour_of
 
 
@@ -34,6 +35,24 @@ def test_a_word_that_only_begins_like_a_level_is_text() -> None:
 
 def test_what_a_component_prints_is_information() -> None:
     assert LineReader().read("stdout", "ERROR of 3 nm") == (logging.INFO, "ERROR of 3 nm")
+
+
+def test_file_is_synced_so_that_its_lines_outlive_a_power_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: dict[int, int] = {}
+
+    def note(descriptor: int) -> None:
+        found = os.fstat(descriptor)
+        synced[found.st_ino] = found.st_size
+
+    monkeypatch.setattr(disk, "sync_data", note)
+    log = RunLog(tmp_path / "log.txt", ExperimentClock.real(), terminal=io.StringIO())
+    log.write("scheduler", logging.ERROR, "the tip is in danger")
+    log.close()
+    disk.SYNCER.now(10.0)
+    on_disk = (tmp_path / "log.txt").stat()
+    assert synced[on_disk.st_ino] == on_disk.st_size > 0
+    if sys.platform != "win32":
+        assert tmp_path.stat().st_ino in synced
 
 
 def test_the_file_has_every_line_and_the_terminal_those_of_its_level(tmp_path: Path) -> None:

@@ -113,6 +113,7 @@ class GxsmEmulator(Emulator):
 
     def run_script(self) -> str:
         """Run the script in the console, as a user does. Returns where it listens."""
+        self.take_button_away()
         before = self._console
         if before is not None:
             before.end()
@@ -145,6 +146,7 @@ class GxsmEmulator(Emulator):
         if self._console is not None and self._listens and not self._console.runs:
             self._listens = False
             self.listening("")
+            self.show_button("run-the-script-again", "the script in the console has ended", self.run_script)
         if self.faults.strikes("script-stopped", now_s):
             self.program.entries.put("script-control", 0.0)
         next_s = self.program.advance(now_s)

@@ -11,8 +11,8 @@ from afspm.exit_codes import ExitCode
 from afspm.logic.supervision.child import ChildPolicy
 from afspm.logic.supervision.liveness import LivenessPolicy
 from afspm.logic.supervision.restart import RestartPolicy
-from afspm.logic.supervision.run_end import KILL_AFTER_S, OWN_PACE_S, EndReason
-from afspm.logic.supervision.supervised_child import ChildSpec
+from afspm.logic.supervision.run_end import KILL_AFTER_S, OWN_PACE_S, TIP_S, EndReason
+from afspm.logic.supervision.supervised_child import CLOSES_WITHIN_S, ChildSpec
 from afspm.logic.supervision.supervisor_core import SCHEDULER_ANSWERS_WITHIN_S, SupervisorCore
 from afspm.logic.supervision.supervisor_events import (
     ActivitySeen,
@@ -259,3 +259,49 @@ def test_the_recorder_leaves_after_the_other_components_and_before_the_scheduler
     assert run.step(TimePassed()) == [(CLOSE, "recorder")]
     run.exits("recorder", ExitCode.ENDED)
     assert run.step(TimePassed()) == [(CLOSE, "scheduler")]
+
+
+def killed_after_s(run: Run, processor_share: float, *, works: bool | None = True) -> float:
+    """Return how long after it was asked to end `series` is killed, which gets a share of a processor."""
+    run.step(EndSignal(signal.SIGINT))
+    assert run.step(TimePassed()) == [(CLOSE, "series")]
+    asked_s = run.now_s
+    while run.now_s < asked_s + 60.0:
+        assert run.core.overdue(run.now_s)[0] == {"series": run.pids["series"]}
+        run.step(ActivitySeen("series", works, 7.0 + processor_share * (run.now_s - asked_s)))
+        if run.step(TimePassed(), 0.1):
+            return run.now_s - asked_s
+    raise AssertionError("it is never killed")
+
+
+def test_process_that_works_on_its_end_has_longer_on_a_busy_computer_but_not_for_ever() -> None:
+    assert killed_after_s(_only_series(), 0.0, works=False) == pytest.approx(KILL_AFTER_S, abs=0.2)
+    assert killed_after_s(_only_series(), 0.0, works=None) == pytest.approx(KILL_AFTER_S, abs=0.2)
+    slow = killed_after_s(_only_series(), CLOSES_WITHIN_S / 8.0)
+    assert slow == pytest.approx(8.0 + KILL_AFTER_S, abs=0.3)
+    assert killed_after_s(_only_series(), CLOSES_WITHIN_S / 60.0) == pytest.approx(TIP_S, abs=0.3)
+
+
+def test_process_that_goes_round_for_ever_is_killed_soon_where_the_computer_is_idle() -> None:
+    assert killed_after_s(_only_series(), 1.0) <= CLOSES_WITHIN_S + KILL_AFTER_S + 0.2
+
+
+def _only_series() -> Run:
+    run = Run(ChildSpec("series"))
+    run.beat("series")
+    return run
+
+
+def test_component_that_is_started_again_at_the_end_has_time_on_a_busy_computer() -> None:
+    """Four seconds before the end it was killed: it starts slowly, then draws the night."""
+    run = Run()
+    run.beat()
+    run.exits("series", -9)
+    run.step(TimePassed(), 4.0)
+    run.exits("scope", ExitCode.ENDED)
+    for _ in range(200):
+        run.step(ActivitySeen("series", True))
+        assert (CLOSE, "series") not in run.step(TimePassed(), 0.1)
+    assert run.core.overdue(run.now_s)[0]["series"] == run.pids["series"]
+    run.beat("series", "scheduler")
+    assert (CLOSE, "series") not in run.step(TimePassed(), 1.0), "it has yet to hear what it missed"
