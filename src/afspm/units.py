@@ -94,9 +94,11 @@ class Unit:
 
     Attributes:
         si: the SI unit that the component gets, e.g. "m".
+        is_written: whether the file has to write a unit, where a plain number could mean several (seconds, minutes).
     """
 
     si: str
+    is_written: bool = False
 
     def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> object:
         """Makes pydantic read the text too. Called by it alone, so that we need not load it here."""
@@ -113,6 +115,8 @@ class Unit:
         if isinstance(value, bool) or not isinstance(value, str | float | int):
             raise UnitError(f"{value!r} is not a quantity", hint=_hint(self.si))
         number = si(value, self.si)
+        if self.is_written and number and (not isinstance(value, str) or not parse_quantity(value)[1]):
+            raise UnitError(f"{value} has no unit", hint=_hint(self.si))
         if not math.isfinite(number):
             raise UnitError(f"{value!r} is not a finite number")
         return number
@@ -120,6 +124,8 @@ class Unit:
 
 Length = Annotated[float, Unit("m")]
 Duration = Annotated[float, Unit("s")]
+Period = Annotated[float, Unit("s", is_written=True)]
+"""A duration on which a night depends: 10 may mean seconds or minutes, so the file names the unit."""
 Angle = Annotated[float, Unit("rad")]
 Voltage = Annotated[float, Unit("V")]
 Current = Annotated[float, Unit("A")]

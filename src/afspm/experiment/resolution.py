@@ -26,6 +26,7 @@ from afspm.experiment.class_loader import ComponentDeclaration
 from afspm.experiment.document import Document
 from afspm.experiment.findings import nearest
 from afspm.experiment.parts import EMULATED, SIMULATED, ExperimentPart, ExperimentParts
+from afspm.experiment.planned_measurements import PlannedMeasurements
 from afspm.experiment.sections import ExperimentSections, read_sections
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.wiring import BoundSocket, Wiring, WiringKeys
@@ -96,6 +97,7 @@ class ResolvedExperiment:
     Attributes:
         processes: by name, in the order of the file.
         listening: where components listen by settings of their own, beside the wiring.
+        plans: by component, as far as they are fixed before it runs.
     """
 
     parts: ExperimentParts
@@ -108,6 +110,7 @@ class ResolvedExperiment:
     listening: list[BoundSocket] = field(default_factory=list)
     limits: ExperimentLimits = field(default_factory=ExperimentLimits)
     caching: CacheSettings = field(default_factory=CacheSettings)
+    plans: dict[str, PlannedMeasurements] = field(default_factory=dict)
 
     @property
     def problems(self) -> ProblemNames:
@@ -259,6 +262,11 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
             _look_inside(process, process.component, resolved)
         else:
             _resolve_plan(process, process.component, resolved)
+    speeds = [plan.scan_speed_m_s for plan in resolved.plans.values()]
+    usual_m_s = next((speed for speed in speeds if speed is not None), None)
+    for name, plan in resolved.plans.items():
+        if what := planned_measurements.too_slow(plan, usual_m_s):
+            resolved.warning(f"[{name}] {what}", name, "every", hint="rounds that come too late are left out")
 
 
 def _look_inside(process: ResolvedProcess, component: type, resolved: ResolvedExperiment) -> None:
@@ -307,8 +315,10 @@ def _resolve_plan(process: ResolvedProcess, component: type, resolved: ResolvedE
     process.declared = replace(
         process.declared, needs_actions=plan.needs_actions, needs_parameters=plan.needs_parameters
     )
-    for reason in planned_measurements.refusals(name, plan, resolved.limits):
-        resolved.document.error(f"[{name}] plans what its limits refuse: {reason}", name)
+    resolved.plans[name] = plan
+    for refusal in planned_measurements.refusals(name, plan, resolved.limits):
+        what = f"[{name}] plans what its limits refuse: {refusal.reason}"
+        resolved.document.error(what, name, *refusal.where, hint=refusal.hint)
 
 
 def _written_role(part: ExperimentPart, resolved: ResolvedExperiment) -> Role:

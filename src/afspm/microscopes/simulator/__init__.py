@@ -154,6 +154,8 @@ class Simulator(Driver):
         self._faults_settings = _made(Fault, faults or [], "faults", errors)
         self._panel = _made(PanelEvent, panel or [], "panel", errors)
         self._fault_action, self._approach_s = fault_action, approach_s
+        self.initial: Mapping[str, Value] = {}
+        self.scan_speed_m_s: float | None = None
         loop = _loop_of(self._world_settings)
         with errors:
             super().__init__(
@@ -180,6 +182,9 @@ class Simulator(Driver):
         at_first = {name: value for name, value in {**_AT_FIRST, **in_force}.items() if name in self.table}
         with errors:
             self._initial = self.table.written({**at_first, **initial}, where="initial")
+            self.initial = {name: self._initial[name] for name in initial}
+            speed = self._initial.get(names.SCAN_SPEED)
+            self.scan_speed_m_s = speed if isinstance(speed, float) else None
         for i, event in enumerate(self._panel):
             with errors:
                 self.table.written(event.set or {}, where=f"panel[{i}].set")
