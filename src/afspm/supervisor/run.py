@@ -124,7 +124,8 @@ def go(
         handed = key_handout.hand_over(experiment, starts)
         reporter = reporter_of(experiment, starts, clock, common.run, handed.supervisor)
         tasks = [from_start(start) for start in handed.starts]
-        supervisor = Supervisor(tasks, log, clock, experiment.policy(), reporter)
+        ends_idle = experiment.ends_idle([task.name for task in tasks])
+        supervisor = Supervisor(tasks, log, clock, experiment.policy(), reporter, ends_idle=ends_idle)
         with handed.laid_down(folder):
             outcome = supervisor.run()
         try:
