@@ -220,6 +220,12 @@ class Overview:
         return tuple(self._drift.values())
 
     @property
+    def ended_ns(self) -> int | None:
+        """When the experiment ended; None: it goes on, was stopped, or was cut off."""
+        entries = reversed(self.entries)
+        return next((one.time_ns for one in entries if one.event is ControlEvent.EXPERIMENT_ENDED), None)
+
+    @property
     def note_spans(self) -> list[Span]:
         """The notes as spans without length, for time lines."""
         spans = [Span(note.text, note.time_ns, note.time_ns, note.who) for note in self.notes]

@@ -63,7 +63,7 @@ REPORT_PERIOD_S = 0.1
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """The outcome of a run."""
+    """The outcome of a run; `duration_s` in real time, up to its end, without what components finish then."""
 
     why: EndReason
     text: str
@@ -142,7 +142,7 @@ class Supervisor:
             self._reaper.close()
         ending = self._core.ending
         assert ending is not None
-        return RunOutcome(ending.why, ending.text, self._core.reports(), self._clock.monotonic_s() - began_s)
+        return RunOutcome(ending.why, ending.text, self._core.reports(), ending.began_s - began_s)
 
     def stop(self) -> None:
         """End the run as Ctrl-C does. From any thread; a second call kills at once."""

@@ -78,6 +78,7 @@ class RunEnd:
         last: what has been done already.
         in_haste: somebody wants it to be over now.
         busy_s: when somebody was last seen to be busy after being asked.
+        began_s: when it began to end.
     """
 
     why: EndReason
@@ -88,14 +89,15 @@ class RunEnd:
     last: EndStep | None = None
     in_haste: bool = False
     busy_s: float = -math.inf
+    began_s: float = 0.0
 
     @classmethod
     def begin(cls, why: EndReason, text: str, now_s: float) -> RunEnd:
         """Begin to end. Where the experiment itself ended, all know and close by themselves: not disturbed at first."""
         if not why.is_announced:
-            return cls(why, text, ask_s=now_s, kill_s=now_s + KILL_AFTER_S, latest_s=now_s)
+            return cls(why, text, ask_s=now_s, kill_s=now_s + KILL_AFTER_S, latest_s=now_s, began_s=now_s)
         ask_s = now_s + OWN_PACE_S
-        return cls(why, text, ask_s, ask_s + KILL_AFTER_S, latest_s=now_s + FAREWELL_S)
+        return cls(why, text, ask_s, ask_s + KILL_AFTER_S, latest_s=now_s + FAREWELL_S, began_s=now_s)
 
     def hurried(self, now_s: float) -> RunEnd:
         """Return the end in haste: those not asked yet are, those that were are killed."""

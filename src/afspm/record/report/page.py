@@ -70,8 +70,8 @@ def _what(story: RunStory) -> str:
 
 def _when(story: RunStory, clock: PageTimes) -> str:
     told = f"{clock.period()}, {duration_text(story.lasted_ns / NS_PER_S)}"
-    if story.speed != 1.0:
-        told += f" ({duration_text(story.lasted_ns / NS_PER_S / story.speed)} real)"
+    if story.speed != 1.0 and story.real_s is not None:
+        told += f" ({duration_text(story.real_s)} real)"
     end = story.end
     ended = story.ended
     if end is not None:
