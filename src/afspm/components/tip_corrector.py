@@ -13,8 +13,9 @@ from afspm.components.planned_scans import pair
 from afspm.components.tip_judge import Opinion, TipJudge
 from afspm.components.tip_treatments import treatments
 from afspm.components.tip_verdict import read_verdict
-from afspm.components.tip_workshop import DONE_ACTION, TipWorkshop, nm
+from afspm.components.tip_workshop import DONE_ACTION, TipWorkshop
 from afspm.errors import AfspmError, ConfigError, ControlLost, FileError, NoResponse, Refused
+from afspm.formatting import position_text
 from afspm.model import Problem, Region, Scan, ScanSet, names
 from afspm.units import Duration, Length, Speed, Voltage
 
@@ -186,7 +187,7 @@ class TipCorrector(Component):
             try:
                 scans = self.scope.scan(place, shape=shape)
             except (Refused, NoResponse) as error:
-                self.log.warning("no test scan at %s: %s", nm(place.center_m), error.what)
+                self.log.warning("no test scan at %s: %s", position_text(place.center_m), error.what)
                 refused.append(error.what)
                 if len(refused) == len(looks):
                     raise _Blind(f"no test scan can be taken: {error.what}") from error
