@@ -41,6 +41,7 @@ def test_a_run_whose_series_is_done_ends_as_if_it_had_been_ended(run: Run, tmp_p
     one: AfspmRun = run("--without", "witness", more=DRAWN + NOTIFY.format(file=str(calls)), scans=2)
     assert one.end() == 3, one.output
     assert one.facts()["how"] == "plans_done"
+    assert 10.0 < one.facts()["real_s"] < 300.0
     assert "nothing was left to run: series is done" in one.output
     assert (one.folder / "night.png").exists(), "components finish what they have to"
     assert notified(calls) == ["end"]

@@ -38,11 +38,14 @@ class IdleWatch:
     def look(self, children: Collection[SupervisedChild], now_s: float, liveness: LivenessPolicy) -> bool:
         """Return whether nothing that acts has been left for a while."""
         acting = [child for child in children if child.spec.acts]
-        is_idle = bool(acting) and all(child.is_over for child in acting)
         starts_before, self.starts = self.starts, sum(child.starts for child in children)
-        is_changed = self.starts != starts_before
-        if not is_idle or is_changed or any(_is_at_work(child, now_s, liveness) for child in children):
+        if not acting or not all(child.is_over for child in acting):
             self.since_s, self.is_logged, self.is_postponed, self.is_ending = None, False, False, False
+            return False
+        if self.is_ending:  # components are at work on what they finish
+            return True
+        if self.starts != starts_before or any(_is_at_work(child, now_s, liveness) for child in children):
+            self.since_s = None
             return False
         if self.since_s is None:
             self.since_s = now_s
@@ -57,11 +60,9 @@ class IdleWatch:
 
     def deadline_s(self) -> float | None:
         """Return when to look again; None: no time by itself."""
-        if self.since_s is None:
+        if self.since_s is None or self.is_ending or (self.is_logged and not self.ends):
             return None
-        if not self.is_logged:
-            return self.since_s + IDLE_AFTER_S
-        return self.asked_s + ASK_AGAIN_S if self.ends and not self.is_ending else None
+        return max(self.since_s + IDLE_AFTER_S, self.asked_s + ASK_AGAIN_S)
 
 
 def describe_idle(children: Collection[SupervisedChild]) -> str:

@@ -294,6 +294,8 @@ def test_a_run_whose_plans_are_done_ends_once_the_microscope_is_not_in_use() -> 
     assert set(run.others) == {AskUse()}
     run.step(UseReported(""))
     assert run.others[-1] == EndExperiment()
+    run.step(Beaten("classifier", Beat(step_age_s=0.5)))  # it finishes something
+    run.step(TimePassed(), 0.5)
     run.exits("classifier", ExitCode.ENDED)
     assert run.core.ending is not None
     assert run.core.ending.why is EndReason.PLANS_DONE
