@@ -16,7 +16,8 @@ from afspm.components.scan_plan import XY, PlanStep, RoundSchedule, ScanPlan, gr
 from afspm.errors import ConfigError, InvalidValue, RequestError, UnitError
 from afspm.formatting import day_and_time
 from afspm.model import Region, names
-from afspm.units import Angle, Length, Period
+from afspm.model.names import BASE_PARAMETERS
+from afspm.units import Angle, Length, Period, convert
 
 Pixels = tuple[int, int]
 FRAME = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
@@ -288,7 +289,9 @@ def checked_parameters(given: Mapping[str, str | float] | None, where: str) -> d
     parameters = dict(given or {})
     for name, quantity in parameters.items():
         try:
-            to_parameter(name, quantity, None)
+            parameter = to_parameter(name, quantity, None)
+            if parameter.unit and (si_unit := BASE_PARAMETERS.get(name)):
+                convert(1.0, parameter.unit, si_unit)
         except (InvalidValue, UnitError) as error:
             raise ConfigError(error.what, where=f"{where}.{name}", hint=error.hint) from error
     return parameters

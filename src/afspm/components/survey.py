@@ -101,6 +101,9 @@ class Survey(Component):
                     raise ConfigError("is of particles, and says nothing of `targets`", where=name)
         if count < 1:
             raise ConfigError(f"{count} targets are none", where="count")
+        for name, value in {"min_height": min_height, "separation": separation}.items():
+            if value is not None and value < 0.0:
+                raise ConfigError(f"{lengths_text([value])} is below zero", where=name)
         separation_m = half_m if separation is None else separation
         self.finder = TargetFinder(targets, count, min_height, separation_m, min(self._wide.region.size_m), refine)
         self._record: SurveyRecord | None = None

@@ -83,6 +83,8 @@ class TipCorrector(Component):
     ) -> None:
         self.workshop_center = pair(workshop_center)
         self.test_center = None if test_center is None else pair(test_center)
+        # `afspm check` holds them against the limits
+        self.positions = tuple(place for place in (self.workshop_center, self.test_center) if place is not None)
         self.allowed = treatments(pulse_voltages, pulse_duration, crash_depths, crash_speed)
         pulses = (names.PULSE,) if pulse_voltages else ()
         crashes = (names.CRASH,) if crash_depths else ()

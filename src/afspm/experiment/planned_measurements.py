@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from afspm.client.parameter_values import to_parameter
@@ -32,6 +32,7 @@ class PlannedMeasurements:
         parameters: values to set, by the setting that gives them: {"zoom_parameters": (Parameter("scan-speed", …),)}.
         period_s: from the beginning of one round to that of the next; 0: no pause.
         scan_speed_m_s: of a microscope that knows the speed of its first scan.
+        is_listed: whether the file lists the regions, each with a place of its own.
     """
 
     regions: tuple[Region, ...] = ()
@@ -42,6 +43,18 @@ class PlannedMeasurements:
     parameters: Mapping[str, tuple[Parameter, ...]] = field(default_factory=dict)
     period_s: float = 0.0
     scan_speed_m_s: float | None = None
+    is_listed: bool = False
+
+    def frame(self) -> Iterator[Parameter]:
+        """Yield the parameters that its scans set: sizes, places and pixels."""
+        for region in self.regions:
+            sides = zip((names.SCAN_SIZE_X, names.SCAN_SIZE_Y), region.size_m, strict=True)
+            corner = zip((names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y), region.top_left_m, strict=True)
+            yield from (Parameter(name, repr(float(value_m)), "m") for name, value_m in (*sides, *corner))
+        if self.shape is not None:
+            rows, columns = self.shape
+            yield Parameter(names.SCAN_RESOLUTION_X, str(columns))
+            yield Parameter(names.SCAN_RESOLUTION_Y, str(rows))
 
 
 @dataclass(frozen=True)
@@ -81,6 +94,7 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
         {name: _as_parameters(values) for name, values in given.items() if isinstance(values, Mapping)},
         getattr(made, "beat_s", 0.0),
         getattr(made, "scan_speed_m_s", None),
+        isinstance(settings.get("regions"), list),
     )
 
 
@@ -99,10 +113,10 @@ def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) 
     guard = LimitChecker(_without_changes(limits))
     found: dict[str, Refusal] = {}
 
-    def check(kind: ControlRequest, subject: object, where: tuple[str | int, ...] = ()) -> None:
+    def check(kind: ControlRequest, subject: object, where: tuple[str | int, ...] = (), hint: str = "") -> None:
         refused = guard.check(name, Request(kind, subject, b""), 0)
         if refused is not None:
-            found.setdefault(refused.reason, Refusal(refused.reason, where))
+            found.setdefault(refused.reason, Refusal(refused.reason, where, hint))
 
     for setting, parameters in planned.parameters.items():
         if setting == "initial":  # by the microscope, whoever may set it later; a frame comes in parts
@@ -110,12 +124,16 @@ def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) 
         for parameter in parameters:
             check(ControlRequest.PARAM, parameter, (setting, parameter.name))
     guard = LimitChecker(_without_changes(limits))
-    for region in planned.regions:
-        check(ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, planned.shape))
-    for xy in planned.positions:
-        check(ControlRequest.SET_PROBE_POS, ProbePosition(xy))
     cure = _cure(planned, limits.region)
-    return [replace(one, hint=cure) if not one.where else one for one in found.values()]
+    for number, region in enumerate(planned.regions):
+        wanted, where = ScanParameters(region, planned.shape), ("regions", number)
+        if planned.is_listed:
+            check(ControlRequest.SET_SCAN_PARAMS, wanted, where, _nearest_text(region, limits.region))
+        elif not found:  # of a grid outside, one reason is enough
+            check(ControlRequest.SET_SCAN_PARAMS, wanted, hint=cure)
+    for xy in planned.positions:
+        check(ControlRequest.SET_PROBE_POS, ProbePosition(xy), hint=cure)
+    return list(found.values())
 
 
 def _cure(planned: PlannedMeasurements, allowed: Region | None) -> str:
@@ -124,11 +142,7 @@ def _cure(planned: PlannedMeasurements, allowed: Region | None) -> str:
     if allowed is None or not points:
         return ""
     if len(planned.regions) == 1 and not planned.positions:
-        nearest = nearest_region(planned.regions[0], allowed)
-        center, size = (
-            f'["{lengths_text([x])}", "{lengths_text([y])}"]' for x, y in (nearest.center_m, nearest.size_m)
-        )
-        return f"the nearest that fits: center = {center}, size = {size}"
+        return _nearest_text(planned.regions[0], allowed)
     shift = _shift_m(points, allowed, 0.0)
     if shift is None:
         return f"all of it is larger than the region allowed, {lengths_text(allowed.size_m, ' x ')}"
@@ -136,6 +150,16 @@ def _cure(planned: PlannedMeasurements, allowed: Region | None) -> str:
     return f"moved by ({x}, {y}) all of it fits"
 
 
+def _nearest_text(region: Region, allowed: Region | None) -> str:
+    if allowed is None:
+        return ""
+    nearest = nearest_region(region, allowed)
+    places = (nearest.center_m, nearest.size_m)
+    center, size = (f'["{lengths_text([x])}", "{lengths_text([y])}"]' for x, y in places)
+    return f"the nearest that fits: center = {center}, size = {size}"
+
+
+_REACH = 1e-9  # as of the limits: what lies on the border, to the precision of the arithmetic, is inside
 _MARGIN = 1e-3
 """Relative: by so much a cure stays within the region where its rounded numbers would not."""
 
@@ -143,17 +167,17 @@ _MARGIN = 1e-3
 def nearest_region(region: Region, allowed: Region) -> Region:
     """Return the region of the same angle, in round numbers, nearest to one that fits; smaller if need be."""
     exact = _rounded(_nearest(region, allowed, 0.0))
-    if all(allowed.contains(corner) for corner in exact.corners_m()):
+    reach = replace(allowed, size_m=(allowed.size_m[0] * (1 + _REACH), allowed.size_m[1] * (1 + _REACH)))
+    if all(reach.contains(corner) for corner in exact.corners_m()):
         return exact
     return _rounded(_nearest(region, allowed, _MARGIN))
 
 
 def _rounded(region: Region) -> Region:
-    """Return a region in the digits of `lengths_text`."""
-    (x, y), (width, height) = region.center_m, region.size_m
-    return replace(
-        region, center_m=(float(f"{x:.5g}"), float(f"{y:.5g}")), size_m=(float(f"{width:.5g}"), float(f"{height:.5g}"))
-    )
+    """Return a region in the digits of `lengths_text`; a centre that is zero but for the arithmetic is zero."""
+    width, height = (float(f"{size_m:.5g}") for size_m in region.size_m)
+    x, y = (float(f"{place_m:.5g}") if abs(place_m) > 1e-6 * width else 0.0 for place_m in region.center_m)
+    return replace(region, center_m=(x, y), size_m=(width, height))
 
 
 def _nearest(region: Region, allowed: Region, margin: float) -> Region:

@@ -31,7 +31,7 @@ from afspm.experiment.sections import ExperimentSections, read_sections
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.wiring import BoundSocket, Wiring, WiringKeys
 from afspm.logic.limits import ExperimentLimits
-from afspm.model import ProblemNames, Role
+from afspm.model import Parameter, ProblemNames, Role
 
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 FROM_SECTIONS = ("control", "limits", "cache")
@@ -261,7 +261,7 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
         if process.wrong is not None:
             _look_inside(process, process.component, resolved)
         else:
-            _resolve_plan(process, process.component, resolved)
+            _resolve_plan(process, process.component, resolved, has)
     speeds = [plan.scan_speed_m_s for plan in resolved.plans.values()]
     usual_m_s = next((speed for speed in speeds if speed is not None), None)
     for name, plan in resolved.plans.items():
@@ -298,7 +298,9 @@ def _inside(error: AfspmError) -> tuple[str | int, ...]:
     return tuple(int(index) if index else key for key, index in _STEP.findall(where))
 
 
-def _resolve_plan(process: ResolvedProcess, component: type, resolved: ResolvedExperiment) -> None:
+def _resolve_plan(
+    process: ResolvedProcess, component: type, resolved: ResolvedExperiment, has: MicroscopeCapabilities | None
+) -> None:
     """Make a ready-made component once: it knows best whether its settings fit together."""
     name = process.name
     try:
@@ -319,6 +321,13 @@ def _resolve_plan(process: ResolvedProcess, component: type, resolved: ResolvedE
     for refusal in planned_measurements.refusals(name, plan, resolved.limits):
         what = f"[{name}] plans what its limits refuse: {refusal.reason}"
         resolved.document.error(what, name, *refusal.where, hint=refusal.hint)
+    if has is None:
+        return
+    wanted: list[tuple[tuple[str, ...], Parameter]] = [((name,), one) for one in plan.frame()]
+    wanted += [((name, key, one.name), one) for key, given in plan.parameters.items() for one in given]
+    for path, parameter in wanted:
+        if reason := has.refuses(parameter):
+            resolved.document.error(f"[{name}] plans what its microscope refuses: {reason}", *path)
 
 
 def _written_role(part: ExperimentPart, resolved: ResolvedExperiment) -> Role:

@@ -26,14 +26,17 @@ REGION = '[limits]\nregion = { x = ["-2 um", "2 um"], y = ["-2 um", "2 um"] }\n'
 @pytest.mark.parametrize(
     ("plan", "setting", "what", "hint"),
     [
-        (SERIES + SIZE, 'every = "-10 min"', "[series] every: a period of -600 s", 'above zero, for example "15 min"'),
-        (GRID, 'every = "-1 s"', "[grid] every: a period of -1 s", "above zero"),
-        (LIST, 'every = "-1 s"', "[list] every: a period of -1 s", "above zero"),
+        (SERIES + SIZE, 'every = "-10 min"', "[series] every = '-10 min': '-10 min' is below 0 s", "a time"),
+        (GRID, 'every = "-1 s"', "[grid] every = '-1 s': '-1 s' is below 0 s", "a time"),
+        (LIST, 'every = "-1 s"', "[list] every = '-1 s': '-1 s' is below 0 s", "a time"),
         (SERIES + SIZE, "every = 10", "[series] every = 10: 10 has no unit", 'a time, for example "15 min"'),
         (SERIES + SIZE + 'every = "1 min"\n', "duration = 8", "duration = 8: 8 has no unit", "a time, for example"),
         (SERIES + SIZE, 'every = "10"', "every = '10': 10 has no unit", "a time, for example"),
         (SERIES + SIZE, 'end_when_done = "yes"', "end_when_done is true or false, not 'yes'", ""),
         (SERIES + SIZE, "keep_control = 1", "keep_control is true or false, not 1", ""),
+        (SERIES + SIZE, 'parameters = { scan-speed = "2 um" }', "um can't be converted to m/s", "give it in m/s"),
+        (GRID, 'spacing = ["0 nm", "1 um"]', "[grid] 3 points of a grid lie 0 m apart", "spacing is above zero"),
+        (SURVEY + 'zoom = "1 um"\n', 'min_height = "-1 nm"', "[survey] min_height: -1 nm is below zero", ""),
         (SERIES + SIZE, "pixels = [0, 128]", "[series] pixels: [0, 128] is no number of pixels", "columns and rows"),
         (LIST, "pixels = [128, -1]", "[list] pixels: [128, -1] is no number of pixels", "columns and rows"),
         (SURVEY + 'zoom = "1 um"\n', "zoom_pixels = [128, 0]", "[survey] zoom_pixels: [128, 0]", "columns and rows"),
@@ -53,7 +56,8 @@ def test_a_plan_that_can_not_be_is_an_error_at_its_line(
     error = only_error(experiment)
     assert what in error.what
     assert hint in error.hint
-    assert error.place.line == line_of(experiment, setting.split(" ")[0])
+    of_all = "apart" in what  # of spacing and counts together
+    assert error.place.line == line_of(experiment, "[grid]" if of_all else setting.split(" ")[0])
 
 
 @pytest.mark.parametrize("setting", ["every = 0", 'every = "0 s"', 'every = "15 min"', "end_when_done = false"])
@@ -79,6 +83,36 @@ def test_parameters_of_a_plan_are_held_against_the_limits(write: Write, plan: st
     assert "plans what its limits refuse: scan-speed" in error.what
     assert "above the highest allowed" in error.what
     assert error.place.line == line_of(experiment, setting.split(" ")[0])
+
+
+@pytest.mark.parametrize(
+    ("plan", "what", "line"),
+    [
+        (SERIES + SIZE + 'parameters = { scan-speed = "0 um/s" }\n', "scan-speed: 0 µm/s is outside", "parameters"),
+        (SERIES + 'size = ["200 um", "1 um"]\n', "scan-size-x: 200000 nm is outside", "[series]"),
+        (SERIES + SIZE + "pixels = [8000, 64]\n", "scan-resolution-x: 8000 px is outside", "[series]"),
+    ],
+)
+def test_a_plan_is_held_against_what_the_microscope_takes(write: Write, plan: str, what: str, line: str) -> None:
+    experiment = write(plan, frame=SIMULATED)
+    found = errors(experiment)
+    assert any("plans what its microscope refuses" in error.what and what in error.what for error in found)
+    assert {error.place.line for error in found} == {line_of(experiment, line)}
+    assert errors(write(plan)) == [], "of a command nothing is known"
+
+
+@pytest.mark.parametrize("setting", ['poll_period_s = "0 s"', 'poll_period_s = "-1 s"', 'approach_s = "-1 s"'])
+def test_a_duration_of_the_microscope_is_not_below_zero(write: Write, setting: str) -> None:
+    experiment = write("", frame=SIMULATED + setting + "\n")
+    error = only_error(experiment)
+    assert error.place.line == line_of(experiment, setting.split(" ")[0])
+
+
+def test_a_tip_is_treated_within_the_limits(write: Write) -> None:
+    corrector = '[repair]\ncomponent = true\nclass = "TipCorrector"\nworkshop_center = ["3 um", "0 um"]\n'
+    error = only_error(write(corrector + REGION, frame=SIMULATED))
+    assert "[repair] plans what its limits refuse: the probe position" in error.what
+    assert error.hint == "moved by (-1 µm, 0 nm) all of it fits"
 
 
 def test_values_of_the_start_are_held_against_the_limits(write: Write) -> None:
@@ -143,6 +177,17 @@ def test_the_cure_of_a_grid_outside_is_how_far_it_moves(write: Write) -> None:
 
 
 ALLOWED = st.floats(1e-6, 1e-5)
+
+
+def test_each_region_of_a_list_has_a_line_and_a_cure(write: Write) -> None:
+    places = '{ center = [0, 0], size = ["1 um", "1 um"] },\n{ center = ["9 um", 0], size = ["1 um", "1 um"] }'
+    listed = f'[list]\ncomponent = true\nclass = "ScanList"\nregions = [\n{places}]\n'
+    experiment = write(listed + REGION, frame=SIMULATED)
+    error = only_error(experiment)
+    assert error.hint == 'the nearest that fits: center = ["1.5 µm", "0 nm"], size = ["1 µm", "1 µm"]'
+    assert error.place.line == line_of(experiment, '{ center = ["9 um"')
+
+
 LENGTHS = st.floats(1e-8, 1e-5)
 PLACES = st.floats(-1e-5, 1e-5)
 ANGLES = st.floats(-math.pi, math.pi)
@@ -155,7 +200,8 @@ def test_the_nearest_region_lies_within_the_region_allowed(
     wanted = Region((x, y), (width, height), angle)
     allowed = Region((1e-6, -2e-6), (across, up), turned)
     nearest = nearest_region(wanted, allowed)
-    assert all(allowed.contains((float(x), float(y))) for x, y in nearest.corners_m())
+    reach = Region(allowed.center_m, (across * (1 + 1e-9), up * (1 + 1e-9)), turned)  # as the limits have it
+    assert all(reach.contains((float(x), float(y))) for x, y in nearest.corners_m())
     assert nearest.size_m[0] / nearest.size_m[1] == pytest.approx(width / height, rel=1e-4)
     if all(allowed.contains((float(x), float(y))) for x, y in wanted.corners_m()):
         assert nearest.center_m == pytest.approx(wanted.center_m, abs=1e-3 * max(across, up))

@@ -25,7 +25,7 @@ from afspm.simulation.settings import build
 from afspm.simulation.world import read_settings
 from afspm.translator.driver import Action, Driver, action
 from afspm.translator.parameters import FEEDBACK_ON, Value
-from afspm.units import Duration
+from afspm.units import Duration, PollPeriod
 
 if TYPE_CHECKING:
     from afspm.process.context import ProcessContext
@@ -130,7 +130,7 @@ class Simulator(Driver):
         panel: list[Table] | None = None,
         parameters: Rows | None = None,
         actions: Rows | None = None,
-        poll_period_s: Duration = 0.25,
+        poll_period_s: PollPeriod = 0.25,
         result_timeout_s: Duration = 10.0,
         live_lines_s: Duration | None = None,
     ) -> None:
