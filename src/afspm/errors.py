@@ -45,12 +45,12 @@ class Interrupted(KeyboardInterrupt):
         return rendered(self, "nothing is left half done")
 
 
-def rendered(error: BaseException, said: str) -> list[str]:
+def rendered(error: BaseException, text: str) -> list[str]:
     """Return an error and the caller's own lines, without those of afspm and of libraries."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [one for one in frames if not one.filename.startswith(_PACKAGE) and _LIBRARIES not in one.filename]
     own = [one for one in own if one.line]
-    return [f"\x1b[31m{type(error).__name__}\x1b[0m: {said}", *map(_place, own)]
+    return [f"\x1b[31m{type(error).__name__}\x1b[0m: {text}", *map(_place, own)]
 
 
 def _place(frame: traceback.FrameSummary) -> str:

@@ -174,7 +174,7 @@ def unheard(watch: Watch, overview: Overview) -> dict[str, int]:
 
 
 def processes_of(watch: Watch, overview: Overview) -> Iterator[ProcessState]:
-    """Yield the processes; of a run that is over, none is alive, whatever was the last that it could report."""
+    """Yield the processes; in a run that is over none is alive, though the last report may say so."""
     for state in overview.processes.values():
         if not watch.is_over or state.condition in OVER:
             yield state

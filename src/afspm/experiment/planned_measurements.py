@@ -30,7 +30,7 @@ class PlannedMeasurements:
 
     Attributes:
         parameters: values to set, by the setting that gives them: {"zoom_parameters": (Parameter("scan-speed", …),)}.
-        period_s: from the beginning of one round to that of the next; 0: no pause.
+        period_s: between the beginnings of two rounds; 0: no pause.
         scan_speed_m_s: of a microscope that knows the speed of its first scan.
         is_listed: whether the file lists the regions, each with a place of its own.
     """
@@ -119,7 +119,7 @@ def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) 
             found.setdefault(refused.reason, Refusal(refused.reason, where, hint))
 
     for setting, parameters in planned.parameters.items():
-        if setting == "initial":  # by the microscope, whoever may set it later; a frame comes in parts
+        if setting == "initial":  # set by the microscope itself; a frame comes in parts
             guard = LimitChecker(replace(_for_all(_without_changes(limits)), region=None))
         for parameter in parameters:
             check(ControlRequest.PARAM, parameter, (setting, parameter.name))

@@ -77,7 +77,7 @@ def chosen_names(resolved: ResolvedExperiment, only: Collection[str], without: C
 def ends_idle(resolved: ResolvedExperiment, names: Collection[str]) -> bool:
     """Return whether a run of these processes ends when nothing that acts is left.
 
-    Only where all that act, and the scheduler, are started here: of others nobody here knows whether they go on.
+    Only where all that act, and the scheduler, are started here: plans on other computers may go on.
     """
     acting = {name for name, process in resolved.processes.items() if process.role is Role.COMPONENT and process.acts}
     schedulers = {scheduler.name for scheduler in resolved.with_role(Role.SCHEDULER)}

@@ -60,7 +60,7 @@ class ControlSection(Section):
     malfunction_after: Annotated[Duration, Field(ge=0)] = 5.0
     """Real seconds that the microscope may be lost, before that is a malfunction and nobody stays in control."""
     idle: Literal["end", "stay"] = "end"
-    """Whether the run ends when nothing that acts is left: no plan goes on, and nobody is in control."""
+    """Whether the run ends when nothing that acts is left: no plan goes on, and no client is in control."""
     solved_by_hand: tuple[str, ...] = ("device-malfunction",)
     """Problems that a person puts right: they may be flagged though no component solves them."""
     end_on: tuple[str, ...] = ()

@@ -132,7 +132,7 @@ def go(
             outcome = supervisor.run()
         try:
             ending = {**facts, ENDED: outcome.text, HOW: outcome.why.name.lower()}
-            if not before or REAL_S in facts:  # else a part was cut off, and nobody knows how long that took
+            if not before or REAL_S in facts:  # else a part was cut off, for an unknown time
                 so_far_s = before.get(REAL_S, 0.0)
                 ending[REAL_S] = round(so_far_s + outcome.duration_s, 1)
             run_bounded(lambda: run_folder.write_run(folder, ending), WRITTEN_WITHIN_S)

@@ -599,7 +599,7 @@ def test_whoever_asks_is_told_the_time_of_the_experiment_and_how_it_passes() -> 
     assert json.loads(answer.payload) == {**clock, "run": "", "simulated": False, "versions": {}, "in_use": ""}
 
 
-def test_whoever_asks_for_the_time_is_told_whether_the_microscope_is_in_use() -> None:
+def test_the_answer_with_the_time_says_whether_the_microscope_is_in_use() -> None:
     lab = Lab()
 
     def in_use() -> str:

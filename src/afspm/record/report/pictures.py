@@ -62,7 +62,7 @@ class FigurePicture:
 
 
 def of_scans(run: Run, rows: Sequence[ScanRow], bad_ns: Collection[int] = ()) -> list[TopographyPicture]:
-    """Return the scans with pictures; `bad_ns`: the times of those that are framed."""
+    """Return the scans with pictures; `bad_ns`: the times of the scans to frame."""
     return [replace(one, is_bad=one.row.time_ns in bad_ns) for one in _read(run, rows)]
 
 
@@ -75,7 +75,7 @@ def bad_ns(run: Run, story: RunStory) -> frozenset[int]:
 
 
 def chosen(rows: Sequence[ScanRow], most: int = MOST, kept_ns: Collection[int] = ()) -> list[ScanRow]:
-    """Return at most `most` rows in their order: those of these times, and some evenly among the rest."""
+    """Return at most `most` rows in their order: the scans of these times, and some evenly among the rest."""
     if len(rows) <= most:
         return list(rows)
     odd = [k for k, row in enumerate(rows) if row.time_ns in kept_ns][: most // 2]
