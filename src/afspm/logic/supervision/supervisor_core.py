@@ -17,7 +17,7 @@ from afspm.logic.supervision.child import (
     KillChild,
     StartChild,
 )
-from afspm.logic.supervision.idle import IdleWatch, describe_idle
+from afspm.logic.supervision.idle import IDLE_AFTER_S, IdleWatch, describe_idle
 from afspm.logic.supervision.run_end import EndReason, EndStep, RunEnd, unfinished
 from afspm.logic.supervision.supervised_child import ChildLife, ChildSpec, ProcessReport, SupervisedChild
 from afspm.logic.supervision.supervisor_events import (
@@ -287,7 +287,9 @@ class SupervisorCore:
             self._end(EndReason.LOST, what)
         else:
             again = f"`afspm restart {name}` starts it again, Ctrl-C ends the run"
-            self._log(LOGGED_AS, "CRITICAL", f"gave up {name}; the rest goes on: {why}; {again}")
+            is_last = child.spec.acts and all(other.is_over for other in self.children.values() if other.spec.acts)
+            rest = f"the run ends in {IDLE_AFTER_S:.0f} s" if is_last and self._idle.ends else "the rest goes on"
+            self._log(LOGGED_AS, "CRITICAL", f"gave up {name}; {rest}: {why}; {again}")
 
     def _end(self, why: EndReason, text: str) -> None:
         self._release()

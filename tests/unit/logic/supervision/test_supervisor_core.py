@@ -307,6 +307,7 @@ def test_a_run_whose_last_plan_was_given_up_ends_and_can_be_resumed() -> None:
     run = IdleRun(ends_idle=True)
     run.exits("series", ExitCode.DONE)
     run.exits("grid", ExitCode.CONFIG, "no such channel")
+    assert "gave up grid; the run ends in 10 s: no such channel" in run.lines[-1].text
     run.rest(IDLE_AFTER_S + 1.0)
     run.step(UseReported(""))
     assert run.core.ending is not None
