@@ -233,7 +233,7 @@ SQUARE = Region((0.0, 0.0), (5e-7, 5e-7))
     ("kind", "subject", "words"),
     [
         (R.ACTION, "start-scan", "start-scan"),
-        (R.PARAM, Parameter("scan-speed", "2", "um/s"), "scan-speed = 2 um/s"),
+        (R.PARAM, Parameter("scan-speed", "2", "um/s"), "scan-speed = 2 µm/s"),
         (R.PARAM, Parameter("scan-speed"), "reads scan-speed"),
         (R.PARAM, Parameter("zctrl-pgain", "3"), "zctrl-pgain = 3"),
         (
