@@ -80,7 +80,7 @@ def test_a_problem_is_raised_and_cleared(night: Night, page: Any) -> None:
     press(page, "Flag")
     night.until(lambda: 9 in night.control().problems)
     page.wait_for_selector(".flag:has-text('drop-on-the-table'):has-text('flagged by dashboard:Ada')")
-    page.wait_for_selector(".flag .advice:has-text('then clear the problem')")
+    page.wait_for_selector(".flag .advice:has-text('then clear it')")
     page.wait_for_selector(".lane > b:text-is('drop-on-the-table')")
     press(page, "Clear drop-on-the-table")
     night.until(lambda: 9 not in night.control().problems)
@@ -114,7 +114,7 @@ def test_parameters_are_read_and_set_and_refusals_give_their_reason(night: Night
     assert refusal.refused
     assert refusal.reason in page.inner_text(".outcomes")
     assert "above the highest allowed, 3 V" in refusal.reason
-    page.wait_for_selector(".refusals >> text=tip-bias-voltage = 7.0 V")
+    page.wait_for_selector(".refusals >> text=tip-bias-voltage = 7 V")
     page.wait_for_selector(".q-field--error:has-text('above the highest allowed')")
     assert read(page, "scan-speed") == "4 µm/s", "what was not refused is set"
     keep(page, "refused")
@@ -268,7 +268,7 @@ def test_a_scan_is_stopped_after_taking_over(night: Night, page: Any) -> None:
 
 def test_stopping_in_automated_says_that_it_takes_over(night: Night, page: Any) -> None:
     press(page, "Stop the scan")
-    page.wait_for_selector(".question:has-text('MANUAL first')")
+    page.wait_for_selector(".question:has-text('sets the mode to MANUAL')")
     page.keyboard.press("Escape")
     page.locator(".question").wait_for(state="detached")
     assert night.control().mode is ControlMode.AUTOMATED
