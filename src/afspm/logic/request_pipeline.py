@@ -185,10 +185,17 @@ def _renew_lease(draft: StateDraft, event: RequestIn) -> None:
 def _tell_time(draft: StateDraft, event: RequestIn) -> None:
     """Tell what all parts of an experiment have in common: the run, what time it is, and how it passes."""
     settings = draft.env.settings
-    common = {"run": settings.run, "simulated": settings.simulated, "now_ns": draft.now_ns}
+    common = {"run": settings.run, "simulated": settings.simulated, "now_ns": draft.now_ns, "in_use": _in_use(draft)}
     told = json.dumps({**settings.clock, **common, "versions": dict(settings.versions)}).encode()
     response = Response(int(ControlResponse.SUCCESS), told, "", event.request.id)
     draft.effects.append(Reply(event.connection, event.name, response, CLOCK_REQUEST))
+
+
+def _in_use(draft: StateDraft) -> str:
+    """Return why an experiment without a plan is not to end now; empty: nothing keeps it."""
+    if draft.control.mode is ControlMode.MANUAL:
+        return "the mode is MANUAL"
+    return f"{draft.control.holder} is in control" if draft.control.holder else ""
 
 
 # --- 3. within limits: nothing forbids it, and the microscope is where it has to be ---------------------------------

@@ -461,14 +461,14 @@ def test_a_turned_frame_whose_corner_is_out_of_reach_is_refused(bench: Any) -> N
 
 def test_the_reason_names_value_limit_and_where_it_was_set(bench: Any) -> None:
     reason = bench.ask(PARAM, Parameter("scan-speed", "200", "um/s")).reason
-    assert reason == "scan-speed: 200 um/s is outside 0.001 um/s to 100 um/s (set in parameters.toml)"
+    assert reason == "scan-speed: 200 µm/s is outside 0.001 µm/s to 100 µm/s (set in parameters.toml)"
 
 
 def test_what_the_controller_makes_something_else_of_is_refused_and_put_back(bench: Any) -> None:
     bench.microscope.stuck = {"Speed": 3.0}
     response = bench.ask(PARAM, Parameter("scan-speed", "5", "um/s"))
     assert response.code == PARAM_ERROR
-    assert "set 3 um/s instead of 5 um/s" in response.reason
+    assert "set 3 µm/s instead of 5 µm/s" in response.reason
     bench.microscope.stuck = {"Speed": 5.00005}  # its precision
     assert bench.ask(PARAM, Parameter("scan-speed", "5", "um/s")).code == OK
 
