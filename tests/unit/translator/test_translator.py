@@ -809,6 +809,21 @@ def test_a_repeated_id_is_answered_and_not_carried_out_again(bench: Any) -> None
     assert bench.microscope.set_calls == 1
 
 
+def test_forgotten_id_is_not_carried_out_again(bench: Any) -> None:
+    assert bench.ask(ACTION, names.RETRACT, "me/1/1").code == OK
+    assert bench.ask(ACTION, names.RETRACT, "me/key/tip/0").code == OK
+    for n in range(2, 332):
+        assert bench.ask(PARAM, Parameter("scan-speed", "2", "um/s"), f"me/1/{n}").code == OK
+    for _ in range(2):
+        response = bench.ask(ACTION, names.RETRACT, "me/1/1")
+        assert (response.code, response.detail) == (ControlResponse.NO_RESPONSE, ResponseDetail.OUTCOME_UNKNOWN)
+        assert "not above one that was forgotten" in response.reason
+        assert bench.ask(ACTION, names.RETRACT, "me/key/tip/0").code == OK
+        bench.start()
+    assert bench.microscope.done == ["retract", "retract"]
+    assert bench.ask(ACTION, names.RETRACT, "me/1/332").code == OK
+
+
 def test_a_request_that_was_refused_may_be_asked_again(bench: Any) -> None:
     bench.microscope.state = ScopeState.MOVING
     assert bench.ask(ACTION, names.START_SCAN, "me/1/1").code == NOT_FREE
