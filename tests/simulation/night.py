@@ -357,6 +357,7 @@ class Night:
             self.invariants.fail(f"nothing was scanned in the calm; control: {self.scheduler.core.control}")
         cached = [packet for packet, *_ in self.scheduler.core.cached()]
         self.timeline.run_until(self.timeline.monotonic_s() + 1.0)
+        self.invariants.written.has_all_starts()
         for client in self.components.values():
             settled = self.timeline.monotonic_s() - max(client.since_s, self.scheduler.since_s) > _SETTLED_S
             if client.alive and self.scheduler.alive and settled:

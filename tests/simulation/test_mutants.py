@@ -29,6 +29,7 @@ from tests.simulation.drift_night import DriftNight
 from tests.simulation.invariants import InvariantViolated
 from tests.simulation.night import Fault, Night, Plan, plan
 
+pytestmark = pytest.mark.slow
 NIGHTS = 24
 Patch = pytest.MonkeyPatch
 
@@ -235,6 +236,10 @@ def entries_are_not_kept_over_a_kill(patch: Patch) -> None:
     patch.setattr(PacketCache, "restore", restore)
 
 
+def starts_are_not_saved_before_they_are_sent(patch: Patch) -> None:
+    patch.setattr(EventLog, "sending", lambda self, *args: self)
+
+
 def the_tip_is_never_retracted(patch: Patch) -> None:
     patch.setattr(Watchdog, "_endangered", lambda self, microscope: self)
 
@@ -314,6 +319,7 @@ MUTANTS = [
     entries_are_published_at_once,
     entries_backwards,
     entries_are_not_kept_over_a_kill,
+    starts_are_not_saved_before_they_are_sent,
     flag_leaves_control,
     two_in_control,
     anybody_while_flagged,

@@ -202,10 +202,17 @@ def _renew_lease(draft: StateDraft, event: RequestIn) -> None:
 def _tell_time(draft: StateDraft, event: RequestIn) -> None:
     """Tell what all parts of an experiment have in common: the run, what time it is, and how it passes."""
     settings = draft.env.settings
-    common = {"run": settings.run, "simulated": settings.simulated, "now_ns": draft.now_ns}
+    common = {"run": settings.run, "simulated": settings.simulated, "now_ns": draft.now_ns, "in_use": _in_use(draft)}
     told = json.dumps({**settings.clock, **common, "versions": dict(settings.versions)}).encode()
     response = Response(int(ControlResponse.SUCCESS), told, "", event.request.id)
     draft.effects.append(Reply(event.connection, event.name, response, CLOCK_REQUEST))
+
+
+def _in_use(draft: StateDraft) -> str:
+    """Return why an experiment without a plan is not to end now; empty: nothing keeps it."""
+    if draft.control.mode is ControlMode.MANUAL:
+        return "the mode is MANUAL"
+    return f"{draft.control.holder} is in control" if draft.control.holder else ""
 
 
 # --- 3. queued: it waits for its turn -------------------------------------------------------------------------------
@@ -282,7 +289,9 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
 
 def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None) -> None:
     name, request = job.client, job.request
-    job = job._replace(mapped=mapped, states_seen=draft.microscope.states_seen, sent_ns=draft.now_ns)
+    sent_ns = draft.event_log.sent_ns(name, request, draft.now_ns)
+    job = job._replace(mapped=mapped, states_seen=draft.microscope.states_seen, sent_ns=sent_ns)
+    draft.event_log = draft.event_log.sending(name, request, sent_ns)
     if job.command:
         draft.limits = draft.limits.sending(name, job.outgoing, draft.now_ns, _names_meant(job))
         draft.pending = replace(draft.pending, turn=None)

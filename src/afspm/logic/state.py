@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, fields
 from afspm.logic.arbitration import ArbitrationState
 from afspm.logic.cache import PacketCache
 from afspm.logic.coordinate_frame import CoordinateFrame
-from afspm.logic.event_log import EventLog
+from afspm.logic.event_log import EventLog, SentStart
 from afspm.logic.events import Codec, Effect, Log, SaveState
 from afspm.logic.forwarder import Forwarder
 from afspm.logic.frozen import replace
@@ -49,6 +49,7 @@ class SavedState:
     lease_s: float | None = None
     sessions: Mapping[str, str] = field(default_factory=dict)
     sent_actions: tuple[SentAction, ...] = ()
+    starts: tuple[SentStart, ...] = ()
     forgotten: Mapping[str, int] = field(default_factory=dict)
     limits: LimitState = field(default_factory=LimitState)
     tip: RetractState = field(default_factory=RetractState)
@@ -113,7 +114,7 @@ class SchedulerState:
     def saved_parts(self) -> tuple[object, ...]:
         """The parts of which every change is saved before it is told."""
         saved = self.control, self.lease.token, self.lease.asked_s, self.watchdog.tip, self.microscope.risk
-        return *saved, self.limits.state.usage, self.idempotency.sent_actions
+        return *saved, self.limits.state.usage, self.idempotency.sent_actions, self.event_log.starts
 
     def due_s(self) -> float | None:
         """Return when, in real monotonic time, a part has something to do that depends on no other."""
@@ -214,6 +215,7 @@ def saved_state(state: SchedulerState, env: Environment) -> SavedState:
         lease_s=state.lease.asked_s,
         sessions=state.sessions.tokens(),
         sent_actions=state.idempotency.sent_actions,
+        starts=state.event_log.starts,
         forgotten=state.idempotency.floors.numbers,
         limits=state.limits.state,
         tip=state.watchdog.tip,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
 from tests.simulation.codec import TableCodec
@@ -34,6 +35,7 @@ from afspm.model import (
     ControlRequest,
     ControlResponse,
     JournalEntry,
+    LoggedPacket,
     Packet,
     PacketHeader,
     Parameter,
@@ -62,11 +64,12 @@ class Lab:
         *,
         state: SavedState | None = None,
         codec: TableCodec | None = None,
+        packets: Sequence[LoggedPacket] = (),
+        now: tuple[float, int] = (100.0, 1_750_000_000 * NS),
     ) -> None:
         self.codec = codec or TableCodec()
         self.core = SchedulerCore(settings or SchedulerSettings(), self.codec)
-        self.now_s = 100.0
-        self.now_ns = 1_750_000_000 * NS
+        self.now_s, self.now_ns = now
         self.connections: dict[str, int] = {}
         self.effects: list[Effect] = []
         self.forwarded: list[Forward] = []
@@ -74,6 +77,7 @@ class Lab:
         self.entries_seen = 0
         if state is not None:
             self.core.restore(as_saved(state))
+            self.core.restore_cache(packets)
         self.effects += self.core.start(self.now_s, self.now_ns)
 
     def step(self, event: Input) -> list[Effect]:
