@@ -14,6 +14,7 @@ from tests.simulation.scheduler import SchedulerHost
 from tests.simulation.timeline import Timeline
 
 _MALFUNCTION = Problem.DEVICE_MALFUNCTION
+_OF_CONTROL = range(int(ControlRequest.REQUEST_CTRL), int(ControlRequest.END_EXPERIMENT) + 1)
 _SLACK_S = 1.0
 
 
@@ -165,4 +166,4 @@ def _who(event: Input | None, effects: Sequence[Effect]) -> str:
     """Return who asked for what a step did; a request that waited for the scheduler's start is answered on a tick."""
     if isinstance(event, RequestIn):
         return event.name
-    return next((effect.name for effect in effects if isinstance(effect, Reply)), "")
+    return next((effect.name for effect in effects if isinstance(effect, Reply) and effect.asked in _OF_CONTROL), "")
