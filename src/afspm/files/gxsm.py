@@ -27,6 +27,7 @@ CONTROLLER = "GXSM"
 _ANGSTROM = ("AA", "Å", "Ang")
 _TEXT_MAX = 1 << 16
 _FILE_NAME = re.compile(r"-X([pm])-(.+)\.nc$")
+_WAS_DASH = re.compile(r"(?<=[A-Z0-9])m(?=[A-Z])")
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,12 +134,16 @@ def _unit(raw: _Raw) -> tuple[str, float]:
 
 
 def _channel(raw: _Raw, path: Path) -> str:
-    """As the program shows it, e.g. "ZS-Topo", which is ZSmTopo in the file's name; the way back is told."""
+    """Return the channel's name as the program shows it, and mark the way back.
+
+    "ZS-Topo" is ZSmTopo in the file's name. Gxsm3 has the name nowhere else: "ADC0-ITunnel" has the label "I". There an
+    "m" between a capital or digit and a capital is taken for the dash that it was.
+    """
     label = raw.attributes.get("ZLabel", "")
     match = _FILE_NAME.search(raw.texts.get("basename", "")) or _FILE_NAME.search(path.name)
     if match is None:
         return label
-    name = label if label.replace("-", "m") == match[2] else match[2]
+    name = label if label.replace("-", "m") == match[2] else _WAS_DASH.sub("-", match[2])
     return f"{name} Backward" if match[1] == "m" else name
 
 

@@ -276,6 +276,16 @@ class Driver(ABC):
             FileError: it is not (yet) whole; asked for again until `result_timeout_s` is over.
         """
 
+    def followed(self) -> bool | None:
+        """Return whether a measurement was whole whose end `status` never reported, since another one followed at once.
+
+        To be written where a panel can repeat scans. Called after `results`, which have to list it by then.
+
+        Returns:
+            once for each of them: True if it was whole, False if it was broken off; None: there was none.
+        """
+        return None
+
     def lines(self, start: int) -> Sequence[ScanLines]:
         """Return the complete lines of a running scan beyond the first `start`, in the order in which they are scanned.
 

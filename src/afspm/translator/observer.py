@@ -107,7 +107,11 @@ class Observer:
         if is_over:
             self._polling.over(self._clock.monotonic_s())
         with self._clock.late() if is_over else nullcontext():
-            self.play(self._state.sequence.observe(status, self._outbox.look(), self._clock.now_s()))
+            results = self._outbox.look()
+            is_whole = self._driver.followed()
+            steps = [] if is_whole is None else self._state.sequence.follow(is_whole=is_whole)
+            steps += self._state.sequence.observe(status, results and not steps, self._clock.now_s())
+            self.play(steps)
 
     def play(self, steps: Sequence[SequenceStep]) -> None:
         """Do the steps of a status sequence: save all that they change at once, then publish.

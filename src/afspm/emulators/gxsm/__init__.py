@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Final
 from afspm.emulators.emulator import Crashed, Emulator
 from afspm.emulators.gxsm import block, calls, file_writer, files, program
 from afspm.emulators.gxsm.block import SharedMemoryBlock
-from afspm.emulators.gxsm.calls import GxsmFunctions, NoAnswer
+from afspm.emulators.gxsm.calls import GxsmFunctions, NoAnswer, WrongArguments
 from afspm.emulators.gxsm.console import SCRIPT, ScriptCall, ScriptConsole
 from afspm.emulators.gxsm.entries import USER_UNITS
 from afspm.emulators.gxsm.program import GxsmProgram
@@ -169,11 +169,14 @@ class GxsmEmulator(Emulator):
     def _answer_all(self) -> None:
         while self.unanswered and not self.silent and not self.faults.lasts("wedge", self.clock.now_s()):
             call = self.unanswered.popleft()
+            self.program.advance(self.clock.now_s())  # GXSM does one thing after the other
             try:
                 found = self._calls.answer(call.method, call.arguments)
             except NoAnswer:
                 self.silent = True
                 return
+            except WrongArguments as error:
+                found = SystemError(str(error)) if self._block is None else error.value
             except (NameError, SystemError) as error:  # what a script of the user's is to see
                 found = error
             except Exception as error:
