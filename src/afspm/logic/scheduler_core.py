@@ -62,6 +62,7 @@ def step(
     """Return the state after an event, and what is to be done, in order."""
     draft = StateDraft(state, env, now_s, now_ns)
     _HANDLERS[type(event)](draft, event)
+    request_pipeline.send_next(draft)
     _end_when_safe(draft)
     return draft.finish()
 
@@ -128,6 +129,7 @@ class SchedulerCore:
             draft.effects += ended(response, draft.now_s, draft.now_ns)
 
         draft.forwarder, _ = draft.forwarder.ask_own(request, now_s, on_answer)
+        request_pipeline.send_own(draft)
         return self._finish(draft)
 
     def _finish(self, draft: StateDraft) -> list[Effect]:
@@ -246,7 +248,7 @@ def _on_announced(draft: StateDraft, event: Announced) -> None:
 
 
 def _on_reply(draft: StateDraft, event: TranslatorReply) -> None:
-    draft.forwarder, settled = draft.forwarder.answered(event.number, event.response, draft.now_s)
+    draft.forwarder, settled = draft.forwarder.answered(event.number, event.response)
     if settled is not None:
         request_pipeline.settle(draft, settled)
 
@@ -326,7 +328,6 @@ def _see_to_deadlines(draft: StateDraft) -> None:
         draft.pending, waiting = draft.pending.clear_up(name)
         if waiting is not None:
             request_pipeline.refuse_second(draft, waiting)
-    request_pipeline.act_when_moved(draft)
     draft.forwarder, settled = draft.forwarder.expired(draft.now_s)
     for one in settled:
         request_pipeline.settle(draft, one)

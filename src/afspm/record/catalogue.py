@@ -23,7 +23,7 @@ from afspm.record.run_json import RUN_FILE
 from afspm.record.run_lock import describe_state
 
 INDEX_FILE: Final = "runs.sqlite"
-_FORMAT: Final = 1
+_FORMAT: Final = 2
 _WATCHED: Final = (RUN_FILE, "journal.sqlite", "journal.sqlite-wal")
 """Files of a run by which it is seen that something has changed."""
 _WORD: Final = re.compile(r"(?:(\w+):)?(.+)", re.DOTALL)
@@ -36,7 +36,7 @@ class RunSummary:
     Attributes:
         folder: relative to the folder of all runs, with "/".
         name: of the experiment.
-        began_ns, ended_ns: the first and last that was published, in experiment time; None: nothing was.
+        began_ns, ended_ns: when it began and ended, in experiment time (or was published last); None: nothing was.
         state: how it ended, in words.
         metadata: sample, person, project, technique … as far as they are known.
         scans: the whole ones; spectra: their number.
@@ -211,13 +211,13 @@ def _summary(folder: Path) -> RunSummary:
 
 
 def _read(run: Run) -> RunSummary:
-    overview = run.overview(("ControlState",))
+    overview = run.overview(("ControlState", "JournalEntries"))
     began = next(iter(overview.controls.spans), None)
     return RunSummary(
         folder="",
         name=run.name,
         began_ns=None if began is None else began.start_ns,
-        ended_ns=run.newest_ns or None,
+        ended_ns=overview.ended_ns or run.newest_ns or None,
         state=describe_state(run.folder),
         metadata=run.metadata,
         simulated=run.simulated,

@@ -39,6 +39,7 @@ from afspm.model import (
     ScopeStatus,
     Spectrum,
 )
+from afspm.model.events import PERSON
 from afspm.model.geometry import XY
 from afspm.record.running_scan import DoneScan, RunningScan
 from afspm.record.timeline import Span, Timeline
@@ -221,6 +222,24 @@ class Overview:
         return tuple(self._drift.values())
 
     @property
+    def in_control(self) -> str:
+        """The holder of control; in MANUAL the person who set that mode, or "a person"; empty: it is free."""
+        if self.control is None:
+            return ""
+        if self.control.mode is not ControlMode.MANUAL:
+            return self.control.holder or ""
+        changes = (one for one in reversed(self.entries) if one.event is ControlEvent.MODE_CHANGED)
+        newest = next(changes, None)
+        who = newest.who if newest is not None and newest.mode is ControlMode.MANUAL else ""
+        return who.partition(PERSON)[2] or who or "a person"
+
+    @property
+    def ended_ns(self) -> int | None:
+        """When the experiment ended; None: it goes on, was stopped, or was cut off."""
+        entries = reversed(self.entries)
+        return next((one.time_ns for one in entries if one.event is ControlEvent.EXPERIMENT_ENDED), None)
+
+    @property
     def note_spans(self) -> list[Span]:
         """The notes as spans without length, for time lines."""
         spans = [Span(note.text, note.time_ns, note.time_ns, note.who) for note in self.notes]
@@ -239,7 +258,8 @@ class Overview:
     @property
     def control_since_ns(self) -> int | None:
         """Since when whoever is in control is, or nobody is; None if nothing is known."""
-        return self.controls.changed_ns
+        is_manual = self.control is not None and self.control.mode is ControlMode.MANUAL
+        return self.modes.changed_ns if is_manual else self.controls.changed_ns
 
     def scan_progress(self, now_ns: int) -> tuple[float, int] | None:
         """Of the running scan: (the part that is done, 0 to 1, and how many ns remain); None if that is not known."""

@@ -18,7 +18,7 @@ from afspm.plain_data import Plain, PlainMapping
 from afspm.translator.parameters import ParameterTable, Value
 from afspm.translator.polling import EAGER_S
 from afspm.translator.setting_groups import SettingsGroup
-from afspm.units import Duration
+from afspm.units import Duration, PollPeriod
 
 if TYPE_CHECKING:
     from afspm.process.context import ProcessContext
@@ -189,7 +189,7 @@ class Driver(ABC):
         *,
         parameters: Mapping[str, Mapping[str, object]] | None = None,
         actions: Mapping[str, Mapping[str, object]] | None = None,
-        poll_period_s: Duration = 0.1,
+        poll_period_s: PollPeriod = 0.1,
         result_timeout_s: Duration = 10.0,
         live_lines_s: Duration | None = None,
         trace: bool = False,

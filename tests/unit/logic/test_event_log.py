@@ -279,7 +279,7 @@ SQUARE = Region((0.0, 0.0), (5e-7, 5e-7))
     ("kind", "subject", "words"),
     [
         (R.ACTION, "start-scan", "start-scan"),
-        (R.PARAM, Parameter("scan-speed", "2", "um/s"), "scan-speed = 2 um/s"),
+        (R.PARAM, Parameter("scan-speed", "2", "um/s"), "scan-speed = 2 µm/s"),
         (R.PARAM, Parameter("scan-speed"), "reads scan-speed"),
         (R.PARAM, Parameter("zctrl-pgain", "3"), "zctrl-pgain = 3"),
         (
@@ -290,7 +290,7 @@ SQUARE = Region((0.0, 0.0), (5e-7, 5e-7))
         (
             R.SET_SCAN_PARAMS,
             ScanParameters(Region((1.5e-4, -2e-7), (2e-6, 1e-6), 0.5235987756)),
-            "scan parameters: 2 x 1 um at (150, -0.2) um, turned by 30 deg",
+            "scan parameters: 2 x 1 µm at (150, -0.2) µm, turned by 30 deg",
         ),
         (R.SET_SCAN_PARAMS, ScanParameters(RegionChange(width_m=1e-9)), "scan parameters: width 1 nm"),
         (R.SET_SCAN_PARAMS, ScanParameters(None, ShapeChange(rows=7)), "scan parameters: rows 7"),

@@ -255,7 +255,7 @@ STORY = [
 def test_who_comes_late_has_the_past_from_the_journal() -> None:
     late = seen(*STORY, ("ControlState", control(None, mode=ControlMode.MANUAL), 41))
     assert [(s.label, s.start_ns // S) for s in late.controls.spans] == [("series", 2), ("corrector", 26)]
-    assert late.control_since_ns == 36 * S
+    assert (late.in_control, late.control_since_ns) == ("ada", 40 * S)
     (flagged,) = late.problem_timelines[TIP].spans
     assert (flagged.by, flagged.start_ns, flagged.end_ns) == ("classifier", 22 * S, 35 * S)
     assert late.modes.now is not None

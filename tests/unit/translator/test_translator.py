@@ -461,14 +461,14 @@ def test_a_turned_frame_whose_corner_is_out_of_reach_is_refused(bench: Any) -> N
 
 def test_the_reason_names_value_limit_and_where_it_was_set(bench: Any) -> None:
     reason = bench.ask(PARAM, Parameter("scan-speed", "200", "um/s")).reason
-    assert reason == "scan-speed: 200 um/s is outside 0.001 um/s to 100 um/s (set in parameters.toml)"
+    assert reason == "scan-speed: 200 µm/s is outside 0.001 µm/s to 100 µm/s (set in parameters.toml)"
 
 
 def test_what_the_controller_makes_something_else_of_is_refused_and_put_back(bench: Any) -> None:
     bench.microscope.stuck = {"Speed": 3.0}
     response = bench.ask(PARAM, Parameter("scan-speed", "5", "um/s"))
     assert response.code == PARAM_ERROR
-    assert "set 3 um/s instead of 5 um/s" in response.reason
+    assert "set 3 µm/s instead of 5 µm/s" in response.reason
     bench.microscope.stuck = {"Speed": 5.00005}  # its precision
     assert bench.ask(PARAM, Parameter("scan-speed", "5", "um/s")).code == OK
 
@@ -807,6 +807,21 @@ def test_a_repeated_id_is_answered_and_not_carried_out_again(bench: Any) -> None
     other = bench.ask(PARAM, Parameter("scan-speed", "3", "um/s"), "me/1/1")
     assert other.code == ControlResponse.FAILURE
     assert bench.microscope.set_calls == 1
+
+
+def test_forgotten_id_is_not_carried_out_again(bench: Any) -> None:
+    assert bench.ask(ACTION, names.RETRACT, "me/1/1").code == OK
+    assert bench.ask(ACTION, names.RETRACT, "me/key/tip/0").code == OK
+    for n in range(2, 332):
+        assert bench.ask(PARAM, Parameter("scan-speed", "2", "um/s"), f"me/1/{n}").code == OK
+    for _ in range(2):
+        response = bench.ask(ACTION, names.RETRACT, "me/1/1")
+        assert (response.code, response.detail) == (ControlResponse.NO_RESPONSE, ResponseDetail.OUTCOME_UNKNOWN)
+        assert "not above one that was forgotten" in response.reason
+        assert bench.ask(ACTION, names.RETRACT, "me/key/tip/0").code == OK
+        bench.start()
+    assert bench.microscope.done == ["retract", "retract"]
+    assert bench.ask(ACTION, names.RETRACT, "me/1/332").code == OK
 
 
 def test_a_request_that_was_refused_may_be_asked_again(bench: Any) -> None:
