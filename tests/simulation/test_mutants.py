@@ -350,7 +350,7 @@ def _nights() -> None:
 
 
 def _drift_nights() -> None:
-    for seed in (2, 10, 18, 34):
+    for seed in (28, 44, 54, 82):  # each finds it: another save shifts the sequence of chance
         DriftNight(_bad_night(seed)).run()
 
 
