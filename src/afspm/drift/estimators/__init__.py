@@ -54,8 +54,10 @@ def unguarded(spec: str | PlainMapping | Estimator = DEFAULT) -> Estimator:
 
 
 def _made(spec: str | PlainMapping | Estimator) -> tuple[Estimator, str]:
-    is_one = not isinstance(spec, str | Mapping)
-    made, name = (spec, type(spec).__name__) if is_one else named("estimator", spec, READY_MADE, DEFAULT)
+    made: object = spec
+    name = type(spec).__name__
+    if isinstance(spec, str | Mapping):
+        made, name = named("estimator", spec, READY_MADE, DEFAULT)
     if not callable(getattr(made, "register", None)):
         raise ConfigError(
             f"{name} is not an estimator",
