@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.errors import InvalidValue
-from afspm.model import Region
+from afspm.model import Region, RegistrationOutcome
 
 Array = NDArray[np.float64]
 
@@ -149,6 +149,13 @@ class Registration:
     def failed(cls, failure: str) -> Registration:
         """Return the result of an estimator that raised, or whose result is unusable."""
         return replace(cls.refused(failure), failure=failure)
+
+    @property
+    def outcome(self) -> RegistrationOutcome:
+        """Return what became of the pair."""
+        if self.accepted:
+            return RegistrationOutcome.COARSE if self.failure else RegistrationOutcome.REGISTERED
+        return RegistrationOutcome.FAILED if self.failure else RegistrationOutcome.REFUSED
 
     @property
     def sd_m(self) -> float:

@@ -91,7 +91,7 @@ class Update:
             is_coarse = bool(accepted) and all(one.failure for one in accepted)
             return RegistrationOutcome.COARSE if is_coarse else RegistrationOutcome.REGISTERED
         if not found:
-            return RegistrationOutcome.NEW_PLACE
+            return RegistrationOutcome.NEW
         is_failed = any(one.failure for one in found)
         return RegistrationOutcome.FAILED if is_failed else RegistrationOutcome.REFUSED
 

@@ -18,7 +18,7 @@ class RegistrationOutcome(IntEnum):
     """Recognised in none of the earlier scans of its place: the position is dead reckoning."""
     FAILED = 4
     """Not registered because of an error, a time limit or a missing channel: the position is dead reckoning."""
-    NEW_PLACE = 5
+    NEW = 5
     """No earlier scan shows its part of the sample: the position is dead reckoning."""
 
     @classmethod
@@ -27,6 +27,14 @@ class RegistrationOutcome(IntEnum):
         known = {one.value for one in cls}
         return cls(number) if number in known else cls.REGISTERED if matched else cls.REFUSED
 
+    @classmethod
+    def from_label(cls, label: str) -> RegistrationOutcome:
+        """Return the outcome of a table. Raises ValueError: there is no such outcome."""
+        for one in cls:
+            if one.label == label:
+                return one
+        raise ValueError(f"no outcome {label!r}")
+
     @property
     def is_registered(self) -> bool:
         """Return whether the position was measured; else it is dead reckoning."""
@@ -34,15 +42,15 @@ class RegistrationOutcome(IntEnum):
 
     @property
     def label(self) -> str:
-        """Return the name for tables and files, such as "new-place"."""
-        return self.name.lower().replace("_", "-")
+        """Return the name for tables and files, such as "refused"."""
+        return self.name.lower()
 
 
 _NOTES = {
     RegistrationOutcome.COARSE: "{} of them coarsely",
     RegistrationOutcome.FAILED: "{} failed",
     RegistrationOutcome.REFUSED: "{} not recognised",
-    RegistrationOutcome.NEW_PLACE: "{} of a new place",
+    RegistrationOutcome.NEW: "{} of a new place",
 }
 
 

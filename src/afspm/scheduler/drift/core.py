@@ -67,13 +67,13 @@ _HOW = {
     RegistrationOutcome.COARSE: "is registered coarsely",
     RegistrationOutcome.REFUSED: "is not recognised, and published at the predicted position",
     RegistrationOutcome.FAILED: "could not be registered, and is published at the predicted position",
-    RegistrationOutcome.NEW_PLACE: "shows a new place, and is published at the predicted position",
+    RegistrationOutcome.NEW: "shows a new place, and is published at the predicted position",
 }
 _LEVELS = {
     RegistrationOutcome.COARSE: "WARNING",
     RegistrationOutcome.REFUSED: "WARNING",
     RegistrationOutcome.FAILED: "ERROR",
-    RegistrationOutcome.NEW_PLACE: "INFO",
+    RegistrationOutcome.NEW: "INFO",
 }
 _MOST_TRIES = 2
 """So often a scan is registered, if the worker ends over it."""

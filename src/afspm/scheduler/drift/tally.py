@@ -21,7 +21,7 @@ class RegistrationTally:
     def add(self, outcome: RegistrationOutcome) -> None:
         """Count a scan."""
         self._counts[outcome] += 1
-        if outcome is not RegistrationOutcome.NEW_PLACE:
+        if outcome is not RegistrationOutcome.NEW:
             self._lately.append(outcome.is_registered)
 
     @property
