@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from afspm.errors import AfspmError
 from afspm.experiment.toml_lines import Table
 from afspm.logic.limit_checker import LimitChecker
 from afspm.logic.limits import ExperimentLimits
@@ -20,13 +21,18 @@ PURE = (
 
 @dataclass(frozen=True)
 class PlannedMeasurements:
-    """The measurements of a plan, and what the microscope must have for them."""
+    """The measurements of a plan, and what the microscope must have for them.
+
+    Attributes:
+        drift_doubts: what to warn of where drift is corrected; `where` names the setting.
+    """
 
     regions: tuple[Region, ...] = ()
     positions: tuple[tuple[float, float], ...] = ()
     shape: tuple[int, int] | None = None
     needs_actions: tuple[str, ...] = ()
     needs_parameters: tuple[str, ...] = ()
+    drift_doubts: tuple[AfspmError, ...] = ()
 
 
 def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
@@ -44,7 +50,8 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
     regions = tuple(r for r in getattr(plan, "regions", ()) if isinstance(r, Region))
     positions = tuple(getattr(made, "positions", ()))
     needs = (tuple(getattr(made, name, ())) for name in ("needs_actions", "needs_parameters"))
-    return PlannedMeasurements(regions, positions, getattr(plan, "shape", None), *needs)
+    doubts = tuple(getattr(made, "drift_doubts", ()))
+    return PlannedMeasurements(regions, positions, getattr(plan, "shape", None), *needs, drift_doubts=doubts)
 
 
 def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[str]:

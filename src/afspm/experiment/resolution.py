@@ -35,6 +35,8 @@ from afspm.model import ProblemNames, Role
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 FROM_SECTIONS = ("control", "limits", "cache")
 """Arguments of a scheduler's constructor that come from sections of these names."""
+DRIFT = "DriftMapping"
+"""Published by a scheduler that corrects drift."""
 
 
 @dataclass
@@ -309,6 +311,9 @@ def _resolve_plan(process: ResolvedProcess, component: type, resolved: ResolvedE
     )
     for reason in planned_measurements.refusals(name, plan, resolved.limits):
         resolved.document.error(f"[{name}] plans what its limits refuse: {reason}", name)
+    if any(DRIFT in scheduler.declared.publishes for scheduler in resolved.with_role(Role.SCHEDULER)):
+        for doubt in plan.drift_doubts:
+            resolved.document.warning(f"[{name}] {doubt.what}", name, doubt.where, hint=doubt.hint)
 
 
 def _written_role(part: ExperimentPart, resolved: ResolvedExperiment) -> Role:
