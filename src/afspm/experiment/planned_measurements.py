@@ -49,9 +49,8 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
     plan = getattr(made, "plan", None)
     regions = tuple(r for r in getattr(plan, "regions", ()) if isinstance(r, Region))
     positions = tuple(getattr(made, "positions", ()))
-    needs = (tuple(getattr(made, name, ())) for name in ("needs_actions", "needs_parameters"))
-    doubts = tuple(getattr(made, "drift_doubts", ()))
-    return PlannedMeasurements(regions, positions, getattr(plan, "shape", None), *needs, drift_doubts=doubts)
+    said = (tuple(getattr(made, name, ())) for name in ("needs_actions", "needs_parameters", "drift_doubts"))
+    return PlannedMeasurements(regions, positions, getattr(plan, "shape", None), *said)
 
 
 def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[str]:
