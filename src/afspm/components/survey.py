@@ -240,7 +240,7 @@ class Survey(Component):
         registration, sd_m = visit.registration, visit.position_sd_m
         how = ""
         if registration is not None and not registration.is_registered:
-            sd = "unknown" if sd_m is None else f"± {lengths_text([sd_m])}"
+            sd = "unknown" if sd_m is None else f"± {lengths_text([float(f'{sd_m:.2g}')])}"
             how = f", its position by dead reckoning ({sd}): the zoom is {registration.label}"
         self.log.info("target %d of %d at %s measured%s", visit.number, of, where, how)
 

@@ -7,6 +7,7 @@ and a plain correlation takes the place of the estimate where it is known where 
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -40,8 +41,13 @@ class PairFailure:
     reason: str
 
     def __str__(self) -> str:
-        pair = f"scan {self.scan!r} with {self.reference!r}"
+        pair = f"{_file(self.scan)} with {_file(self.reference)}"
         return f"{self.estimator} failed to register {pair}: {self.reason}: an error of the estimator, not of the scans"
+
+
+def _file(key: str) -> str:
+    """Return the name of a file without its folder, for keys that are files."""
+    return re.split(r"[\\/]", key)[-1] or "a scan"
 
 
 Report = Callable[[PairFailure], None]

@@ -317,8 +317,10 @@ class DriftCore(SchedulerCore):
         effects: list[Effect] = [Log("ERROR", failure) for failure in said.failures]
         if said.outcome is not RegistrationOutcome.REGISTERED:
             how = _HOW[said.outcome]
-            sd = "unknown" if math.isnan(said.sd_m) else f"± {lengths_text([said.sd_m])}"
-            text = f"scan {filename or said.key} {how} ({sd}): {said.reason}; {self._tally.summary()}"
+            sd = "unknown" if math.isnan(said.sd_m) else f"± {lengths_text([float(f'{said.sd_m:.2g}')])}"
+            name = filename.replace("\\", "/").rpartition("/")[2] or said.key
+            why = "" if said.failures else f": {said.reason}"  # an error is logged already
+            text = f"scan {name} {how} ({sd}){why}; {self._tally.summary()}"
             effects.append(Log(level or _LEVELS[said.outcome], text))
         return effects
 

@@ -108,7 +108,7 @@ class Estimation:
             references=used,
             rescan=_why_again(self._rule, scan, asked, update),
             forecast=update.forecast.to_dict(),
-            failures=[str(failure) for failure in self._failures],
+            failures=list(dict.fromkeys(map(str, self._failures))),  # a pair may be tried in several ways
         )
 
 

@@ -30,7 +30,7 @@ RESCAN = "DriftRescan"
 _DRIFT, _MALFUNCTION = int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFUNCTION)
 _MOST_UNREGISTERED = 3
 """So many scans in a row that nobody could register are as good as a sample that is lost: that of the trackers."""
-_AT_START = "the drift is unknown until a scan in the other direction gives its velocity"
+_AT_START = "a scan in the other direction gives the velocity of the drift"
 
 Step = Callable[[Input], list[Effect]]
 
@@ -124,7 +124,8 @@ class DriftResponse:
         if upwards is None:
             why = f"the microscope does not report {names.SCAN_DIRECTION}"
             return [Log("INFO", f"{why}: the first scan is not taken in both directions")]
-        effects = step(ProblemSeen(_DRIFT, flagged=True, name=self._name))
+        told = "thermal-drift is flagged until the first scan was taken in both directions: normal at the start"
+        effects = [Log("INFO", told), *step(ProblemSeen(_DRIFT, flagged=True, name=self._name))]
         return effects + self._want(RescanKind.OPPOSITE, _AT_START, step, now_ns, upwards=not upwards)
 
     def _found(self, step: Step) -> list[Effect]:
