@@ -67,7 +67,7 @@ def test_a_problem_says_what_to_do_and_whether_a_component_does_it() -> None:
     assert tip.advice == "Condition or change the tip, then clear the problem."
 
 
-def test_the_first_thermal_drift_is_said_to_be_normal() -> None:
+def test_the_first_thermal_drift_is_shown_as_normal() -> None:
     overview = Overview()
     overview.take("ControlState", ControlState(ControlMode.AUTOMATED, None, (int(Problem.THERMAL_DRIFT),)), S)
     asked = wire.message_type("DriftRescan")(kind=int(RescanKind.OPPOSITE))

@@ -422,7 +422,7 @@ def test_scans_that_are_not_registered_well_are_listed_with_their_uncertainty(tm
     assert "± 30 nm, registered" in text
 
 
-def test_the_first_thermal_drift_is_no_problem_and_said_to_be_normal(tmp_path: Path) -> None:
+def test_the_first_thermal_drift_is_no_problem_and_shown_as_normal(tmp_path: Path) -> None:
     store = RecordStore(tmp_path, RecordSettings({"experiment": "survey"}))
     asked = wire.message_type("DriftRescan")(kind=int(model.RescanKind.OPPOSITE))
     asked.timestamp.FromNanoseconds(START + 10 * S)

@@ -691,7 +691,7 @@ def test_some_unregistered_scans_between_others_flag_nothing(lab: Lab) -> None:
     assert not problems(lab)
 
 
-def test_the_first_flag_of_a_run_is_said_to_be_normal() -> None:
+def test_the_first_flag_of_a_run_is_logged_as_normal() -> None:
     lab = Lab(DriftCompensationSettings())
     lab.in_force()
     set_direction(lab, "up")
