@@ -1,14 +1,21 @@
-"""`python -m benchmarks [NAME …]`: measures (default: everything), prints a table, writes build/bench.json."""
+"""`python -m benchmarks [--short] [NAME …]`: measures (default: everything), prints a table, writes build/bench.json.
+
+Exits with 1 where a target was missed, and with 3 where a measurement failed.
+"""
 
 from __future__ import annotations
 
 import importlib
 import json
+import os
 import signal
 import sys
+import traceback
+from collections.abc import Iterator
 from pathlib import Path
 
-from benchmarks.rows import MEASUREMENTS, Row
+from benchmarks.effort import SHORT, VARIABLE
+from benchmarks.rows import MEASUREMENTS, Failure, Measurement, Row
 
 MODULES = (
     "codec",
@@ -25,25 +32,40 @@ MODULES = (
 RESULT = Path("build/bench.json")
 
 
-def main(names: list[str]) -> int:
+def main(arguments: list[str]) -> int:
+    names = {name for name in arguments if name != "--short"}
+    if len(names) < len(arguments):
+        os.environ[VARIABLE] = SHORT  # read where a measurement is imported
     for module in MODULES:
         importlib.import_module(f"benchmarks.{module}")
-    if unknown := set(names) - MEASUREMENTS.keys():
+    if unknown := names - MEASUREMENTS.keys():
         print(f"there is no measurement {sorted(unknown)}; there are {sorted(MEASUREMENTS)}", file=sys.stderr)
         return 2
-    rows: list[Row] = []
+    rows: list[Row | Failure] = []
     print(f"{'':58} {'ours':>10} {'bare':>10} {'ratio':>7}  target", flush=True)
     for name, measure in MEASUREMENTS.items():
         if not names or name in names:
-            for row in measure():
+            for row in _measured(name, measure):
                 rows.append(row)
                 print(_line(row), flush=True)
     RESULT.parent.mkdir(exist_ok=True)
     RESULT.write_text(json.dumps([row.to_json() for row in rows], indent=1) + "\n", encoding="utf-8")
-    return 0 if all(row.met for row in rows) else 1
+    if any(isinstance(row, Failure) for row in rows):
+        return 3
+    return 0 if all(isinstance(row, Row) and row.met for row in rows) else 1
 
 
-def _line(row: Row) -> str:
+def _measured(name: str, measure: Measurement) -> Iterator[Row | Failure]:
+    try:
+        yield from measure()
+    except Exception as error:  # whatever went wrong with one measurement, the others are still of use
+        traceback.print_exc()
+        yield Failure(name, f"{type(error).__name__}: {error}")
+
+
+def _line(row: Row | Failure) -> str:
+    if isinstance(row, Failure):
+        return f"{row.name:58} FAILED: {row.error}"
     sign = "<=" if row.better == "low" else ">="
     bare = "" if row.bare is None else f"{row.bare:.4g}"
     mark = "" if row.met else "  MISSED"

@@ -10,6 +10,7 @@ import numpy as np
 
 from afspm import wire
 from afspm.model import Region, Scan
+from benchmarks.effort import effort
 from benchmarks.rows import Row, measurement
 
 
@@ -19,7 +20,7 @@ def scan(pixels: int) -> Scan:
     return Scan(Region((0.0, 0.0), (2e-6, 2e-6)), "Height", "m", values, 1_800_000_000_000_000_000)
 
 
-def _timed(work: Callable[[], object], repeats: int = 20) -> float:
+def _timed(work: Callable[[], object], repeats: int = effort(20, 1)) -> float:
     began = perf_counter()
     for _ in range(repeats):
         work()
@@ -38,7 +39,7 @@ def codec() -> Iterator[Row]:
             _timed(lambda: bytearray(source)),
             _timed(lambda: wire.decode("Scan2d", payload)),
         )
-        for _ in range(15)
+        for _ in range(effort(15, 1))
     ]
     encoding, copying, decoding = (statistics.median(t) for t in zip(*times, strict=True))
     yield Row("encode a scan of 512², against a memcpy", "µs", encoding, copying, 2.0)

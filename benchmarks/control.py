@@ -14,11 +14,12 @@ from afspm.model import ControlRequest, Request
 from afspm.transport.network import Network
 from afspm.transport.port import ControlConnected, ReplyReceived
 from afspm.transport.zmq_port import ZmqPort
+from benchmarks.effort import effort
 from benchmarks.processes import CLOCK, Roles, roles
 from benchmarks.rows import Row, alternate, measurement
 
-ROUND_TRIPS = 600
-ALTERNATIONS = 9
+ROUND_TRIPS = effort(600, 3)
+ALTERNATIONS = effort(9, 1)
 
 
 class Client:

@@ -17,13 +17,14 @@ from typing import Any
 from urllib.error import URLError
 
 from benchmarks.control import Client
+from benchmarks.effort import effort
 from benchmarks.processes import roles
 from benchmarks.rows import Row, measurement
 from benchmarks.stage import Stage, picture
 
-SIDE, TIMES = 512, 12
-VIEWERS, COUNTED_S = 20, 8.0
-ALTERNATIONS, SETTLING_S, MEASURED_S = 7, 1.0, 3.0
+SIDE, TIMES = 512, effort(12, 3)
+VIEWERS, COUNTED_S = 20, effort(8.0, 0.0)
+ALTERNATIONS, SETTLING_S, MEASURED_S = effort((7, 1.0, 3.0), (1, 0.1, 0.1))
 WITHIN_S = 30.0
 MS_PER_NS = 1e-6
 

@@ -23,13 +23,13 @@ import zmq
 import afspm
 from afspm.errors import RequestError
 from afspm.supervisor.ports import FreePorts
+from benchmarks.effort import effort
 from benchmarks.rows import Row, measurement
 
 DEADLINE_S = 30.0
-STARTS = 5
-KILLS = 5
-ENDS = 5
-IDLE_S = 10.0
+STARTS = KILLS = ENDS = effort(5, 1)
+IDLE_S = effort(10.0, 0.2)
+SETTLING_S = effort(3.0, 0.0)
 
 # six processes, none of which has anything to do
 EXPERIMENT = """
@@ -209,7 +209,7 @@ def idle() -> Iterator[Row]:
         run.wait_for(r"watcher .*knows the state")
         pids = [run.process.pid, *run.pids.values()]
         # the last of them are still starting: what they do in the first seconds is not idling
-        threading.Event().wait(3.0)
+        threading.Event().wait(SETTLING_S)
         began_s, before_s = perf_counter(), _cpu_s(pids)
         threading.Event().wait(IDLE_S)
         percent = 100.0 * (_cpu_s(pids) - before_s) / (perf_counter() - began_s)

@@ -14,12 +14,13 @@ from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.zmq_port import ZmqPort
 from afspm.transport.zmq_server import ZmqServerPort
 from benchmarks.codec import scan
+from benchmarks.effort import effort
 from benchmarks.processes import CLOCK, roles
 from benchmarks.roles import ANY
 from benchmarks.rows import Row, alternate, measurement
 
-SCANS = 50
-ALTERNATIONS = 9
+SCANS = effort(50, 2)
+ALTERNATIONS = effort(9, 1)
 
 
 @measurement

@@ -15,11 +15,12 @@ import afspm
 from afspm.emulators.asylum import ibw
 from afspm.emulators.gxsm import files as gxsm
 from afspm.emulators.nanonis import files as nanonis
+from benchmarks.effort import effort
 from benchmarks.rows import Row, alternate, measurement
 
-PIXELS = 1024
+PIXELS = effort(1024, 32)
 CHANNELS = ("Height", "Amplitude", "Deflection", "Phase")
-TIMES = 9
+TIMES = effort(9, 1)
 AT_MOST_S = 0.15
 TIMES_BARE = 50.0
 """Bare, nothing is made float64, turned or given a place; a quiet machine is assumed."""

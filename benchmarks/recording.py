@@ -26,23 +26,24 @@ from afspm.record.store import RecordSettings, RecordStore
 from afspm.storage.packet_log import START, LogReader, committed, log_folder
 from benchmarks.codec import scan
 from benchmarks.control import Client
+from benchmarks.effort import effort
 from benchmarks.processes import roles
 from benchmarks.rows import Row, alternate, measurement
 from benchmarks.scans import Line
 
-ALTERNATIONS = 9
-FLOODS = 5
+ALTERNATIONS = effort(9, 1)
+FLOODS = effort(5, 1)
 PACE_S = 0.1
 """Between scans at a realistic rate: ten channels of 512² a second are more than any microscope takes."""
-PACED = 20
+PACED = effort(20, 1)
 FAST = 20
 """Scans of 512² a second: 40 MB/s, more than microscopes deliver."""
-WARM = 6
-FLOOD = 60
+WARM = effort(6, 1)
+FLOOD = effort(60, 2)
 """Scans as fast as they can be sent: more than a gigabyte a second, which few disks take. Then each costs what it takes
 to append it to the log; the recorder works when there is nothing else to do."""
 RECORDED_WITHIN_S = 120.0
-SCANS = 10_000
+SCANS, OPENED = effort((10_000, 5), (10, 1))
 START_NS = 1_773_518_400_000_000_000
 _SCAN, _NUMBERS = scan(512), itertools.count()
 
@@ -193,7 +194,11 @@ def long_run() -> Iterator[Row]:
         folder = Path(name)
         _write(folder)
         yield Row(
-            f"a run of {SCANS} scans is open", "s", statistics.median(_open_s(folder) for _ in range(5)), None, 1.0
+            f"a run of {SCANS} scans is open",
+            "s",
+            statistics.median(_open_s(folder) for _ in range(OPENED)),
+            None,
+            1.0,
         )
 
 

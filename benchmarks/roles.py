@@ -6,6 +6,7 @@ import json
 import logging
 import math
 import sys
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ ANY = "tcp://127.0.0.1:0"
 MARK = "FeedbackAnalysis"
 """What is published beside scans: a message that every scheduler lets through."""
 LAST = bytes.fromhex("0d0000803f")
+LOG_BYTES = 64 << 20
 PROBE = 100
 """Payloads up to this size are no scans: they ask whether anybody is there, or say that it was the last."""
 
@@ -88,6 +90,31 @@ def bare_packet_proxy(publisher: str, queue: int) -> None:
     front.connect(publisher)
     ready(bound(back))
     zmq.proxy(front, back)
+
+
+def bare_logging_proxy(publisher: str, queue: int) -> None:
+    """Append each packet to a file, which is written over now and then, before passing the packet on."""
+    context: zmq.Context[Any] = zmq.Context()
+    front, back = context.socket(zmq.XSUB), context.socket(zmq.XPUB)
+    for socket in (front, back):
+        socket.set_hwm(queue)
+    front.connect(publisher)
+    ready(bound(back))
+    poller = zmq.Poller()
+    poller.register(front, zmq.POLLIN)
+    poller.register(back, zmq.POLLIN)
+    with tempfile.TemporaryFile(buffering=0) as log:
+        while True:
+            for socket, _ in poller.poll():
+                if socket is back:
+                    front.send(back.recv())
+                    continue
+                frames = front.recv_multipart(copy=False)
+                for frame in frames:
+                    log.write(frame.buffer)
+                if log.tell() > LOG_BYTES:
+                    log.seek(0)
+                back.send_multipart(frames, copy=False)
 
 
 class Tally:

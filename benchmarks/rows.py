@@ -9,7 +9,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
 
 
 @dataclass(frozen=True)
@@ -53,13 +53,30 @@ class Row:
         }
 
 
+@dataclass(frozen=True)
+class Failure:
+    """A measurement that broke off.
+
+    Attributes:
+        name: of the measurement; the rows that it had yielded before are good.
+        error: what was raised.
+    """
+
+    name: str
+    error: str
+
+    def to_json(self) -> dict[str, object]:
+        return {"name": self.name, "error": self.error, "met": False}
+
+
 Measurement = Callable[[], Iterator[Row]]
+M = TypeVar("M", bound=Measurement)
 MEASUREMENTS: dict[str, Measurement] = {}
 
 
-def measurement(function: Measurement) -> Measurement:
-    """Register a function that yields rows, under its name."""
-    MEASUREMENTS[function.__name__] = function
+def measurement(function: M, name: str = "") -> M:
+    """Register a function that yields rows, under its name or another."""
+    MEASUREMENTS[name or function.__name__] = function
     return function
 
 

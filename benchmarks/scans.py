@@ -1,4 +1,8 @@
-"""Scans through the scheduler to many subscribers, against PUB, XSUB/XPUB proxy, SUB."""
+"""Scans through the scheduler to many subscribers, against PUB, XSUB/XPUB proxy, SUB.
+
+The scheduler writes each packet into a file before it publishes it. So does the proxy that it is compared with; a proxy
+that writes nothing stands beside it in a row of its own.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +18,15 @@ from afspm import wire
 from afspm.transport.network import Network
 from afspm.transport.zmq_server import ZmqServerPort
 from benchmarks.codec import scan
+from benchmarks.effort import effort
 from benchmarks.processes import CLOCK, Roles, roles
 from benchmarks.roles import ANY, LAST, MARK
 from benchmarks.rows import Row, alternate, measurement
 
-SCANS = {128: (400, 31), 512: (60, 15), 2048: (8, 5)}
+SCANS = effort(
+    {128: (400, 31), 512: (60, 15), 2048: (8, 5)},
+    {128: (4, 1), 512: (2, 1), 2048: (1, 1)},
+)
 """By edge in pixels: how many are published in a batch, and how many batches: a short one says little by itself. All of
 a batch may be under way, so no queue is shorter."""
 QUEUE = 1000
@@ -36,11 +44,12 @@ class Line:
         self._tally_address = f"tcp://127.0.0.1:{self._tally.bind_to_random_port('tcp://127.0.0.1')}"
         self._processes = processes
 
-    def bare(self, subscribers: int) -> None:
+    def bare(self, subscribers: int, *, logged: bool = False) -> None:
         publisher = self._context.socket(zmq.PUB)
         publisher.set_hwm(QUEUE)
         source = f"tcp://127.0.0.1:{publisher.bind_to_random_port('tcp://127.0.0.1')}"
-        middle = self._processes.start("bare_packet_proxy", publisher=source, queue=QUEUE)
+        proxy = "bare_logging_proxy" if logged else "bare_packet_proxy"
+        middle = self._processes.start(proxy, publisher=source, queue=QUEUE)
         for _ in range(subscribers):
             self._processes.start("bare_subscriber", source=middle, tally=self._tally_address, queue=QUEUE)
 
@@ -96,7 +105,7 @@ def scans() -> Iterator[Row]:
     for subscribers in (1, 4, 16):
         with roles() as processes:
             bare, ours = Line(processes), Line(processes)
-            bare.bare(subscribers)
+            bare.bare(subscribers, logged=True)
             ours.ours(subscribers)
             for pixels, (count, batches) in SCANS.items():
                 payload = wire.encode(scan(pixels))[1]
@@ -107,3 +116,18 @@ def scans() -> Iterator[Row]:
                 )
                 target = 0.7 if pixels < 512 else 0.8
                 yield Row(f"scans of {pixels}² to {subscribers} subscribers", "1/s", fast, reference, target, "high")
+
+
+@measurement
+def scans_beside_a_proxy_without_a_log() -> Iterator[Row]:
+    """What the log costs: a write of each packet into a file, on the same two cores."""
+    with roles() as processes:
+        bare, ours = Line(processes), Line(processes)
+        bare.bare(1)
+        ours.ours(1)
+        for pixels, (count, batches) in SCANS.items():
+            payload = wire.encode(scan(pixels))[1]
+            fast, reference = alternate(
+                partial(ours.scans_per_s, payload, count), partial(bare.scans_per_s, payload, count), batches
+            )
+            yield Row(f"scans of {pixels}², beside a proxy without a log", "1/s", fast, reference, 0.4, "high")

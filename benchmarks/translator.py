@@ -14,12 +14,13 @@ import zmq
 from afspm import wire
 from afspm.model import ControlRequest, Parameter, Region, Request, Scan, ScopeState, ScopeStatus, Spectrum, names
 from afspm.translator import Driver, Value, action
+from benchmarks.effort import effort
 from benchmarks.processes import roles
 from benchmarks.rows import Row, measurement
 
-REQUESTS = 400
-SCANS = 12
-LASTS_S = 1.7
+REQUESTS = effort(400, 3)
+SCANS = effort(12, 1)
+LASTS_S = effort(1.7, 0.1)
 
 
 class Instant(Driver):

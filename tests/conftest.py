@@ -6,9 +6,7 @@ import gc
 import os
 import shutil
 import signal
-import sys
 from collections.abc import Callable, Iterator
-from functools import cache
 from typing import Any
 
 import pytest
@@ -33,50 +31,22 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # while tests are collected hardly anything becomes garbage
 gc.disable()
 
-COMPUTING = ("tests/simulation/", "tests/unit/")
-"""How the names of tests begin that need the processor all the time; the others wait for processes of their own."""
-COMPUTERS = 2
-"""So many processes do these as long as there are any, beside those that wait: no core is ever idle."""
-LONG = ("tests/docs/", "tests/system/experiment/")
-"""How the names of tests begin that wait longest: first of those that wait, or one of them would be the last."""
-TOGETHER = ("tests/ui/", "tests/unit/components/test_tip_")
-"""How the names of tests begin that one process does, in a row, since they share what is made once in a process."""
+SLOW = ("tests/system/", "tests/ui/", "tests/docs/test_notebook_page.py", "tests/docs/test_snippets.py")
+"""Where the tests of `make test-all` are: they start processes, a browser or whole experiments, and wait for them."""
+SLOW_MODULES = ("_faults.py",)
+"""Of the tests of controllers, those that wait for timeouts in real time."""
+QUICK = ("tests/system/scheduler/", "tests/system/supervisor/", "tests/system/process/")
+"""Of these, what `make test` runs all the same: the processes that everything else stands on."""
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Those that compute come first, those that wait longest at the end, where those that wait are taken from."""
-    items.sort(key=lambda item: (not item.nodeid.startswith(COMPUTING), item.nodeid.startswith(LONG)))
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Who does which test, with pytest-xdist."""
-    if sys.platform == "win32":  # a test that takes too long ends its whole process there, which this can't replace
-        return None
-    from xdist.scheduler import LoadScopeScheduling
-
-    @cache
-    def shares(module: str) -> bool:
-        return 'scope="module"' in (config.rootpath / module).read_text(encoding="utf-8")
-
-    class FromBothEnds(LoadScopeScheduling):
-        """Some take tests from the end of those that compute, the others from the end of those that wait.
-
-        What a module makes once is made once. (The marks of pytest-xdist 3.8 for groups go unseen with pytest 9.2:
-        its issue 1386.)
-        """
-
-        def _split_scope(self, nodeid: str) -> str:
-            module = nodeid.split("::")[0]
-            own = module if shares(module) else nodeid
-            return next((name for name in TOGETHER if nodeid.startswith(name)), own)
-
-        def _assign_work_unit(self, node: Any) -> None:
-            if self.nodes.index(node) >= COMPUTERS:
-                self.workqueue.move_to_end(next(reversed(self.workqueue)), last=False)
-            super()._assign_work_unit(node)
-
-    return FromBothEnds(config, log)
+    """Mark by folder what `make test` leaves to `make test-all`."""
+    for item in items:
+        module = item.nodeid.partition("::")[0]
+        is_slow = module.startswith(SLOW) and not module.startswith(QUICK)
+        if is_slow or (module.startswith("tests/vendors/") and module.endswith(SLOW_MODULES)):
+            item.add_marker(pytest.mark.slow)
 
 
 def pytest_collection_finish() -> None:

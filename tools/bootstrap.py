@@ -1,7 +1,7 @@
 """Make the environment .venv from the lock file, with nothing but Python 3.11 or later.
 
-Run by the Makefile: `python3 tools/bootstrap.py demo` (what a plain install holds), `test` (and what the tests need) or
-`all` (and the tools of `make check`), or `gateway` (what judges the gateway). Each adds to what is there.
+Run by the Makefile: `python3 tools/bootstrap.py demo` (what a plain install holds), `test` (and what the tests need),
+`all` (and the tools of `make check`), `gateway` (what judges the gateway) or `coverage`. Each adds to what is there.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def main(wanted: str) -> None:
         _compile()
     if wanted != "demo":
         groups = ["test", *(["browser"] if _has_browser() else []), *(["check"] if wanted == "all" else [])]
-        groups += ["gateway"] if wanted == "gateway" else []
+        groups += [wanted] if wanted in ("coverage", "gateway") else []
         _sync(*(f"--group={group}" for group in ["pip", *groups]), *(f"--extra={extra}" for extra in EXTRAS))
 
 

@@ -1,6 +1,6 @@
 """Writes the reports of the emulated controllers, for the matrix: `python tools/commission_emulators.py [NAME…]`.
 
-It goes through `afspm commission` with each, as a person who sees no panel.
+It goes through `afspm commission` with each, at the speed that the command has by itself.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from afspm.testing.commissioning.guide import UNSEEN
 from afspm.testing.commissioning.procedure import commission
 from afspm.testing.commissioning.report import InstrumentReport
 from afspm.testing.translators import CheckOptions
@@ -32,14 +31,14 @@ class NoPanel:
     def text(self, question: str) -> str:
         return "u" if "(u:" in question else ""
 
-    def choose(self, question: str, options: Sequence[str]) -> str:
-        return UNSEEN
+    def choose(self, question: str, options: Sequence[str], default: str = "") -> str:
+        return default
 
 
 def main(names: Sequence[str]) -> None:
     for name in names or sorted(file.stem.removeprefix("emulated_") for file in EXPERIMENTS.glob("emulated_*.toml")):
         file = REPORTS / f"emulated_{name}.toml"
-        options = CheckOptions([EXPERIMENTS / f"emulated_{name}.toml"], runs=ROOT / "build/commissioning", speed=5.0)
+        options = CheckOptions([EXPERIMENTS / f"emulated_{name}.toml"], runs=ROOT / "build/commissioning")
         result = commission(options, NoPanel(), file, "emulator")
         sys.stdout.write(f"{name}: {'passed' if result.passed else 'NOT AS IT SHOULD BE'} {result.lost}\n")
         report = InstrumentReport.read(file)

@@ -19,6 +19,7 @@ from typing import Any, Final, Protocol
 
 from afspm.emulators.gxsm import GxsmEmulator
 from afspm.emulators.gxsm.signalled import CONTENT, LENGTH, SIZE, STATUS
+from afspm.microscopes.gxsm import bridge, bridge_client
 from afspm.microscopes.gxsm.errors import GxsmError
 from afspm.microscopes.gxsm.link import Address, Link, open_link
 from afspm.translator.driver import ControllerLost
@@ -78,7 +79,6 @@ class GxsmFuzzer(Fuzzer[GxsmEmulator]):
 
     def call(self) -> tuple[str, bool | None]:
         if self.chance.random() < 0.05:
-            self.close()  # the bridge serves one client at a time
             return self._wire.send_odd(), None
         method, arguments = self.named()
         return f"{method}{arguments!r:.200}", self._call(method, *arguments)
@@ -164,16 +164,25 @@ class _Bridge:
 
     def send_odd(self) -> str:
         lines = [self._line() for _ in range(self._chance.randrange(1, 6))]
-        if self._chance.random() < 0.8:
-            lines.insert(0, Path("~/.afspm/gxsm-bridge-secret").expanduser().read_bytes())
         sent = b"\n".join(lines) + self._chance.choice((b"\n", b"\n", b""))
         with socket.create_connection(self._at, _PATIENCE_S) as connection, suppress(ConnectionError):
+            if self._chance.random() < 0.8:
+                self._introduce(connection)
             connection.sendall(sent)
             if self._chance.random() < 0.8:
                 connection.shutdown(socket.SHUT_WR)
                 while connection.recv(1 << 16):
                     pass
         return f"{lines!r:.400}"
+
+    def _introduce(self, connection: socket.socket) -> None:
+        known, nonce, address = bridge.secret(), "0" * bridge.NONCE, "{}:{}".format(*connection.getpeername())
+        with connection.makefile("rb") as replies:
+            connection.sendall(bridge_client.message("challenge", nonce))
+            theirs, _ = json.loads(replies.readline())["value"]
+            proof = bridge.proof(known, "client", address, nonce, theirs)
+            connection.sendall(json.dumps(["response", proof]).encode() + b"\n")
+            replies.readline()
 
     def _line(self) -> bytes:
         kind = self._chance.random()

@@ -16,8 +16,14 @@ _COMMANDS: Final = (
     "imaging.start", "imaging.stop", "imaging.acquire", "imaging.pause", "imaging.resume", "approach.approach",
     "approach.approach_async", "approach.withdraw", "approach.stop_approach", "spectroscopy.start", "spectroscopy.stop",
     "spectroscopy.acquire", "scanner.move_to_target_offsets", "imaging.scanning_started.empty", "nothing.there",
+    "workspace.add_frame", "workspace.delete_item", "workspace.all_item_ids", "workspace.save_to_file",
+    "workspace.clear", "workspace.load_from_file", "automation.add_to_queue", "automation.process_queue",
+    "automation.clear_queue", "automation.abort", "laser.alignment.align_all", "mode.wavemode.load",
+    "spectroscopy.select_cycle",
 )  # fmt: skip
 _SCRIPTS: Final = (
+    "local t = {} while true do t[#t + 1] = ('x'):rep(1e6) end", "t = {} while true do t[#t + 1] = ('x'):rep(1e6) end",
+    "string.format = nil return 1.5", "while true do pcall(function() while true do end end) end",
     "", "x =", "return", "return root", "return nil, nil", "while true do end", "error({})", "error()", "return {{}}",
     "return string.rep('x', 1e5)", "local t = {} t.t = t return t", "root = nil return 1", "return os, io, require",
     "return root.session.select('91-01-000', 5)", "return root.session.select_main(0)", "return root.session.select(1)",

@@ -35,10 +35,22 @@ class AfspmError(Exception):
 
     def _render_traceback_(self) -> list[str]:
         """Return the lines that IPython shows in place of the traceback: the error, and the caller's own lines."""
-        frames = traceback.extract_tb(self.__traceback__)
-        own = [one for one in frames if not one.filename.startswith(_PACKAGE) and _LIBRARIES not in one.filename]
-        own = [one for one in own if one.line]
-        return [f"\x1b[31m{type(self).__name__}\x1b[0m: {self}", *map(_place, own)]
+        return rendered(self, str(self))
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C, or the stop button of a notebook, during a call of afspm."""
+
+    def _render_traceback_(self) -> list[str]:
+        return rendered(self, "nothing is left half done")
+
+
+def rendered(error: BaseException, text: str) -> list[str]:
+    """Return an error and the caller's own lines, without those of afspm and of libraries."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [one for one in frames if not one.filename.startswith(_PACKAGE) and _LIBRARIES not in one.filename]
+    own = [one for one in own if one.line]
+    return [f"\x1b[31m{type(error).__name__}\x1b[0m: {text}", *map(_place, own)]
 
 
 def _place(frame: traceback.FrameSummary) -> str:

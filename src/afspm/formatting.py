@@ -13,7 +13,7 @@ _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, 
 PREFIXABLE = frozenset(
     {"m", "V", "A", "s", "N", "Hz", "W", "F", "m/s", "m/V", "V/m", "C", "S", "Pa", "Ohm", "Ω", "T", "g"}
 )
-_LENGTHS = ((1e-3, "mm"), (1e-6, "um"), (1e-9, "nm"), (1e-12, "pm"))
+_LENGTHS = ((1e-3, "mm"), (1e-6, "µm"), (1e-9, "nm"), (1e-12, "pm"))
 
 
 def duration_text(seconds: float) -> str:
@@ -51,7 +51,7 @@ def area_text(size_m: Sequence[float]) -> str:
     """(width, height) of a region.
 
     >>> area((2e-6, 1e-6))
-    '2 x 1 um'
+    '2 x 1 µm'
     """
     return lengths_text(size_m, " x ")
 
@@ -60,7 +60,7 @@ def position_text(xy_m: tuple[float, float]) -> str:
     """(x, y).
 
     >>> place((1.2e-6, -5e-7))
-    '(1.2, -0.5) um'
+    '(1.2, -0.5) µm'
     """
     numbers, unit = lengths_text(xy_m).rsplit(" ", 1)
     return f"({numbers}) {unit}"
@@ -69,10 +69,10 @@ def position_text(xy_m: tuple[float, float]) -> str:
 def typeset(told: str) -> str:
     """Return what `lengths`, `area` and `place` give, for pages.
 
-    >>> typeset("2 x 1 um at (1.2, -0.5) um")
+    >>> typeset("2 x 1 µm at (1.2, -0.5) µm")
     '2 × 1 µm at (1.2, −0.5) µm'
     """
-    return told.replace(" x ", " × ").replace(" um", " µm").replace("-", "−")
+    return told.replace(" x ", " × ").replace("-", "−")
 
 
 def time_of_day(time_ns: int, zone: tzinfo | None = None, *, seconds: bool = True) -> str:
@@ -142,6 +142,11 @@ def typeset_area(size_m: Sequence[float]) -> str:
 def typeset_length(length_m: float) -> str:
     """Return a length for a page: "200 nm"."""
     return typeset(lengths_text([length_m]))
+
+
+def unit_text(unit: str) -> str:
+    """Return a unit as texts show it: "um/s" as "µm/s"."""
+    return f"µ{unit[1:]}" if unit.startswith("um") else unit
 
 
 def counted(count: int, one: str, many: str = "") -> str:

@@ -94,9 +94,13 @@ class Unit:
 
     Attributes:
         si: the SI unit that the component gets, e.g. "m".
+        is_written: whether the file has to write a unit, where a plain number could mean several (seconds, minutes).
+        least: the smallest value, in that unit.
     """
 
     si: str
+    is_written: bool = False
+    least: float = -math.inf
 
     def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> object:
         """Makes pydantic read the text too. Called by it alone, so that we need not load it here."""
@@ -113,13 +117,21 @@ class Unit:
         if isinstance(value, bool) or not isinstance(value, str | float | int):
             raise UnitError(f"{value!r} is not a quantity", hint=_hint(self.si))
         number = si(value, self.si)
+        if self.is_written and number and (not isinstance(value, str) or not parse_quantity(value)[1]):
+            raise UnitError(f"{value} has no unit", hint=_hint(self.si))
         if not math.isfinite(number):
             raise UnitError(f"{value!r} is not a finite number")
+        if number < self.least:
+            raise UnitError(f"{value!r} is below {self.least:g} {self.si}", hint=_hint(self.si))
         return number
 
 
 Length = Annotated[float, Unit("m")]
-Duration = Annotated[float, Unit("s")]
+Duration = Annotated[float, Unit("s", least=0.0)]
+Period = Annotated[float, Unit("s", is_written=True, least=0.0)]
+"""A duration on which a night depends: 10 may mean seconds or minutes, so the file names the unit."""
+PollPeriod = Annotated[float, Unit("s", least=1e-3)]
+"""The time between two looks at a controller: without any, a process does nothing else."""
 Angle = Annotated[float, Unit("rad")]
 Voltage = Annotated[float, Unit("V")]
 Current = Annotated[float, Unit("A")]

@@ -12,16 +12,21 @@ from afspm.model import (
     ControlRequest,
     ControlResponse,
     Parameter,
+    ProbePosition,
     Problem,
     ProcessState,
     ProcessStates,
+    Region,
+    RegionChange,
     RelayedMessage,
+    ScanParameters,
     ScopeState,
     names,
 )
 from tests.simulation.client import Client, Doing
 
 _OK = int(ControlResponse.SUCCESS)
+_IN_THE_MIDDLE = Region((0.0, 0.0), (1e-6, 1e-6))
 
 
 class Experiment(Client):
@@ -62,6 +67,8 @@ class Experiment(Client):
             yield from self.sleep(self.some(20.0))
             return
         begun = yield from self.ask(ControlRequest.ACTION, names.START_SCAN)
+        if begun.code == ControlResponse.ACTION_ERROR:  # the place has drifted out of the region that is allowed
+            yield from self.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(_IN_THE_MIDDLE))
         if begun.code != _OK:
             yield from self.sleep(self.some(20.0))
             return
@@ -173,6 +180,86 @@ class Careless(Experiment):
             yield from self.ask(ControlRequest.PARAM, Parameter(names.FEEDBACK_ON, "on"))
             yield from self.ask(ControlRequest.RELEASE_CTRL)
             yield from self.sleep(self.some(600.0))
+
+
+class Burster(Experiment):
+    """Sends its commands without waiting for answers, as a program of its own may; all within reach of the limits."""
+
+    def behave(self) -> Doing:
+        while True:
+            if not (yield from self.regain(Problem.NONE)):
+                continue
+            for _ in range(self.timeline.random.randint(1, 8)):
+                yield from self.until(lambda: self.scope is ScopeState.FREE, 5.0)
+                # of two that are the same, the record could not tell one from the other
+                for kind, subject in dict.fromkeys(self._wish() for _ in range(self.timeline.random.randint(2, 7))):
+                    self.tell(kind, subject)
+                yield from self.sleep(2.0 * self.timeline.random.random())
+                self.tell(ControlRequest.ACTION, names.STOP_SCAN)
+            yield from self.ask(ControlRequest.RELEASE_CTRL)
+            yield from self.sleep(self.some(1200.0))
+
+    def _wish(self) -> tuple[int, Any]:
+        """Return a random request; sizes and corners are up to twice as large as fits."""
+        chance = self.timeline.random
+        at_m, size_m = chance.uniform(-5e-6, 5e-6), chance.uniform(0.2e-6, 8e-6)
+        small = Region((at_m / 3, chance.uniform(-1e-6, 1e-6)), (1e-6, 1e-6))
+        return chance.choice(
+            (
+                _setting(names.SCAN_SIZE_X, size_m),
+                _setting(names.SCAN_SIZE_Y, size_m),
+                _setting(names.SCAN_TOP_LEFT_X, at_m),
+                _setting(names.SCAN_TOP_LEFT_Y, at_m),
+                _setting(names.SCAN_ANGLE, chance.uniform(-1.5, 1.5)),
+                (ControlRequest.SET_SCAN_PARAMS, ScanParameters(small)),
+                (ControlRequest.SET_SCAN_PARAMS, ScanParameters(RegionChange(left_m=at_m, width_m=size_m))),
+                (ControlRequest.SET_PROBE_POS, ProbePosition((at_m, 0.0))),
+                _setting(names.PROBE_POS_X, at_m),
+                _setting(names.PROBE_POS_Y, at_m),
+                _setting(names.ZCTRL_SETPOINT, chance.uniform(0.5, 2.0)),
+                _setting(names.ZCTRL_SETPOINT, chance.uniform(0.5, 2.0)),
+                _setting(names.MOVE_SPEED, chance.uniform(0.5e-6, 2e-6)),
+                _setting(names.MOVE_SPEED, chance.uniform(0.5e-6, 2e-6)),
+                (ControlRequest.ACTION, names.START_SCAN),
+                (ControlRequest.ACTION, names.START_SCAN),
+            )
+        )
+
+
+def _setting(name: str, value: float) -> tuple[int, Any]:
+    return ControlRequest.PARAM, Parameter(name, repr(value), "rad" if name == names.SCAN_ANGLE else None)
+
+
+class Adjuster(Client):
+    """A person who turns one knob again and again, beside the component in control."""
+
+    def behave(self) -> Doing:
+        while True:
+            yield from self.sleep(self.some(300.0))
+            for _ in range(self.timeline.random.randint(1, 4)):
+                value = repr(self.timeline.random.uniform(0.5, 2.0))
+                self.tell(ControlRequest.PARAM, Parameter(names.ZCTRL_SETPOINT, value))
+
+
+class Forgetful(Experiment):
+    """Repeats the id of an action after more requests than scheduler and translator remember."""
+
+    def behave(self) -> Doing:
+        while True:
+            if not (yield from self.regain(Problem.NONE)):
+                continue
+            yield from self.until(lambda: self.scope is ScopeState.FREE, 5.0)
+            key = f"{self.identity}/{self.name}-{self.life}/{self._requests + 1}"
+            yield from self.ask(ControlRequest.ACTION, names.START_SCAN)
+            yield from self.ask(ControlRequest.ACTION, names.STOP_SCAN)
+            for _ in range(350):
+                if not self._holds():
+                    break
+                yield from self.ask(ControlRequest.PARAM, Parameter(names.ZCTRL_PGAIN, "1.0"))
+            yield from self.ask(ControlRequest.ACTION, names.START_SCAN, key)
+            yield from self.ask(ControlRequest.ACTION, names.STOP_SCAN)
+            yield from self.ask(ControlRequest.RELEASE_CTRL)
+            yield from self.sleep(1e6)  # once is enough, and long enough
 
 
 class Impostor(Client):

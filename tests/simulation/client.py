@@ -182,9 +182,7 @@ class Client(Process):
 
     def ask(self, kind: int, subject: Any = None, key: str = "") -> Generator[float, None, Response]:
         """Ask the scheduler, again if it is silent. NO_RESPONSE if it stays so."""
-        self._requests += 1
-        request_id = key or f"{self.identity}/{self.name}-{self.life}/{self._requests}"
-        request = Request(int(kind), subject, self.codec.encode(subject), request_id if self.knows_ids else "")
+        request = self._request(kind, subject, key)
         for _ in range(TRIES if self.knows_ids else 1):
             yield from self.until(lambda: self._line is not None and self._line.up)
             self._asked, self._answer = request, None
@@ -195,6 +193,16 @@ class Client(Process):
                 break
         answer, self._asked, self._answer = self._answer, None, None
         return answer or Response(int(ControlResponse.NO_RESPONSE), b"", "silence", request.id)
+
+    def tell(self, kind: int, subject: Any = None) -> None:
+        """Ask the scheduler, and wait for no answer."""
+        if self._line is not None and self._line.up:
+            self._line.ask(self._request(kind, subject))
+
+    def _request(self, kind: int, subject: Any, key: str = "") -> Request:
+        self._requests += 1
+        request_id = key or f"{self.identity}/{self.name}-{self.life}/{self._requests}"
+        return Request(int(kind), subject, self.codec.encode(subject), request_id if self.knows_ids else "")
 
     def until(self, holds: Callable[[], bool], timeout_s: float = 1e9) -> Generator[float, None, bool]:
         """Wait until something holds; False if the time is up first."""

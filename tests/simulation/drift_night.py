@@ -11,19 +11,18 @@ import numpy as np
 from afspm.drift.mapping import Mapping
 from afspm.drift.trackers.paper import PaperForecast
 from afspm.logic.events import Effect, Publish
-from afspm.model import ControlResponse, Packet, Region, RegistrationOutcome, Request, Scan, ScanParameters, ScopeState
+from afspm.model import Packet, Region, RegistrationOutcome, Scan, ScanParameters, ScopeState
 from afspm.model.geometry import XY
 from afspm.scheduler.drift.core import DriftCore
 from afspm.scheduler.drift.messages import Forecasted, Registered, RescanWanted, ScanJob, WorkerGone, WorkerSaid
 from afspm.scheduler.drift.settings import DriftCompensationSettings, RescanRule
 from tests.simulation.codec import TableCodec
 from tests.simulation.invariants import InvariantViolated
-from tests.simulation.microscope import FakeMicroscope, FakeScan, Habits
+from tests.simulation.microscope import SHAPE, FakeMicroscope, FakeScan, Habits
 from tests.simulation.night import Night, Plan
 from tests.simulation.scheduler import SchedulerHost
 from tests.simulation.timeline import START_S
 
-SHAPE = (4, 4)
 WANTED = Region((0.0, 0.0), (2e-6, 2e-6))
 LONGEST_S = 2.0
 CERTAIN_M = 1e-12
@@ -71,14 +70,10 @@ class DriftTable(TableCodec):
 
 
 class DriftingMicroscope(FakeMicroscope):
-    """Tells and takes regions; moving takes a moment."""
+    """Moving takes a moment."""
 
     region = Region((0.3e-6, 0.0), (2e-6, 2e-6))
     scan_began_s = 0.0
-
-    def _tell_what_is_in_force(self) -> None:
-        self._publish("ScanParameters2d", ScanParameters(self.region, SHAPE))
-        self._publish_state(self.state)
 
     def _publish(self, message: str, thing: object) -> None:
         if isinstance(thing, FakeScan):
@@ -90,16 +85,10 @@ class DriftingMicroscope(FakeMicroscope):
         self.scan_began_s = self.timeline.now_s()
         super()._begin(state)
 
-    def _carry_out(self, request: Request) -> ControlResponse:
-        code = super()._carry_out(request)
-        subject = request.subject
-        if code is ControlResponse.SUCCESS and isinstance(subject, ScanParameters):
-            assert isinstance(subject.region, Region)
-            self.region = subject.region
-            self._publish_state(ScopeState.MOVING)
-            self._publish("ScanParameters2d", ScanParameters(self.region, SHAPE))
-            self.later(0.05 * self.timeline.random.random(), self._moved)
-        return code
+    def _publish_region(self) -> None:
+        self._publish_state(ScopeState.MOVING)
+        super()._publish_region()
+        self.later(0.05 * self.timeline.random.random(), self._moved)
 
     def _moved(self) -> None:
         if self.state is ScopeState.MOVING:

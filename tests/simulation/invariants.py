@@ -40,6 +40,7 @@ from tests.simulation.microscope import FakeMicroscope
 from tests.simulation.scheduler import SchedulerHost
 from tests.simulation.timeline import Timeline
 from tests.simulation.tip_safety import TipSafety
+from tests.simulation.within_limits import WithinLimits
 from tests.simulation.written import Written
 
 _SUCCESS, _NO_RESPONSE = int(ControlResponse.SUCCESS), int(ControlResponse.NO_RESPONSE)
@@ -67,6 +68,7 @@ class Invariants:
         self._timeline = timeline
         self._settings = settings
         self.tip = TipSafety(timeline, settings, microscope, self._must)
+        self.limits = WithinLimits(timeline, settings, microscope, self._must)
         self._microscope = microscope
         self._scheduler_since_s = 0.0
         self.components: list[Client] = []
@@ -81,6 +83,8 @@ class Invariants:
         self._published: dict[int, tuple[str, bytes | memoryview]] = {}
         self._by_source: dict[int, int] = {}
         self._actions: dict[tuple[str, str], str] = {}
+        self._parameters: dict[tuple[str, str], str] = {}
+        self._codec = codec
         self.times_are_certain = self.memory_is_certain = True
         self._open: dict[tuple[str, str], tuple[float, int]] = {}
         self._definite: dict[tuple[str, str], int] = {}
@@ -94,7 +98,7 @@ class Invariants:
     def forgets(self) -> None:
         """The scheduler may be killed before it could write down what it knows."""
         self.times_are_certain = self.memory_is_certain = False
-        self.written.is_certain = self.tip.memory_is_certain = False
+        self.written.is_certain = self.tip.memory_is_certain = self.limits.memory_is_certain = False
 
     # --- the scheduler ---
 
@@ -113,7 +117,8 @@ class Invariants:
             self._publish(effect)
         elif isinstance(effect, Forward):
             self._forward(host, effect)
-        if isinstance(effect, Reply | Publish):
+        # a scan of the translator's says nothing of control, and may go out before a change of it is saved
+        if isinstance(effect, Reply) or (isinstance(effect, Publish) and effect.source_ns is None):
             self._saved(host)
 
     def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:
@@ -211,6 +216,8 @@ class Invariants:
         key = (event.name, event.request.id)
         if event.request.kind == ControlRequest.ACTION:
             self._actions[key] = str(event.request.subject)
+        if isinstance(event.request.subject, Parameter):
+            self._parameters[key] = event.request.subject.name
         replied = any(isinstance(e, Reply) and e.response.id == event.request.id for e in effects)
         if event.request.id and not replied:
             self._open.setdefault(key, (self._timeline.monotonic_s(), event.connection))
@@ -222,6 +229,10 @@ class Invariants:
         response = reply.response
         key = (reply.name, response.id)
         self._open.pop(key, None)
+        name = self._parameters.get(key)
+        if name is not None and response.id and response.code == _SUCCESS:
+            value = self._codec.decode_parameter(response.payload)
+            self._must(value is not None and value.name == name, f"{key} asked for {name}, and was answered {value}")
         if response.id and response.code != _NO_RESPONSE and NAME_TAKEN not in response.reason:
             before = self._definite.setdefault(key, response.code)
             self._must(before == response.code, f"{key} was answered {before}, and now {response.code}")
@@ -239,7 +250,10 @@ class Invariants:
         while self._open:
             key, (since_s, _) = next(iter(self._open.items()))
             since_s = max(since_s, host.since_s)
-            if now_s - since_s <= self._settings.request_timeout_s + _SLACK_S:
+            allowed_s = self._settings.request_timeout_s + _SLACK_S
+            if host.core.control.ended:  # the answers wait for the tip to be away, but not for ever
+                allowed_s += self._settings.patience_s
+            if now_s - since_s <= allowed_s:
                 return
             self.fail(f"{key} was accepted {now_s - since_s:.1f} s ago and has no answer")
 
@@ -247,9 +261,11 @@ class Invariants:
         request = effect.request
         name = request.id.split("/")[0]
         if request.kind in _FORWARDED and request.id and not _is_get(request):
-            self._must(
-                name == host.core.control.holder, f"a command of {name} is sent, {host.core.control.holder} holds"
-            )
+            holder, rules = host.core.control.holder, self._settings.rules
+            adjusts = isinstance(request.subject, Parameter) and request.subject.name in rules.adjustable
+            may = name == holder or (adjusts and name in (rules.roles.operate or ()))
+            self._must(may, f"a command of {name} is sent, {holder} holds")
+            self.limits.sent(request)
             self._used_ns = self._timeline.now_ns()
             value = request.subject.value if isinstance(request.subject, Parameter) else None
             self._must(value != "nan", "a NaN is sent to the microscope")
@@ -257,6 +273,8 @@ class Invariants:
     def executed(self, request: Request) -> None:
         """The microscope carries out a command."""
         self.tip.executed(request)
+        self.written.executed(request)
+        self.limits.executed(request)
         if request.id:
             count = self._microscope.executed[request.id, request.kind]
             once = count == 1 or request.kind != ControlRequest.ACTION or not self.memory_is_certain

@@ -6,18 +6,26 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from afspm.errors import InvalidValue
 from afspm.model import (
     ControlRequest,
     ControlResponse,
     Feedback,
     Packet,
     Parameter,
+    PositionChange,
+    ProbePosition,
+    Region,
+    RegionChange,
     Request,
     Response,
+    ScanParameters,
     ScopeState,
     ScopeStatus,
     names,
 )
+from afspm.plain_data import Plain
+from afspm.translator.requests import RequestOutcomes
 from tests.simulation.codec import TableCodec
 from tests.simulation.network import ControlLine, Feed
 from tests.simulation.process import Process
@@ -27,6 +35,24 @@ CHANNELS = ("Height", "Height_Retrace")
 _STARTS = {names.START_SCAN: ScopeState.SCANNING, names.START_SPEC: ScopeState.SPEC}
 _STOPS = {names.STOP_SCAN: ScopeState.SCANNING, names.STOP_SPEC: ScopeState.SPEC}
 _HISTORY = 200
+SHAPE = (4, 4)
+WHILE_BUSY = frozenset({names.ZCTRL_SETPOINT})
+"""The parameters that may be set during a scan."""
+_PARTS: dict[str, Callable[[Region], float]] = {
+    names.SCAN_TOP_LEFT_X: lambda region: region.top_left_m[0],
+    names.SCAN_TOP_LEFT_Y: lambda region: region.top_left_m[1],
+    names.SCAN_SIZE_X: lambda region: region.size_m[0],
+    names.SCAN_SIZE_Y: lambda region: region.size_m[1],
+    names.SCAN_ANGLE: lambda region: region.angle_rad,
+}
+_CHANGES: dict[str, Callable[[float], RegionChange]] = {
+    names.SCAN_TOP_LEFT_X: lambda value: RegionChange(left_m=value),
+    names.SCAN_TOP_LEFT_Y: lambda value: RegionChange(low_m=value),
+    names.SCAN_SIZE_X: lambda value: RegionChange(width_m=value),
+    names.SCAN_SIZE_Y: lambda value: RegionChange(height_m=value),
+    names.SCAN_ANGLE: lambda value: RegionChange(angle_rad=value),
+}
+_PROBE = (names.PROBE_POS_X, names.PROBE_POS_Y)
 
 
 @dataclass(frozen=True)
@@ -70,19 +96,27 @@ class FakeMicroscope(Process):
     Attributes:
         executed: how often each command (client's id, or scheduler's number, and kind) was carried out, in all lives.
         scans_done: in all lives.
-        feedback_on, tip_is_away: the controller's, which outlives its translator.
+        feedback_on, tip_is_away, region, probe_m, values: the controller's, which outlives its translator.
+        on_changed: called with a parameter, its value before and now.
+        on_placed: called after the scan's region or the probe was set.
     """
+
+    region = Region((0.0, 0.0), (1e-6, 1e-6))
 
     def __init__(self, timeline: Timeline, codec: TableCodec, habits: Habits) -> None:
         super().__init__(timeline, "translator")
         self.habits = habits
         self.executed: Counter[tuple[str, int]] = Counter()
         self.on_executed: Callable[[Request], None] = lambda request: None
+        self.on_changed: Callable[[str, float, float], None] = lambda name, before, now: None
+        self.on_placed: Callable[[], None] = lambda: None
+        self.probe_m = (0.0, 0.0)
+        self.values = {names.TIP_BIAS_VOLTAGE: 1.0, names.ZCTRL_SETPOINT: 1.0, names.MOVE_SPEED: 1e-6}
         self.scans_done = 0
         self.tip_is_good = True
         self.feedback_on, self.tip_is_away = True, False
         self._codec = codec
-        self._ledger: dict[str, Response] = {}  # on its disk
+        self._kept: Plain = {}  # on its disk
         self._newest_ns = 0
         self._history: deque[Packet] = deque(maxlen=_HISTORY)
         self._forget()
@@ -102,9 +136,13 @@ class FakeMicroscope(Process):
         self._tell_what_is_in_force()
 
     def _tell_what_is_in_force(self) -> None:
-        self._publish("ScanParameters2d", "the region")
-        self._publish("ZCtrlParameters", Feedback(on=self.feedback_on))
+        self._publish("ScanParameters2d", ScanParameters(self.region, SHAPE))
+        self._publish("ProbePosition", ProbePosition(self.probe_m))
+        self._publish("ZCtrlParameters", self._feedback())
         self._publish_state(self.state)
+
+    def _feedback(self) -> Feedback:
+        return Feedback(on=self.feedback_on, setpoint=self.values[names.ZCTRL_SETPOINT])
 
     # --- as a server ---
 
@@ -141,8 +179,8 @@ class FakeMicroscope(Process):
         self._serve()
 
     def _handle(self, request: Request) -> Response:
-        known = self._ledger.get(request.id) if self.habits.knows_ids and request.id else None
-        if known is not None:
+        outcomes = RequestOutcomes(self._kept, all_or_nothing=False)
+        if self.habits.knows_ids and (known := outcomes.outcome(request)) is not None:
             return known
         code = self._carry_out(request)
         payload = b""
@@ -152,13 +190,21 @@ class FakeMicroscope(Process):
         response = Response(int(code), payload, "" if code is ControlResponse.SUCCESS else f"it is {self.state.name}")
         if self.habits.knows_ids and request.id:
             response.id = request.id
-            self._ledger[request.id] = response
+            outcomes.begin(request)
+            outcomes.finish(request, response)
         return response
 
     def _in_force(self, asked: Parameter) -> Parameter:
-        if asked.name == names.FEEDBACK_ON:
-            return Parameter(asked.name, "on" if self.feedback_on else "off")
-        return Parameter(asked.name, asked.value or "1.0", "V")
+        name = asked.name
+        if name == names.FEEDBACK_ON:
+            return Parameter(name, "on" if self.feedback_on else "off")
+        if name in _PARTS:
+            return Parameter(name, repr(_PARTS[name](self.region)), "rad" if name == names.SCAN_ANGLE else "m")
+        if name in _PROBE:
+            return Parameter(name, repr(self.probe_m[_PROBE.index(name)]), "m")
+        return (
+            Parameter(name, repr(self.values[name])) if name in self.values else Parameter(name, asked.value or "1.0")
+        )
 
     def _carry_out(self, request: Request) -> ControlResponse:
         subject = request.subject
@@ -172,7 +218,8 @@ class FakeMicroscope(Process):
             if self.state is _STOPS[subject]:
                 self._interrupt()
             return ControlResponse.SUCCESS
-        if self.state is not ScopeState.FREE:
+        adjusts = isinstance(subject, Parameter) and subject.name in WHILE_BUSY
+        if self.state is not ScopeState.FREE and not adjusts:
             return ControlResponse.NOT_FREE
         if request.id:
             self.executed[request.id, request.kind] += 1
@@ -185,7 +232,49 @@ class FakeMicroscope(Process):
             self.tip_is_away = True
         elif isinstance(subject, Parameter) and subject.name == names.FEEDBACK_ON:
             self._switch_feedback(on=subject.value == "on")
+        else:
+            return self._set(subject)
         return ControlResponse.SUCCESS
+
+    def _set(self, subject: object) -> ControlResponse:
+        x_m, y_m = self.probe_m
+        match subject:
+            case ScanParameters(region=Region() | RegionChange() as region):
+                return self._place(region)
+            case ProbePosition(xy_m=(x_m, y_m)):
+                self._move_probe(x_m, y_m)
+            case PositionChange():
+                self._move_probe(
+                    x_m if subject.x_m is None else subject.x_m, y_m if subject.y_m is None else subject.y_m
+                )
+            case Parameter(value=str(text)) if subject.name in _CHANGES:
+                return self._place(_CHANGES[subject.name](float(text)))
+            case Parameter(value=str(text)) if subject.name in _PROBE:
+                is_x = subject.name == names.PROBE_POS_X
+                self._move_probe(float(text) if is_x else x_m, y_m if is_x else float(text))
+            case Parameter(value=str(text)) if subject.name in self.values:
+                before, self.values[subject.name] = self.values[subject.name], float(text)
+                self.on_changed(subject.name, before, float(text))
+                if subject.name == names.ZCTRL_SETPOINT:
+                    self._publish("ZCtrlParameters", self._feedback())
+        return ControlResponse.SUCCESS
+
+    def _place(self, region: Region | RegionChange) -> ControlResponse:
+        try:
+            self.region = region.onto(self.region) if isinstance(region, RegionChange) else region
+        except InvalidValue:
+            return ControlResponse.PARAM_ERROR
+        self.on_placed()
+        self._publish_region()
+        return ControlResponse.SUCCESS
+
+    def _publish_region(self) -> None:
+        self._publish("ScanParameters2d", ScanParameters(self.region, SHAPE))
+
+    def _move_probe(self, x_m: float, y_m: float) -> None:
+        self.probe_m = (x_m, y_m)
+        self.on_placed()
+        self._publish("ProbePosition", ProbePosition(self.probe_m))
 
     # --- the microscope ---
 
@@ -202,7 +291,7 @@ class FakeMicroscope(Process):
     def _switch_feedback(self, *, on: bool) -> None:
         self.feedback_on = on
         if self.alive:
-            self._publish("ZCtrlParameters", Feedback(on=on))
+            self._publish("ZCtrlParameters", self._feedback())
 
     def _begin(self, state: ScopeState) -> None:
         self._publish_state(state)

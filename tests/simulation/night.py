@@ -15,7 +15,7 @@ from afspm.logic.supervision.child import ChildPolicy
 from afspm.logic.supervision.liveness import LivenessPolicy
 from afspm.logic.supervision.restart import RestartPolicy
 from afspm.logic.watchdog import WatchdogSettings
-from afspm.model import Packet, PacketHeader, ScopeState, names
+from afspm.model import Packet, PacketHeader, Region, ScopeState, names
 from tests.simulation import behaviours
 from tests.simulation.client import Client
 from tests.simulation.codec import TableCodec
@@ -58,11 +58,16 @@ CAST = {
     "old": behaviours.Version1Experiment,
     "careless": behaviours.Careless,
     "person": behaviours.Person,
+    "burster": behaviours.Burster,
+    "adjuster": behaviours.Adjuster,
+    "forgetful": behaviours.Forgetful,
 }
-_TROUBLE = ("greedy", "crasher", "impostor", "operator", "stranger", "careless")
+_TROUBLE = ("greedy", "crasher", "impostor", "operator", "stranger", "careless", "burster", "adjuster", "forgetful")
 _ALWAYS = ("experiment", "classifier", "corrector", "feedback", "person")
 _PEOPLE = ("operator", "person", "dawn")
 _JOURNAL_S = 0.1
+_SLOWEST_S = 8.0
+"""Packets that are published before the journal is written must be few enough for a restart to remember."""
 _LONGEST_SILENCE_S = 8.0
 """Heartbeats of the network find a half-open connection by then."""
 
@@ -299,7 +304,7 @@ class Night:
         elif fault.what == "full disk":
             self._full_disk(fault.for_s)
         elif fault.what == "slow disk":
-            self.scheduler.journal_s = fault.for_s
+            self.scheduler.journal_s = min(fault.for_s, _SLOWEST_S)
             self.timeline.after(fault.for_s, setattr, self.scheduler, "journal_s", _JOURNAL_S)
         elif fault.what == "clock":
             self.invariants.times_are_certain = False
@@ -352,6 +357,7 @@ class Night:
             self.invariants.fail(f"nothing was scanned in the calm; control: {self.scheduler.core.control}")
         cached = [packet for packet, *_ in self.scheduler.core.cached()]
         self.timeline.run_until(self.timeline.monotonic_s() + 1.0)
+        self.invariants.written.has_all_starts()
         for client in self.components.values():
             settled = self.timeline.monotonic_s() - max(client.since_s, self.scheduler.since_s) > _SETTLED_S
             if client.alive and self.scheduler.alive and settled:
@@ -369,8 +375,13 @@ class Night:
 
 def _settings(plan: Plan) -> SchedulerSettings:
     limits = ExperimentLimits(
-        {names.TIP_BIAS_VOLTAGE: Limit(low=-10.0, high=10.0, source="night")},
-        {names.PULSE: Limit(only=("corrector", "feedback"), source="night")},
+        {
+            names.TIP_BIAS_VOLTAGE: Limit(low=-10.0, high=10.0, source="night"),
+            names.ZCTRL_SETPOINT: Limit(step=0.3, source="night"),
+            names.MOVE_SPEED: Limit(rate_per_s=2e-9, source="night"),
+        },
+        {names.PULSE: Limit(only=("corrector", "feedback"), interval_s=60.0, source="night")},
+        region=Region((0.0, 0.0), (8e-6, 8e-6)),
     )
     watchdog = WatchdogSettings(
         stop_when=frozenset(plan.stop_when),
@@ -380,7 +391,10 @@ def _settings(plan: Plan) -> SchedulerSettings:
         longest_s=20.0,
     )
     return SchedulerSettings(
-        rules=Rules(RoleTable(end=("dawn",), mode=_PEOPLE, clear=_PEOPLE)),
+        rules=Rules(
+            RoleTable(end=("dawn",), mode=_PEOPLE, clear=_PEOPLE, operate=("adjuster",)),
+            adjustable=frozenset({names.ZCTRL_SETPOINT}),
+        ),
         lease_s=plan.lease_s,
         watchdog=watchdog,
         limits=limits,

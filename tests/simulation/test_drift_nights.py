@@ -22,7 +22,7 @@ def test_a_quiet_night_s_scans_lie_where_they_were_taken_on_the_sample() -> None
     assert night.published >= 2 * (outcome.scans - 2)
     assert np.median(night.misplaced_m) < 0.5e-9
     # the microscope followed the sample, by what was known before each scan
-    assert abs(night.microscope.region.center_m[0]) > 1e-6  # type: ignore[attr-defined]
+    assert abs(night.microscope.region.center_m[0]) > 1e-6
 
 
 def test_a_worker_in_trouble_costs_no_scan() -> None:

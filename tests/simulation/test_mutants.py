@@ -9,14 +9,15 @@ from typing import Any
 
 import pytest
 
-from afspm.logic import answers, arbitration, control_change, event_log, scheduler_core
+from afspm.logic import answers, arbitration, control_change, event_log, request_pipeline, scheduler_core
 from afspm.logic.arbitration import ArbitrationEvent, ControlChange, Transition
 from afspm.logic.cache import PacketCache
+from afspm.logic.coordinate_frame import MappedRequest
 from afspm.logic.event_log import EventLog
-from afspm.logic.events import Effect, SaveState
-from afspm.logic.forwarder import Forwarder
+from afspm.logic.events import Effect, RequestIn, SaveState
+from afspm.logic.forwarder import ForwardedRequest, Forwarder
 from afspm.logic.holder_timeout import HolderTimeout, Lease
-from afspm.logic.idempotency_cache import IdempotencyCache
+from afspm.logic.idempotency_cache import Floors, IdempotencyCache
 from afspm.logic.lifecycle import ExperimentEnd
 from afspm.logic.limit_checker import LimitChecker
 from afspm.logic.microscope_status import MicroscopeStatus
@@ -24,10 +25,12 @@ from afspm.logic.sessions import Hearing, SessionTable
 from afspm.logic.state import SchedulerState, StateDraft
 from afspm.logic.watchdog import Watchdog
 from afspm.model import JournalEntries, JournalEntry
+from tests.simulation.drift_night import DriftNight
 from tests.simulation.invariants import InvariantViolated
 from tests.simulation.night import Fault, Night, Plan, plan
 
-NIGHTS = 16
+pytestmark = pytest.mark.slow
+NIGHTS = 24
 Patch = pytest.MonkeyPatch
 
 _FEW = ("experiment", "classifier", "corrector", "feedback", "person")
@@ -43,6 +46,9 @@ def _bad_night(seed: int) -> Plan:
     if seed % 4 == 1:  # one whose tip is often in danger, at a microscope that can't always withdraw it
         cast = (*_FEW, "careless", "stranger")
         drawn = replace(drawn, cast=cast, ends=True, retracts=seed != 13, speed=60.0)
+    if seed % 4 == 2:  # clients that do not wait for answers, and one that repeats ids
+        drawn = replace(drawn, cast=(*_FEW, "burster", "adjuster", "forgetful"))
+        away += [Fault("storm", "experiment", 0.2, 100.0)]  # packets arrive after answers to later requests
     there = ("scheduler", "translator", *drawn.cast)
     faults = (*(fault for fault in drawn.faults if fault.whom in there), *away)
     slow = replace(drawn, speed=drawn.speed / 2.0)  # in more real time more connections come and go
@@ -131,14 +137,15 @@ def nothing_expires(patch: Patch) -> None:
 def any_answer_will_do(patch: Patch) -> None:
     real = Forwarder.answered
 
-    def answered(self: Forwarder, number: int, response: Any, now_s: float) -> Any:
-        return real(self, self.flight.number if self.flight else number, response, now_s)
+    def answered(self: Forwarder, number: int, response: Any) -> Any:
+        return real(self, self.flight.number if self.flight else number, response)
 
     patch.setattr(Forwarder, "answered", answered)
 
 
-def nothing_is_called_back(patch: Patch) -> None:
+def a_former_holder_commands_on(patch: Patch) -> None:
     patch.setattr(answers, "call_back", lambda draft, former, cause: None)
+    patch.setattr(request_pipeline, "_not_allowed_now", lambda draft, job: None)
 
 
 def told_before_saved(patch: Patch) -> None:
@@ -229,6 +236,10 @@ def entries_are_not_kept_over_a_kill(patch: Patch) -> None:
     patch.setattr(PacketCache, "restore", restore)
 
 
+def starts_are_not_saved_before_they_are_sent(patch: Patch) -> None:
+    patch.setattr(EventLog, "sending", lambda self, *args: self)
+
+
 def the_tip_is_never_retracted(patch: Patch) -> None:
     patch.setattr(Watchdog, "_endangered", lambda self, microscope: self)
 
@@ -254,7 +265,36 @@ def the_end_never_comes(patch: Patch) -> None:
 
 
 def limits_are_not_checked(patch: Patch) -> None:
-    patch.setattr(LimitChecker, "check", lambda self, *args: None)
+    patch.setattr(LimitChecker, "check", lambda self, *args, **how: None)
+
+
+def limits_are_decided_at_arrival(patch: Patch) -> None:
+    """As before decision 0060: a queued request is sent as it was decided at its arrival."""
+    real, decided = request_pipeline.enqueue, dict[str, MappedRequest | None]()
+
+    def enqueue(draft: StateDraft, event: RequestIn) -> None:
+        job = ForwardedRequest.of(event, command=not request_pipeline.reads(event.request))
+        frame = draft.env.frame
+        mapped = None if frame is None else frame.outgoing(job.client, job.request, draft.now_ns)
+        if job.command and isinstance(mapped, MappedRequest | None):
+            names = None if mapped is None else mapped.names
+            sent = job.request if mapped is None else mapped.request
+            refusal = draft.limits.check(job.client, sent, draft.now_ns, names) or draft.limits.check_place(job.request)
+            if refusal is not None:
+                answers.answer_unsent(draft, job, refusal)
+                return
+            decided[job.request.id] = mapped
+        real(draft, event)
+
+    def send(draft: StateDraft, job: ForwardedRequest) -> None:
+        request_pipeline._send(draft, job, decided.get(job.request.id))
+
+    patch.setattr(request_pipeline, "enqueue", enqueue)
+    patch.setattr(request_pipeline, "_decide", send)
+
+
+def forgotten_ids_are_new(patch: Patch) -> None:
+    patch.setattr(Floors, "is_below", lambda self, client, request_id: False)
 
 
 def everybody_has_every_role(patch: Patch) -> None:
@@ -269,6 +309,8 @@ MUTANTS = [
     the_end_does_not_wait_for_the_tip,
     the_end_never_comes,
     limits_are_not_checked,
+    limits_are_decided_at_arrival,
+    forgotten_ids_are_new,
     everybody_has_every_role,
     answers_are_written_down_once_more,
     every_fiftieth_answer_is_not_written_down,
@@ -277,6 +319,7 @@ MUTANTS = [
     entries_are_published_at_once,
     entries_backwards,
     entries_are_not_kept_over_a_kill,
+    starts_are_not_saved_before_they_are_sent,
     flag_leaves_control,
     two_in_control,
     anybody_while_flagged,
@@ -292,7 +335,7 @@ MUTANTS = [
     sent_actions_are_not_saved,
     nothing_expires,
     any_answer_will_do,
-    nothing_is_called_back,
+    a_former_holder_commands_on,
     told_before_saved,
     times_go_back,
     doubles_of_the_translator_pass,
@@ -306,6 +349,11 @@ def _nights() -> None:
         Night(_bad_night(seed)).run()
 
 
+def _drift_nights() -> None:
+    for seed in (2, 10, 18, 34):
+        DriftNight(_bad_night(seed)).run()
+
+
 def test_without_a_mutant_nothing_is_found() -> None:
     _nights()
 
@@ -315,3 +363,10 @@ def test_a_broken_scheduler_is_found(mutant: Callable[[Patch], None], monkeypatc
     mutant(monkeypatch)
     with pytest.raises(InvariantViolated):
         _nights()
+
+
+def test_limits_decided_at_arrival_are_found_in_sample_coordinates(monkeypatch: Patch) -> None:
+    _drift_nights()
+    limits_are_decided_at_arrival(monkeypatch)
+    with pytest.raises(InvariantViolated):
+        _drift_nights()

@@ -13,18 +13,22 @@ from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.model import (
     ControlEvent,
     ControlMode,
+    ControlRequest,
     ControlResponse,
     JournalEntries,
     JournalEntry,
     Packet,
     ProblemNames,
+    Request,
     component_of,
+    names,
 )
 from tests.simulation.codec import TableCodec
 from tests.simulation.scheduler import SchedulerHost
 from tests.simulation.timeline import Timeline
 
-_NO_RESPONSE = int(ControlResponse.NO_RESPONSE)
+_NO_RESPONSE, _SUCCESS = int(ControlResponse.NO_RESPONSE), int(ControlResponse.SUCCESS)
+_STARTS = (names.START_SCAN, names.START_SPEC)
 _REMEMBERED = 5000
 _LATE_S = 0.5
 _CATCHING_UP_S = 10.0
@@ -88,6 +92,8 @@ class Written:
         self._derived = _Derived()
         self.entries = 0
         self.is_certain = True
+        self._started: dict[str, set[str]] = {}
+        self._starts: dict[str, set[int]] = {}
 
     def carried_out(self, host: SchedulerHost, effect: Effect) -> None:
         """Before each effect."""
@@ -97,6 +103,17 @@ class Written:
             self._reply(effect)
         elif isinstance(effect, Publish) and effect.packet.envelope == ENTRIES:
             self._publish(effect.packet, at_the_end=host.core.control.ended)
+
+    def executed(self, request: Request) -> None:
+        """The microscope carries out a command."""
+        if request.id and request.kind == ControlRequest.ACTION and request.subject in _STARTS:
+            self._started.setdefault(request.id.partition("/")[0], set()).add(request.id)
+
+    def has_all_starts(self) -> None:
+        """Each measurement that was begun has the entry of its start, also where a process was killed in between."""
+        for who, begun in self._started.items():
+            written = len(self._starts.get(who, ()))
+            self._must(written >= len(begun) or not self.is_certain, f"{who}: {len(begun)} begun, {written} written")
 
     def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:
         """After each step."""
@@ -154,6 +171,8 @@ class Written:
 
     def _take(self, entry: JournalEntry, told: list[Told]) -> None:
         self.entries += 1
+        if entry.sent_ns is not None and entry.what in _STARTS and entry.response in (_SUCCESS, _NO_RESPONSE):
+            self._starts.setdefault(entry.who, set()).add(entry.sent_ns)
         self._must(entry.time_ns >= self._newest_ns, f"written down out of order: {entry}")
         self._newest_ns = entry.time_ns
         if entry.kind == CONTROL:

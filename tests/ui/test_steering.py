@@ -77,10 +77,10 @@ def test_a_person_takes_over_and_hands_back(night: Night, page: Any, keep: Any) 
 
 def test_a_problem_is_raised_and_cleared(night: Night, page: Any) -> None:
     choose(page, "problem", "drop-on-the-table")
-    press(page, "Raise")
+    press(page, "Flag")
     night.until(lambda: 9 in night.control().problems)
     page.wait_for_selector(".flag:has-text('drop-on-the-table'):has-text('flagged by dashboard:Ada')")
-    page.wait_for_selector(".flag .advice:has-text('then clear the problem')")
+    page.wait_for_selector(".flag .advice:has-text('then clear it')")
     page.wait_for_selector(".lane > b:text-is('drop-on-the-table')")
     press(page, "Clear drop-on-the-table")
     night.until(lambda: 9 not in night.control().problems)
@@ -90,7 +90,7 @@ def test_a_problem_is_raised_and_cleared(night: Night, page: Any) -> None:
 def test_all_problems_are_cleared_with_one_button(night: Night, page: Any) -> None:
     for problem, number in (("drop-on-the-table", 9), ("thermal-drift", 4)):
         choose(page, "problem", problem)
-        press(page, "Raise")
+        press(page, "Flag")
         night.until(lambda number=number: number in night.control().problems)  # type: ignore[misc]
     press(page, "Clear all problems")
     night.until(lambda: not night.control().problems)
@@ -114,7 +114,7 @@ def test_parameters_are_read_and_set_and_refusals_give_their_reason(night: Night
     assert refusal.refused
     assert refusal.reason in page.inner_text(".outcomes")
     assert "above the highest allowed, 3 V" in refusal.reason
-    page.wait_for_selector(".refusals >> text=tip-bias-voltage = 7.0 V")
+    page.wait_for_selector(".refusals >> text=tip-bias-voltage = 7 V")
     page.wait_for_selector(".q-field--error:has-text('above the highest allowed')")
     assert read(page, "scan-speed") == "4 µm/s", "what was not refused is set"
     keep(page, "refused")
@@ -181,7 +181,12 @@ def test_a_scan_is_taken_where_a_rectangle_is_drawn(night: Night, page: Any, kee
     page.mouse.up()
     page.wait_for_selector(".question")
     assert page.locator(".question input[aria-label=width]").input_value().startswith("40")
+    assert page.evaluate("afspm.image.wanted.width") == pytest.approx(0.4e-6, rel=0.05), "it is drawn while it is asked"
+    page.fill(".question input[aria-label=angle]", "30 deg")
+    page.wait_for_function("Math.abs(afspm.image.wanted.angle - Math.PI / 6) < 1e-3")
     keep(page, "scan-here")
+    page.fill(".question input[aria-label=angle]", "0 deg")
+    page.wait_for_function("afspm.image.wanted.angle === 0")
     before = len(night.follower.overview.scans)
     page.click(".question button:has-text('Scan')")
     said(page, "begins")
@@ -189,6 +194,7 @@ def test_a_scan_is_taken_where_a_rectangle_is_drawn(night: Night, page: Any, kee
     region = night.follower.overview.scans[-1].region
     assert region.size_m == pytest.approx((0.4e-6, 0.3e-6), rel=0.05)
     assert region.center_m == pytest.approx(centre, abs=1e-8)
+    assert page.evaluate("afspm.image.wanted") is None
     assert night.follower.overview.scans[-1].holder is None
 
 
@@ -262,7 +268,7 @@ def test_a_scan_is_stopped_after_taking_over(night: Night, page: Any) -> None:
 
 def test_stopping_in_automated_says_that_it_takes_over(night: Night, page: Any) -> None:
     press(page, "Stop the scan")
-    page.wait_for_selector(".question:has-text('MANUAL first')")
+    page.wait_for_selector(".question:has-text('sets the mode to MANUAL')")
     page.keyboard.press("Escape")
     page.locator(".question").wait_for(state="detached")
     assert night.control().mode is ControlMode.AUTOMATED
@@ -305,7 +311,7 @@ def test_two_persons_are_told_apart(night: Night, page: Any, opened: Opened) -> 
     after = seen(night)
     other = opened(night.url, person="Žofie Ö")
     choose(other, "problem", "drop-on-the-table")
-    press(other, "Raise")
+    press(other, "Flag")
     night.until(lambda: 9 in night.control().problems)
     assert night.entry("dashboard:Žofie Ö", "drop-on-the-table", after=after).response == 0
     press(page, "Clear drop-on-the-table")

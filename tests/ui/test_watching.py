@@ -236,6 +236,12 @@ def test_time_line_and_log_are_on_the_first_screen(
         assert box["y"] + box["height"] <= 900, part
     picture = page.evaluate("(() => { const { width, height } = afspm.image.geometry.box; return [width, height]; })()")
     assert max(picture) > 300
+    panel, axis = (page.locator(part).bounding_box() for part in ("section.time", "section.time .lane-axis"))
+    assert axis["y"] + axis["height"] <= panel["y"] + panel["height"], "the axis of the time line is seen"
+    assert panel["y"] + panel["height"] - axis["y"] - axis["height"] < 70, "the time line fills its panel"
+    cut = """[...document.querySelectorAll('.lane b, .process .name, ul.log b')]
+        .filter((one) => one.offsetParent && one.scrollWidth > one.clientWidth).map((one) => one.textContent)"""
+    assert page.evaluate(cut) == []
     keep(page, f"first-screen-{person or 'nobody'}")
 
 
@@ -254,6 +260,7 @@ def test_a_phone_shows_one_part_at_a_time_below_a_bar_that_stays(
     page.evaluate("window.scrollTo(0, 5000)")
     bar, tabs = (page.locator(part).bounding_box() for part in ("[data-part=mode]", ".tabs"))
     assert 0 <= bar["y"] < 150
+    assert page.locator("h1").is_visible(), "the name of the experiment"
     assert tabs["y"] + tabs["height"] == pytest.approx(844, abs=1)
     keep(page, f"phone-{name}")
 

@@ -8,10 +8,17 @@ import numpy as np
 import pytest
 
 from afspm import Region
-from afspm.errors import AfspmError, InvalidValue
+from afspm.client.interrupts import Interrupts
+from afspm.errors import AfspmError, Interrupted, InvalidValue
 from afspm.model import Scan, ScanSet
 
 CELL = "def frame(height):\n    return Region((0, 0), (1e-6, height))\n\nframe(0)\n"
+
+
+class InterruptedPort:
+    """All that an interrupt needs of a port."""
+
+    def wake_up(self) -> None: ...
 
 
 def shown(name: str) -> list[str]:
@@ -41,6 +48,17 @@ def test_what_is_not_there_is_missed_as_python_does_and_told_in_a_sentence() -> 
     with pytest.raises(KeyError) as caught:
         scans["Z"]
     assert str(caught.value) == "no channel 'Z'; there are Height"
+
+
+def test_a_notebook_shows_an_interrupt_without_the_lines_of_afspm() -> None:
+    interrupts = Interrupts(InterruptedPort())  # type: ignore[arg-type]
+    interrupts.interrupt()
+    with pytest.raises(KeyboardInterrupt) as caught:
+        interrupts.heed()
+    assert isinstance(caught.value, Interrupted)
+    first, *rest = caught.value._render_traceback_()
+    assert "Interrupted" in first
+    assert rest == [f"  line {caught.traceback[0].lineno + 1} of {__file__}: interrupts.heed()"]
 
 
 def test_a_file_of_the_user_is_named() -> None:

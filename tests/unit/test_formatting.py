@@ -40,8 +40,8 @@ def test_durations_are_told_as_exactly_as_it_matters(seconds: float, told: str) 
     [
         ((0.0, 0.0), "0, 0 nm"),
         ((5e-7, 2.5e-7), "500, 250 nm"),
-        ((1.5e-4, -2e-7), "150, -0.2 um"),
-        ((9.96e-7,), "0.996 um"),
+        ((1.5e-4, -2e-7), "150, -0.2 µm"),
+        ((9.96e-7,), "0.996 µm"),
         ((-2e-3,), "-2 mm"),
         ((3e-12,), "3 pm"),
     ],
@@ -51,9 +51,9 @@ def test_lengths_are_in_the_unit_of_the_largest(values_m: tuple[float, ...], tol
 
 
 def test_areas_and_places_and_the_same_for_pages() -> None:
-    assert formatting.area_text((2e-6, 1e-6)) == "2 x 1 um"
-    assert formatting.position_text((1.2e-6, -5e-7)) == "(1.2, -0.5) um"
-    assert formatting.typeset("2 x 1 um at (1.2, -0.5) um") == "2 × 1 µm at (1.2, −0.5) µm"
+    assert formatting.area_text((2e-6, 1e-6)) == "2 x 1 µm"
+    assert formatting.position_text((1.2e-6, -5e-7)) == "(1.2, -0.5) µm"
+    assert formatting.typeset("2 x 1 µm at (1.2, -0.5) µm") == "2 × 1 µm at (1.2, −0.5) µm"
 
 
 def test_times_are_those_of_the_zone_that_is_given_and_utc_is_named() -> None:

@@ -21,6 +21,7 @@ confirm it. The first steps only read (connecting may change how the controller 
 stops the scan, puts the settings back, and withdraws the tip if it is at the sample. The same command goes on later."""
 
 
+_TRIES = 5
 _STYLES = {"✓": "green", "✗": "bold red", "–": "yellow"}
 
 
@@ -90,14 +91,23 @@ class Terminal:
         """Ask for a line."""
         return self._line(f"{question}: ")
 
-    def choose(self, question: str, options: Sequence[str]) -> str:
-        """Ask for one of the options, by its number or its word, until it is one."""
+    def choose(self, question: str, options: Sequence[str], default: str = "") -> str:
+        """Ask for one of the options, by its number or its word; an empty answer is the default, if there is one.
+
+        Raises:
+            KeyboardInterrupt: none was chosen, however often it was asked.
+        """
         numbered = ", ".join(f"{number} {option}" for number, option in enumerate(options, 1))
-        while True:
-            said = self._line(f"{question} [{numbered}] ").strip()
-            chosen = options[int(said) - 1] if said.isdigit() and 0 < int(said) <= len(options) else said
+        if default:
+            numbered += f"; Enter: {default}"
+        for _ in range(_TRIES):
+            answer = self._line(f"{question} [{numbered}] ").strip().casefold() or default
+            chosen = options[int(answer) - 1] if answer.isdecimal() and 0 < int(answer) <= len(options) else answer
             if chosen in options:
                 return chosen
+            self.show(f"  {answer!r} is none of them: type a number from 1 to {len(options)}, or the word")
+        self.show(f"  no choice after {_TRIES} answers: ended")
+        raise KeyboardInterrupt
 
     def _line(self, question: str) -> str:
         """Ask; Ctrl-C then interrupts, and the end of the input as well."""

@@ -54,6 +54,7 @@ def dashboard(
     folder = _run_here(where)
     if folder is None:
         raise typer.Exit(_start_part(where))
+    typer.echo(f"opening the page of {folder.name} …")  # before what takes seconds to load
     if goes_on(folder):
         raise typer.Exit(_join(folder, settings))
     _serve_recorded(folder, settings)

@@ -117,7 +117,7 @@ class StatusText:
         line.append(mode, "bold yellow" if mode == "MANUAL" else "")
         if mode == "MANUAL":
             return line.append(self._since(seen.modes.changed_ns))
-        return line.append(f", {seen.control.holder or 'nobody'} is in control{self._since(seen.control_since_ns)}")
+        return line.append(f", {seen.in_control or 'nobody'} is in control{self._since(seen.control_since_ns)}")
 
     def _problems(self) -> Iterator[Text]:
         for _, name, span in flagged(self._seen):
@@ -148,7 +148,8 @@ class StatusText:
         if parameters is None or not isinstance(parameters.region, Region):
             return line
         pixels = f", {parameters.shape[1]} x {parameters.shape[0]}" if isinstance(parameters.shape, tuple) else ""
-        return line.append(f"  {area_text(parameters.region.size_m)}{pixels}", "dim")
+        size = area_text(parameters.region.size_m)
+        return line.append(f"  {size if self._run.fancy else size.replace('µ', 'u')}{pixels}", "dim")
 
     def _bar(self, part: float) -> str:
         return f"{bar(part, fancy=self._run.fancy)} {100 * part:3.0f} %"

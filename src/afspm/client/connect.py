@@ -6,6 +6,7 @@ import dataclasses
 import json
 import logging
 import weakref
+from collections.abc import Sequence
 from pathlib import Path
 
 from afspm.client.experiment_link import ExperimentLink
@@ -28,7 +29,7 @@ JOINED_WITHIN_S = 5.0
 HEARD_WITHIN_S = 30.0  # what is cached may be many large scans
 
 
-def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
+def connect(where: str | Path = "runs", name: str = "notebook", *, messages: Sequence[str] = ()) -> Scope:
     """Join a running experiment; what is returned can be used like `self.scope` in a component.
 
         with afspm.connect("runs/my_experiment-20261120-040000") as scope:
@@ -38,19 +39,24 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
         where: the folder of the run, the folder of all runs (its newest is meant), or the experiment file (its newest
             run is meant, in the folder `runs` here or beside it).
         name: what others see as the holder of control. Two that join need different names.
+        messages: modules and .proto files with message types of your own, as in the experiment file. They are imported
+            here; those that the run names are not, since its folder may come from another person.
 
     Raises:
         FileError: there is no such run.
-        ConfigError: it has nobody to connect to.
+        ConfigError: it has nobody to connect to; or `messages` can't be imported.
         NoResponse: its scheduler is not running, or nothing is heard of what it publishes.
         ExperimentEnded: it has just ended.
     """
     folder = find_run(Path(where))
     launch = guest_of(folder, name)
-    register_all(launch.messages)
+    log = _log_of(name)
+    register_all(messages)
+    if unread := set(map(_stem, launch.messages)) - set(map(_stem, messages)):
+        log.warning("messages of %s are not read: name it in connect(messages=[…])", ", ".join(sorted(unread)))
     clock = ExperimentClock.from_dict(launch.clock)
     port = open_port(launch, clock)
-    link = ExperimentLink.of_launch(launch, port, new_session(launch.run), log=_log_of(name))
+    link = ExperimentLink.of_launch(launch, port, new_session(launch.run), log=log)
     try:
         if not link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S)):
             hint = cut_off_message(folder) or "is the experiment still running?"
@@ -63,6 +69,10 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
         raise
     weakref.finalize(scope, port.close)
     return scope
+
+
+def _stem(source: str) -> str:
+    return Path(source).name  # of a file: it may be beside the experiment file or here
 
 
 def _log_of(name: str) -> logging.Logger:

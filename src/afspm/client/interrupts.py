@@ -6,6 +6,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from afspm.errors import Interrupted
 from afspm.process import signals
 from afspm.transport.port import Port
 
@@ -45,7 +46,7 @@ class Interrupts:
         """Raise KeyboardInterrupt if an interrupt has come."""
         if self._has_come and not self._is_deferred:
             self._has_come = False
-            raise KeyboardInterrupt
+            raise Interrupted
 
     def interrupt(self) -> None:
         """Have the call under way, or the next, raise KeyboardInterrupt as by Ctrl-C. From any thread."""

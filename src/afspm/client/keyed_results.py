@@ -17,6 +17,7 @@ from afspm.model import LoggedPacket, Packet, ScanSet, Spectrum
 from afspm.plain_data import Plain
 from afspm.process.memory import Memory
 from afspm.storage.atomic import OutageLog, write_atomic
+from afspm.storage.disk import is_full
 from afspm.storage.segment import head_of, read_packet
 
 _log = logging.getLogger("afspm.memory")
@@ -53,6 +54,11 @@ class KeyedResults:
         self._folder = folder / f"{name}.results" if folder else None
         self._outage = OutageLog("what is measured can't be kept", _log)
         self._memory = Memory(folder / f"{name}.scope.json" if folder else None)
+
+    @property
+    def disk_is_full(self) -> bool:
+        """Return whether the disk of the run has no room any more."""
+        return self._folder is not None and is_full(self._folder.parent)
 
     @property
     def pending(self) -> Plain | None:

@@ -18,7 +18,7 @@ from afspm.client.targets import Target, target_from
 from afspm.errors import ExperimentEnded, MeasurementFailed, NoResponse, Refused, RequestError, WireError
 from afspm.formatting import day_and_time
 from afspm.logic.sessions import KEYED
-from afspm.model import ControlRequest, ControlResponse, Packet, Response
+from afspm.model import ControlRequest, ControlResponse, Packet, Response, Scan
 from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
 
 BEGUN_WITHIN_S = 2 * CUT_OFF_SHOWS_WITHIN_S
@@ -294,9 +294,15 @@ class MeasurementRunner:
         """Return whether the result is complete; else note why not, before the next attempt."""
         target = task.target
         missing = self._channels.get(target.what, frozenset()) - frozenset(map(target.name_of, cycle.results))
-        if cycle.outcome is CycleOutcome.COMPLETED and not missing:
+        blank = [one.channel for one in cycle.results if isinstance(one, Scan) and one.is_blank]
+        is_blank = bool(blank) and len(blank) == len(cycle.results)
+        if cycle.outcome is CycleOutcome.COMPLETED and not missing and not is_blank:
+            if blank:
+                self._link.log.warning("%s without any value in %s: NaN alone", target.what, ", ".join(sorted(blank)))
             return True
-        if cycle.outcome is CycleOutcome.COMPLETED:
+        if cycle.outcome is CycleOutcome.COMPLETED and is_blank:
+            why = "no channel has any value, all are NaN"
+        elif cycle.outcome is CycleOutcome.COMPLETED:
             del self._channels[target.what]  # the same again: then these channels are not recorded any more
             why = f"without {', '.join(sorted(missing))}, which it had before"
         else:
@@ -312,8 +318,10 @@ class MeasurementRunner:
     def _why_failed(self, target: Target, cycle: Cycle) -> str:
         if not self._control.held:
             return f"control was lost: {self._control.why_lost}"
+        if cycle.outcome is not CycleOutcome.ANOTHER and self._results.disk_is_full:
+            return "it has no result, and the disk of the run is full"
         if cycle.outcome is CycleOutcome.INTERRUPTED:
-            return "something else stopped it"
+            return "it was stopped at the microscope, or its file is missing; the log of the translator says which"
         if cycle.outcome is CycleOutcome.ANOTHER:
             other = target.describe(cycle.other)
             return f"not what was asked for was measured, but {other}; who else sets the microscope?"

@@ -41,7 +41,8 @@ class FeedbackError:
         over: share of the pixels, 0 to 1, where the signal lies above the setpoint by more than the threshold: in
             tapping, the tip is off the sample.
         under: the same below it: in tapping, the tip presses too hard.
-        missed: share of the relief that is in the error instead of the height.
+        missed: the relief in the error by the relief in the height; above one where the error has more of it, as that
+            of a loop that oscillates, or is far too slow.
         swing: how the height moves with the error: one or more if the tip swings above the sample by itself, zero or
             less if it comes late.
     """
@@ -57,7 +58,8 @@ class FeedbackError:
         return self.over + self.under
 
     def __str__(self) -> str:
-        return f"{self.share:.0%} of the pixels beyond the threshold, {self.missed:.0%} of the relief in the error"
+        relief = f"{self.missed:.0%} of the relief" if self.missed <= 1.0 else f"{self.missed:.2g} times the relief"
+        return f"{self.share:.0%} of the pixels beyond the threshold, {relief} of the height in the error"
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from datetime import UTC
@@ -15,7 +16,8 @@ from afspm.components.scan_plan import XY, PlanStep, RoundSchedule, ScanPlan, gr
 from afspm.errors import ConfigError, InvalidValue, RequestError, UnitError
 from afspm.formatting import day_and_time
 from afspm.model import Region, names
-from afspm.units import Angle, Duration, Length
+from afspm.model.names import BASE_PARAMETERS
+from afspm.units import Angle, Length, Period, convert
 
 Pixels = tuple[int, int]
 FRAME = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
@@ -62,12 +64,7 @@ class PlannedScans(Component):
         missed: Missed = "extend",
     ) -> None:
         self.keep_control, self.end_when_done, self.missed = keep_control, end_when_done, missed
-        self.parameters = dict(parameters or {})
-        for name, quantity in self.parameters.items():
-            try:
-                to_parameter(name, quantity, None)
-            except (InvalidValue, UnitError) as error:
-                raise ConfigError(error.what, where=f"parameters.{name}", hint=error.hint) from error
+        self.parameters = checked_parameters(parameters, "parameters")
         self.needs_parameters = (*FRAME, *self.parameters)
 
     def run(self) -> None:
@@ -195,19 +192,19 @@ class ScanSeries(PlannedScans):
         center: tuple[Length, Length] = (0.0, 0.0),
         angle: Angle = 0.0,
         pixels: Pixels = (128, 128),
-        every: Duration = 0.0,
+        every: Period = 0.0,
         scans: int | None = None,
-        duration: Duration | None = None,
+        duration: Period | None = None,
         **planned: Any,
     ) -> None:
         super().__init__(**planned)
+        self.beat_s = period(every)
         if scans is not None and duration is not None:
             raise ConfigError("both `scans` and `duration` are given", hint="one of them says when to end")
         rounds = scans if duration is None else rounds_within(duration, every)
         if self.end_when_done and rounds is None:
             raise ConfigError("`end_when_done` without an end", hint="give `scans` or `duration`")
         self.plan = _plan((Region(pair(center), pair(size), angle),), pixels, rounds)
-        self.beat_s = every
         self.ends_on_time = duration is not None
 
 
@@ -239,13 +236,13 @@ class ScanList(PlannedScans):
         regions: list[ListedRegion],
         pixels: Pixels = (128, 128),
         rounds: int = 1,
-        every: Duration = 0.0,
+        every: Period = 0.0,
         **planned: Any,
     ) -> None:
         super().__init__(**planned)
         listed = (given if isinstance(given, ListedRegion) else ListedRegion(**given) for given in regions)
         self.plan = _plan(tuple(one.region for one in listed), pixels, rounds)
-        self.beat_s = every
+        self.beat_s = period(every)
 
 
 class RegionGrid(PlannedScans):
@@ -271,13 +268,13 @@ class RegionGrid(PlannedScans):
         angle: Angle = 0.0,
         pixels: Pixels = (128, 128),
         rounds: int = 1,
-        every: Duration = 0.0,
+        every: Period = 0.0,
         **planned: Any,
     ) -> None:
         super().__init__(**planned)
         points = grid_centers(pair(center), (counts[0], counts[1]), pair(spacing or size), angle)
         self.plan = _plan(tuple(Region(point, pair(size), angle) for point in points), pixels, rounds)
-        self.beat_s = every
+        self.beat_s = period(every)
 
 
 def pair(values: Sequence[float]) -> XY:
@@ -287,6 +284,34 @@ def pair(values: Sequence[float]) -> XY:
     return float(values[0]), float(values[1])
 
 
-def _plan(regions: tuple[Region, ...], pixels: Sequence[int], rounds: int | None) -> ScanPlan:
+def checked_parameters(given: Mapping[str, str | float] | None, where: str) -> dict[str, str | float]:
+    """Return the values to set before a scan. Raises ConfigError: one of them has no meaning."""
+    parameters = dict(given or {})
+    for name, quantity in parameters.items():
+        try:
+            parameter = to_parameter(name, quantity, None)
+            if parameter.unit and (si_unit := BASE_PARAMETERS.get(name)):
+                convert(1.0, parameter.unit, si_unit)
+        except (InvalidValue, UnitError) as error:
+            raise ConfigError(error.what, where=f"{where}.{name}", hint=error.hint) from error
+    return parameters
+
+
+def period(every_s: float, where: str = "every") -> float:
+    """Return the time from one round to the next. Raises ConfigError: no such time."""
+    if not 0.0 <= every_s < math.inf:
+        raise ConfigError(f"a period of {every_s:g} s", where=where, hint='above zero, for example "15 min"')
+    return every_s
+
+
+def shape_of(pixels: Sequence[int], where: str = "pixels") -> tuple[int, int]:
+    """Return (columns, rows) as (rows, columns). Raises ConfigError: a scan of no pixels."""
+    if len(pixels) != 2 or min(pixels) < 1:
+        hint = "columns and rows, each at least 1, for example [128, 128]"
+        raise ConfigError(f"{list(pixels)} is no number of pixels", where=where, hint=hint)
     columns, rows = pixels
-    return ScanPlan(regions, (int(rows), int(columns)), rounds)
+    return int(rows), int(columns)
+
+
+def _plan(regions: tuple[Region, ...], pixels: Sequence[int], rounds: int | None) -> ScanPlan:
+    return ScanPlan(regions, shape_of(pixels), rounds)

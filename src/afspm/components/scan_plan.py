@@ -114,6 +114,9 @@ def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad
     columns, rows = counts
     if columns < 1 or rows < 1:
         raise InvalidValue(f"a grid of {columns} x {rows} points has none")
+    for count, step_m in zip(counts, spacing_m, strict=True):
+        if count > 1 and not step_m > 0.0:
+            raise InvalidValue(f"{count} points of a grid lie {step_m:g} m apart", hint="spacing is above zero")
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
     points = []
     for row in range(rows):

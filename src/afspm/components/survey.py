@@ -11,12 +11,12 @@ from pathlib import Path
 from afspm.client.component import Component
 from afspm.client.events import Events
 from afspm.client.keyed_results import check_key
-from afspm.components.planned_scans import FRAME, Pixels, pair
+from afspm.components.planned_scans import FRAME, Pixels, checked_parameters, pair, shape_of
 from afspm.components.scan_plan import XY, ScanPlan
 from afspm.components.target_finder import TargetFinder
 from afspm.drift.record import drift_knowledge
 from afspm.errors import ConfigError, Refused
-from afspm.formatting import counted, lengths_text, position_text
+from afspm.formatting import area_text, counted, lengths_text, position_text
 from afspm.model import Region, RegistrationOutcome, Scan, ScanSet, names, registration_summary
 from afspm.storage.atomic import OutageLog
 from afspm.survey.record import Outcome, SurveyRecord, Visit
@@ -92,10 +92,16 @@ class Survey(Component):
         end_when_done: bool = False,
         file: str = "targets",
     ) -> None:
+        self.parameters = checked_parameters(parameters, "parameters")
+        self.zoom_parameters = checked_parameters(zoom_parameters, "zoom_parameters")
         wide, closer = Region(pair(center), _both(size), angle), Region((0.0, 0.0), _both(zoom), angle)
+        for zoom_m, whole_m in zip(closer.size_m, wide.size_m, strict=True):
+            if zoom_m > whole_m:
+                what = f"a zoom of {area_text(closer.size_m)} is larger than the survey"
+                raise ConfigError(what, where="zoom", hint=f"at most {area_text(wide.size_m)}")
         chosen = _fine_enough(wide, closer) if pixels is None else pixels
-        self._wide = _ScanSetup(wide, _shape(chosen), dict(parameters or {}))
-        self._closer = _ScanSetup(closer, _shape(zoom_pixels), dict(zoom_parameters or {}))
+        self._wide = _ScanSetup(wide, shape_of(chosen), self.parameters)
+        self._closer = _ScanSetup(closer, shape_of(zoom_pixels, "zoom_pixels"), self.zoom_parameters)
         self.drift_doubts = tuple(_too_coarse(wide, chosen, closer, is_given=pixels is not None))
         self.plan = ScanPlan((self._wide.region,), self._wide.shape)  # the part that `afspm check` can look at
         half_m = min(self._closer.region.size_m) / 2
@@ -107,6 +113,9 @@ class Survey(Component):
                     raise ConfigError("is of particles, and says nothing of `targets`", where=name)
         if count < 1:
             raise ConfigError(f"{count} targets are none", where="count")
+        for name, value in {"min_height": min_height, "separation": separation}.items():
+            if value is not None and value < 0.0:
+                raise ConfigError(f"{lengths_text([value])} is below zero", where=name)
         separation_m = half_m if separation is None else separation
         self.finder = TargetFinder(targets, count, min_height, separation_m, min(self._wide.region.size_m), refine)
         self._record: SurveyRecord | None = None
@@ -312,8 +321,3 @@ def _place(name: str, place: float | Sequence[float], half_zoom_m: float) -> _Cu
 
 def _both(length: float | Sequence[float]) -> XY:
     return (float(length), float(length)) if isinstance(length, int | float) else pair(length)
-
-
-def _shape(pixels: Sequence[int]) -> tuple[int, int]:
-    columns, rows = pixels
-    return int(rows), int(columns)

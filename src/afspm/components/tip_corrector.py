@@ -13,8 +13,9 @@ from afspm.components.planned_scans import pair
 from afspm.components.tip_judge import Opinion, TipJudge
 from afspm.components.tip_treatments import treatments
 from afspm.components.tip_verdict import read_verdict
-from afspm.components.tip_workshop import DONE_ACTION, TipWorkshop, nm
+from afspm.components.tip_workshop import DONE_ACTION, TipWorkshop
 from afspm.errors import AfspmError, ConfigError, ControlLost, FileError, NoResponse, Refused
+from afspm.formatting import position_text
 from afspm.model import Problem, Region, Scan, ScanSet, names
 from afspm.units import Duration, Length, Speed, Voltage
 
@@ -82,6 +83,8 @@ class TipCorrector(Component):
     ) -> None:
         self.workshop_center = pair(workshop_center)
         self.test_center = None if test_center is None else pair(test_center)
+        # `afspm check` holds them against the limits
+        self.positions = tuple(place for place in (self.workshop_center, self.test_center) if place is not None)
         self.allowed = treatments(pulse_voltages, pulse_duration, crash_depths, crash_speed)
         pulses = (names.PULSE,) if pulse_voltages else ()
         crashes = (names.CRASH,) if crash_depths else ()
@@ -186,7 +189,7 @@ class TipCorrector(Component):
             try:
                 scans = self.scope.scan(place, shape=shape)
             except (Refused, NoResponse) as error:
-                self.log.warning("no test scan at %s: %s", nm(place.center_m), error.what)
+                self.log.warning("no test scan at %s: %s", position_text(place.center_m), error.what)
                 refused.append(error.what)
                 if len(refused) == len(looks):
                     raise _Blind(f"no test scan can be taken: {error.what}") from error

@@ -6,11 +6,11 @@ from typing import Any
 
 from afspm import wire
 from afspm.model import Scan
-from afspm.record.night_record import BAD
+from afspm.record.bad_scans import BAD, VERDICT_MESSAGE, read_verdict
 
 __all__ = ["BAD", "GOOD", "MESSAGE", "UNCLEAR", "read_verdict", "verdict_message"]
 
-MESSAGE = "SpatialROIWithScoreList"
+MESSAGE = VERDICT_MESSAGE
 GOOD, UNCLEAR = 1.0, 0.5
 
 
@@ -26,10 +26,3 @@ def verdict_message(scan: Scan, score: float) -> Any:
     entry.spatial.roi.angle = scan.region.angle_rad
     entry.spatial.length_units, entry.spatial.angular_units = "m", "rad"
     return message
-
-
-def read_verdict(message: Any) -> tuple[int, float] | None:
-    """Return (time of the scan in ns, score) of such a message; None if it says nothing of a scan."""
-    if not message.spatials or not message.HasField("timestamp"):
-        return None
-    return message.timestamp.ToNanoseconds(), float(message.spatials[0].score)

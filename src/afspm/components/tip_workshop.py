@@ -9,6 +9,7 @@ from afspm import wire
 from afspm.client.component import Component
 from afspm.components.tip_treatments import XY, Pulse, Treatment, clearance_m, fresh_place
 from afspm.errors import ControlLost, FileError, NoResponse, Refused
+from afspm.formatting import position_text
 from afspm.model import Region, ScopeState, names
 
 SETTLED_WITHIN_S = 2.0  # real time: a microscope that does not say that it is busy is taken to be ready then
@@ -76,7 +77,9 @@ class TipWorkshop:
         if not self._scope.wait_until(
             lambda: self._stands_at(place) or not self._scope.in_control, timeout_s=SETTLED_WITHIN_S
         ):
-            self._log.error("%s was not done: the probe is %s, and not at %s", treatment, self._where(), nm(place))
+            self._log.error(
+                "%s was not done: the probe is %s, and not at %s", treatment, self._where(), position_text(place)
+            )
             return False
         where = self._where()
         self._act(action)
@@ -92,7 +95,7 @@ class TipWorkshop:
             parameters = self._scope.scan_parameters
             if parameters is None or not isinstance(parameters.region, Region):
                 raise
-            self._log.debug("moving the scan frame along to %s: %s", nm(place), refused.reason)
+            self._log.debug("moving the scan frame along to %s: %s", position_text(place), refused.reason)
             size_m = (self._spacing, self._spacing)
             self._frame = replace(parameters.region, center_m=place, size_m=size_m)
             self._scope.set_scan_region(self._frame)
@@ -105,7 +108,7 @@ class TipWorkshop:
 
     def _where(self) -> str:
         position = self._scope.probe_position
-        return "an unknown place" if position is None else f"at {nm(position.xy_m)}"
+        return "an unknown place" if position is None else f"at {position_text(position.xy_m)}"
 
     def _act(self, action: str) -> None:
         """Do it, and let it end: what is asked of a busy microscope it refuses."""
@@ -128,7 +131,3 @@ class TipWorkshop:
         else:
             self._scope.set(names.CRASH_DEPTH, treatment.depth_m, "m")
             self._scope.set(names.CRASH_SPEED, treatment.speed_m_per_s, "m/s")
-
-
-def nm(place: XY) -> str:
-    return f"({place[0] * 1e9:.0f}, {place[1] * 1e9:.0f}) nm"

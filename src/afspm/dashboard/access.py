@@ -95,15 +95,14 @@ class Access:
         """Return who shows a name and a password with a request; None if that is wrong, or was wrong too often."""
         return Visitor(person) if self._passwords.proves(person, password, address) else None
 
-    def wait_s(self, address: str) -> float:
-        """Return how long an address that was wrong too often has to wait; 0 if it needn't."""
-        return self._passwords.wait_s(address)
+    def wait_s(self, person: str, address: str) -> float:
+        """Return the real seconds until a password of a person is looked at again from an address; 0: it is now."""
+        return self._passwords.wait_s(person, address)
 
     def enter(self, person: str, password: str, address: str) -> str | None:
         """Sign in; returns the cookie, None if the password is wrong (then `wait_s` may be above zero)."""
         if not self._passwords.proves(person, password, address):
             return None
-        self._passwords.forgive(address)
         return self.cookie(person)
 
     def cookie(self, person: str) -> str:

@@ -65,7 +65,7 @@ class Actions:
         return _result(self._commands.end(), "The experiment is ending")
 
     def flag(self, problem: int) -> ActionResult:
-        """Raise a problem."""
+        """Flag a problem."""
         return _result(self._commands.flag(problem), f"{self._watch.problems.name(problem)} is flagged")
 
     def clear(self, problem: int) -> ActionResult:

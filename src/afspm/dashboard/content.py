@@ -14,7 +14,7 @@ from afspm.dashboard.flags import Flag, flags
 from afspm.dashboard.sample_map import MapContent, map_html, picture_url
 from afspm.drawing.timeline import TimelineRow, timeline_html, tint_class
 from afspm.formatting import duration_text, time_of_day, typeset_area
-from afspm.model import ControlMode, JournalEntry, LogLine, Note, ProcessState, Region
+from afspm.model import ControlMode, JournalEntry, LogLine, Note, ProcessCondition, ProcessState, Region
 from afspm.model.events import PERSON
 from afspm.record.overview import OVER, Overview, ScanSummary
 from afspm.record.timeline import Span, Timeline
@@ -113,7 +113,7 @@ class Contents:
                 notes=notes_html(overview),
                 channels=watch.frames.channels,
                 problems=tuple(flags(overview)),
-                processes=tuple(overview.processes.values()),
+                processes=tuple(processes_of(watch, overview)),
                 unheard=silent,
                 log=tuple(overview.log),
                 is_manual=control is not None and control.mode is ControlMode.MANUAL,
@@ -171,6 +171,16 @@ def unheard(watch: Watch, overview: Overview) -> dict[str, int]:
     speed = 1.0 / watch.clock.real_s(1.0)
     running = [state.name for state in overview.processes.values() if state.condition not in OVER]
     return {name: ns for name in running if (ns := overview.unheard_ns(name, speed)) is not None}
+
+
+def processes_of(watch: Watch, overview: Overview) -> Iterator[ProcessState]:
+    """Yield the processes; in a run that is over none is alive, though the last report may say so."""
+    for state in overview.processes.values():
+        if not watch.is_over or state.condition in OVER:
+            yield state
+        else:
+            since_ns = max(state.since_ns, overview.ended_ns or overview.newest_ns)
+            yield replace(state, condition=ProcessCondition.ENDED, since_ns=since_ns, step_age_s=0.0)
 
 
 def trouble(watch: Watch) -> str:
@@ -236,7 +246,8 @@ def status_html(watch: Watch, overview: Overview) -> str:
     since_ns, now_ns = overview.control_since_ns, _now_ns(watch, overview)
     since = "" if since_ns is None else f" for {duration_text((now_ns - since_ns) / NS_PER_S)}"
     mode = control.mode.name
-    who = f'<b class="{tint_class(control.holder)}">{escape(control.holder)}</b>' if control.holder else "nobody"
+    holder = overview.in_control
+    who = f'<b class="{tint_class(holder)}">{escape(holder)}</b>' if holder else "nobody"
     parts = [
         _chip(mode, "mode", f"mode-{mode.lower()}"),
         _chip(f"{who} is in control<small>{since}</small>", "holder"),

@@ -119,6 +119,10 @@ class NightWatch(Watch):
         return self.moment.time_ns
 
     @property
+    def is_over(self) -> bool:
+        return self.moment.time_ns >= (self.overview.ended_ns or self._night.end_ns)
+
+    @property
     def is_current(self) -> bool:
         """False once a note was added."""
         return self._events is self._night.events

@@ -1,7 +1,8 @@
-"""The dialog of *Scan here*: size and pixels of a scan can be edited before it is taken."""
+"""The dialog of *Scan here*: size, pixels and angle of a scan can be edited before it is taken."""
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass, replace
 
@@ -12,7 +13,7 @@ from afspm.errors import InvalidValue, UnitError
 from afspm.formatting import quantity, typeset_position
 from afspm.model import Region
 from afspm.plain_data import PlainMapping
-from afspm.units import convert, parse_quantity
+from afspm.units import convert, parse_quantity, si_or_text
 
 MOST_PIXELS = 8192
 Shape = tuple[int, int]
@@ -34,16 +35,18 @@ class ScanChoice:
         side_m, pixels = max(self.region.size_m), max(self.shape)
         return ScanChoice(replace(self.region, size_m=(side_m, side_m)), (pixels, pixels))
 
-    def edited(self, width: str, height: str, pixels: str) -> ScanChoice:
-        """Return it with sizes as a person writes them, and so many square pixels along the longer side.
+    def edited(self, width: str, height: str, pixels: str, angle: str = "") -> ScanChoice:
+        """Return it with sizes and angle as a person writes them, and square pixels, `pixels` along the longer side.
 
         Raises:
-            UnitError, InvalidValue: a text that is no length, or no number of pixels.
+            UnitError, InvalidValue: a text that is no length, no angle, or no number of pixels.
         """
+        angle_rad = si_or_text(angle, "rad") if angle.strip() else self.region.angle_rad
         size_m = (_length_m(width), _length_m(height))
         if not pixels.strip().isdigit() or not 1 <= int(pixels) <= MOST_PIXELS:
             raise InvalidValue(f"pixels must be a whole number from 1 to {MOST_PIXELS}")
-        return ScanChoice(replace(self.region, size_m=size_m), _shape(int(pixels), size_m))
+        region = replace(self.region, size_m=size_m, angle_rad=angle_rad)
+        return ScanChoice(region, _shape(int(pixels), size_m))
 
 
 class ScanDialog:
@@ -66,12 +69,11 @@ class ScanDialog:
         return None if choice is None else (choice.region, choice.shape)
 
     def _fields(self) -> None:
-        region = self._choice.region
-        angle = f", turned by {math.degrees(region.angle_rad):.3g}°" if region.angle_rad else ""
-        ui.label(f"Around {typeset_position(region.center_m)}{angle}.")
+        ui.label(f"Around {typeset_position(self._choice.region.center_m)}, as drawn in the picture.")
         with ui.element("div").classes("fields"):
-            self._width, self._height, self._pixels = (
-                ui.input(name, on_change=self._read).props("dense outlined") for name in ("width", "height", "pixels")
+            self._width, self._height, self._pixels, self._angle = (
+                ui.input(name, on_change=self._read).props("dense outlined")
+                for name in ("width", "height", "pixels", "angle")
             )
             self._square = ui.checkbox("square", on_change=self._snap).props("dense")
         self._said = ui.label().classes("quiet").props('role="status"')
@@ -81,6 +83,7 @@ class ScanDialog:
         for field, side_m in zip((self._width, self._height), choice.region.size_m, strict=True):
             field.set_value(quantity(side_m, "m"))
         self._pixels.set_value(str(max(choice.shape)))
+        self._angle.set_value(_degrees(choice.region))
 
     def _snap(self) -> None:
         if self._square.value and (choice := self._read()) is not None:
@@ -91,13 +94,23 @@ class ScanDialog:
         try:
             width = str(self._width.value or "")
             height = width if self._square.value else str(self._height.value or "")
-            choice = self._choice.edited(width, height, str(self._pixels.value or ""))
+            pixels, angle = str(self._pixels.value or ""), str(self._angle.value or "")
+            if angle == _degrees(self._choice.region):  # as exact as it is set, not as it is shown
+                angle = ""
+            choice = self._choice.edited(width, height, pixels, angle)
         except (UnitError, InvalidValue) as error:
             self._said.set_text(str(error))
             return None
+        (x, y), (across, up) = choice.region.center_m, choice.region.size_m
+        drawn = {"x": x, "y": y, "width": across, "height": up, "angle": choice.region.angle_rad}
+        ui.run_javascript(f"window.afspm?.image?.want({json.dumps(drawn)})")
         rows, columns = choice.shape
         self._said.set_text(f"{columns} × {rows} px of {quantity(choice.region.size_m[0] / columns, 'm', 3)}")
         return choice
+
+
+def _degrees(region: Region) -> str:
+    return f"{math.degrees(region.angle_rad):.4g} deg"
 
 
 def _length_m(text: str) -> float:

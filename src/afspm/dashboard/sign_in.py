@@ -61,13 +61,7 @@ class Guard:
         if (shown := _password_in(asked)) is not None:
             address = asked.client.host if asked.client else ""
             visitor = await asyncio.to_thread(self._access.by_password, *shown, address)
-            if visitor is not None and asked.url.path == "/" and "authorization" not in asked.headers:
-                # and out of the address line, where others see it
-                answer = RedirectResponse("/", 303)
-                _set_cookie(answer, self._access.cookie(visitor.person), secure=asked.url.scheme in ("https", "wss"))
-                await answer(scope, receive, send)
-                return
-        if visitor is None and asked.url.path not in PUBLIC:
+        if visitor is None and scope["path"] not in PUBLIC:
             wants_page = scope.get("method") == "GET" and "text/html" in asked.headers.get("accept", "")
             if wants_page:
                 await RedirectResponse(SIGN_IN, 303)(scope, receive, send)
@@ -95,7 +89,7 @@ def add_sign_in(app: FastAPI, access: Access, title: str, *, encrypted: bool, on
         address = request.client.host if request.client else ""
         cookie = await asyncio.to_thread(access.enter, name, password, address)
         if cookie is None:
-            wait_s = access.wait_s(address)
+            wait_s = access.wait_s(name, address)
             later = f"Too many failed attempts: try again in {wait_s:.0f} s." if wait_s else WRONG
             return page(person, later, 429 if wait_s else 403)
         return _set_cookie(RedirectResponse("/", 303), cookie, secure=encrypted)
@@ -131,12 +125,11 @@ def _set_cookie(answer: Response, cookie: str, *, secure: bool) -> Response:
 
 
 def _password_in(asked: HTTPConnection) -> tuple[str, str] | None:
-    """Return (name of the person, password) as a program shows it, or a link."""
-    person = asked.query_params.get("name", "")
+    # of a program; not in a link: any page could hold one, and a person who follows it would steer under another name
     shown = asked.headers.get("authorization", "")
-    if shown.startswith("Bearer "):
-        return person, shown.removeprefix("Bearer ")
-    return (person, asked.query_params["token"]) if "token" in asked.query_params else None
+    if not shown.startswith("Bearer "):
+        return None
+    return asked.query_params.get("name", ""), shown.removeprefix("Bearer ")
 
 
 async def _refuse(status: int, why: str, scope: Message, receive: Receive, send: Send) -> None:

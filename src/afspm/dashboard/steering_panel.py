@@ -107,7 +107,7 @@ class SteeringPanel:
         with ui.element("div").classes("acts"):
             options = {number: name for name, number in session.watch.problems.items()}
             self._problem = ui.select(options, label="problem", value=next(iter(options))).props("dense outlined")
-            button("Raise", lambda: session.do(partial(Actions.flag, problem=int(self._problem.value))))
+            button("Flag", lambda: session.do(partial(Actions.flag, problem=int(self._problem.value))))
         with ui.element("div").classes("acts"):
             button("End the experiment …", self._ask_end, "negative").props("outline")
         ui.on("scan_here", self._ask_scan)
@@ -139,7 +139,9 @@ class SteeringPanel:
 
     async def _ask_scan(self, event: events.GenericEventArguments) -> None:
         dialog = ScanDialog.of_place(event.args)
-        if (wanted := await dialog.ask()) is not None:
+        wanted = await dialog.ask()
+        ui.run_javascript("window.afspm?.image?.want(null)")
+        if wanted is not None:
             self._session.do(lambda a: a.scan(*wanted))
 
     async def _ask_spectrum(self, event: events.GenericEventArguments) -> None:

@@ -18,7 +18,7 @@ _DAY_S = _STEPS_S[-1]
 
 CSS = """
 .lanes{display:grid;gap:3px}
-.lane,.lane-axis{display:grid;grid-template-columns:130px minmax(0,1fr);align-items:center;gap:8px}
+.lane,.lane-axis{display:grid;grid-template-columns:var(--names,130px) minmax(0,1fr);align-items:center;gap:8px}
 .lane b,.lane-axis b{font-weight:500;font-size:12.5px;text-align:right}
 .lane b{overflow:hidden;text-overflow:ellipsis;white-space:nowrap}
 .lane>div{position:relative;height:17px;background:var(--lane);border-radius:2px;overflow:hidden}
@@ -32,7 +32,7 @@ CSS = """
 .lane-axis>div{position:relative;height:18px}
 .lane-axis span{position:absolute;top:1px;font-size:11.5px;color:var(--quiet);transform:translateX(-50%)}
 .lanes{font-variant-numeric:tabular-nums}
-@media (max-width:760px){.lane,.lane-axis{grid-template-columns:78px minmax(0,1fr);gap:5px}}
+@media (max-width:760px){.lane,.lane-axis{grid-template-columns:1fr;gap:0}.lane b,.lane-axis b{text-align:left}}
 """
 
 
@@ -96,7 +96,8 @@ def timeline_html(
     axes = _axis(begin_ns, end_ns, zone, "UTC" if local_too else "")
     axes += _axis(begin_ns, end_ns, None, "local") if local_too else ""
     strip = _pictures(pictures, begin_ns, end_ns)
-    return f'<div class="lanes">{strip}{body}{axes}</div>'
+    longest = max(len(row.name) for row, _ in read)
+    return f'<div class="lanes" style="--names:min(max(9ch, {longest}ch), 40%)">{strip}{body}{axes}</div>'
 
 
 def _axis(begin_ns: int, end_ns: int, zone: tzinfo | None, name: str) -> str:

@@ -9,7 +9,8 @@ import sys
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -36,6 +37,8 @@ _AGAIN_S = 1.0
 _TAKEN = {100, 10013, 10048} if sys.platform == "win32" else {errno.EADDRINUSE}
 """The errors of a port that another program has. On Windows those of its C library, which ZeroMQ hands on, and of its
 sockets: WSAEACCES, where the other has it for itself alone, and WSAEADDRINUSE."""
+_LOOKS_S = 0.2
+"""While a button can be pressed, its file is looked for so often, real time."""
 FAREWELL_S = 0.5
 """So long, real time, a controller stays there when the experiment has ended: the translator stops the tip first."""
 
@@ -44,6 +47,18 @@ class Crashed(AfspmError):
     """The emulated controller is to vanish without another word, as one that crashes does."""
 
     code = "emulator-crashed"
+
+
+@dataclass(frozen=True)
+class ScreenButton:
+    """A button on the emulated screen, which a person presses by deleting a file.
+
+    Attributes:
+        pressed: called from the emulator's thread.
+    """
+
+    file: Path
+    pressed: Callable[[], object]
 
 
 class Emulator(ABC):
@@ -111,6 +126,7 @@ class Emulator(ABC):
         self._faults = [Fault.of(fault) for fault in faults]
         self._stop = threading.Event()
         self._leave_at_s = math.inf
+        self._button: ScreenButton | None = None
 
     def check(self) -> None:
         """Check the settings.
@@ -168,6 +184,32 @@ class Emulator(ABC):
 
     # -- what is there for it
 
+    def show_button(self, name: str, why: str, pressed: Callable[[], object]) -> None:
+        """Show a button until it is pressed or taken away; there is one at a time.
+
+        A person, or a test, presses it by deleting the file `delete-to-NAME.txt` in `folder`: so it can be pressed from
+        any program and any computer that sees the folder, alone as well as in an experiment.
+
+        Args:
+            why: it has to be pressed, for the log and the file.
+        """
+        self.take_button_away()
+        file = self.folder / f"delete-to-{name}.txt"
+        try:
+            file.write_text(f"{why}\nDelete this file to press the button.\n", encoding="utf-8")
+        except OSError as error:
+            self.log.error("the button %s can't be shown, since %s can't be written: %s", name, file, error)
+            return
+        self._button = ScreenButton(file, pressed)
+        self.log.warning("%s: delete %s to press the button", why, file)
+
+    def take_button_away(self) -> None:
+        """Show no button any more."""
+        button, self._button = self._button, None
+        if button is not None:
+            with suppress(OSError):  # a file that can't be deleted presses nothing any more
+                button.file.unlink()
+
     def run(self, clock: Clock, folder: Path, log: logging.Logger, listening: Callable[[str], None]) -> None:
         """Be the controller until `stop`.
 
@@ -191,6 +233,7 @@ class Emulator(ABC):
                 self.woken.take()
         finally:
             self.close()
+            self.take_button_away()
             self.woken.close()
 
     def _open(self) -> str:
@@ -306,8 +349,21 @@ class Emulator(ABC):
 
     def _wait_s(self) -> float:
         """Real seconds until something happens by itself."""
+        self._look_for_button()
         now_s = self.clock.now_s()
         times = (self._survive(self.tick, now_s), self.rig.next_change_s(now_s), self.faults.next_s(now_s))
         due_s = min((at_s for at_s in times if at_s is not None), default=math.inf)
         leave_in_s = self._leave_at_s - self.clock.monotonic_s()
-        return max(0.0, min(LONGEST_WAIT_S, leave_in_s, self.clock.real_s(due_s - now_s)))
+        longest_s = LONGEST_WAIT_S if self._button is None else _LOOKS_S
+        return max(0.0, min(longest_s, leave_in_s, self.clock.real_s(due_s - now_s)))
+
+    def _look_for_button(self) -> None:
+        button = self._button
+        if button is not None and not button.file.exists():
+            self._button = None
+            self.log.warning("%s was deleted: the button is pressed", button.file.name)
+
+            def press(now_s: float) -> None:
+                button.pressed()
+
+            self._survive(press, self.clock.now_s())

@@ -14,20 +14,28 @@ import zmq
 
 from afspm.emulators.emulator import LOOPBACK, Emulator
 from afspm.emulators.playback import Deviation, Playback
+from afspm.microscopes.gxsm import bridge
 from afspm.storage.atomic import write_atomic
-from afspm.translator.trace import ZEROMQ, read_trace
+from afspm.translator.trace import ZEROMQ, TraceHeader, read_trace
 from afspm.transport.polling import milliseconds
 
 RESULT = "replay.json"
 _AT_ONCE = 1 << 16
+_INTRODUCED = "Gxsm"
+"""The driver whose connections begin with proofs of a secret, which a trace does not hold."""
 
 
 @dataclass
 class ReplayClient:
-    """A client: of TCP by its socket, of ZeroMQ by its identity."""
+    """A client: of TCP by its socket, of ZeroMQ by its identity.
+
+    Attributes:
+        introduction: that has to be over before its questions are answered; None: there is none.
+    """
 
     number: int
     tcp: socket.socket | None = None
+    introduction: bridge.Introduction | None = None
     identity: bytes = b""
     received: bytearray = field(default_factory=bytearray)
 
@@ -58,7 +66,11 @@ class TraceReplay(Emulator):
         read_trace(self._trace)
 
     def open(self) -> str:
-        self.playback = Playback(read_trace(self._trace))
+        lines = read_trace(self._trace)
+        header = lines[0]
+        is_introduced = isinstance(header, TraceHeader) and header.driver == _INTRODUCED
+        self._secret = bridge.secret() if is_introduced else b""
+        self.playback = Playback(lines)
         self._clients: list[ReplayClient] = []
         if self.playback.transport == ZEROMQ:
             return self._open_zeromq()
@@ -88,7 +100,9 @@ class TraceReplay(Emulator):
         for key, _ in self._selector.select(timeout_s):
             if key.fileobj is self._listener:
                 connected, _ = self._listener.accept()
-                client = ReplayClient(self.playback.connect(), connected)
+                address = "{}:{}".format(*connected.getsockname())
+                introduction = bridge.Introduction(self._secret, address) if self._secret else None
+                client = ReplayClient(self.playback.connect(), connected, introduction)
                 self._clients.append(client)
                 self._selector.register(connected, selectors.EVENT_READ, client)
             elif isinstance(key.data, ReplayClient) and key.data.tcp is not None:
@@ -101,6 +115,14 @@ class TraceReplay(Emulator):
         client.received += part
         if not part:
             self._drop(client)
+        while b"\n" in client.received and client.introduction is not None and not client.introduction.is_over:
+            line, _, rest = client.received.partition(b"\n")
+            client.received[:] = rest
+            reply = client.introduction.reply(bridge.parsed(bytes(line)))
+            if not reply:
+                self._drop(client)
+                return
+            tcp.sendall(reply.encode() + b"\n")
 
     def _serve_zeromq(self, timeout_s: float) -> None:
         poller = zmq.Poller()
@@ -117,7 +139,8 @@ class TraceReplay(Emulator):
 
     def _answer(self, client: ReplayClient) -> bool:
         """Answer what a client has asked, or end its connection; False: there is nothing to answer yet."""
-        if not client.received:
+        is_stranger = client.introduction is not None and not client.introduction.is_over
+        if not client.received or is_stranger:
             return False
         try:
             answer = self.playback.ask(client.number, bytes(client.received))

@@ -267,6 +267,19 @@ class Rig:
         self.drawing.wait()
         self.world.compensate(velocity_m_per_s, self.clock.now_s())
 
+    def shift_sample(self, by_m: tuple[float, float], lasts_s: float) -> None:
+        """Move the sample with a coarse stage, so that the tip is over another place of it, (x, y) further.
+
+        Raises:
+            RigBusy. InvalidValue: no distance or duration.
+        """
+        _finite("the way of the stage", *by_m)
+        self.occupy("stage", lasts_s)
+        if lasts_s > 0.0:
+            now_s = self.clock.now_s()
+            self.world.compensate((by_m[0] / lasts_s, by_m[1] / lasts_s), now_s)
+            self.world.compensate((0.0, 0.0), now_s + lasts_s)
+
     def engage(self) -> None:
         """Bring the tip to the sample."""
         self._free_now_s()

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from afspm.errors import AfspmError
+from afspm.errors import AfspmError, Refused
 from afspm.experiment.toml_lines import Table
 from afspm.model import Parameter, names
 
@@ -20,11 +20,23 @@ class MicroscopeCapabilities:
 
     Attributes:
         sets: by name of an action that the experiment file adds, the parameters that it sets.
+        table: of its parameters.
     """
 
     actions: frozenset[str]
     parameters: Mapping[str, str | None]
     sets: Mapping[str, tuple[Parameter, ...]]
+    table: ParameterTable
+
+    def refuses(self, parameter: Parameter) -> str:
+        """Return why the microscope would refuse a value; empty: it would not, or has no such parameter."""
+        if parameter.name not in self.table or parameter.value is None:
+            return ""
+        try:
+            self.table[parameter.name].parse(parameter.value, parameter.unit)
+        except Refused as refused:
+            return refused.reason
+        return ""
 
 
 def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None:
@@ -41,7 +53,7 @@ def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None
         sets = {name: _set_by(what, table) for name, what in added.items()}
     except (AfspmError, AttributeError):
         return None  # the microscope itself will say what is wrong with its table
-    return MicroscopeCapabilities(frozenset(actions), {name: table[name].si_unit for name in table}, sets)
+    return MicroscopeCapabilities(frozenset(actions), {name: table[name].si_unit for name in table}, sets, table)
 
 
 def _set_by(action: object, table: ParameterTable) -> tuple[Parameter, ...]:

@@ -186,6 +186,12 @@ class Experiment:
 
         return self.resolved.simulated_with(process_starts.chosen_names(self.resolved, only, without))
 
+    def ends_idle(self, names: Collection[str]) -> bool:
+        """Return whether a run of these processes ends when nothing that acts is left."""
+        from afspm.experiment import process_starts
+
+        return process_starts.ends_idle(self.resolved, names)
+
     def asking(self, names: Collection[str]) -> Launch | None:
         """Return a launch line by which `names` ask a scheduler that is started elsewhere; None: nobody can."""
         from afspm.experiment import process_starts

@@ -35,7 +35,7 @@ from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.validation_messages import report
 from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.model import Parameter, Region, names
-from afspm.units import Angle, Duration, Length, parse_quantity, require_unit, si
+from afspm.units import Angle, Duration, Length, parse_quantity, require_unit, si, si_unit
 
 Quantity = str | float
 Pair = tuple[Length, Length]
@@ -131,7 +131,7 @@ class LimitsReader:
         read = self._validated(ParameterLimit, table, path)
         if read is None:
             return None
-        unit = self.parameters.get(name) or _unit_of(read)
+        unit = self._unit(name, read, path)
         low, high, step, rate = (self._in(read, key, unit, path) for key in ("min", "max", "step", "rate"))
         for key, value in (("step", step), ("rate", rate)):
             if value is not None and value <= 0:
@@ -143,6 +143,21 @@ class LimitsReader:
             elif step is not None and step > high - low:
                 self.document.warning(f"[limits.{name}] step is larger than the whole range", *path, "step")
         return Limit(low, high, step, rate, read.every, read.only, unit, str(self.document.place(*path)))
+
+    def _unit(self, name: str, read: ParameterLimit, path: tuple[str, ...]) -> str | None:
+        known = self.parameters.get(name)
+        if known is not None or all(value is None for value in (read.min, read.max, read.step, read.rate)):
+            return known
+        given = _unit_given(read)
+        if given is None:
+            if name in names.BASE_PARAMETERS:
+                what = f"[limits.{name}] has no unit, and the microscope's own unit is not known before it runs"
+                self.document.error(what, *path, hint='give one, as in "500 pA"')
+            return ""
+        what = f"[limits.{name}] counts in {given}, as the microscope's own unit is not known before it runs"
+        hint = f"values without a unit are taken to be in {given}: see that the translator means the same"
+        self.document.warning(what, *path, hint=hint)
+        return given
 
     def _action(self, name: str, table: object) -> Limit | None:
         path = ("limits", "actions", name)
@@ -210,12 +225,14 @@ class LimitsReader:
                 self.document.error(what, "limits", name, "min", hint="no scan would be allowed")
 
 
-def _unit_of(read: ParameterLimit) -> str | None:
-    """Return the unit of the first value given: the operating mode of the microscope decides what it is."""
-    for value in (read.min, read.max, read.step):
+def _unit_given(read: ParameterLimit) -> str | None:
+    for key, value in (("min", read.min), ("max", read.max), ("step", read.step), ("rate", read.rate)):
         if isinstance(value, str):
-            with contextlib.suppress(AfspmError):
-                return parse_quantity(value)[1] or None
+            with contextlib.suppress(AfspmError):  # reported when the value is read
+                given = parse_quantity(value)[1]
+                over, slash, _ = given.rpartition("/")
+                if unit := si_unit(over if key == "rate" and slash else given):
+                    return unit
     return None
 
 

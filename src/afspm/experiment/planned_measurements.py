@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
+from afspm.client.parameter_values import to_parameter
 from afspm.errors import AfspmError
 from afspm.experiment.toml_lines import Table
+from afspm.formatting import duration_text, lengths_text, quantity
 from afspm.logic.limit_checker import LimitChecker
 from afspm.logic.limits import ExperimentLimits
-from afspm.model import ControlRequest, ProbePosition, Region, Request, ScanParameters
+from afspm.model import ControlRequest, Parameter, ProbePosition, Region, Request, ScanParameters, names
+from afspm.model.geometry import XY
+from afspm.units import si
 
 PURE = (
     "afspm.components",
@@ -25,14 +31,46 @@ class PlannedMeasurements:
 
     Attributes:
         drift_doubts: what to warn of where drift is corrected; `where` names the setting.
+        parameters: values to set, by the setting that gives them: {"zoom_parameters": (Parameter("scan-speed", …),)}.
+        period_s: between the beginnings of two rounds; 0: no pause.
+        scan_speed_m_s: of a microscope that knows the speed of its first scan.
+        is_listed: whether the file lists the regions, each with a place of its own.
     """
 
     regions: tuple[Region, ...] = ()
-    positions: tuple[tuple[float, float], ...] = ()
+    positions: tuple[XY, ...] = ()
     shape: tuple[int, int] | None = None
     needs_actions: tuple[str, ...] = ()
     needs_parameters: tuple[str, ...] = ()
+    parameters: Mapping[str, tuple[Parameter, ...]] = field(default_factory=dict)
+    period_s: float = 0.0
+    scan_speed_m_s: float | None = None
+    is_listed: bool = False
     drift_doubts: tuple[AfspmError, ...] = ()
+
+    def frame(self) -> Iterator[Parameter]:
+        """Yield the parameters that its scans set: sizes, places and pixels."""
+        for region in self.regions:
+            sides = zip((names.SCAN_SIZE_X, names.SCAN_SIZE_Y), region.size_m, strict=True)
+            corner = zip((names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y), region.top_left_m, strict=True)
+            yield from (Parameter(name, repr(float(value_m)), "m") for name, value_m in (*sides, *corner))
+        if self.shape is not None:
+            rows, columns = self.shape
+            yield Parameter(names.SCAN_RESOLUTION_X, str(columns))
+            yield Parameter(names.SCAN_RESOLUTION_Y, str(rows))
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A reason for which the limits refuse a part of a plan.
+
+    Attributes:
+        where: the setting that it is about; empty: several.
+    """
+
+    reason: str
+    where: tuple[str | int, ...] = ()
+    hint: str = ""
 
 
 def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
@@ -49,38 +87,170 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
     plan = getattr(made, "plan", None)
     regions = tuple(r for r in getattr(plan, "regions", ()) if isinstance(r, Region))
     positions = tuple(getattr(made, "positions", ()))
-    said = (tuple(getattr(made, name, ())) for name in ("needs_actions", "needs_parameters", "drift_doubts"))
-    return PlannedMeasurements(regions, positions, getattr(plan, "shape", None), *said)
+    given = {name: getattr(made, name, None) for name in _PARAMETERS}
+    return PlannedMeasurements(
+        regions,
+        positions,
+        getattr(plan, "shape", None),
+        tuple(getattr(made, "needs_actions", ())),
+        tuple(getattr(made, "needs_parameters", ())),
+        {name: _as_parameters(values) for name, values in given.items() if isinstance(values, Mapping)},
+        getattr(made, "beat_s", 0.0),
+        getattr(made, "scan_speed_m_s", None),
+        isinstance(settings.get("regions"), list),
+        tuple(getattr(made, "drift_doubts", ())),
+    )
 
 
-def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[str]:
+_PARAMETERS = ("parameters", "zoom_parameters", "initial")
+"""Attributes with values that a component sets, as its settings are called."""
+
+
+def _as_parameters(values: Mapping[str, object]) -> tuple[Parameter, ...]:
+    plain = {name: value for name, value in values.items() if isinstance(value, float | int | str)}
+    return tuple(to_parameter(name, value, None) for name, value in plain.items())
+
+
+def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[Refusal]:
     """Return why the limits would refuse what is planned; each reason once."""
     # steps and rates depend on what is in force by then
     guard = LimitChecker(_without_changes(limits))
-    wanted: list[tuple[ControlRequest, object]] = [
-        (ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, planned.shape)) for region in planned.regions
-    ]
-    wanted += [(ControlRequest.SET_PROBE_POS, ProbePosition(xy)) for xy in planned.positions]
-    reasons = []
-    for kind, subject in wanted:
+    found: dict[str, Refusal] = {}
+
+    def check(kind: ControlRequest, subject: object, where: tuple[str | int, ...] = (), hint: str = "") -> None:
         refused = guard.check(name, Request(kind, subject, b""), 0)
         if refused is not None:
-            reasons.append(refused.reason)
-    return list(dict.fromkeys(reasons))
+            found.setdefault(refused.reason, Refusal(refused.reason, where, hint))
+
+    for setting, parameters in planned.parameters.items():
+        if setting == "initial":  # set by the microscope itself; a frame comes in parts
+            guard = LimitChecker(replace(_for_all(_without_changes(limits)), region=None))
+        for parameter in parameters:
+            check(ControlRequest.PARAM, parameter, (setting, parameter.name))
+    guard = LimitChecker(_without_changes(limits))
+    cure = _cure(planned, limits.region)
+    for number, region in enumerate(planned.regions):
+        wanted, where = ScanParameters(region, planned.shape), ("regions", number)
+        if planned.is_listed:
+            check(ControlRequest.SET_SCAN_PARAMS, wanted, where, _nearest_text(region, limits.region))
+        elif not found:  # of a grid outside, one reason is enough
+            check(ControlRequest.SET_SCAN_PARAMS, wanted, hint=cure)
+    for xy in planned.positions:
+        check(ControlRequest.SET_PROBE_POS, ProbePosition(xy), hint=cure)
+    return list(found.values())
+
+
+def _cure(planned: PlannedMeasurements, allowed: Region | None) -> str:
+    """Return how a plan would lie within the region allowed: the nearest region, or how far all of it has to move."""
+    points = [point for region in planned.regions for point in region.corners_m()] + list(planned.positions)
+    if allowed is None or not points:
+        return ""
+    if len(planned.regions) == 1 and not planned.positions:
+        return _nearest_text(planned.regions[0], allowed)
+    shift = _shift_m(points, allowed, 0.0)
+    if shift is None:
+        return f"all of it is larger than the region allowed, {lengths_text(allowed.size_m, ' x ')}"
+    x, y = (lengths_text([value]) for value in shift)
+    return f"moved by ({x}, {y}) all of it fits"
+
+
+def _nearest_text(region: Region, allowed: Region | None) -> str:
+    if allowed is None:
+        return ""
+    nearest = nearest_region(region, allowed)
+    places = (nearest.center_m, nearest.size_m)
+    center, size = (f'["{lengths_text([x])}", "{lengths_text([y])}"]' for x, y in places)
+    return f"the nearest that fits: center = {center}, size = {size}"
+
+
+_REACH = 1e-9  # as of the limits: what lies on the border, to the precision of the arithmetic, is inside
+_MARGIN = 1e-3
+"""Relative: by so much a cure stays within the region where its rounded numbers would not."""
+
+
+def nearest_region(region: Region, allowed: Region) -> Region:
+    """Return the region of the same angle, in round numbers, nearest to one that fits; smaller if need be."""
+    exact = _rounded(_nearest(region, allowed, 0.0))
+    reach = replace(allowed, size_m=(allowed.size_m[0] * (1 + _REACH), allowed.size_m[1] * (1 + _REACH)))
+    if all(reach.contains(corner) for corner in exact.corners_m()):
+        return exact
+    return _rounded(_nearest(region, allowed, _MARGIN))
+
+
+def _rounded(region: Region) -> Region:
+    """Return a region in the digits of `lengths_text`; a centre that is zero but for the arithmetic is zero."""
+    width, height = (float(f"{size_m:.5g}") for size_m in region.size_m)
+    x, y = (float(f"{place_m:.5g}") if abs(place_m) > 1e-6 * width else 0.0 for place_m in region.center_m)
+    return replace(region, center_m=(x, y), size_m=(width, height))
+
+
+def _nearest(region: Region, allowed: Region, margin: float) -> Region:
+    sides = [high - low for low, high in _extent(region.corners_m(), allowed)]
+    smaller = min(1.0, *((1 - margin) * size / side for size, side in zip(allowed.size_m, sides, strict=True)))
+    fitting = replace(region, size_m=(region.size_m[0] * smaller, region.size_m[1] * smaller))
+    shift = _shift_m(fitting.corners_m(), allowed, margin) or (0.0, 0.0)
+    return fitting.moved_to((region.center_m[0] + shift[0], region.center_m[1] + shift[1]))
+
+
+def _extent(points: Iterable[XY], allowed: Region) -> list[tuple[float, float]]:
+    """Return the lowest and highest place of points along the sides of the region allowed, from its centre."""
+    cos, sin = math.cos(allowed.angle_rad), math.sin(allowed.angle_rad)
+    places = [(float(x) - allowed.center_m[0], float(y) - allowed.center_m[1]) for x, y in points]
+    along = [cos * x + sin * y for x, y in places]
+    across = [cos * y - sin * x for x, y in places]
+    return [(min(along), max(along)), (min(across), max(across))]
+
+
+def _shift_m(points: Iterable[XY], allowed: Region, margin: float) -> XY | None:
+    """Return the shortest shift by which points come to lie within a region; None: they are too far apart."""
+    moves = []
+    for (low, high), size in zip(_extent(points, allowed), allowed.size_m, strict=True):
+        if high - low > size * (1 + 1e-12):
+            return None
+        half = (1 - margin) * size / 2.0
+        if high - low > 2.0 * half:
+            moves.append(-(low + high) / 2.0)
+        else:
+            moves.append(max(0.0, -half - low) or min(0.0, half - high))
+    cos, sin = math.cos(allowed.angle_rad), math.sin(allowed.angle_rad)
+    return cos * moves[0] - sin * moves[1], sin * moves[0] + cos * moves[1]
+
+
+def too_slow(planned: PlannedMeasurements, usual_m_s: float | None) -> str:
+    """Return that a round takes longer than its period; empty: it does not, or its speed is not known.
+
+    Args:
+        usual_m_s: the speed of a scan where the plan sets none.
+    """
+    speeds = [one for one in planned.parameters.get("parameters", ()) if one.name == names.SCAN_SPEED]
+    speed_m_s = si(f"{speeds[0].value} {speeds[0].unit or 'm/s'}", "m/s") if speeds else usual_m_s
+    if not speed_m_s or planned.shape is None or not planned.period_s:
+        return ""
+    rows = planned.shape[0]
+    round_s = sum(2.0 * rows * region.size_m[0] / speed_m_s for region in planned.regions)
+    if round_s <= planned.period_s:
+        return ""
+    what = "the scan" if len(planned.regions) == 1 else f"a round of {len(planned.regions)} scans"
+    return (
+        f"{what} takes about {duration_text(round_s)} at {quantity(speed_m_s, 'm/s')},"
+        f" longer than its period of {duration_text(planned.period_s)}"
+    )
 
 
 def refused_actions(limits: ExperimentLimits) -> list[tuple[str, str]]:
     """Return the actions whose settings the limits would always refuse, and why."""
-    parameters = {name: replace(limit, only=None) for name, limit in _without_changes(limits).parameters.items()}
-    guard = LimitChecker(
-        replace(limits, parameters=parameters, actions={}, region=None)
-    )  # where the tip is is not known yet
+    # where the tip is is not known yet
+    guard = LimitChecker(replace(_for_all(_without_changes(limits)), actions={}, region=None))
     found = []
     for action in limits.sets:
         refused = guard.check("", Request(ControlRequest.ACTION, action, b""), 0)
         if refused is not None:
             found.append((action, refused.reason))
     return found
+
+
+def _for_all(limits: ExperimentLimits) -> ExperimentLimits:
+    return replace(limits, parameters={name: replace(limit, only=None) for name, limit in limits.parameters.items()})
 
 
 def _without_changes(limits: ExperimentLimits) -> ExperimentLimits:

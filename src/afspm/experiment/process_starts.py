@@ -74,6 +74,16 @@ def chosen_names(resolved: ResolvedExperiment, only: Collection[str], without: C
     return {name for name in names if (not only or name in only) and name not in without}
 
 
+def ends_idle(resolved: ResolvedExperiment, names: Collection[str]) -> bool:
+    """Return whether a run of these processes ends when nothing that acts is left.
+
+    Only where all that act, and the scheduler, are started here: plans on other computers may go on.
+    """
+    acting = {name for name, process in resolved.processes.items() if process.role is Role.COMPONENT and process.acts}
+    schedulers = {scheduler.name for scheduler in resolved.with_role(Role.SCHEDULER)}
+    return resolved.sections.control.idle == "end" and (acting | schedulers) <= set(names)
+
+
 def not_installed(resolved: ResolvedExperiment, names: Collection[str]) -> Iterator[Finding]:
     """Yield an error for each of these processes whose class requires a package that is not installed here."""
     for process in resolved.processes.values():
@@ -247,7 +257,7 @@ def _retracts(resolved: ResolvedExperiment) -> bool:
     return control.retract and FEEDBACK_OFF in dangerous
 
 
-_OF_OTHERS = {"request_timeout", "request_retries", "solved_by_hand"}
+_OF_OTHERS = {"idle", "request_timeout", "request_retries", "solved_by_hand"}
 _IN_SECONDS = ("lease", "grace", "malfunction_after")
 
 

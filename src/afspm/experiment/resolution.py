@@ -26,11 +26,12 @@ from afspm.experiment.class_loader import ComponentDeclaration
 from afspm.experiment.document import Document
 from afspm.experiment.findings import nearest
 from afspm.experiment.parts import EMULATED, SIMULATED, ExperimentPart, ExperimentParts
+from afspm.experiment.planned_measurements import PlannedMeasurements
 from afspm.experiment.sections import ExperimentSections, read_sections
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.wiring import BoundSocket, Wiring, WiringKeys
 from afspm.logic.limits import ExperimentLimits
-from afspm.model import ProblemNames, Role
+from afspm.model import Parameter, ProblemNames, Role
 
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 FROM_SECTIONS = ("control", "limits", "cache")
@@ -98,6 +99,7 @@ class ResolvedExperiment:
     Attributes:
         processes: by name, in the order of the file.
         listening: where components listen by settings of their own, beside the wiring.
+        plans: by component, as far as they are fixed before it runs.
     """
 
     parts: ExperimentParts
@@ -110,6 +112,7 @@ class ResolvedExperiment:
     listening: list[BoundSocket] = field(default_factory=list)
     limits: ExperimentLimits = field(default_factory=ExperimentLimits)
     caching: CacheSettings = field(default_factory=CacheSettings)
+    plans: dict[str, PlannedMeasurements] = field(default_factory=dict)
 
     @property
     def problems(self) -> ProblemNames:
@@ -260,7 +263,12 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
         if process.wrong is not None:
             _look_inside(process, process.component, resolved)
         else:
-            _resolve_plan(process, process.component, resolved)
+            _resolve_plan(process, process.component, resolved, has)
+    speeds = [plan.scan_speed_m_s for plan in resolved.plans.values()]
+    usual_m_s = next((speed for speed in speeds if speed is not None), None)
+    for name, plan in resolved.plans.items():
+        if what := planned_measurements.too_slow(plan, usual_m_s):
+            resolved.warning(f"[{name}] {what}", name, "every", hint="rounds that come too late are left out")
 
 
 def _look_inside(process: ResolvedProcess, component: type, resolved: ResolvedExperiment) -> None:
@@ -292,7 +300,9 @@ def _inside(error: AfspmError) -> tuple[str | int, ...]:
     return tuple(int(index) if index else key for key, index in _STEP.findall(where))
 
 
-def _resolve_plan(process: ResolvedProcess, component: type, resolved: ResolvedExperiment) -> None:
+def _resolve_plan(
+    process: ResolvedProcess, component: type, resolved: ResolvedExperiment, has: MicroscopeCapabilities | None
+) -> None:
     """Make a ready-made component once: it knows best whether its settings fit together."""
     name = process.name
     try:
@@ -309,11 +319,20 @@ def _resolve_plan(process: ResolvedProcess, component: type, resolved: ResolvedE
     process.declared = replace(
         process.declared, needs_actions=plan.needs_actions, needs_parameters=plan.needs_parameters
     )
-    for reason in planned_measurements.refusals(name, plan, resolved.limits):
-        resolved.document.error(f"[{name}] plans what its limits refuse: {reason}", name)
+    resolved.plans[name] = plan
+    for refusal in planned_measurements.refusals(name, plan, resolved.limits):
+        what = f"[{name}] plans what its limits refuse: {refusal.reason}"
+        resolved.document.error(what, name, *refusal.where, hint=refusal.hint)
     if any(DRIFT in scheduler.declared.publishes for scheduler in resolved.with_role(Role.SCHEDULER)):
         for doubt in plan.drift_doubts:
             resolved.document.warning(f"[{name}] {doubt.what}", name, doubt.where, hint=doubt.hint)
+    if has is None:
+        return
+    wanted: list[tuple[tuple[str, ...], Parameter]] = [((name,), one) for one in plan.frame()]
+    wanted += [((name, key, one.name), one) for key, given in plan.parameters.items() for one in given]
+    for path, parameter in wanted:
+        if reason := has.refuses(parameter):
+            resolved.document.error(f"[{name}] plans what its microscope refuses: {reason}", *path)
 
 
 def _written_role(part: ExperimentPart, resolved: ResolvedExperiment) -> Role:

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Annotated, Literal, TypeVar, get_args
 
 import pydantic
-from pydantic import Field
+from pydantic import Field, StrictBool
 
 from afspm.experiment.document import Document
 from afspm.experiment.run_metadata import Orcid
@@ -34,7 +34,7 @@ class ClockSection(Section):
 
     start: datetime | None = None
     speed: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
-    waits: bool = True
+    waits: StrictBool = True
 
 
 class RolesSection(Section):
@@ -53,23 +53,25 @@ class ControlSection(Section):
 
     lease: PositiveDuration | None = None
     grace: Annotated[Duration, Field(ge=0)] = 5.0
-    stop_scan_on_problem: bool = True
-    stop_scan_on_manual: bool = True
+    stop_scan_on_problem: StrictBool = True
+    stop_scan_on_manual: StrictBool = True
     request_timeout: PositiveDuration = 5.0
     request_retries: Annotated[int, Field(ge=0)] = 3
     malfunction_after: Annotated[Duration, Field(ge=0)] = 5.0
     """Real seconds that the microscope may be lost, before that is a malfunction and nobody stays in control."""
+    idle: Literal["end", "stay"] = "end"
+    """Whether the run ends when nothing that acts is left: no plan goes on, and no client is in control."""
     solved_by_hand: tuple[str, ...] = ("device-malfunction",)
     """Problems that a person puts right: they may be flagged though no component solves them."""
     end_on: tuple[str, ...] = ()
     """Problems that end the experiment when they are flagged."""
-    retract: bool = True
+    retract: StrictBool = True
     """Whether the tip is retracted when control is left in a dangerous state, where the microscope can."""
     dangerous: tuple[DangerousState, ...] | None = None
     """Those states; None: what the watchdog takes for dangerous by itself."""
     adjustable: tuple[AdjustableParameter, ...] = ()
     """Parameters that who may operate sets in AUTOMATED mode, too, beside the component in control."""
-    spectra_by_variable: bool = False
+    spectra_by_variable: StrictBool = False
     """Whether the translator sends the values of a spectrum variable after variable, as some of version 1 do."""
     roles: RolesSection = RolesSection()
 
@@ -78,9 +80,9 @@ class SecuritySection(Section):
     """[security]: the folder of CURVE keys, or the spoken word that there are none."""
 
     keys: str | None = None
-    plain: bool = False
+    plain: StrictBool = False
     """No keys are made for the run either: programs of this computer that know nothing of keys can join."""
-    insecure: bool = False
+    insecure: StrictBool = False
 
 
 class RestartSection(Section):
@@ -101,8 +103,8 @@ class RestartSection(Section):
 class RecordSection(Section):
     """[record]: what is kept of a run, beside what components write."""
 
-    on: bool = True
-    scans: bool = True
+    on: StrictBool = True
+    scans: StrictBool = True
     """Scans and spectra, too, each as a file."""
 
 

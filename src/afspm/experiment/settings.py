@@ -121,6 +121,8 @@ def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Documen
         return _object(value, path, document)
     if isinstance(value, list) and any(map(_is_object, value)):
         return [_value(Any, item, path, document) for item in value]
+    if annotation is bool:
+        annotation = pydantic.StrictBool  # pydantic reads "yes" and 1 as true, TOML has true
     try:
         adapter = pydantic.TypeAdapter(annotation, config=None if _has_own_config(annotation) else _TYPES)
     except pydantic.PydanticUndefinedAnnotation:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, tzinfo
@@ -9,6 +10,7 @@ from typing import Any
 
 from afspm.model import Scan, Spectrum
 
+_UNIT = re.compile(r"\s*\(((?:[^()]|\([^()]*\))*)\)")  # one pair of parentheses may stand in another: A/sqrt(Hz)
 _TOPOGRAPHY = ("height", "zsensor", "topo", "zs-topo", "z")
 
 
@@ -46,6 +48,18 @@ class FileContent:
                 if scan.channel.casefold().startswith(start):
                     return scan
         return heights[0] if len(self.scans) == 1 and heights else None
+
+
+def name_and_unit(column: str) -> tuple[str, str]:
+    """Return a column's name without its unit, and the unit, which is the last text in parentheses; "" if none is.
+
+    "Current (A) [filt]" is ("Current [filt]", "A"), and "Current PSD (A/sqrt(Hz))" is ("Current PSD", "A/sqrt(Hz)").
+    """
+    found = list(_UNIT.finditer(column))
+    if not found:
+        return column.strip(), ""
+    unit = found[-1]
+    return (column[: unit.start()] + column[unit.end() :]).strip(), unit[1].strip()
 
 
 def local_ns(text: str, layout: str, zone: tzinfo | None) -> int:

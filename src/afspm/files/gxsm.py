@@ -27,6 +27,7 @@ CONTROLLER = "GXSM"
 _ANGSTROM = ("AA", "Å", "Ang")
 _TEXT_MAX = 1 << 16
 _FILE_NAME = re.compile(r"-X([pm])-(.+)\.nc$")
+_WAS_DASH = re.compile(r"(?<=[A-Z0-9])m(?=[A-Z])")
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,18 +122,28 @@ def _ns(numbers: dict[str, float], key: str) -> int | None:
 
 
 def _unit(raw: _Raw) -> tuple[str, float]:
-    """Of the values times dz, and dz; ångström is told as m."""
-    unit = raw.attributes.get("ZSrcUnit") or raw.attributes.get("unit", "")
-    return ("m" if unit in _ANGSTROM else unit), raw.numbers["dz"]
+    """Return the unit of the values times dz, and dz; ångström is given as m.
+
+    ZSrcUnit is the name of the unit in GXSM's own list, where a second millivolt is "mV1". The unit itself is var_unit
+    in Gxsm4, which has that name in `unit`, and `unit` in Gxsm3. A length is in ångström by either.
+    """
+    given = raw.attributes
+    named = given.get("ZSrcUnit", "")
+    unit = given.get("var_unit") or given.get("unit", "") or named
+    return ("m" if {unit, named} & set(_ANGSTROM) else unit), raw.numbers["dz"]
 
 
 def _channel(raw: _Raw, path: Path) -> str:
-    """As the program shows it, e.g. "ZS-Topo", which is ZSmTopo in the file's name; the way back is told."""
+    """Return the channel's name as the program shows it, and mark the way back.
+
+    "ZS-Topo" is ZSmTopo in the file's name. Gxsm3 has the name nowhere else: "ADC0-ITunnel" has the label "I". There an
+    "m" between a capital or digit and a capital is taken for the dash that it was.
+    """
     label = raw.attributes.get("ZLabel", "")
     match = _FILE_NAME.search(raw.texts.get("basename", "")) or _FILE_NAME.search(path.name)
     if match is None:
         return label
-    name = label if label.replace("-", "m") == match[2] else match[2]
+    name = label if label.replace("-", "m") == match[2] else _WAS_DASH.sub("-", match[2])
     return f"{name} Backward" if match[1] == "m" else name
 
 

@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from afspm.errors import FileError
-from afspm.files.content import FileContent, local_ns
+from afspm.files.content import FileContent, local_ns, name_and_unit
 from afspm.files.gxsm import CONTROLLER
 from afspm.files.igor import decoded
 from afspm.model import Spectrum
 from afspm.units import convert
 
 _BEGIN, _END = "#C Data Table", "#C END."
-_COLUMN = re.compile(r'"([^"]*?)\s*\(([^()]*)\)"')
 
 
 def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
@@ -61,12 +60,12 @@ def _spectrum(columns: list[str], table: np.ndarray, kind: str, end: int | None,
     units: list[str] = []
     values: list[np.ndarray] = []
     for column, numbers in zip(columns, table.T, strict=True):
-        match = _COLUMN.fullmatch(column.strip())
-        if match is None or match[1].strip() in names:
+        name, unit = name_and_unit(column.strip().strip('"'))
+        if not unit or name in names:
             continue
-        length = match[2] == "Å"
-        names.append(match[1].strip())
-        units.append("m" if length else match[2])
+        length = unit == "Å"
+        names.append(name)
+        units.append("m" if length else unit)
         values.append(convert(numbers, "Å", "m") if length else numbers)
     if not names:
         raise FileError("its table has no column with a unit")

@@ -26,13 +26,37 @@ def is_hdf5(path: Path) -> bool:
 
 
 def opened(path: Path) -> h5py.File:
-    """The file; to be closed. Raises FileError: it is none."""
+    """The file; to be closed. Raises FileError: it is none, or has a part in another file."""
     import h5py
 
     if not is_hdf5(path):
         raise FileError("is not an HDF5 file", where=str(path))
     _check_heaps(path.read_bytes(), path)
-    return h5py.File(path, "r")
+    file = h5py.File(path, "r")
+    try:
+        _check_links(file, path)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def _check_links(file: h5py.File, path: Path) -> None:
+    # values in other files: the library would read any file of this computer, and a scan that comes from elsewhere,
+    # drawn or exported, would show its content
+    import h5py
+
+    def is_elsewhere(name: bytes, info: h5py.h5l.LinkInfo) -> bytes | None:
+        return name if info.type == h5py.h5l.TYPE_EXTERNAL else None
+
+    def has_values_elsewhere(name: str, node: h5py.Dataset | h5py.Group) -> str | None:
+        return name if isinstance(node, h5py.Dataset) and (node.external or node.is_virtual) else None
+
+    root = file["/"].id
+    found = root.links.visit(is_elsewhere, info=True) or file.visititems(has_values_elsewhere)
+    if found is not None:
+        name = found.decode("utf-8", "replace") if isinstance(found, bytes) else found
+        raise FileError(f"is refused: /{name} is in another file", where=str(path))
 
 
 def _check_heaps(data: bytes, path: Path) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import re
 from datetime import tzinfo
 from pathlib import Path
 
 import numpy as np
 
 from afspm.errors import FileError
-from afspm.files.content import FileContent, local_ns
+from afspm.files.content import FileContent, local_ns, name_and_unit
 from afspm.files.nanonis import CONTROLLER
 from afspm.model import Spectrum
 
@@ -39,7 +38,7 @@ def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
             raise FileError(f"row {number} of its table has {len(line)} columns instead of {len(columns)}")
     if not lines:
         raise FileError("is incomplete: its table is empty")
-    names, units = zip(*map(_name_and_unit, columns), strict=True)
+    names, units = zip(*map(name_and_unit, columns), strict=True)
     values = np.array([[float(cell) for cell in line] for line in lines])
     end = _time(header, ("Saved Date", "Date"), zone)
     spectrum = Spectrum(_position_m(header), header["Experiment"], names, units, values, end, str(path))
@@ -51,12 +50,6 @@ def _position_m(header: dict[str, str]) -> tuple[float, float] | None:
     """Where the tip was; None if that is not said, or is no place."""
     x, y = (float(header.get(f"{axis} (m)", "nan")) for axis in "XY")
     return (x, y) if math.isfinite(x) and math.isfinite(y) else None
-
-
-def _name_and_unit(column: str) -> tuple[str, str]:
-    """ "Current (A) [filt]" -> ("Current [filt]", "A")."""
-    unit = re.search(r" ?\(([^()]*)\)", column)
-    return (column, "") if unit is None else ((column[: unit.start()] + column[unit.end() :]).strip(), unit[1])
 
 
 def _time(header: dict[str, str], keys: tuple[str, ...], zone: tzinfo | None) -> int | None:

@@ -15,7 +15,7 @@ from afspm.web.component import WebComponent
 from afspm.web.passwords import Passwords, is_loopback
 from afspm.web.watch import Bell
 
-MOST_CONNECTIONS = 200
+MOST_REQUESTS = 200
 
 
 class Gateway(WebComponent):
@@ -85,7 +85,7 @@ class Gateway(WebComponent):
             Frame.SAMPLE if launch.sample_coordinates else Frame.TIP,
         )  # fmt: skip
         app = application(services, self._passwords, host=self._host, origins=self._origins)
-        self.serve(app, bound, most_connections=MOST_CONNECTIONS)
+        self.serve(app, bound, most_requests=MOST_REQUESTS)
 
     def on_message(self, envelope: str, message: object) -> None:
         time_ns = self.packet_time_ns()

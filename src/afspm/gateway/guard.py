@@ -62,12 +62,11 @@ class GatewayGuard:
                 return ""
             raise RefusedRequest(RefusalCode.NAME_NEEDED, "name and token are missing")
         name, token = _name_and_token(shown)
-        # a program with a wrong token locks out itself, and no others of its computer
-        address = f"{asked.client.host if asked.client else ''} {name if self._passwords.knows(name) else ''}"
+        address = asked.client.host if asked.client else ""
         if not name or name != check_name(name):
             raise RefusedRequest(RefusalCode.UNAUTHORIZED, "that can't be a name")
         if not await asyncio.to_thread(self._passwords.proves, name, token, address):
-            wait_s = self._passwords.wait_s(address)
+            wait_s = self._passwords.wait_s(name, address)
             later = f"; too many wrong ones: wait {wait_s:.0f} s" if wait_s else ""
             raise RefusedRequest(RefusalCode.UNAUTHORIZED, f"name or token is wrong{later}")
         return name

@@ -42,34 +42,24 @@ def refuse_peer(draft: StateDraft, event: RequestIn, why: str, code: int = Contr
     reply(draft, event, Response(int(code), b"", why, event.request.id), tells_why=True)
 
 
-def refuse(draft: StateDraft, event: RequestIn, refusal: Response) -> None:
-    """Refuse a request that is not sent."""
-    draft.log("WARNING", f"refused {event.name}: {refusal.reason}")
-    answer_unsent(draft, event, refusal)
-
-
-def answer_unsent(draft: StateDraft, event: RequestIn, response: Response) -> None:
-    """Answer a request that is not sent; it may have waited, and be asked by another connection by now."""
-    job, reason = ForwardedRequest.of(event), response.reason
-    if response.code == ControlResponse.NO_RESPONSE:
-        reason = f"not sent: what had to come before it failed ({reason})"
-        draft.idempotency = draft.idempotency.forgotten(event.name, event.request)
-        answer_job(draft, job, Response(response.code, b"", reason, event.request.id, ResponseDetail.NOT_SENT))
+def answer_unsent(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
+    """Answer a request that is not sent. Of a repeated one it stays unknown whether it was carried out before."""
+    unknown = ResponseDetail.OUTCOME_UNKNOWN
+    if job.is_repeated:
+        reason = f"outcome unknown: it was sent once, and is not sent again ({response.reason})"
+        response = Response(int(ControlResponse.NO_RESPONSE), b"", reason, job.request.id, unknown)
+        finish(draft, job, response, RequestStatus.UNKNOWN)
+    elif response.code == ControlResponse.NO_RESPONSE:
+        draft.idempotency = draft.idempotency.forgotten(job.client, job.request)
+        answer_job(draft, job, Response(response.code, b"", response.reason, job.request.id, ResponseDetail.NOT_SENT))
     else:
-        finish(draft, job, Response(response.code, b"", reason, event.request.id), was_sent=False)
+        finish(draft, job, Response(response.code, b"", response.reason, job.request.id))
 
 
-def finish(
-    draft: StateDraft,
-    job: ForwardedRequest,
-    response: Response,
-    status: RequestStatus | None = None,
-    *,
-    was_sent: bool = True,
-) -> None:
+def finish(draft: StateDraft, job: ForwardedRequest, response: Response, status: RequestStatus | None = None) -> None:
     """Remember the answer to a request, or that its outcome is unknown, and give it."""
     draft.idempotency = draft.idempotency.noted(job.client, job.request, response if status is None else status)
-    if was_sent and status is None and not response.ok:
+    if job.sent_s is not None and status is None and not response.ok:
         take_back(draft, job)  # what was refused does not count as used; what nobody knows of does
     answer_job(draft, job, response)
 
@@ -93,10 +83,7 @@ def call_back(draft: StateDraft, former: str | None, cause: Cause | None) -> Non
     reason = f"control was taken before this was sent: {cause.value if cause else 'the mode was changed'}"
     draft.forwarder, jobs = draft.forwarder.called_back(lambda job: job.command and former in (None, job.client))
     for job in jobs:
-        finish(draft, job, Response(int(ControlResponse.NOT_IN_CONTROL), b"", reason, job.request.id))
-    draft.pending, events = draft.pending.called_back(former)
-    for event in events:
-        answer_unsent(draft, event, Response(int(ControlResponse.NOT_IN_CONTROL), b"", reason))
+        answer_unsent(draft, job, Response(int(ControlResponse.NOT_IN_CONTROL), b"", reason, job.request.id))
 
 
 def write_down(

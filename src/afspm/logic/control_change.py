@@ -19,6 +19,7 @@ from afspm.logic.descriptions import is_routine, said
 from afspm.logic.event_log import control_entries
 from afspm.logic.events import RequestIn
 from afspm.logic.frozen import replace
+from afspm.logic.idempotency_cache import RequestStatus
 from afspm.logic.microscope_status import feedback_of
 from afspm.logic.publishing import publish_control
 from afspm.logic.sessions import token_of
@@ -94,6 +95,8 @@ def answer_unless_ending(
     """Answer a request, now or when the tip is seen to."""
     if (kept := draft.end.keep((event, code, why, detail))) is not None:
         draft.end = kept
+        # asked again meanwhile, it gets this answer, and not one more
+        draft.idempotency = draft.idempotency.noted(event.name, event.request, RequestStatus.PENDING)
     else:
         answers.answer(draft, event, code, why, detail=detail)
 

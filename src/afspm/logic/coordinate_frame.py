@@ -9,7 +9,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Protocol
 
-from afspm.model import Packet, PacketHeader, Parameter, Request, Response
+from afspm.model import Packet, PacketHeader, Parameter, ProbePosition, Region, Request, Response
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,14 @@ class MappedRequest:
 class CoordinateFrame(Protocol):
     """Maps between the coordinates that components speak of and those of the microscope."""
 
+    def maps(self, now_ns: int) -> bool:
+        """Return whether components are given other coordinates than those of the microscope."""
+        ...
+
+    def in_force(self, place: Region | ProbePosition, now_ns: int) -> None:
+        """Take a place that was read from the microscope; the next part of a place is put onto it."""
+        ...
+
     def outgoing(self, who: str, request: Request, now_ns: int) -> MappedRequest | Response | None:
         """A request as the microscope must be asked. The same id always gives the same bytes.
 
@@ -39,7 +47,11 @@ class CoordinateFrame(Protocol):
         ...
 
     def move_before(self, action: str, now_ns: int) -> MappedRequest | None:
-        """Return the request that must come first, so that an action happens where it was meant to; None: none."""
+        """Return the request that must come right before an action, so that it happens where it was meant to.
+
+        Returns:
+            None if nothing has to come before it.
+        """
         ...
 
     def carried_out(self, sent: Request, told: Parameter | None, now_ns: int) -> None:

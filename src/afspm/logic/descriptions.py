@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from afspm.formatting import area_text, lengths_text, position_text
+from afspm.formatting import PREFIXABLE, area_text, lengths_text, position_text, quantity, unit_text
 from afspm.logic.arbitration import ArbitrationEvent, ArbitrationState, Cause, ControlInput, Rules, Transition
 from afspm.model import (
     LEASE_REQUEST,
@@ -79,7 +79,15 @@ def _parameter(subject: object, problems: ProblemNames) -> str:
         return f"parameter {subject}"
     if subject.value is None:
         return f"reads {subject.name}"
-    return f"{subject.name} = {subject.value}{f' {subject.unit}' if subject.unit else ''}"
+    return f"{subject.name} = {_value(subject.value, subject.unit or '')}"
+
+
+def _value(text: str, unit: str) -> str:
+    """Return a value with a prefix that reads well where its unit is SI, else in the unit that was sent."""
+    try:
+        return quantity(float(text), unit, 6) if unit in PREFIXABLE else f"{text} {unit_text(unit)}".strip()
+    except ValueError:
+        return f"{text} {unit_text(unit)}".strip()
 
 
 def _scan_parameters(subject: object, problems: ProblemNames) -> str:

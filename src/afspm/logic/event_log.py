@@ -6,6 +6,7 @@ is published.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -20,11 +21,13 @@ from afspm.model import (
     RESTART_REQUEST,
     ControlEvent,
     ControlRequest,
+    ControlResponse,
     JournalEntries,
     JournalEntry,
     ProblemNames,
     Request,
     Response,
+    names,
 )
 
 ENTRIES = "JournalEntries"
@@ -41,6 +44,10 @@ LATE = "late: the client had been told that there was no answer"
 SCHEDULER = "scheduler"
 """Who asks for what nobody else did."""
 _UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})
+_STARTS = frozenset({names.START_SCAN, names.START_SPEC})
+_STARTS_KEPT = 16
+"""Starts kept over a restart: many more than can be passed on while one entry waits to be published."""
+_CUT_OFF = "the scheduler was restarted before the answer was written down"
 
 
 class AnsweredRequest(NamedTuple):
@@ -82,18 +89,48 @@ class AnsweredRequest(NamedTuple):
 
 
 @dataclass(frozen=True)
+class SentStart:
+    """The start of a measurement, saved before it is passed on: the measurement has its key from the entry of it.
+
+    Attributes:
+        sent_ns: when it was passed on for the first time.
+    """
+
+    who: str
+    action: str
+    request_id: str
+    sent_ns: int
+
+    def entry(self, now_ns: int) -> JournalEntry:
+        """Return the entry of a start whose answer was lost with the scheduler's process."""
+        return JournalEntry(
+            now_ns,
+            REQUEST,
+            self.who,
+            self.action,
+            int(ControlResponse.NO_RESPONSE),
+            _CUT_OFF,
+            request=int(ControlRequest.ACTION),
+            sent_ns=self.sent_ns,
+            key=key_of(self.who, self.request_id),
+        )
+
+
+@dataclass(frozen=True)
 class EventLog:
     """The entries that are still to be published.
 
     Attributes:
         due_s: when, in real monotonic time, they are to be published; None: there are none.
         left_out: requests beyond `most`.
+        starts: the last that were passed on, saved before they are: a kill loses the entries that were gathered.
     """
 
     most: int = MOST
     due_s: float | None = None
     gathered: tuple[AnsweredRequest | JournalEntry, ...] = ()
     left_out: int = 0
+    starts: tuple[SentStart, ...] = ()
 
     def add(self, now_s: float, *entries: AnsweredRequest | JournalEntry) -> EventLog:
         if not entries:
@@ -109,12 +146,36 @@ class EventLog:
             return replace(self, left_out=self.left_out + 1)
         return self.add(now_s, entry)
 
+    def sent_ns(self, who: str, request: Request, now_ns: int) -> int:
+        """Return when a request was passed on for the first time: now, unless it is a start that is repeated."""
+        known = (one.sent_ns for one in self.starts if (one.who, one.request_id) == (who, request.id) and request.id)
+        return next(known, now_ns)
+
+    def sending(self, who: str, request: Request, sent_ns: int) -> EventLog:
+        """Remember a request that is passed on, if it starts a measurement."""
+        if request.kind != ControlRequest.ACTION or request.subject not in _STARTS:
+            return self
+        start = SentStart(who, str(request.subject), request.id, sent_ns)
+        return self if start in self.starts else replace(self, starts=(*self.starts, start)[-_STARTS_KEPT:])
+
+    def restored(
+        self, starts: Sequence[SentStart], published: Iterable[JournalEntry], now_s: float, now_ns: int
+    ) -> EventLog:
+        """Take up the starts of the life before; those without a published entry get one.
+
+        Args:
+            published: entries that outlived the restart.
+        """
+        known = {(entry.who, entry.sent_ns) for entry in published}
+        lost = [one.entry(now_ns) for one in starts if (one.who, one.sent_ns) not in known]
+        return replace(self, starts=tuple(starts)).add(now_s, *lost)
+
     def take(self, problems: ProblemNames, now_ns: int) -> tuple[EventLog, JournalEntries]:
         """Return the entries in words, oldest first: they are the caller's to publish."""
         entries = [one if isinstance(one, JournalEntry) else one.entry(problems) for one in self.gathered]
         if self.left_out:
             entries.append(JournalEntry(now_ns, REQUEST, SCHEDULER, f"{self.left_out} more requests are left out"))
-        return EventLog(self.most), JournalEntries(tuple(entries))
+        return EventLog(self.most, starts=self.starts), JournalEntries(tuple(entries))
 
 
 def unreadable_entry(now_ns: int, who: str, response: Response) -> JournalEntry:

@@ -1,7 +1,9 @@
-"""Requests on their way to the translator: one at a time, each with its deadline, and every one is answered.
+"""The line to the translator: one request in flight, the others wait, each has a deadline, and every one is answered.
 
 A translator of version 1 serves one request after the other and says nothing while it does. So one is in flight; the
-others wait here, where they can still be called back, and a request that waited too long is answered unsent.
+others wait here, where they can still be called back, and a request that waited too long is answered unsent. The line
+keeps the order and the times; whether a request is sent, and as what, is decided as its turn comes
+(`request_pipeline.send_next`).
 """
 
 from __future__ import annotations
@@ -33,10 +35,11 @@ class ForwardedRequest(NamedTuple):
         sent_s: when it was sent; None while it waits.
         answered: the client has been told that there was no response in time.
         connection: the one it was asked by.
-        states_seen: how many states the microscope had told when it was sent on its way.
+        states_seen: how many states the microscope had told when it was sent.
         mapped: what is sent in place of `request`, where the microscope has other coordinates.
         heard_s: when it was asked, real.
-        sent_ns: when it was passed on, experiment time; None: it was not.
+        sent_ns: when it was sent, experiment time; None: it was not.
+        is_repeated: it was sent before under its id, with an unknown outcome.
         on_answer: takes the answer to one of the scheduler's own.
     """
 
@@ -52,21 +55,14 @@ class ForwardedRequest(NamedTuple):
     mapped: MappedRequest | None = None
     heard_s: float = 0.0
     sent_ns: int | None = None
+    is_repeated: bool = False
     on_answer: OwnAnswer | None = None
 
     @classmethod
-    def of(
-        cls,
-        event: RequestIn,
-        *,
-        command: bool = True,
-        deadline_s: float = 0.0,
-        states_seen: int = 0,
-        mapped: MappedRequest | None = None,
-    ) -> ForwardedRequest:
+    def of(cls, event: RequestIn, *, command: bool = True, is_repeated: bool = False) -> ForwardedRequest:
         return cls(
-            event.name, event.request, command, 0, deadline_s,
-            connection=event.connection, states_seen=states_seen, mapped=mapped, heard_s=event.heard_s,
+            event.name, event.request, command,
+            connection=event.connection, heard_s=event.heard_s, is_repeated=is_repeated,
         )  # fmt: skip
 
     @property
@@ -104,7 +100,7 @@ class Forwarder:
         longest_queue: how many may wait.
         up: the translator is connected.
         flight: the request that is with the translator.
-        own, queue: those that wait: of the scheduler, which go first, and of clients.
+        own, queue: waiting requests in their order: of the scheduler, which go first, and of clients.
         overdue: those whose answer may still come, by number.
         outbox: to be sent now; the caller empties it.
     """
@@ -133,25 +129,24 @@ class Forwarder:
             waiting = (_unknown(self.flight, why), *waiting)
         return replace(self, up=False, flight=None, own=(), queue=()), waiting
 
-    def ask(self, job: ForwardedRequest, now_s: float) -> tuple[Forwarder, SettledRequest | None]:
-        """Send a client's request, now or when its turn comes. Returns also its refusal, if it was refused.
+    @property
+    def is_free(self) -> bool:
+        """True while a request can be sent."""
+        return self.up and self.flight is None
 
-        A request that has a deadline already, since it waited for something else before, keeps it.
-        """
+    def ask(self, job: ForwardedRequest, now_s: float) -> tuple[Forwarder, SettledRequest | None]:
+        """Have a client's request wait for its turn. Returns also its refusal, if it was refused."""
         if not self.up:
             return self, _not_sent(job, "the translator is not connected")
-        if self.flight is None:
-            return self._sent(job, now_s), None
         if len(self.queue) >= self.longest_queue:
             return self, _not_sent(job, f"{self.longest_queue} requests wait for the translator already")
-        job = job._replace(number=self.number + 1, deadline_s=job.deadline_s or now_s + self.timeout_s)
-        queue = sorted((*self.queue, job), key=lambda waiting: waiting.deadline_s)
-        return replace(self, number=job.number, queue=tuple(queue)), None
+        job = job._replace(number=self.number + 1, deadline_s=now_s + self.timeout_s)
+        return replace(self, number=job.number, queue=(*self.queue, job)), None
 
     def ask_own(
         self, request: Request, now_s: float, on_answer: OwnAnswer | None = None, mapped: MappedRequest | None = None
     ) -> tuple[Forwarder, ForwardedRequest | None]:
-        """Send a request of the scheduler's own before all that wait. None: the translator is not connected."""
+        """Have a request of the scheduler's own sent before all that wait. None: the translator is not connected."""
         if not self.up:
             return self, None
         number, deadline_s = self.number + 1, now_s + self.timeout_s
@@ -159,16 +154,31 @@ class Forwarder:
             "", request, command=True, number=number, deadline_s=deadline_s,
             mapped=mapped, heard_s=now_s, on_answer=on_answer,
         )  # fmt: skip
-        if self.flight is None:
-            return self._sent(job, now_s), job
         return replace(self, number=number, own=(*self.own, job)), job
 
-    def answered(self, number: int, response: Response, now_s: float) -> tuple[Forwarder, SettledRequest | None]:
+    def sent(self, job: ForwardedRequest, now_s: float) -> Forwarder:
+        """Send a request that waited."""
+        assert self.is_free
+        rest = self.without(job.number)
+        return replace(
+            rest, flight=job._replace(sent_s=now_s), outbox=(*self.outbox, Forward(job.number, job.outgoing))
+        )
+
+    def without(self, number: int) -> Forwarder:
+        """Remove a waiting request."""
+        own, queue = (tuple(job for job in jobs if job.number != number) for jobs in (self.own, self.queue))
+        return replace(self, own=own, queue=queue)
+
+    def waiting(self, number: int) -> ForwardedRequest | None:
+        """Return a client's request that waits, by its number; None: it was sent, answered or called back."""
+        return next((job for job in self.queue if job.number == number), None)
+
+    def answered(self, number: int, response: Response) -> tuple[Forwarder, SettledRequest | None]:
         """Take an answer of the translator. None: it belongs to no request that is open."""
         job = self.flight
         if job is not None and job.number == number:
             outcome = ForwardOutcome.LATE if job.answered else ForwardOutcome.ANSWERED
-            return self._next(now_s), SettledRequest(job, outcome, response)
+            return replace(self, flight=None), SettledRequest(job, outcome, response)
         late = self.overdue.get(number)
         if late is None:
             return self, None
@@ -187,12 +197,8 @@ class Forwarder:
         forwarder = replace(self, flight=flight, own=own, queue=queue)
         if flight is not None and flight.answered and now_s >= self._patience_ends_s(flight):
             overdue = [*self.overdue.items(), (flight.number, flight)][-self.longest_queue :]
-            forwarder = replace(forwarder, overdue=dict(overdue))._next(now_s)
+            forwarder = replace(forwarder, overdue=dict(overdue), flight=None)
         return forwarder, tuple(settled)
-
-    def requests(self) -> list[tuple[str, Request]]:
-        """Return the requests of clients that are on their way: who asked, and for what."""
-        return [(job.client, job.request) for job in (self.flight, *self.queue) if job is not None and job.client]
 
     def asked_again(self, client: str, request_id: str, now_s: float) -> Forwarder | None:
         """Wait once more for an overdue request that its client repeats; None: it is not at the translator."""
@@ -213,23 +219,9 @@ class Forwarder:
             times.append(self._patience_ends_s(self.flight) if self.flight.answered else self.flight.deadline_s)
         return min(times, default=None)
 
-    def _sent(self, job: ForwardedRequest, now_s: float) -> Forwarder:
-        """Send a request; one that waited has its number and deadline already."""
-        number, deadline_s = job.number or self.number + 1, job.deadline_s or now_s + self.timeout_s
-        flight = job._replace(number=number, deadline_s=deadline_s, sent_s=now_s)
-        outbox = (*self.outbox, Forward(number, job.outgoing))
-        return replace(self, number=max(number, self.number), flight=flight, outbox=outbox)
-
     def _patience_ends_s(self, job: ForwardedRequest) -> float:
         assert job.sent_s is not None
         return job.sent_s + self.timeout_s + self.patience_s
-
-    def _next(self, now_s: float) -> Forwarder:
-        if self.own:
-            return replace(self, own=self.own[1:])._sent(self.own[0], now_s)
-        if self.queue:
-            return replace(self, queue=self.queue[1:])._sent(self.queue[0], now_s)
-        return replace(self, flight=None)
 
 
 def _not_sent(job: ForwardedRequest, why: str) -> SettledRequest:

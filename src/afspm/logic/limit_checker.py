@@ -1,21 +1,33 @@
 """Checks requests against the limits of an experiment.
 
 Nothing is clamped. A refusal names the parameter, the value, the limit and where the limit was set.
+
+A check is right only for the moment at which it is made: steps, rates and places are measured from the values in
+force. So a request is checked right before it is sent, after everything before it has settled, and `depends_on` names
+the values that are read from the microscope for that check.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from afspm.errors import InvalidValue
 from afspm.logic.frozen import replace
 from afspm.logic.limit_state import LastUse, LimitState, Usage
 from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.logic.parameter_values import ParameterValue, ParameterValueError, numbers, values_of
-from afspm.logic.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES, changes_by, moved
+from afspm.logic.positions import (
+    PROBE_CHANGES,
+    REGION_CHANGES,
+    SHAPE_CHANGES,
+    KnownPosition,
+    changes_by,
+    moved,
+)
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -36,10 +48,8 @@ from afspm.model.names import BASE_PARAMETERS
 
 _REACH = 1e-9  # relative: what lies on the border, to the precision of the arithmetic, is inside
 _TOLD_REACH = 1e-3  # the same of a place that the controller tells: in steps of its own, and in single precision
-_TOLD = frozenset(
-    (*PROBE_CHANGES, *REGION_CHANGES, *SHAPE_CHANGES, names.ZCTRL_SETPOINT, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN)
-)
-"""What a translator publishes whenever it changes."""
+_PLACES = ((frozenset(REGION_CHANGES), frozenset({names.START_SCAN})), (frozenset(PROBE_CHANGES), names.AT_PROBE))
+"""The parameters of each place, with the actions that happen there."""
 
 
 class _Breach(Exception):
@@ -51,6 +61,13 @@ class _Breach(Exception):
         self.reason = reason
 
 
+class _Use(NamedTuple):
+    who: str
+    request_id: str
+    now_ns: int
+    is_repeated: bool
+
+
 @dataclass(frozen=True)
 class LimitChecker:
     """Checks requests against the limits, and keeps in mind what steps and rates are measured from."""
@@ -58,14 +75,23 @@ class LimitChecker:
     limits: ExperimentLimits = field(default_factory=ExperimentLimits)
     state: LimitState = field(default_factory=LimitState)
 
-    def check(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> Response | None:
+    def check(
+        self,
+        who: str,
+        request: Request,
+        now_ns: int,
+        used: Collection[str] | None = None,
+        *,
+        is_repeated: bool = False,
+    ) -> Response | None:
         """Return the refusal of a request that breaks a limit or has no meaning; None: it may be sent.
 
         Args:
             used: the parameters that `who` means to set; the others of the request only change with them. None: all.
+            is_repeated: this very request was sent before, and its outcome is unknown: it is no second use.
         """
         try:
-            self._check(who, request, now_ns, used)
+            self._check(_Use(who, request.id, now_ns, is_repeated), request, used)
         except _Breach as breach:
             return Response(int(breach.code), b"", breach.reason, request.id)
         except (ParameterValueError, InvalidValue) as error:
@@ -81,36 +107,80 @@ class LimitChecker:
             return Response(int(ControlResponse.ACTION_ERROR), b"", reason, request.id)
         return None
 
-    def to_be_read(self, request: Request) -> list[str]:
-        """Return the parameters that a request sets, whose limits depend on values that nobody publishes.
+    def depends_on(self, request: Request, *, is_mapped: bool = False) -> list[str]:
+        """Return the parameters to be read before a request is checked: it is measured from their values.
 
-        They are read from the microscope first: somebody at the panel may have changed them, or a request of unknown
-        outcome.
+        The value set or published last is not enough: a request of unknown outcome or a person at the panel may have
+        changed it, and an old packet may arrive after the answer to a newer request.
+
+        Args:
+            is_mapped: a place is mapped and sent as a whole, whichever part of it was asked for.
         """
-        unpublished = self.limits.bounded - _TOLD
-        return [name for name in self._names_set_by(request) if name in unpublished] if unpublished else []
+        given = self._names_set_by(request)
+        needed = [name for name in given if name in self.limits.bounded]
+        if self.limits.region is not None or is_mapped:
+            action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
+            for place, actions in _PLACES:
+                if action in actions or 0 < len(place.intersection(given)) < len(place):
+                    needed += sorted(place)
+        if len(SHAPE_CHANGES.keys() & given) == 1:
+            needed += sorted(SHAPE_CHANGES)
+        return list(dict.fromkeys(needed))
 
     def to_be_known(self) -> list[str]:
-        """Return the parameters to be read before anybody sets them: how fast one changes takes two looks."""
-        rated = (name for name, limit in self.limits.parameters.items() if limit.rate_per_s is not None)
-        return [name for name in rated if name not in _TOLD]
+        """Return the parameters to be read before the first request sets them: a rate takes two looks."""
+        return list(self.limits.rated)
+
+    def was_read(self, values: Mapping[str, Parameter | None], now_ns: int) -> LimitChecker:
+        """Take values that were read for a check.
+
+        Args:
+            values: None where the microscope answered no value. A parameter that it does not have is not among them.
+        """
+        numbers_read = {name: None if told is None else self._number(told) for name, told in values.items()}
+        usage = self.state.usage
+        for name, value in numbers_read.items():
+            if value is None:
+                usage = usage.forget(name)
+            elif name in self.limits.bounded:
+                usage = usage.learn(name, value, now_ns, was_read=True)
+        return replace(self, state=LimitState(usage, self.state.position.was_read(numbers_read)))
+
+    def unknown(self, request: Request) -> LimitChecker:
+        """Forget the values that a request of unknown outcome may have changed."""
+        given = self._names_set_by(request)
+        usage = self.state.usage
+        for name in given:
+            usage = usage.forget(name)
+        return replace(self, state=LimitState(usage, self.state.position.without(given)))
 
     def forget(self, name: str) -> LimitChecker:
         """Drop the value of a parameter that could not be read."""
         return self._using(self.state.usage.forget(name))
 
     def sending(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> LimitChecker:
-        """Count what a request uses: it was checked, and is about to be sent."""
+        """Count what a request uses: it was checked, and is about to be sent.
+
+        The time of a change is unknown until the request has settled, so a limited rate is not measured from it.
+        """
         usage = self.state.usage
         for name in self._uses(request, used):
             usage = usage.use_sent(name, LastUse(now_ns, who, request.id))
+        for name in self.limits.rated.intersection(self._names_set_by(request)) if self.limits.rated else ():
+            usage = usage.changing(name)
         return self._using(usage)
+
+    def counts(self, request: Request) -> bool:
+        """Return whether the interval between two such requests is limited."""
+        return bool(self._uses(request, None))
 
     def not_done(self, who: str, request: Request, used: Collection[str] | None = None) -> LimitChecker:
         """Take back what a request used: it was not carried out, for sure."""
         usage = self.state.usage
         for name in self._uses(request, used):
             usage = usage.use_undone(name, who, request.id)
+        for name in self._names_set_by(request):
+            usage = usage.unchanged(name)
         return self._using(usage)
 
     def carried_out(
@@ -136,8 +206,16 @@ class LimitChecker:
             checker = checker.in_force(said, now_ns)
         return checker
 
+    def published(self, subject: object, now_ns: int) -> LimitChecker:
+        """Learn places, and the times at which values with a limited rate change, from a published message."""
+        usage = self.state.usage
+        for name, value in numbers(self._sensible(subject)):
+            if name in self.limits.rated:
+                usage = usage.learn(name, value, now_ns)
+        return self._with(usage, self.state.position.learn(subject))
+
     def in_force(self, subject: object, now_ns: int, *, was_read: bool = False) -> LimitChecker:
-        """Take what the translator said is in force, or what was set: a ScanParameters, Feedback, Parameter …"""
+        """Learn values that were set or read: a ScanParameters, Feedback, Parameter …"""
         values, usage, position = numbers(self._sensible(subject)), self.state.usage, self.state.position
         if isinstance(subject, Parameter):
             if not values:  # what a microscope tells is not ours to judge
@@ -146,7 +224,9 @@ class LimitChecker:
         for name, value in values:
             if name in self.limits.bounded:
                 usage = usage.learn(name, value, now_ns, was_read=was_read)
-        position = position.learn(subject)
+        return self._with(usage, position.learn(subject))
+
+    def _with(self, usage: Usage, position: KnownPosition) -> LimitChecker:
         if usage is self.state.usage and position is self.state.position:
             return self
         return replace(self, state=LimitState(usage, position))
@@ -175,20 +255,23 @@ class LimitChecker:
         except ParameterValueError:
             return []
 
+    def _number(self, told: Parameter) -> float | None:
+        return next((value.number for value in self._sensible(told)), None)
+
     # --- checks ---
 
-    def _check(self, who: str, request: Request, now_ns: int, used: Collection[str] | None) -> None:
+    def _check(self, use: _Use, request: Request, used: Collection[str] | None) -> None:
         if request.kind == ControlRequest.ACTION:
             action = str(request.subject)
-            self._check_use(who, request.id, action, self.limits.actions.get(action), now_ns, "action")
+            self._check_use(use, action, self.limits.actions.get(action), "action")
             try:
-                self._check_settings(who, request, now_ns, used)
+                self._check_settings(use, request, used)
             except (_Breach, ParameterValueError, InvalidValue) as breach:
                 raise _Breach(ControlResponse.ACTION_ERROR, f"{action}: {breach}") from breach
         else:
-            self._check_settings(who, request, now_ns, used)
+            self._check_settings(use, request, used)
 
-    def _check_settings(self, who: str, request: Request, now_ns: int, used: Collection[str] | None) -> None:
+    def _check_settings(self, use: _Use, request: Request, used: Collection[str] | None) -> None:
         subjects = self._set_by(request)
         values = [value for subject in subjects for value in values_of(subject, self.limits.parameters)]
         # parameters may move or turn the scan, or make it too many pixels, as well; several do so together
@@ -203,9 +286,9 @@ class LimitChecker:
         for name, value in values:
             limit = self.limits.parameters.get(name)
             if used is None or name in used:
-                self._check_use(who, request.id, name, limit, now_ns, "parameter")
+                self._check_use(use, name, limit, "parameter")
             if limit is not None and value is not None:
-                self._check_value(name, value, limit, now_ns)
+                self._check_value(name, value, limit, use.now_ns)
 
     def _set_by(self, request: Request) -> Collection[object]:
         """Return what a request sets: its subject, or for an action what the microscope does as that."""
@@ -213,14 +296,15 @@ class LimitChecker:
             return self.limits.sets.get(str(request.subject), ())
         return () if is_get(request) else (request.subject,)
 
-    def _check_use(self, who: str, request_id: str, name: str, limit: Limit | None, now_ns: int, what: str) -> None:
+    def _check_use(self, use: _Use, name: str, limit: Limit | None, what: str) -> None:
         if limit is None:
             return
+        who, now_ns = use.who, use.now_ns
         error = ControlResponse.ACTION_ERROR if what == "action" else ControlResponse.PARAM_ERROR
         if limit.only is not None and not {who, component_of(who)} & set(limit.only):
             rule = f"only {', '.join(sorted(limit.only))} may" if limit.only else "no component may"
             raise _Breach(error, f"{who} may not use the {what} {name}: {rule} ({limit.source})")
-        last_ns = self.state.usage.last_ns(name, who, request_id)
+        last_ns = self.state.usage.last_ns(name, (who, use.request_id) if use.is_repeated else None)
         if limit.interval_s is not None and last_ns is not None and now_ns - last_ns < limit.interval_s * 1e9:
             ago_s = (now_ns - last_ns) / 1e9
             raise _Breach(

@@ -34,9 +34,9 @@ class LastUse:
     who: str
     request_id: str
 
-    def is_of(self, who: str, request_id: str) -> bool:
-        """Return whether it is that very request, which may be asked again."""
-        return bool(request_id) and (self.who, self.request_id) == (who, request_id)
+    def is_of(self, repeated: tuple[str, str] | None) -> bool:
+        """Return whether a repeated request (client, id) made this use."""
+        return repeated is not None and bool(self.request_id) and (self.who, self.request_id) == repeated
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,11 @@ class Usage:
 
     Attributes:
         sent: uses of unknown outcome, which count.
+        before: the values from which a rate was measured, before a request that has not settled.
     """
 
     known: Mapping[str, KnownValue] = field(default_factory=dict)
+    before: Mapping[str, KnownValue] = field(default_factory=dict)
     done: Mapping[str, LastUse] = field(default_factory=dict)
     sent: Mapping[str, LastUse] = field(default_factory=dict)
 
@@ -61,16 +63,34 @@ class Usage:
         if known is not None and known.value == value:
             return self
         new = replace(known, value=value) if known is not None and was_read else KnownValue(value, now_ns, value)
-        return replace(self, known={**self.known, name: new})
+        return replace(self, known={**self.known, name: new}, before=_without(self.before, name))
 
     def forget(self, name: str) -> Usage:
         """Drop a value that is not known any more."""
-        return replace(self, known=_without(self.known, name)) if name in self.known else self
+        if name not in self.known and name not in self.before:
+            return self
+        return replace(self, known=_without(self.known, name), before=_without(self.before, name))
 
-    def last_ns(self, name: str, who: str, request_id: str) -> int | None:
-        """Return when it was used last, by another request than this one."""
+    def changing(self, name: str) -> Usage:
+        """Set a value aside until it is known whether, and when, it was changed."""
+        if name not in self.known:
+            return self
+        return replace(self, known=_without(self.known, name), before={**self.before, name: self.known[name]})
+
+    def unchanged(self, name: str) -> Usage:
+        """Take up a value again: it was not changed."""
+        if name not in self.before:
+            return self
+        return replace(self, known={**self.known, name: self.before[name]}, before=_without(self.before, name))
+
+    def last_ns(self, name: str, repeated: tuple[str, str] | None = None) -> int | None:
+        """Return when it was used last.
+
+        Args:
+            repeated: client and id of a repeated request, whose own use does not count.
+        """
         uses = (uses.get(name) for uses in (self.done, self.sent))
-        return max((use.at_ns for use in uses if use is not None and not use.is_of(who, request_id)), default=None)
+        return max((use.at_ns for use in uses if use is not None and not use.is_of(repeated)), default=None)
 
     def use_sent(self, name: str, use: LastUse) -> Usage:
         return replace(self, sent={**self.sent, name: use})

@@ -71,6 +71,11 @@ class ExperimentLimits:
         return frozenset(name for name, limit in self.parameters.items() if limit.bounds_changes)
 
     @cached_property
+    def rated(self) -> frozenset[str]:
+        """The parameters with a limited rate."""
+        return frozenset(name for name, limit in self.parameters.items() if limit.rate_per_s is not None)
+
+    @cached_property
     def counted(self) -> frozenset[str]:
         """The parameters and actions of which it matters when they were used last."""
         both = {**self.parameters, **self.actions}

@@ -8,7 +8,6 @@ from afspm.logic.arbitration import ArbitrationEvent, ControlInput
 from afspm.logic.control_change import TRANSLATOR
 from afspm.logic.events import PacketIn, Publish
 from afspm.logic.publishing import CONTROL_STATE
-from afspm.logic.request_pipeline import act_when_moved
 from afspm.logic.state import StateDraft
 from afspm.model import (
     ControlMode,
@@ -84,7 +83,7 @@ def _learn(draft: StateDraft, told: object) -> None:
         if draft.microscope.risk != before.risk:
             safety_commands.send(draft)
     if isinstance(told, Feedback | ScanParameters | ProbePosition):
-        draft.limits = draft.limits.in_force(told, draft.now_ns)
+        draft.limits = draft.limits.published(told, draft.now_ns)
 
 
 def _take_state(draft: StateDraft, state: ScopeState) -> None:
@@ -97,4 +96,3 @@ def _take_state(draft: StateDraft, state: ScopeState) -> None:
     if draft.microscope.lost_since_s is None and flagged_by == TRANSLATOR:
         control_change.decide(draft, ControlInput(ArbitrationEvent.CLEAR, TRANSLATOR, Problem.DEVICE_MALFUNCTION))
     safety_commands.send(draft)
-    act_when_moved(draft)

@@ -1,4 +1,4 @@
-"""Requests that are not sent yet: each waits for a value, a move of the microscope, or a connection to close."""
+"""The request whose turn it is, while reads or a move come before it; and requests of unclear connections."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from afspm.logic.events import RequestIn
 from afspm.logic.forwarder import ForwardedRequest
 from afspm.logic.frozen import replace
 from afspm.logic.microscope_status import MicroscopeStatus
-from afspm.model import ScopeState, ScopeStatus
+from afspm.model import Parameter, ScopeState, ScopeStatus
 
 SETTLED_WITHIN_S = 2.0
 """Real time for which a microscope that tells nothing of a move is waited for after it."""
@@ -17,32 +17,15 @@ _UNCLEAR_S = 0.5  # real; the closing of a connection is seen within millisecond
 
 
 @dataclass(frozen=True)
-class PendingRead:
-    """A request that waits for the values its limits depend on.
-
-    Attributes:
-        number: of the read, to find it again.
-        names: of the values that are still to come.
-        deadline_s: when (real) it must be answered.
-    """
-
-    number: int
-    event: RequestIn
-    names: frozenset[str]
-    deadline_s: float
-
-
-@dataclass(frozen=True)
 class PrePositioner:
-    """An action whose place has moved in the microscope's coordinates: it waits until the microscope was moved there.
+    """The move before an action whose place has moved in the microscope's coordinates.
 
     Attributes:
-        move: the request that moves it.
+        move: the request that moves the microscope.
         states_seen: states told before the move.
-        settled_at_s: until when (real) the microscope is waited for after the move.
+        settled_at_s: until when (real) the microscope is waited for after the move; None: it has not moved yet.
     """
 
-    event: RequestIn
     move: ForwardedRequest
     states_seen: int
     settled_at_s: float | None = None
@@ -67,34 +50,58 @@ class PrePositioner:
 
 
 @dataclass(frozen=True)
-class PendingRequests:
-    """All that wait.
+class Turn:
+    """The turn of one request: values are read, and the microscope is moved, before it is sent.
 
     Attributes:
+        number: of the request, in the forwarder's queue.
+        awaited: parameters that are being read; None: the reading has not begun.
+        values: by parameter; None where the microscope answered no value.
+        move: the move before an action; None: there was none.
+    """
+
+    number: int
+    awaited: frozenset[str] | None = None
+    values: Mapping[str, Parameter | None] = field(default_factory=dict)
+    move: PrePositioner | None = None
+
+    def reading(self, names: frozenset[str]) -> Turn:
+        return replace(self, awaited=names, values={})
+
+    def was_read(self, name: str, told: Parameter | None) -> Turn:
+        """Take the value of a parameter; None: the microscope answered none."""
+        return replace(self.lacks(name), values={**self.values, name: told})
+
+    def lacks(self, name: str) -> Turn:
+        """Go on without a parameter, which the microscope does not have."""
+        return replace(self, awaited=(self.awaited or frozenset()) - {name})
+
+    def moving(self, move: PrePositioner) -> Turn:
+        """Wait for a move, after which values are read again."""
+        return Turn(self.number, move=move)
+
+    def is_ready(self, microscope: MicroscopeStatus, now_s: float) -> bool:
+        """Return whether the request can be decided now."""
+        return not self.awaited and (self.move is None or self.move.is_ready(microscope, now_s))
+
+
+@dataclass(frozen=True)
+class PendingRequests:
+    """All that waits.
+
+    Attributes:
+        turn: of the request that waits for reads or a move.
         unclear: requests from a second connection under a name, by that name, and until when they are not answered.
         refused: connections that were refused, which is logged once for each.
     """
 
-    reads: tuple[PendingRead, ...] = ()
-    move: PrePositioner | None = None
+    turn: Turn | None = None
     unclear: Mapping[str, tuple[RequestIn, float]] = field(default_factory=dict)
     refused: frozenset[int] = frozenset()
 
-    def read(self, number: int) -> PendingRead | None:
-        return next((one for one in self.reads if one.number == number), None)
-
-    def without_read(self, number: int, *instead: PendingRead) -> PendingRequests:
-        return replace(self, reads=(*(one for one in self.reads if one.number != number), *instead))
-
-    def called_back(self, client: str | None) -> tuple[PendingRequests, list[RequestIn]]:
-        """Take back the requests of a client that has lost control; None: of all."""
-        gone = [one for one in self.reads if client in (None, one.event.name)]
-        events = [one.event for one in gone]
-        move = self.move
-        if move is not None and client in (None, move.event.name):
-            events.append(move.event)
-            move = None
-        return replace(self, reads=tuple(one for one in self.reads if one not in gone), move=move), events
+    @property
+    def move(self) -> PrePositioner | None:
+        return None if self.turn is None else self.turn.move
 
     def with_unclear(self, event: RequestIn, now_s: float) -> PendingRequests:
         return replace(self, unclear={**self.unclear, event.name: (event, now_s + _UNCLEAR_S)})
@@ -110,10 +117,10 @@ class PendingRequests:
         """Return the names for which both connections go on: they are two."""
         return [name for name, (_, until_s) in self.unclear.items() if now_s >= until_s]
 
-    def due_s(self) -> float | None:
+    def due_s(self, *, line_is_free: bool) -> float | None:
         """Return when, in real time, there is something to do; before that the forwarder watches over the move."""
         dues = [until_s for _, until_s in self.unclear.values()]
-        if self.move is not None and self.move.settled_at_s is not None:
+        if line_is_free and self.move is not None and self.move.settled_at_s is not None:
             dues.append(self.move.settled_at_s)
         return min(dues, default=None)
 

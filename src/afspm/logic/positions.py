@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 
@@ -27,6 +27,10 @@ REGION_CHANGES: dict[str, Callable[[float], RegionChange]] = {
     names.SCAN_ANGLE: lambda value: RegionChange(angle_rad=value),
 }
 
+_CORNER_AND_SIZE = REGION_CHANGES.keys() - {names.SCAN_ANGLE}
+_ANYWHERE = Region((0.0, 0.0), (1.0, 1.0))
+"""A placeholder, every part of which is replaced at once."""
+
 
 @dataclass(frozen=True, slots=True)
 class KnownPosition:
@@ -43,14 +47,23 @@ class KnownPosition:
 
     def learn(self, subject: object) -> KnownPosition:
         """Take a place, or a part of one, that was set or told."""
+        with suppress(InvalidValue):  # a part of a region that is not known yet
+            return self.onto(subject)
+        return self
+
+    def onto(self, subject: object) -> KnownPosition:
+        """Return the places after a place, or a part of one, was set.
+
+        Raises:
+            InvalidValue: a part of a region that is not known, or no region.
+        """
         if isinstance(subject, ScanParameters):
-            with suppress(InvalidValue):  # a part of a region that is not known yet
-                scan = subject.onto(ScanParameters(self.region, self.shape))
-                region = scan.region if isinstance(scan.region, Region) else None
-                return replace(self, region=region, shape=scan.shape if isinstance(scan.shape, tuple) else None)
-        elif isinstance(subject, ProbePosition):
+            scan = subject.onto(ScanParameters(self.region, self.shape))
+            region = scan.region if isinstance(scan.region, Region) else None
+            return replace(self, region=region, shape=scan.shape if isinstance(scan.shape, tuple) else None)
+        if isinstance(subject, ProbePosition):
             return replace(self, probe_m=subject.xy_m)
-        elif isinstance(subject, PositionChange) and self.probe_m is not None:
+        if isinstance(subject, PositionChange) and self.probe_m is not None:
             return replace(self, probe_m=moved(self.probe_m, subject))
         return self
 
@@ -61,6 +74,41 @@ class KnownPosition:
             for change in changes_by(values):
                 known = known.learn(change)
         return known
+
+    def was_read(self, values: Mapping[str, float | None]) -> KnownPosition:
+        """Take the values of single parameters, read together; a parameter that is missing keeps its value.
+
+        A frame without an angle, on a microscope that has no such parameter, is not turned.
+
+        Args:
+            values: None where the microscope answered no number.
+        """
+        wrong = [name for name, value in values.items() if value is None]
+        known = self.without(wrong)
+        read = [(name, value) for name, value in values.items() if value is not None]
+        names_read = {name for name, _ in read}
+        if known.region is None and names_read >= _CORNER_AND_SIZE and names.SCAN_ANGLE not in wrong:
+            known = replace(known, region=_ANYWHERE)
+        if known.shape is None and names_read >= SHAPE_CHANGES.keys():
+            known = replace(known, shape=(1, 1))
+        if known.probe_m is None and names_read >= PROBE_CHANGES.keys():
+            known = replace(known, probe_m=(0.0, 0.0))
+        for place in (REGION_CHANGES, SHAPE_CHANGES, PROBE_CHANGES):
+            given = [(name, value) for name, value in read if name in place]
+            try:
+                for change in changes_by(given):
+                    known = known.onto(change)
+            except InvalidValue:  # a frame of no size, half a pixel: what the microscope answered is no place
+                known = known.without([name for name, _ in given])
+        return known
+
+    def without(self, names_: Collection[str]) -> KnownPosition:
+        """Forget the places of unknown parameters."""
+        return KnownPosition(
+            None if REGION_CHANGES.keys() & names_ else self.region,
+            None if SHAPE_CHANGES.keys() & names_ else self.shape,
+            None if PROBE_CHANGES.keys() & names_ else self.probe_m,
+        )
 
 
 def changes_by(values: Iterable[tuple[str, float]]) -> list[PositionChange | ScanParameters]:

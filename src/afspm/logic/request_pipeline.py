@@ -1,7 +1,23 @@
-"""A request from being heard to being answered, in five stages, from top to bottom of this module.
+"""A request from its arrival to its answer, in five stages, from top to bottom of this module.
 
-Admitted (session, idempotency), authorised (arbitration), within limits, forwarded, settled. Nothing is done twice, and
-every request gets an answer.
+| stage | decided | by |
+| --- | --- | --- |
+| 1. admitted | at arrival | session, idempotency |
+| 2. authorised | at arrival, and again when it is sent | the arbitration table |
+| 3. queued | at arrival | the forwarder: one line to the translator, in order |
+| 4. within limits | as its turn comes, right before it is sent | limits, drift frame, the microscope itself |
+| 5. settled | at the answer, or when it is overdue | |
+
+Nothing is done twice, and every request gets an answer.
+
+**Why limits are decided at the fourth stage.** Limits compare a request with values in force, and requests before it
+in the queue change these. So a request is decided as its turn comes: no other command is on its way, all earlier ones
+have settled, and the scheduler first reads the values from the microscope. A request of unknown outcome needs no
+special case: the values that it may have changed are read before the next request that depends on them, or that one is
+refused. An overdue request may still be carried out; since the translator serves one request after the other, a value
+that it answers later is newer. A turn takes up to three steps: values are read, the microscope is moved to where the
+sample has drifted, values are read again. Meanwhile requests that only read pass, and the scheduler's own
+(`safety_commands`) always go first.
 """
 
 from __future__ import annotations
@@ -10,16 +26,16 @@ import json
 from functools import partial
 
 from afspm.logic import answers, control_change, publishing, safety_commands
-from afspm.logic.arbitration import ArbitrationEvent, ControlInput, Rules
+from afspm.logic.arbitration import ArbitrationEvent, ControlChange, ControlInput, Rules, reason, row_for
 from afspm.logic.coordinate_frame import MappedRequest
 from afspm.logic.event_log import SCHEDULER
 from afspm.logic.events import Reply, RequestIn
 from afspm.logic.forwarder import ForwardedRequest, ForwardOutcome, OwnAnswer, SettledRequest
 from afspm.logic.frozen import replace
-from afspm.logic.idempotency_cache import RequestStatus
+from afspm.logic.idempotency_cache import TOO_OLD, RequestStatus
 from afspm.logic.limit_checker import is_get
 from afspm.logic.microscope_status import feedback_of
-from afspm.logic.pending_requests import PendingRead, PrePositioner
+from afspm.logic.pending_requests import PrePositioner, Turn
 from afspm.logic.sessions import Hearing, run_of
 from afspm.logic.state import StateDraft
 from afspm.model import (
@@ -33,15 +49,19 @@ from afspm.model import (
     ControlRequest,
     ControlResponse,
     Parameter,
+    ProbePosition,
     Request,
     Response,
     ResponseDetail,
     component_of,
+    names,
 )
 
 _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 _ANOTHER_RUN = "this is the scheduler of another run: two experiments have the same address"
 _TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of its own"
+_LACKING = (ControlResponse.PARAM_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED)
+"""The answers of a translator that has no such parameter, or none at all."""
 _CONTROL_EVENTS = {
     int(ControlRequest.REQUEST_CTRL): ArbitrationEvent.REQUEST_CONTROL,
     int(ControlRequest.RELEASE_CTRL): ArbitrationEvent.RELEASE_CONTROL,
@@ -54,21 +74,11 @@ _CONTROL_EVENTS = {
 
 
 def handle(draft: StateDraft, event: RequestIn) -> None:
-    """Take a request through its stages, as far as it gets without waiting."""
+    """Take a request through the stages that are decided at its arrival."""
     if event.heard_s < 0.0:
         event.heard_s = draft.now_s
     if admit(draft, event) and authorise(draft, event):
-        pass_on(draft, event)
-
-
-def pass_on(draft: StateDraft, event: RequestIn, deadline_s: float = 0.0) -> None:
-    """Check a request that is authorised, and forward it.
-
-    Args:
-        deadline_s: of one that has waited for what its limits depend on; 0: it has not.
-    """
-    if (job := check_limits(draft, event, deadline_s)) is not None:
-        forward(draft, job)
+        enqueue(draft, event)
 
 
 # --- 1. admitted: the peer may speak for its name, and the request is new -------------------------------------------
@@ -122,14 +132,21 @@ def _repeated(draft: StateDraft, event: RequestIn, outcome: RequestStatus | Resp
         draft.forwarder = waiting
         draft.idempotency = draft.idempotency.noted(name, request, RequestStatus.PENDING)
         return True
+    if outcome is RequestStatus.FORGOTTEN:
+        answers.reply(draft, event, _unknown(request, TOO_OLD))
+        return True
     # A translator that knows ids answers what became of it. Setting something twice does no harm either; an
     # action does, so what nobody knows stays unknown.
     may_send = draft.idempotency.ids_known or request.kind != _ACTION
     if may_send and (draft.control.holder == name or reads(request)):
         return False
-    reason, detail = "outcome unknown: it was sent once, and is not sent again", ResponseDetail.OUTCOME_UNKNOWN
-    answers.reply(draft, event, Response(int(ControlResponse.NO_RESPONSE), b"", reason, request.id, detail))
+    answers.reply(draft, event, _unknown(request, "it was sent once, and is not sent again"))
     return True
+
+
+def _unknown(request: Request, why: str) -> Response:
+    detail = ResponseDetail.OUTCOME_UNKNOWN
+    return Response(int(ControlResponse.NO_RESPONSE), b"", f"outcome unknown: {why}", request.id, detail)
 
 
 # --- 2. authorised: the scheduler answers by itself, or who asks may command the microscope -------------------------
@@ -185,45 +202,138 @@ def _renew_lease(draft: StateDraft, event: RequestIn) -> None:
 def _tell_time(draft: StateDraft, event: RequestIn) -> None:
     """Tell what all parts of an experiment have in common: the run, what time it is, and how it passes."""
     settings = draft.env.settings
-    common = {"run": settings.run, "simulated": settings.simulated, "now_ns": draft.now_ns}
+    common = {"run": settings.run, "simulated": settings.simulated, "now_ns": draft.now_ns, "in_use": _in_use(draft)}
     told = json.dumps({**settings.clock, **common, "versions": dict(settings.versions)}).encode()
     response = Response(int(ControlResponse.SUCCESS), told, "", event.request.id)
     draft.effects.append(Reply(event.connection, event.name, response, CLOCK_REQUEST))
 
 
-# --- 3. within limits: nothing forbids it, and the microscope is where it has to be ---------------------------------
+def _in_use(draft: StateDraft) -> str:
+    """Return why an experiment without a plan is not to end now; empty: nothing keeps it."""
+    if draft.control.mode is ControlMode.MANUAL:
+        return "the mode is MANUAL"
+    return f"{draft.control.holder} is in control" if draft.control.holder else ""
 
 
-def check_limits(draft: StateDraft, event: RequestIn, deadline_s: float = 0.0) -> ForwardedRequest | None:
-    """Return a request as it may be sent; None: it was refused, or waits for a value or a move."""
-    request, mapped = event.request, None
-    if draft.env.frame is not None:
-        outgoing = draft.env.frame.outgoing(event.name, request, draft.now_ns)
-        if isinstance(outgoing, Response):
-            answers.refuse(draft, event, outgoing)
-            return None
-        mapped = outgoing
-    states_seen, command = draft.microscope.states_seen, not reads(request)
-    job = ForwardedRequest.of(event, command=command, deadline_s=deadline_s, states_seen=states_seen, mapped=mapped)
-    if not job.command:
-        return job
-    if (why := _tip_comes_first(draft)) is not None:
+# --- 3. queued: it waits for its turn -------------------------------------------------------------------------------
+
+
+def enqueue(draft: StateDraft, event: RequestIn) -> None:
+    """Queue a request, or refuse it if nothing can be sent now."""
+    name, request, is_command = event.name, event.request, not reads(event.request)
+    if is_command and (why := _tip_comes_first(draft)) is not None:
         answers.answer(draft, event, ControlResponse.NOT_FREE, why)
-        return None
-    if not deadline_s and _reads_first(draft, event):
-        return None
-    if draft.forwarder.up and not _is_within_limits(draft, event, mapped):
-        return None  # if not, there is nobody to tell what is in force, as the asker will hear
-    _use_lease(draft, event.name)
-    if request.kind == _ACTION and not _may_act_here(draft, event):
-        return None
-    return job
+        return
+    is_repeated = draft.idempotency.look_up(name, request) is RequestStatus.UNKNOWN
+    job = ForwardedRequest.of(event, command=is_command, is_repeated=is_repeated)
+    draft.forwarder, refused = draft.forwarder.ask(job, draft.now_s)
+    if refused is None:
+        draft.idempotency = draft.idempotency.noted(name, request, RequestStatus.PENDING)
+    else:
+        answers.answer_unsent(draft, job, refused.response)
+
+
+# --- 4. within limits: as its turn comes, nothing forbids it, and the microscope is where it has to be ---------------
+
+
+def send_next(draft: StateDraft) -> None:
+    """Decide and send waiting requests in their order, until one is in flight."""
+    turn = draft.pending.turn
+    if turn is not None and draft.forwarder.waiting(turn.number) is None:
+        draft.pending = replace(draft.pending, turn=None)  # it was called back, or its time was up
+    send_own(draft)
+    while draft.forwarder.is_free and (job := _next_job(draft)) is not None:
+        _decide(draft, job)
+        send_own(draft)
+
+
+def send_own(draft: StateDraft) -> None:
+    """Send the first of the scheduler's own requests, which are decided already."""
+    forwarder = draft.forwarder
+    if forwarder.is_free and forwarder.own:
+        draft.forwarder = forwarder.sent(forwarder.own[0], draft.now_s)
+
+
+def _next_job(draft: StateDraft) -> ForwardedRequest | None:
+    queue, turn = draft.forwarder.queue, draft.pending.turn
+    if turn is None:
+        return queue[0] if queue else None
+    if turn.is_ready(draft.microscope, draft.now_s):
+        return draft.forwarder.waiting(turn.number)
+    return next((job for job in queue if not job.command), None)
+
+
+def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
+    if not job.command:
+        if not isinstance(mapped := _mapped(draft, job), Response):
+            _send(draft, job, mapped)
+        return
+    if (refusal := _not_allowed_now(draft, job)) is not None:
+        _answer_unsent(draft, job, refusal)
+        return
+    turn = draft.pending.turn or Turn(job.number)
+    if turn.awaited is None and _reads_first(draft, job, turn):
+        return
+    _take_values(draft, turn)
+    mapped = _mapped(draft, job)
+    if isinstance(mapped, Response) or not _is_within_limits(draft, job, mapped):
+        return
+    if job.request.kind == _ACTION:
+        if turn.move is None and _moves_first(draft, job, turn):
+            return
+        if (refusal := draft.limits.check_place(job.request)) is not None:
+            _refuse(draft, job, refusal)
+            return
+    _send(draft, job, mapped)
+
+
+def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None) -> None:
+    name, request = job.client, job.request
+    sent_ns = draft.event_log.sent_ns(name, request, draft.now_ns)
+    job = job._replace(mapped=mapped, states_seen=draft.microscope.states_seen, sent_ns=sent_ns)
+    draft.event_log = draft.event_log.sending(name, request, sent_ns)
+    if job.command:
+        draft.limits = draft.limits.sending(name, job.outgoing, draft.now_ns, _names_meant(job))
+        draft.pending = replace(draft.pending, turn=None)
+        _use_lease(draft, name)
+    draft.forwarder = draft.forwarder.sent(job, draft.now_s)
+    if not request.id:
+        return
+    is_kept = request.kind == _ACTION and (draft.env.frame is not None or not draft.idempotency.ids_known)
+    if is_kept or (job.command and draft.limits.counts(job.outgoing)):
+        draft.idempotency = draft.idempotency.sent(name, request)
+    elif mapped is not None:
+        draft.save()  # with what it was mapped to: asked again, it is sent the same
+
+
+def _refuse(draft: StateDraft, job: ForwardedRequest, refusal: Response) -> None:
+    draft.log("WARNING", f"refused {job.client}: {refusal.reason}")
+    _answer_unsent(draft, job, refusal)
+
+
+def _answer_unsent(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
+    draft.forwarder = draft.forwarder.without(job.number)
+    if job.command:
+        draft.pending = replace(draft.pending, turn=None)
+    answers.answer_unsent(draft, job, response)
 
 
 def _use_lease(draft: StateDraft, client: str) -> None:
     """Begin the lease anew; what a person adjusts beside the holder is no sign of life of the holder."""
     if client == draft.control.holder:
         draft.lease = draft.lease.commanded(draft.now_ns, draft.now_s)
+
+
+def _not_allowed_now(draft: StateDraft, job: ForwardedRequest) -> Response | None:
+    rules = draft.env.settings.rules
+    ask = ControlInput(_microscope_event(job.request, rules), job.client)
+    row = row_for(draft.control, ask, rules)
+    if ControlChange.FORWARD not in row.do:
+        code = ControlResponse.NOT_IN_CONTROL if row.response is None else row.response
+        return Response(int(code), b"", reason(row, draft.control, ask, rules), job.request.id)
+    if (why := _tip_comes_first(draft)) is not None:
+        return Response(int(ControlResponse.NOT_FREE), b"", why, job.request.id)
+    return None
 
 
 def _tip_comes_first(draft: StateDraft) -> str | None:
@@ -242,52 +352,70 @@ def _tip_comes_first(draft: StateDraft) -> str | None:
     )
 
 
-def _is_within_limits(draft: StateDraft, event: RequestIn, mapped: MappedRequest | None) -> bool:
+def _mapped(draft: StateDraft, job: ForwardedRequest) -> MappedRequest | Response | None:
+    if draft.env.frame is None:
+        return None
+    outgoing = draft.env.frame.outgoing(job.client, job.request, draft.now_ns)
+    if isinstance(outgoing, Response):
+        _refuse(draft, job, outgoing)
+    return outgoing  # None: it is sent as it is
+
+
+def _is_within_limits(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None) -> bool:
+    check, now_ns = draft.limits.check, draft.now_ns
     if mapped is None:
-        refusal = draft.limits.check(event.name, event.request, draft.now_ns)
+        refusal = check(job.client, job.request, now_ns, is_repeated=job.is_repeated)
     else:
-        refusal = draft.limits.check(event.name, mapped.request, draft.now_ns, mapped.names)
+        refusal = check(job.client, mapped.request, now_ns, mapped.names, is_repeated=job.is_repeated)
         if refusal is not None:
             refusal = replace(refusal, reason=f"{refusal.reason}; {mapped.said}")
     if refusal is not None:
-        answers.refuse(draft, event, refusal)
+        _refuse(draft, job, refusal)
     return refusal is None
 
 
-def _reads_first(draft: StateDraft, event: RequestIn) -> bool:
-    """Return whether the microscope has to be asked for the values that the limits depend on; then it is."""
-    unread = draft.limits.to_be_read(event.request)
-    if not unread or not draft.forwarder.up:
+def _reads_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
+    frame = draft.env.frame
+    is_mapped = frame is not None and frame.maps(draft.now_ns)
+    needed = draft.limits.depends_on(job.request, is_mapped=is_mapped)
+    if not needed:
         return False
-    others = [(one.event.name, one.event.request) for one in draft.pending.reads]
-    for who, request in others + draft.forwarder.requests():
-        if both := set(unread) & set(draft.limits.to_be_read(request)):
-            reason = f"{min(both)} is being changed by {who}"
-            answers.refuse(draft, event, Response(int(ControlResponse.PARAM_ERROR), b"", reason))
-            return True
-    _use_lease(draft, event.name)
-    draft.idempotency = draft.idempotency.noted(event.name, event.request, RequestStatus.PENDING)
-    number = draft.forwarder.number
-    read = PendingRead(number, event, frozenset(unread), draft.now_s + draft.forwarder.timeout_s)
-    draft.pending = draft.pending.without_read(number, read)
-    for name in unread:
-        _read(draft, name, partial(_was_read, number, name))
+    draft.pending = replace(draft.pending, turn=turn.reading(frozenset(needed)))
+    for name in needed:
+        _read(draft, name, partial(_was_read, job.number, name))
     return True
 
 
 def _was_read(number: int, name: str, draft: StateDraft, response: Response) -> None:
-    _forget_unread(name, draft, response)
-    if (read := draft.pending.read(number)) is None:
+    turn, job = draft.pending.turn, draft.forwarder.waiting(number)
+    if turn is None or job is None or turn.number != number:
         return  # it was called back
-    rest = replace(read, names=read.names - {name})
     if response.code == ControlResponse.NO_RESPONSE:
-        draft.pending = draft.pending.without_read(number)
-        answers.answer_unsent(draft, read.event, response)
-    elif rest.names:
-        draft.pending = draft.pending.without_read(number, rest)
+        _answer_unsent(draft, job, _failed_before(response))
+    elif response.code in _LACKING:
+        draft.limits = draft.limits.forget(name)
+        draft.pending = replace(draft.pending, turn=turn.lacks(name))
     else:
-        draft.pending = draft.pending.without_read(number)
-        pass_on(draft, read.event, read.deadline_s)
+        told = draft.env.codec.decode_parameter(response.payload) if response.ok and response.payload else None
+        told = told if told is not None and told.name == name else None
+        draft.pending = replace(draft.pending, turn=turn.was_read(name, told))
+
+
+def _take_values(draft: StateDraft, turn: Turn) -> None:
+    # only now: packets that arrived while the values were read may be older than these
+    if not turn.values:
+        return
+    draft.limits = draft.limits.was_read(turn.values, draft.now_ns)
+    position, frame = draft.limits.state.position, draft.env.frame
+    if frame is not None:
+        if position.region is not None and names.SCAN_SIZE_X in turn.values:
+            frame.in_force(position.region, draft.now_ns)
+        if position.probe_m is not None and names.PROBE_POS_X in turn.values:
+            frame.in_force(ProbePosition(position.probe_m), draft.now_ns)
+
+
+def _failed_before(response: Response) -> Response:
+    return replace(response, reason=f"not sent: what had to come before it failed ({response.reason})")
 
 
 def read_ahead(draft: StateDraft) -> None:
@@ -307,85 +435,35 @@ def _forget_unread(name: str, draft: StateDraft, response: Response) -> None:
         draft.limits = draft.limits.forget(name)
 
 
-def _may_act_here(draft: StateDraft, event: RequestIn) -> bool:
-    """Return whether an action may be sent at once: if not, it is answered, or waits for a move."""
-    if draft.env.frame is not None:
-        move = draft.env.frame.move_before(str(event.request.subject), draft.now_ns)
-        if move is not None and _moves_first(draft, event, move):
-            return False
-    return _is_in_place(draft, event)
-
-
-def _is_in_place(draft: StateDraft, event: RequestIn) -> bool:
-    refusal = draft.limits.check_place(event.request)
-    if refusal is not None:
-        answers.refuse(draft, event, refusal)
-    return refusal is None
-
-
-def _moves_first(draft: StateDraft, event: RequestIn, move: MappedRequest) -> bool:
-    """Move the microscope before an action. Returns whether the action waits for that, or was answered."""
-    if draft.idempotency.was_sent(event.name, event.request):
+def _moves_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
+    frame = draft.env.frame
+    if frame is None or draft.idempotency.was_sent(job.client, job.request):
         return False
-    if draft.pending.move is not None:
-        answers.answer(draft, event, ControlResponse.NOT_FREE, "the microscope is being moved for another action")
+    move = frame.move_before(str(job.request.subject), draft.now_ns)
+    if move is None:
+        return False
+    if not _is_within_limits(draft, job, move):
         return True
-    if not _is_within_limits(draft, event, move):
-        return True
-    on_answer = partial(_moved, draft.forwarder.number + 1)
-    draft.forwarder, job = draft.forwarder.ask_own(move.request, draft.now_s, on_answer, move)
-    if job is None:
-        return False  # nobody is there to be moved, as the action will be told
-    draft.pending = replace(draft.pending, move=PrePositioner(event, job, draft.microscope.states_seen))
-    draft.idempotency = draft.idempotency.noted(event.name, event.request, RequestStatus.PENDING)
+    on_answer = partial(_moved, job.number)
+    draft.limits = draft.limits.sending(job.client, move.request, draft.now_ns, ())
+    draft.forwarder, own = draft.forwarder.ask_own(move.request, draft.now_s, on_answer, move)
+    assert own is not None  # the line is free
+    own = own._replace(deadline_s=job.deadline_s)
+    draft.pending = replace(draft.pending, turn=turn.moving(PrePositioner(own, draft.microscope.states_seen)))
     draft.save()  # with where it is sent: what is told of it is then known after a restart
     return True
 
 
 def _moved(number: int, draft: StateDraft, response: Response) -> None:
-    move = draft.pending.move
-    if move is None or move.move.number != number:
+    turn, job = draft.pending.turn, draft.forwarder.waiting(number)
+    if turn is None or turn.move is None or job is None or turn.number != number:
         return  # the action was called back
     if response.ok:
-        draft.pending = replace(draft.pending, move=move.moved(draft.now_s))
-        act_when_moved(draft)
+        draft.pending = replace(draft.pending, turn=replace(turn, move=turn.move.moved(draft.now_s)))
+    elif response.code == ControlResponse.NO_RESPONSE:
+        _answer_unsent(draft, job, _failed_before(response))
     else:
-        draft.pending = replace(draft.pending, move=None)
-        answers.answer_unsent(draft, move.event, response)
-
-
-def act_when_moved(draft: StateDraft) -> None:
-    """Send the action that waited for the microscope to be moved, if it is."""
-    move = draft.pending.move
-    if move is None or not move.is_ready(draft.microscope, draft.now_s):
-        return
-    draft.pending = replace(draft.pending, move=None)
-    if _is_in_place(draft, move.event):  # if not, it was moved by somebody else meanwhile
-        states_seen, deadline_s = draft.microscope.states_seen, move.move.deadline_s
-        forward(draft, ForwardedRequest.of(move.event, deadline_s=deadline_s, states_seen=states_seen))
-
-
-# --- 4. forwarded: it is with the translator, or waits for its turn -------------------------------------------------
-
-
-def forward(draft: StateDraft, job: ForwardedRequest) -> None:
-    """Send a request to the translator, once it is remembered."""
-    name, request = job.client, job.request
-    draft.forwarder, refused = draft.forwarder.ask(job._replace(sent_ns=draft.now_ns), draft.now_s)
-    if refused is not None:
-        draft.idempotency = draft.idempotency.forgotten(name, request)
-        event = RequestIn(job.connection, name, request, heard_s=job.heard_s)
-        answers.reply(draft, event, refused.response)
-        return
-    if job.command:
-        draft.limits = draft.limits.sending(name, job.outgoing, draft.now_ns, _names_meant(job))
-    if not request.id:
-        return
-    draft.idempotency = draft.idempotency.noted(name, request, RequestStatus.PENDING)
-    if request.kind == _ACTION and (draft.env.frame is not None or not draft.idempotency.ids_known):
-        draft.idempotency = draft.idempotency.sent(name, request)
-    elif job.mapped is not None:
-        draft.save()  # with what it was mapped to: asked again, it is sent the same
+        _answer_unsent(draft, job, response)
 
 
 # --- 5. settled: the translator has answered, or did not in time ----------------------------------------------------
@@ -402,9 +480,13 @@ def settle(draft: StateDraft, settled: SettledRequest) -> None:
         response = answers.with_id(response, job.request)
         if response.ok and (job.command or job.request.kind == _PARAM):
             response = _learn(draft, job, response)
+    if job.command and end is not ForwardOutcome.NOT_SENT and _is_unknown(response):
+        draft.limits = draft.limits.unknown(job.outgoing)
     if not job.client:
         _settle_own(draft, job, end, response)
-    elif end is ForwardOutcome.NOT_SENT or (end is ForwardOutcome.ANSWERED and _was_not_sent(response)):
+    elif end is ForwardOutcome.NOT_SENT:
+        answers.answer_unsent(draft, job, response)
+    elif end is ForwardOutcome.ANSWERED and _was_not_sent(response):
         draft.idempotency = draft.idempotency.not_sent(job.client, job.request)
         answers.take_back(draft, job)
         answers.answer_job(draft, job, response)
@@ -456,7 +538,8 @@ def _learn(draft: StateDraft, job: ForwardedRequest, response: Response) -> Resp
     draft.limits = draft.limits.carried_out(job.outgoing, now_ns, told, _names_meant(job), job.client)
     if frame is not None:
         frame.carried_out(job.outgoing, told, now_ns)
-        if request.kind == _PARAM and (mapped := frame.answer(request, told, now_ns)) is not None:
+        is_asked = request.kind == _PARAM and bool(job.client)  # the scheduler itself needs the microscope's values
+        if is_asked and (mapped := frame.answer(request, told, now_ns)) is not None:
             response = replace(response, payload=draft.env.codec.encode(mapped))
     if request.kind == _ACTION:
         _action_started(draft, job, is_certain=True)
@@ -479,6 +562,10 @@ def _action_started(draft: StateDraft, job: ForwardedRequest, *, is_certain: boo
 def _names_meant(job: ForwardedRequest) -> tuple[str, ...] | None:
     """Return the parameters that the asker means to set; None: all that are sent."""
     return None if job.mapped is None else tuple(job.mapped.names)
+
+
+def _is_unknown(response: Response) -> bool:
+    return response.code == ControlResponse.NO_RESPONSE and response.detail is not ResponseDetail.NOT_SENT
 
 
 def _was_not_sent(response: Response) -> bool:

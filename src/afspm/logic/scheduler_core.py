@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from afspm.logic import answers, control_change, packet_intake, publishing, request_pipeline, safety_commands
@@ -11,7 +11,7 @@ from afspm.logic.arbitration import ArbitrationEvent, ArbitrationState, ControlI
 from afspm.logic.cache import TIME_STEP_NS, PacketCache
 from afspm.logic.control_change import TRANSLATOR
 from afspm.logic.coordinate_frame import CoordinateFrame
-from afspm.logic.event_log import SCHEDULER, start_entry, unreadable_entry
+from afspm.logic.event_log import ENTRIES, SCHEDULER, SentStart, start_entry, unreadable_entry
 from afspm.logic.events import (
     Announced,
     Codec,
@@ -38,7 +38,17 @@ from afspm.logic.frozen import replace
 from afspm.logic.microscope_status import STOPS
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.state import Environment, SavedState, SchedulerState, StateDraft, restored_state, saved_state
-from afspm.model import ControlMode, ControlState, LoggedPacket, Problem, Request, Response, component_of
+from afspm.model import (
+    ControlMode,
+    ControlState,
+    JournalEntries,
+    JournalEntry,
+    LoggedPacket,
+    Problem,
+    Request,
+    Response,
+    component_of,
+)
 
 _MALFUNCTION = Problem.DEVICE_MALFUNCTION
 _AT_ONCE_S = 0.0  # in real monotonic time: always past
@@ -52,6 +62,7 @@ def step(
     """Return the state after an event, and what is to be done, in order."""
     draft = StateDraft(state, env, now_s, now_ns)
     _HANDLERS[type(event)](draft, event)
+    request_pipeline.send_next(draft)
     _end_when_safe(draft)
     return draft.finish()
 
@@ -94,6 +105,8 @@ class SchedulerCore:
         if self._restored is not None:
             draft.lease = draft.lease.asked(self._restored.lease_s, now_s)
             self._env.cache.remember(self._restored.recent)
+            starts = self._restored.starts
+            draft.event_log = draft.event_log.restored(starts, self._entries_since(starts), now_s, now_ns)
         if draft.control.ended:
             control_change.begin_end(draft)
             _end_when_safe(draft)
@@ -116,11 +129,19 @@ class SchedulerCore:
             draft.effects += ended(response, draft.now_s, draft.now_ns)
 
         draft.forwarder, _ = draft.forwarder.ask_own(request, now_s, on_answer)
+        request_pipeline.send_own(draft)
         return self._finish(draft)
 
     def _finish(self, draft: StateDraft) -> list[Effect]:
         self.state, effects = draft.finish()
         return effects
+
+    def _entries_since(self, starts: Sequence[SentStart]) -> Iterator[JournalEntry]:
+        oldest_ns = min((start.sent_ns for start in starts), default=0)
+        for packet, *_ in self._env.cache if starts else ():
+            if packet.envelope == ENTRIES and (packet.time_ns or 0) >= oldest_ns:
+                found = self._env.codec.decode_packet(ENTRIES, packet.payload)
+                yield from found.entries if isinstance(found, JournalEntries) else ()
 
     def put_off(self, until_s: float) -> None:
         """Wait longer before telling who is in control: more of what was published before a restart is to come."""
@@ -227,7 +248,7 @@ def _on_announced(draft: StateDraft, event: Announced) -> None:
 
 
 def _on_reply(draft: StateDraft, event: TranslatorReply) -> None:
-    draft.forwarder, settled = draft.forwarder.answered(event.number, event.response, draft.now_s)
+    draft.forwarder, settled = draft.forwarder.answered(event.number, event.response)
     if settled is not None:
         request_pipeline.settle(draft, settled)
 
@@ -276,6 +297,9 @@ def _end_when_safe(draft: StateDraft) -> None:
     if owes_retract:
         draft.log("CRITICAL", "the experiment ended with the tip in danger: the microscope did not retract it")
     for event, code, why, detail in kept:
+        newest = draft.sessions.connection_of(event.name)
+        if event.request.id and newest is not None:
+            event.connection = newest  # a client that lost its connection meanwhile asks again by another
         answers.answer(draft, event, code, why, detail=detail)
     draft.send_forwards()
     publishing.publish_entries(draft)
@@ -304,7 +328,6 @@ def _see_to_deadlines(draft: StateDraft) -> None:
         draft.pending, waiting = draft.pending.clear_up(name)
         if waiting is not None:
             request_pipeline.refuse_second(draft, waiting)
-    request_pipeline.act_when_moved(draft)
     draft.forwarder, settled = draft.forwarder.expired(draft.now_s)
     for one in settled:
         request_pipeline.settle(draft, one)

@@ -65,6 +65,17 @@ def token_of(name: str, request_id: str) -> str | None:
     return rest[0] if all(map(str.isdigit, rest[1:])) else None  # a number, and perhaps that of an attempt
 
 
+def number_of(request_id: str) -> tuple[str, int] | None:
+    """Return session and number of an id "<name>/<token>/<n>", which rise in each session; None for other forms.
+
+    The ids of a measurement have two numbers more, or a key: its attempts come hours after one another.
+    """
+    session, _, number = request_id.rpartition("/")
+    name, _, token = session.partition("/")
+    is_numbered = bool(name and token) and token != KEYED and "/" not in token and number.isascii()
+    return (session, int(number)) if is_numbered and number.isdigit() else None
+
+
 def key_of(name: str, request_id: str) -> str:
     """Return the key of a measurement in a request id, "<name>/key/<key>/<n>"; empty if it has none."""
     who, _, rest = request_id.partition("/")

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, fields
 from afspm.logic.arbitration import ArbitrationState
 from afspm.logic.cache import PacketCache
 from afspm.logic.coordinate_frame import CoordinateFrame
-from afspm.logic.event_log import EventLog
+from afspm.logic.event_log import EventLog, SentStart
 from afspm.logic.events import Codec, Effect, Log, SaveState
 from afspm.logic.forwarder import Forwarder
 from afspm.logic.frozen import replace
@@ -38,6 +38,7 @@ class SavedState:
         granted_to: the token of the life of the holder that was granted control.
         lease_s: that the holder asked for.
         sessions: the token of each session that was connected.
+        forgotten: see `idempotency_cache.Floors`.
         last_ns: the time of the newest packet.
         recent: (translator's time, ours) of the packets published last.
         frame: of a scheduler whose components have other coordinates, as JSON.
@@ -48,6 +49,8 @@ class SavedState:
     lease_s: float | None = None
     sessions: Mapping[str, str] = field(default_factory=dict)
     sent_actions: tuple[SentAction, ...] = ()
+    starts: tuple[SentStart, ...] = ()
+    forgotten: Mapping[str, int] = field(default_factory=dict)
     limits: LimitState = field(default_factory=LimitState)
     tip: RetractState = field(default_factory=RetractState)
     tip_risk: TipRisk = field(default_factory=TipRisk)
@@ -111,7 +114,7 @@ class SchedulerState:
     def saved_parts(self) -> tuple[object, ...]:
         """The parts of which every change is saved before it is told."""
         saved = self.control, self.lease.token, self.lease.asked_s, self.watchdog.tip, self.microscope.risk
-        return *saved, self.limits.state.usage, self.idempotency.sent_actions
+        return *saved, self.limits.state.usage, self.idempotency.sent_actions, self.event_log.starts
 
     def due_s(self) -> float | None:
         """Return when, in real monotonic time, a part has something to do that depends on no other."""
@@ -119,7 +122,7 @@ class SchedulerState:
             self.forwarder.deadline_s(),
             self.barrier.due_s(),
             self.end.by_s,
-            self.pending.due_s(),
+            self.pending.due_s(line_is_free=self.forwarder.is_free),
             self.watchdog.due_s,
         )
         return min((due_s for due_s in dues if due_s is not None), default=None)
@@ -212,6 +215,8 @@ def saved_state(state: SchedulerState, env: Environment) -> SavedState:
         lease_s=state.lease.asked_s,
         sessions=state.sessions.tokens(),
         sent_actions=state.idempotency.sent_actions,
+        starts=state.event_log.starts,
+        forgotten=state.idempotency.floors.numbers,
         limits=state.limits.state,
         tip=state.watchdog.tip,
         tip_risk=state.microscope.risk,
@@ -230,7 +235,7 @@ def restored_state(saved: SavedState, settings: SchedulerSettings) -> SchedulerS
         control=saved.control,
         lease=replace(state.lease, token=saved.granted_to),
         sessions=state.sessions.restored(saved.sessions),
-        idempotency=state.idempotency.restored(saved.sent_actions),
+        idempotency=state.idempotency.restored(saved.sent_actions, saved.forgotten),
         limits=replace(state.limits, state=saved.limits),
         watchdog=state.watchdog.restored(saved.tip),
         microscope=replace(state.microscope, risk=saved.tip_risk),

@@ -21,12 +21,24 @@ KINDS: Final = ("image", "contour", "surface")
 _LEVELS: Final = 12
 
 
-def draw(scan: Scan, kind: str = "image", axes: Axes | None = None) -> Axes:
+def draw(
+    scan: Scan,
+    kind: str = "image",
+    axes: Axes | None = None,
+    *,
+    colorbar: bool = True,
+    vmin: float | None = None,
+    vmax: float | None = None,
+) -> Axes:
     """Draw a scan; see `Scan.plot`."""
     if kind not in KINDS:
         raise InvalidValue(f"a scan can't be drawn as {kind!r}", hint=f"one of {', '.join(KINDS)}")
     if not scan.values.size or not np.isfinite(scan.values).any():
         raise InvalidValue(f"the scan {scan.channel!r} has no values to draw")
+    span = value_range(scan.values)
+    low, high = span.low if vmin is None else vmin, span.high if vmax is None else vmax
+    if not low <= high:
+        raise InvalidValue(f"colours from {low:g} to {high:g} {scan.unit}", hint="vmin is below vmax")
     import matplotlib.pyplot as plt
 
     given: Any = axes
@@ -34,19 +46,18 @@ def draw(scan: Scan, kind: str = "image", axes: Axes | None = None) -> Axes:
         given = plt.figure(layout="constrained").add_subplot(projection="3d" if kind == "surface" else None)
         given.set_title(_title(scan), fontsize=9)
     is_first = not given.has_data()
-    drawn = _fill(scan, kind, given)
+    factor, unit = scale(max(abs(low), abs(high)), scan.unit)
+    drawn = _fill(scan, kind, given, factor, (low, high))
     if is_first:
-        _explain(scan, drawn, given)
+        _explain(scan, drawn, given, f"{scan.channel} / {unit}" if unit else scan.channel, colorbar=colorbar)
     return cast("Axes", given)
 
 
-def _fill(scan: Scan, kind: str, axes: Any) -> object:
-    """Draw the values over the places of their pixels, in m."""
+def _fill(scan: Scan, kind: str, axes: Any, factor: float, ends: tuple[float, float]) -> object:
+    """Draw the values, times a factor, over the places of their pixels, in m."""
     x, y = scan.region.pixels_m(scan.shape)
-    span = value_range(scan.values)
-    factor, _ = _value_unit(scan)
     values = np.ma.masked_invalid(scan.values * factor)
-    look = {"cmap": gold(), "vmin": span.low * factor, "vmax": span.high * factor}
+    look = {"cmap": gold(), "vmin": ends[0] * factor, "vmax": ends[1] * factor}
     match kind:
         case "surface":
             return axes.plot_surface(x, y, values, **look)
@@ -56,10 +67,8 @@ def _fill(scan: Scan, kind: str, axes: Any) -> object:
             return axes.pcolormesh(x, y, values, shading="nearest", **look)
 
 
-def _explain(scan: Scan, drawn: object, axes: Any) -> None:
+def _explain(scan: Scan, drawn: object, axes: Any, label: str, *, colorbar: bool) -> None:
     """Add what the first scan in axes needs: units, a colour bar, a scale bar. Others lie over it as they are."""
-    _, unit = _value_unit(scan)
-    label = f"{scan.channel} / {unit}" if unit else scan.channel
     factor, length_unit = scale(max(scan.region.size_m), "m")
     for axis, name in ((axes.xaxis, "x"), (axes.yaxis, "y")):
         axis.set_major_formatter(lambda place_m, _: f"{place_m * factor:.6g}".replace("-", "−"))
@@ -69,14 +78,10 @@ def _explain(scan: Scan, drawn: object, axes: Any) -> None:
         return
     axes.set_facecolor("0.6")  # what was not measured, and behind contour lines
     axes.set_aspect("equal")
-    axes.figure.colorbar(drawn, ax=axes, label=label)
+    if colorbar:  # in axes within these: as high as the picture, which is rarely as high as its place in the figure
+        axes.figure.colorbar(drawn, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), label=label)
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     draw_scale_bar(axes, (right - left, high - low), (left, low), 1.0)
-
-
-def _value_unit(scan: Scan) -> tuple[float, str]:
-    span = value_range(scan.values)
-    return scale(max(abs(span.low), abs(span.high)), scan.unit)
 
 
 def draw_scale_bar(

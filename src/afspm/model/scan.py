@@ -146,6 +146,11 @@ class Scan:
 
         return int(np.isnan(self.values).all(axis=1).sum())
 
+    @property
+    def is_blank(self) -> bool:
+        """Return whether all values are NaN: nothing was measured. False where no values came."""
+        return bool(self.values.size) and self.lines_missing == self.shape[0]
+
     def undistorted(self, velocity_m_s: XY, duration_s: float, *, upwards: bool = True) -> Scan:
         """Return the scan as at the middle of its acquisition, without the drift meanwhile.
 
@@ -186,12 +191,24 @@ class Scan:
 
         return replace(self, values=levelled(self.values, order, fit, quantile, rows))
 
-    def plot(self, kind: str = "image", axes: Axes | None = None) -> Axes:
+    def plot(
+        self,
+        kind: str = "image",
+        axes: Axes | None = None,
+        *,
+        colorbar: bool = True,
+        vmin: float | None = None,
+        vmax: float | None = None,
+    ) -> Axes:
         """Draw the scan with matplotlib: with a scale bar, and a colour bar with units.
 
         Args:
             kind: "image", "contour" or "surface" (in three dimensions).
             axes: to draw in, over what is there; for a surface they need `projection="3d"`. None: a figure of its own.
+            colorbar: whether to draw the colour bar, as high as the picture. Beside other axes it needs the room that
+                `plt.subplots(…, layout="constrained")` makes.
+            vmin, vmax: values at the ends of the colours, in the unit of the values; None: the robust range of this
+                scan, 1 to 99 %. Give both to compare scans.
 
         Returns:
             The axes. Their coordinates are in m, with ticks in the unit that suits them: what is drawn into them next,
@@ -202,7 +219,7 @@ class Scan:
         """
         from afspm.model.plotting import draw
 
-        return draw(self, kind, axes)
+        return draw(self, kind, axes, colorbar=colorbar, vmin=vmin, vmax=vmax)
 
     def to_sidpy(self) -> sidpy.Dataset:
         """Return the scan as a `sidpy.Dataset`, for programs of the pycroscopy ecosystem (needs sidpy).

@@ -124,21 +124,25 @@ def stacked(spectra: Sequence[Spectrum], *, interpolate: bool = False) -> Spectr
     )
 
 
-def map_of(spectra: Sequence[Spectrum], quantity: Quantity, swept: float | None, unit: str, direction: str) -> Scan:
+def map_of(
+    spectra: Sequence[Spectrum], quantity: Quantity, swept: float | None, unit: str, direction: str, name: str = ""
+) -> Scan:
     """Return a quantity over the grid as a scan of one channel; see `SpectrumTable.map`."""
     first = alike(spectra, swept_alike=False)
     points, repeat_of = _grid_of(spectra)
     if isinstance(quantity, str):
         if swept is None:
             raise InvalidValue(f"a map of {quantity} is one at a value of {first.names[0]}", hint="give at=…")
-        channel, unit = f"{quantity} at {swept:g} {first.units[0]}", unit or _unit(first, quantity)
+        own_name, unit = f"{quantity} at {swept:g} {first.units[0]}", unit or _unit(first, quantity)
         number_of: Callable[[Spectrum], float] = partial(_value_at, quantity, swept, direction)
     else:
-        channel, number_of = getattr(quantity, "__name__", "map"), quantity
+        own_name, number_of = getattr(quantity, "__name__", "map").replace("<lambda>", "map"), quantity
     values = np.full((len(points.y_m), len(points.x_m), max(repeat_of) + 1), np.nan)
     for spectrum, cell, repeat in zip(spectra, points.cells, repeat_of, strict=True):
         values[(*cell, repeat)] = number_of(spectrum)
-    return Scan(_region(points, first.frame), channel, unit, mean_over_repeats(values), spectra[-1].time_ns, "")
+    return Scan(
+        _region(points, first.frame), name or own_name, unit, mean_over_repeats(values), spectra[-1].time_ns, ""
+    )
 
 
 def _unit(spectrum: Spectrum, variable: str) -> str:

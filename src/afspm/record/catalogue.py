@@ -17,12 +17,13 @@ from afspm.clock import NS_PER_S
 from afspm.errors import FileError, InvalidValue
 from afspm.formatting import counted
 from afspm.plain_data import Plain
+from afspm.record.journal import not_a_table
 from afspm.record.run import Run, open_run
 from afspm.record.run_json import RUN_FILE
 from afspm.record.run_lock import describe_state
 
 INDEX_FILE: Final = "runs.sqlite"
-_FORMAT: Final = 1
+_FORMAT: Final = 2
 _WATCHED: Final = (RUN_FILE, "journal.sqlite", "journal.sqlite-wal")
 """Files of a run by which it is seen that something has changed."""
 _WORD: Final = re.compile(r"(?:(\w+):)?(.+)", re.DOTALL)
@@ -35,7 +36,7 @@ class RunSummary:
     Attributes:
         folder: relative to the folder of all runs, with "/".
         name: of the experiment.
-        began_ns, ended_ns: the first and last that was published, in experiment time; None: nothing was.
+        began_ns, ended_ns: when it began and ended, in experiment time (or was published last); None: nothing was.
         state: how it ended, in words.
         metadata: sample, person, project, technique … as far as they are known.
         scans: the whole ones; spectra: their number.
@@ -166,6 +167,8 @@ def _prepared(index: sqlite3.Connection) -> sqlite3.Connection:
         (version,) = index.execute("PRAGMA user_version").fetchone()
         if version not in (0, _FORMAT):
             raise ValueError("of another version")
+        if not_a_table(index):
+            raise ValueError("not made by afspm")
         index.execute("CREATE TABLE IF NOT EXISTS runs (folder TEXT PRIMARY KEY, stamp TEXT NOT NULL, about TEXT)")
         index.execute(f"PRAGMA user_version = {_FORMAT}")
     except BaseException:
@@ -208,13 +211,13 @@ def _summary(folder: Path) -> RunSummary:
 
 
 def _read(run: Run) -> RunSummary:
-    overview = run.overview(("ControlState", "DriftRescan"))
+    overview = run.overview(("ControlState", "JournalEntries", "DriftRescan"))
     began = next(iter(overview.controls.spans), None)
     return RunSummary(
         folder="",
         name=run.name,
         began_ns=None if began is None else began.start_ns,
-        ended_ns=run.newest_ns or None,
+        ended_ns=overview.ended_ns or run.newest_ns or None,
         state=describe_state(run.folder),
         metadata=run.metadata,
         simulated=run.simulated,

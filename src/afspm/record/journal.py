@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import re
 import shutil
 import sqlite3
 import tempfile
@@ -53,6 +54,7 @@ CREATE TABLE IF NOT EXISTS log (
   time_ns INTEGER NOT NULL, name TEXT NOT NULL, level TEXT NOT NULL, text TEXT NOT NULL);
 CREATE INDEX IF NOT EXISTS log_by_time ON log (time_ns);
 """
+_VIRTUAL = re.compile(r"\s*CREATE\s+VIRTUAL\b", re.IGNORECASE)
 _DAMAGE = (sqlite3.DatabaseError, UnicodeDecodeError)  # SQLite quotes what it can't make sense of
 
 
@@ -100,10 +102,33 @@ def open_to_read(folder: Path) -> sqlite3.Connection:
         raise damaged(path, error) from error
 
 
+def measured_file(folder: Path, file: str) -> Path:
+    """Return the file of a scan or spectrum, which the journal names relative to its folder.
+
+    Raises:
+        FileError: it is elsewhere. The folder may come from another person, and its files are read and exported.
+    """
+    path = folder / file
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise FileError(f"is not in the folder of the run, {folder}: the journal is not trusted", where=str(path))
+    return path
+
+
 def read_only(path: PurePath) -> str:
     """An absolute path as SQLite is told to open it for reading. It knows no hosts: a share is part of the path."""
     scheme, _, place = path.as_uri().partition("//")
     return f"{scheme}{'//' if place.startswith('/') else '////'}{place}?mode=ro"
+
+
+def not_a_table(connection: sqlite3.Connection) -> str:
+    """Return the name of a view, trigger or virtual table of a database; empty: it has none.
+
+    In the place of a table it would run the program of its author, perhaps without end.
+    """
+    for name, kind, sql in connection.execute("SELECT name, type, sql FROM sqlite_master"):
+        if kind not in ("table", "index") or _VIRTUAL.match(sql or ""):
+            return str(name)
+    return ""
 
 
 def is_damage(error: sqlite3.DatabaseError) -> bool:
@@ -167,6 +192,9 @@ def _checked(uri: str, path: Path, kind: type[sqlite3.Connection] = sqlite3.Conn
     )
     try:
         connection.execute("PRAGMA query_only = 1")
+        connection.execute("PRAGMA trusted_schema = 0")
+        if strange := not_a_table(connection):
+            raise FileError(f"is not a journal that afspm wrote: {strange!r} is not a table", where=str(path))
         tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master")}
         if not tables:
             raise FileError("this record has not begun yet", where=str(path))

@@ -84,11 +84,19 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
         """
         return self._stacked(interpolate=interpolate).to_xarray()
 
-    def map(self, quantity: Quantity, at: float | None = None, *, unit: str = "", direction: str = "forward") -> Scan:
+    def map(
+        self,
+        quantity: Quantity,
+        at: float | None = None,
+        *,
+        unit: str = "",
+        direction: str = "forward",
+        name: str = "",
+    ) -> Scan:
         """Return a map of a quantity over the grid, as a scan with one channel: the mean over repeats.
 
             run.spectra.map("Current", at=0.5).plot()
-            run.spectra.map(lambda spectrum: spectrum["Current"].max(), unit="A")
+            run.spectra.map(lambda spectrum: spectrum["Current"].max(), unit="A", name="largest current")
 
         Args:
             quantity: the name of a variable, which is taken at one value of what was swept; or a function that makes a
@@ -96,6 +104,7 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
             at: that value, in the unit of what was swept.
             unit: of what the function returns.
             direction: "forward" or "backward" along the sweep.
+            name: of the channel; by default that of the variable or function.
 
         Raises:
             InvalidValue: these spectra do not form a grid of at least two by two, or there is no such quantity.
@@ -103,7 +112,7 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
         """
         from afspm.model.spectrum_stack import map_of
 
-        return map_of([self._read(row) for row in self._rows], quantity, at, unit, direction)
+        return map_of([self._read(row) for row in self._rows], quantity, at, unit, direction, name)
 
     def _stacked(self, *, interpolate: bool) -> SpectrumStack:
         from afspm.model.spectrum_stack import stacked

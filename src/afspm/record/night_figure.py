@@ -12,10 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.clock import NS_PER_S
 from afspm.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM, colour_map
+from afspm.drawing.timeline import time_ticks
 from afspm.formatting import counted, period_text, time_of_day
 from afspm.model import names
-from afspm.record.night_record import BAD, NightMark, NightRecord, Shot
+from afspm.record.bad_scans import BAD
+from afspm.record.night_record import NightMark, NightRecord, Shot
 from afspm.record.timeline import Span
 
 if TYPE_CHECKING:
@@ -31,7 +34,6 @@ COLUMNS = 14
 MOST_SHOTS = 98
 MOST_LOOKS = 3
 AROUND_NS = 8 * 60 * 1_000_000_000
-HOUR_NS = 3600 * 1_000_000_000
 PAPER = (255, 255, 255)
 
 
@@ -81,7 +83,7 @@ def draw(
         for i, span in enumerate(repairs):
             look = axes(label_in + i * (width + 0.25), top, width, looks_in)
             _bands(look, record, problems, colours, _around(span, record), names_too=i == 0)
-            _minutes(look, span, record)
+            _times(look, *(round(edge) for edge in look.get_xlim()), about=4)
         _letter(figure, "c", 0.0, 1 - (top - 0.06) / height_in)
     figure.savefig(path, dpi=200)
 
@@ -100,8 +102,7 @@ def _head(figure: Figure, record: NightRecord, title: str, height_in: float, *, 
     y = 1 - 0.17 / height_in
     about = f"{what}{period_text(record.start_ns, record.end_ns, UTC)}, {counted(record.scans, 'scan')}"
     figure.text(0.03, y, about, size=7, va="center")
-    is_judged = any(mark.of_ns is not None for mark in record.marks)
-    legend = "bar: who was in control, as in b" + ("; framed: the tip was judged bad" if is_judged else "")
+    legend = "bar: who was in control, as in b" + ("; framed: bad or interrupted" if record.bad_ns() else "")
     figure.text(0.86, y, legend, size=5.5, va="center", ha="right")
     _letter(figure, "a", 0.0, y)
     if simulated:
@@ -116,6 +117,7 @@ def _sheet(ax: Axes, record: NightRecord, shots: Sequence[Shot], colours: Mappin
     """All pictures as one image, which is much faster than an image each; under each a bar of who took it."""
     pitch, tall = THUMB_PX + GAP_PX, THUMB_PX + GAP_PX + BAR_PX
     canvas = np.full((rows * tall, COLUMNS * pitch, 3), PAPER, np.uint8)
+    bad_ns = record.bad_ns()
     palette = np.vstack([colour_map("gold"), colour_map("gold")[-1:]])  # for each of 256 greys
     for i, shot in enumerate(shots):
         y, x = i // COLUMNS * tall, i % COLUMNS * pitch + GAP_PX // 2
@@ -123,7 +125,7 @@ def _sheet(ax: Axes, record: NightRecord, shots: Sequence[Shot], colours: Mappin
         canvas[y : y + THUMB_PX, x : x + THUMB_PX] = picture
         bar = _rgb(colours.get(record.holder_of(shot) or "", NEUTRAL))
         canvas[y + THUMB_PX + 1 : y + THUMB_PX + BAR_PX, x : x + THUMB_PX] = bar
-        if record.verdict(shot) == BAD:
+        if shot.time_ns in bad_ns:
             _frame(canvas[y : y + THUMB_PX, x : x + THUMB_PX], _rgb(PROBLEM))
     ax.imshow(canvas, interpolation="nearest", aspect="auto")
     ax.set_axis_off()
@@ -198,12 +200,16 @@ def _actions(ax: Axes, record: NightRecord, lanes: Mapping[str, int], limits: tu
 
 
 def _hours(ax: Axes, record: NightRecord) -> None:
-    span_h = (record.end_ns - record.start_ns) / HOUR_NS
-    step = _step(span_h, (0.25, 0.5, 1, 2, 4, 8, 24), most=12)
-    ticks = np.arange(0, span_h + 1e-9, step)
-    ax.set_xticks([record.start_ns + t * HOUR_NS for t in ticks], [f"{t:g}" for t in ticks], size=6)
-    ax.set_xlabel("time / h", size=6, labelpad=1)
+    _times(ax, record.start_ns, record.end_ns, about=10)
+    ax.set_xlabel("time of day, UTC", size=6, labelpad=1)
     _legend(ax)
+
+
+def _times(ax: Axes, begin_ns: int, end_ns: int, *, about: int) -> None:
+    """Label round times of day, as everywhere in the picture."""
+    ticks_ns = [round(tick_s * NS_PER_S) for tick_s in time_ticks(begin_ns / NS_PER_S, end_ns / NS_PER_S, about)]
+    seconds = any(tick_ns % (60 * NS_PER_S) for tick_ns in ticks_ns)
+    ax.set_xticks(ticks_ns, [time_of_day(tick_ns, UTC, seconds=seconds) for tick_ns in ticks_ns], size=6)
 
 
 def _legend(ax: Axes) -> None:
@@ -212,27 +218,6 @@ def _legend(ax: Axes) -> None:
             loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, fontsize=5.5, frameon=False, handletextpad=0.1,
             borderpad=0.1,
         )  # fmt: skip
-
-
-def _minutes(ax: Axes, span: Span, record: NightRecord) -> None:
-    """Count the minutes from when the problem was flagged."""
-    low, high = ax.get_xlim()
-    minute = 60e9
-    span_min = (high - low) / minute
-    step = _step(span_min, (1, 2, 5, 10, 15, 30, 60, 120), most=6)
-    ticks = np.arange(math.ceil((low - span.start_ns) / minute / step), (high - span.start_ns) / minute / step) * step
-    ax.set_xticks([span.start_ns + t * minute for t in ticks], [f"{t:g}" for t in ticks], size=6)
-    hours = (span.start_ns - record.start_ns) / HOUR_NS
-    ax.set_xlabel(f"min from {hours:.2f} h", size=6, labelpad=1)
-
-
-def _step(span: float, steps: Sequence[float], *, most: int) -> float:
-    """The first of the steps of which at most so many make up a span, else the last doubled as often as it takes.
-
-    A time that somebody told wrongly, in the far future, must not make millions of ticks.
-    """
-    step = next((s for s in steps if span / s <= most), steps[-1])
-    return step * 2.0 ** max(0, math.ceil(math.log2(max(span / step / most, 1.0))))
 
 
 def _episodes(record: NightRecord) -> list[Span]:
@@ -261,7 +246,8 @@ def _chosen(record: NightRecord) -> list[Shot]:
     if len(shots) <= MOST_SHOTS:
         return shots
     series = record.holders[0] if record.holders else None
-    odd = {i for i, shot in enumerate(shots) if record.holder_of(shot) != series or record.verdict(shot) == BAD}
+    bad_ns = record.bad_ns()
+    odd = {i for i, shot in enumerate(shots) if record.holder_of(shot) != series or shot.time_ns in bad_ns}
     odd = set(sorted(odd)[: MOST_SHOTS // 2])
     rest = [i for i in range(len(shots)) if i not in odd]
     even = np.linspace(0, len(rest) - 1, MOST_SHOTS - len(odd)).round().astype(int)

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from afspm.model import ControlMode, ControlState, Problem, Scan
 from afspm.plain_data import Plain
+from afspm.record.bad_scans import bad_scans
 from afspm.record.overview import SOON_NS
 from afspm.record.timeline import Span, Timeline
 
 THUMBNAIL_PX = 64
-BAD = 0.0
-"""The score of a scan that was judged to show a bad tip."""
 
 
 @dataclass(frozen=True)
@@ -139,9 +138,11 @@ class NightRecord:
         """Return the spans of manual mode."""
         return self._spans(lambda state: state.mode is ControlMode.MANUAL)
 
-    def verdict(self, shot: Shot) -> float | None:
-        """Return the score of a scan; None if it was not judged."""
-        return next((m.score for m in reversed(self.marks) if m.of_ns == shot.time_ns), None)
+    def bad_ns(self) -> frozenset[int]:
+        """Return the times of the scans that are bad."""
+        verdicts = [(m.of_ns, m.score) for m in self.marks if m.of_ns is not None and m.score is not None]
+        flagged_ns = {number: [span.start_ns for span in self.problem_spans(number)] for number in self.problems}
+        return bad_scans([shot.time_ns for shot in self.shots], verdicts, flagged_ns, self.interruptions)
 
     def _spans(self, holds: Callable[[ControlState], bool], label: str = "") -> list[Span]:
         timeline = Timeline()

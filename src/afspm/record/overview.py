@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -42,6 +43,7 @@ from afspm.model import (
     Spectrum,
     registration_summary,
 )
+from afspm.model.events import PERSON
 from afspm.model.geometry import XY
 from afspm.record.running_scan import DoneScan, RunningScan
 from afspm.record.timeline import Span, Timeline
@@ -262,6 +264,24 @@ class Overview:
         return [s for lane in self.problem_timelines.values() for s in lane.spans if self.is_routine(s)]
 
     @property
+    def in_control(self) -> str:
+        """The holder of control; in MANUAL the person who set that mode, or "a person"; empty: it is free."""
+        if self.control is None:
+            return ""
+        if self.control.mode is not ControlMode.MANUAL:
+            return self.control.holder or ""
+        changes = (one for one in reversed(self.entries) if one.event is ControlEvent.MODE_CHANGED)
+        newest = next(changes, None)
+        who = newest.who if newest is not None and newest.mode is ControlMode.MANUAL else ""
+        return who.partition(PERSON)[2] or who or "a person"
+
+    @property
+    def ended_ns(self) -> int | None:
+        """When the experiment ended; None: it goes on, was stopped, or was cut off."""
+        entries = reversed(self.entries)
+        return next((one.time_ns for one in entries if one.event is ControlEvent.EXPERIMENT_ENDED), None)
+
+    @property
     def note_spans(self) -> list[Span]:
         """The notes as spans without length, for time lines."""
         spans = [Span(note.text, note.time_ns, note.time_ns, note.who) for note in self.notes]
@@ -280,7 +300,8 @@ class Overview:
     @property
     def control_since_ns(self) -> int | None:
         """Since when whoever is in control is, or nobody is; None if nothing is known."""
-        return self.controls.changed_ns
+        is_manual = self.control is not None and self.control.mode is ControlMode.MANUAL
+        return self.modes.changed_ns if is_manual else self.controls.changed_ns
 
     def scan_progress(self, now_ns: int) -> tuple[float, int] | None:
         """Of the running scan: (the part that is done, 0 to 1, and how many ns remain); None if that is not known."""
@@ -357,10 +378,11 @@ class Overview:
         )  # fmt: skip
 
     def _add_scan(self, taken: ScanSummary) -> None:
+        last = next(reversed(self._scans.values()), None)
+        taken = _sharing(taken, last)
         key = (taken.time_ns, taken.channel, taken.region, taken.interrupted)
         if key in self._scans:
             return
-        last = next(reversed(self._scans.values()), None)
         before = 0 if last is None else last.number
         number = before if last is not None and taken.is_of_scan(last) else before + 1
         setpoint = self.running.setpoint if self.running else None
@@ -478,6 +500,26 @@ class Overview:
 
     def _take_position(self, position: ProbePosition, time_ns: int) -> None:
         self.probe_position = position
+
+
+def _sharing(taken: ScanSummary, last: ScanSummary | None) -> ScanSummary:
+    # a page keeps up to a hundred thousand: equal parts of channels and scans are kept once
+    channel, unit = sys.intern(taken.channel), sys.intern(taken.unit)
+    if last is None:
+        return replace(taken, channel=channel, unit=unit)
+    return replace(
+        taken,
+        channel=channel,
+        unit=unit,
+        time_ns=_one(last.time_ns, taken.time_ns),
+        region=_one(last.region, taken.region),
+        shape=_one(last.shape, taken.shape),
+        filename=_one(last.filename, taken.filename),
+    )
+
+
+def _one(before: V, now: V) -> V:
+    return before if before == now else now
 
 
 def _flags(entry: JournalEntry, number: int) -> bool:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from afspm import wire
 from afspm.errors import FileError, WireError
 from afspm.model import Frame, Packet, Scan, Spectrum
-from afspm.record.journal import SCHEDULER
+from afspm.record.journal import SCHEDULER, measured_file
 from afspm.record.measured_tables import Row
 from afspm.wire.values import with_nan, with_values
 
@@ -123,7 +123,7 @@ class _Values:
 
         ((file,),) = self._query(f"SELECT file FROM {table} WHERE number = ?", (number,))
         if file not in self._kept:
-            self._kept[file] = read(self._folder / file)
+            self._kept[file] = read(measured_file(self._folder, file))
             if len(self._kept) > _FILES_KEPT:
                 self._kept.popitem(last=False)
         return self._kept[file]

@@ -28,6 +28,7 @@ from afspm.model import (
     Spectrum,
 )
 from afspm.record import journal
+from afspm.record.bad_scans import VERDICT_MESSAGE, read_verdict
 from afspm.record.journal import SCHEDULER
 from afspm.record.measured_tables import (
     KeyedTable,
@@ -220,6 +221,13 @@ class Run:
 
         return Table(self.overview(messages=("DriftMapping",)).drift, DriftPoint)
 
+    def verdicts(self) -> list[tuple[int, float]]:
+        """Return (time of the scan, score) of each verdict on a scan, in the order in which they came."""
+        sql = "SELECT payload FROM packets WHERE message = ? ORDER BY time_ns, rowid"
+        found = (self._decoded(VERDICT_MESSAGE, payload) for (payload,) in self._query(sql, (VERDICT_MESSAGE,)))
+        verdicts = (read_verdict(message) for message in found if message is not None)
+        return [verdict for verdict in verdicts if verdict is not None]
+
     # --- everything ---
 
     def packets(
@@ -360,7 +368,7 @@ class Run:
 
         if not file:
             raise FileError(f"{what} was interrupted before anything of it was seen", where=str(self.folder))
-        return read(self.folder / file)
+        return read(journal.measured_file(self.folder, file))
 
     @staticmethod
     def _decoded(message: str, payload: bytes) -> object:

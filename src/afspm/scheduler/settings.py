@@ -9,6 +9,7 @@ from afspm.logic.arbitration import Cause, RoleTable, Rules
 from afspm.logic.envelopes import CacheRule, EnvelopeMapping, Envelopes
 from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.logic.settings import SchedulerSettings
+from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import Parameter, ProblemNames, Region
 from afspm.plain_data import PlainMapping
@@ -46,8 +47,9 @@ def scheduler_settings(
 
 
 def _roles(table: Table) -> RoleTable:
+    end = table.get("end_experiment")
     return RoleTable(
-        table.get("end_experiment"),
+        None if end is None else (*end, SUPERVISOR),  # which ends it when nothing that acts is left
         table.get("set_mode"),
         table.get("clear_problems"),
         tuple(table.get("operate") or ()),

@@ -40,6 +40,8 @@ _LEVELS = logging.getLevelNamesMapping()
 _LATE_S = 0.005
 """How late a deadline may be noticed while messages come: to ask for the next one after each takes as long as some of
 them do."""
+_TOGETHER_BYTES = 1 << 20
+"""Packets are written down together up to this size: a first one must not wait long for the others."""
 _WRITTEN_DOWN_LATE = (bytes([RELAY_REQUEST]), bytes([ControlRequest.ADD_EXP_PRBLM]))
 """Requests that are still written down after the end."""
 
@@ -164,7 +166,10 @@ class SchedulerShell:
     # --- what comes in ---
 
     def _take(self, event: events.Input) -> None:
-        self._carry_out(self._core.step(event, self._clock.monotonic_s(), self._clock.now_ns()))
+        self._carry_out(self._decide(event))
+
+    def _decide(self, event: events.Input) -> list[events.Effect]:
+        return self._core.step(event, self._clock.monotonic_s(), self._clock.now_ns())
 
     def _requests(self) -> None:
         for event in self._sockets.router.receive():
@@ -197,9 +202,14 @@ class SchedulerShell:
         self._reply(events.Reply(asked.connection, asked.name, response, number))
 
     def _packets(self) -> None:
+        """Take in the translator's packets; several small ones are written down together, then published.
+
+        To hand one to the disk's thread and wait takes as long as to receive and publish it.
+        """
+        effects, size = list[events.Effect](), 0
         for incoming in self._sockets.subscriber.receive():
             if isinstance(incoming, CaughtUp):
-                self._take(events.TranslatorCaughtUp())
+                effects += self._decide(events.TranslatorCaughtUp())
             if not isinstance(incoming, PacketReceived):
                 continue
             packet = incoming.packet
@@ -208,7 +218,12 @@ class SchedulerShell:
             except WireError as error:
                 self._warnings.warning(f"dropped a packet of the translator: {error}")
                 continue
-            self._take(events.PacketIn(packet, header))
+            effects += self._decide(events.PacketIn(packet, header))
+            size += len(packet.payload)
+            if size >= _TOGETHER_BYTES:
+                self._carry_out(effects)
+                effects, size = [], 0
+        self._carry_out(effects)
 
     def _history(self, subscriber: Hashable, prefixes: tuple[str, ...], since_ns: int) -> Iterable[Packet]:
         self._replay = ()

@@ -22,6 +22,7 @@ from afspm.simulation.settings import check
 
 _LONGEST_S = 2.0**20  # twelve days: the random walk's coarsest interval
 _LEVELS = 22  # halvings of it; finer than a quarter of a second the walk is a straight line
+_FASTEST_M_PER_S = 1e-6  # a thousand times what a bad evening has: a slip of the unit, 60 um/s for 60 nm/min
 _FASTEST_EXPANSION_PER_S = 1e-4  # beyond any sample, and twelve days of it are still a number
 
 
@@ -41,7 +42,7 @@ class DriftSettings:
     """The sum of all contributions, as (x, y, z) unless said otherwise.
 
     Attributes:
-        velocity_m_per_s: constant drift.
+        velocity_m_per_s: constant drift, at most 1e-6 m/s along each axis.
         relaxing: any number of exponential relaxations since the start.
         walk_m_per_sqrt_hour: standard deviation in x and y of a random walk after one hour.
         walk_z_m_per_sqrt_hour: the same for z.
@@ -62,6 +63,9 @@ class DriftSettings:
 
     def __post_init__(self) -> None:
         check(self, from_zero="walk_m_per_sqrt_hour walk_z_m_per_sqrt_hour")
+        if not max(map(abs, self.velocity_m_per_s)) <= _FASTEST_M_PER_S:
+            what = f"{list(self.velocity_m_per_s)} is faster than {_FASTEST_M_PER_S:g} m/s"
+            raise ConfigError(what, where="velocity_m_per_s", hint="1 nm/s is 1e-9, 1 nm/min is 17e-12")
         if not abs(self.expansion_per_s) <= _FASTEST_EXPANSION_PER_S:
             wanted = f"between {-_FASTEST_EXPANSION_PER_S:g} and {_FASTEST_EXPANSION_PER_S:g} 1/s"
             raise ConfigError(f"{self.expansion_per_s!r} is not {wanted}", where="expansion_per_s")

@@ -71,6 +71,7 @@ class SensorSettings:
 
 
 MODES = ("amplitude", "current", "frequency-shift")
+_ONE_ATOM_S = 77.48e-6  # conductance of a contact of one atom, 2 e^2 / h
 _GENTLE = 0.3  # share of the free amplitude that a gentle setpoint takes away
 _GENTLE_M = 1e-9  # distance of a sensor that a gentle frequency shift is met at
 _GROWN = 10.0  # e-foldings in one step, after which nothing is left but the saturated oscillation
@@ -90,7 +91,8 @@ class FeedbackSettings:
         range_m: of the z actuator: the tip withdraws this far if the setpoint is never reached.
         decay_m: the gap over which a tunnelling current falls by e.
         current_floor_a: the smallest current that the logarithmic amplifier resolves.
-        sensor: a table of its own, of the mode "frequency-shift".
+        qplus: in the mode "current" the sensor oscillates too: a channel "Frequency Shift".
+        sensor: a table of its own, of the mode "frequency-shift" and of `qplus`.
     """
 
     mode: str = "amplitude"
@@ -105,6 +107,7 @@ class FeedbackSettings:
     range_m: float = 5e-6
     decay_m: float = 0.05e-9
     current_floor_a: float = 0.2e-12
+    qplus: bool = False
     sensor: SensorSettings = field(default_factory=SensorSettings)
 
     def __post_init__(self) -> None:
@@ -167,6 +170,14 @@ class Loop:
         if s.mode == "frequency-shift":
             return (_GENTLE_M / s.sensor.distance_m(self.setpoint)) ** 2
         return max(0.0, (s.free_amplitude_v - self.setpoint) / s.free_amplitude_v / _GENTLE)
+
+    def tunnelling_distance_m(self, bias_v: float) -> float:
+        """Return the distance from the sample at which the tunnelling current is the setpoint.
+
+        The conductance falls by e over each `decay_m`, from that of a contact of one atom.
+        """
+        conductance_s = self.setpoint / max(abs(bias_v), 1e-6)
+        return self.settings.decay_m * math.log(max(_ONE_ATOM_S / conductance_s, 1.0))
 
     @property
     def error_limits_m(self) -> tuple[float, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,12 +70,29 @@ def current_a(settings: SignalSettings, loop: Loop, gap_m: Array, material: Arra
     return np.asarray(np.clip(current, -settings.preamplifier_a, settings.preamplifier_a))
 
 
+def attraction_hz(loop: Loop, tip: TipShape, sharp_m: float, gap_m: Array, bias_v: float) -> Array:
+    """Return the frequency shift of an oscillating sensor whose tip tunnels; a blunt or double tip is attracted more.
+
+    Args:
+        sharp_m: radius of the sharp tip, for which the sensor has its `radius_m`.
+        gap_m: z less the height at which the setpoint is met.
+    """
+    sensor, distance_m = loop.settings.sensor, loop.tunnelling_distance_m(bias_v) + gap_m
+    of_radius = sensor.radius_m / sharp_m
+    shift = replace(sensor, radius_m=of_radius * tip.imaging_radius_m).shift_hz(distance_m)
+    if tip.second_apex_m is not None:
+        second = replace(sensor, radius_m=of_radius * tip.radius_m)
+        shift = shift + second.shift_hz(distance_m - tip.second_apex_m[2])
+    return shift
+
+
 Channels = dict[str, tuple[str, Array]]
 TipTimes = Sequence[tuple[float, TipShape]]
 """(since when, tip), the first not later than the scan's start."""
 
 _POINTS = 1_400_000  # of the grid, if oversampling is left to us
 _MOST_POINTS = 4_000_000  # of the grid in any case
+_FLICKER_M = 0.02e-9  # of debris at rest: a third of the current, up or down
 _MOST_TAPS = 160  # grid steps that a tip may reach aside: one that reaches further sees no finer detail
 
 
@@ -90,6 +107,7 @@ class Setup:
         unturned: (x, y) with those undone, from (x, y, times).
         held_z_m: where z stands if the feedback is off.
         slope: (x, y) compensation of tilt set on the instrument, m/m.
+        sharp_m: radius of the sharp tip.
         origin_m: (x, y) about which tilt and slope turn.
         offset_m: (x, y) by which the scanner is not yet where it should be (creep), at times.
     """
@@ -106,6 +124,7 @@ class Setup:
     bias_v: float
     held_z_m: float | None
     slope: tuple[float, float]
+    sharp_m: float
 
 
 @dataclass(frozen=True)
@@ -172,12 +191,17 @@ def measure(course: Course, tips: TipTimes, setup: Setup, random: np.random.Gene
     }
     gap_by_row = np.empty(course.shape)
     gap_by_row[order] = gap[:, :nx]
-    channels.update(_signals(gap_by_row, heights, course, setup, random))
+    line_tips = np.empty(course.shape[0], dtype=object)
+    line_tips[order] = _tip_of_lines(course, tips)
+    channels.update(_signals(gap_by_row, heights, line_tips, course, setup, random))
     return Measured(channels, float(z[-1, -1]), float(np.maximum(-gap, 0.0).mean()))
 
 
-def at_rest(course: Course, felt_m: Felt, setup: Setup, random: np.random.Generator) -> dict[str, float]:
-    """Measure at the single pixel of a course, where the tip stands and the feedback has settled."""
+def at_rest(course: Course, felt_m: Felt, tip: TipShape, setup: Setup, random: np.random.Generator) -> dict[str, float]:
+    """Measure at the single pixel of a course, where the tip stands and the feedback has settled.
+
+    Debris on a contaminated tip never settles: the tunnelling current flickers.
+    """
     loop = setup.loop
     height = felt_m.height_m[0] + _tilt(course, (setup.scanner.tilt_x, setup.scanner.tilt_y))
     z = height + (0.0 if loop.engages else loop.settings.range_m / 2)
@@ -185,7 +209,10 @@ def at_rest(course: Course, felt_m: Felt, setup: Setup, random: np.random.Genera
         z = np.full(height.shape, setup.held_z_m)
     noise = setup.noise.white_m * random.standard_normal(height.shape)
     channels = {"Height": ("m", z + noise - _tilt(course, setup.slope))}
-    channels.update(_signals(z - height, felt_m, course, setup, random))
+    gap = z - height
+    if tip.debris_m and loop.settings.mode == "current":
+        gap = gap + _FLICKER_M * random.standard_normal(height.shape)
+    channels.update(_signals(gap, felt_m, np.array([tip], dtype=object), course, setup, random))
     return {name: float(values[0, 0]) for name, (_, values) in channels.items()}
 
 
@@ -298,8 +325,10 @@ def _z(lines: Array, course: Course, setup: Setup, random: np.random.Generator) 
     return z[-2 * nx :].T
 
 
-def _signals(gap_m: Array, heights: Felt, course: Course, setup: Setup, random: np.random.Generator) -> Channels:
-    """Amplitude and phase (when tapping), frequency shift (without contact) and current, of the trace."""
+def _signals(
+    gap_m: Array, heights: Felt, tips: NDArray[np.object_], course: Course, setup: Setup, random: np.random.Generator
+) -> Channels:
+    """Amplitude and phase (when tapping), frequency shift (of an oscillating sensor) and current, of the trace."""
     loop, noise, material = setup.loop, setup.noise, heights.material[0]
     ny, nx = course.shape
 
@@ -317,4 +346,10 @@ def _signals(gap_m: Array, heights: Felt, course: Course, setup: Setup, random: 
         channels["Frequency Shift"] = ("Hz", loop.frequency_shift_hz(gap_m) + white(noise.frequency_hz))
     current = current_a(setup.signals, loop, gap_m, material, setup.bias_v)
     channels["Current"] = ("A", current + white(noise.current_a))
+    if loop.settings.mode == "current" and loop.settings.qplus:
+        shift = np.empty((ny, nx))
+        for tip in set(tips):
+            rows = tips == tip
+            shift[rows] = attraction_hz(loop, tip, setup.sharp_m, gap_m[rows], setup.bias_v)
+        channels["Frequency Shift"] = ("Hz", shift + white(noise.frequency_hz))
     return channels

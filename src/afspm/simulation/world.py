@@ -220,7 +220,7 @@ class World:
         key = (where, tip, len(self.sample.marks))
         if self._felt_at_rest is None or self._felt_at_rest[0] != key:
             self._felt_at_rest = key, feel(course, [(t_s, tip)], setup)
-        return at_rest(course, self._felt_at_rest[1], setup, random)
+        return at_rest(course, self._felt_at_rest[1], tip, setup, random)
 
     def hold(self, z_m: float) -> None:
         """Leave z there while the feedback is off.
@@ -409,6 +409,7 @@ class World:
             bias_v=bias_v,
             held_z_m=self._held_z_m,
             slope=slope,
+            sharp_m=self.settings.tip.radius_m,
         )
 
 

@@ -9,12 +9,13 @@ import logging
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
 from afspm.errors import FileError
-from afspm.storage.disk import SYNCER, DiskTask, DiskThread, sync_file, sync_folder
+from afspm.storage.disk import SYNCER, DiskBacklogFull, DiskTask, DiskThread, DiskTimeout, sync_file, sync_folder
 
 T = TypeVar("T")
 
@@ -23,6 +24,8 @@ PERIOD_S = 1.0
 _DAMAGED = (ValueError, KeyError, TypeError)
 LONGEST = 1 << 20
 """Bytes of a file with its generations, before it is begun anew."""
+SLOW_S = 3.0
+"""How long a disk may be busy, in real time, before that is worth a warning."""
 _TRIES, _AGAIN_S = 50, 0.01
 _ANYONE = 0o666
 
@@ -136,31 +139,59 @@ def _sync_and_close(descriptor: int) -> None:
 
 
 class OutageLog:
-    """A disk that is full, or away for a while, must not end an experiment: what can't be written is told once, until
-    it can be again.
+    """Logs once that writing fails, until it works again: a disk that is full or away must not end an experiment.
+
+    A disk that is slow is logged as a warning, after `SLOW_S`: an ordinary busy disk takes a moment now and then, and
+    what waits for it is still written. A disk that refuses to write, or has so much waiting that something is never
+    written, is CRITICAL at once.
 
     Args:
-        loss: what it means, for people.
+        loss: the consequence, for people.
+        monotonic_s: real time.
     """
 
-    def __init__(self, loss: str, log: logging.Logger) -> None:
+    def __init__(self, loss: str, log: logging.Logger, monotonic_s: Callable[[], float] = time.monotonic) -> None:
         self._loss = loss
         self._log = log
-        self._is_failing = False
+        self._monotonic_s = monotonic_s
+        self._slow_since_s: float | None = None
+        self._logged: int | None = None  # the level, of this outage
 
     @contextlib.contextmanager
     def trying(self) -> Iterator[None]:
-        """Around what writes, and raises FileError or OSError."""
+        """Enclose a write that raises FileError or OSError; both are logged and not passed on."""
         try:
             yield
+        except DiskBacklogFull as error:
+            self._fails(error)
+        except DiskTimeout:
+            self._is_slow()
         except (FileError, OSError) as error:
-            if not self._is_failing:
-                self._log.critical("%s: %s", self._loss, error)
-            self._is_failing = True
+            self._fails(error)
         else:
-            if self._is_failing:
-                self._log.info("writing works again; no longer true: %s", self._loss)
-            self._is_failing = False
+            self._works()
+
+    def _fails(self, error: Exception) -> None:
+        if self._logged != logging.CRITICAL:
+            self._log.critical("%s: %s", self._loss, error)
+        self._logged = logging.CRITICAL
+
+    def _is_slow(self) -> None:
+        now_s = self._monotonic_s()
+        if self._slow_since_s is None:
+            self._slow_since_s = now_s
+        slow_s = now_s - self._slow_since_s
+        if slow_s >= SLOW_S and self._logged is None:
+            self._log.warning("%s: the disk has not answered for %.0f s", self._loss, slow_s)
+            self._logged = logging.WARNING
+
+    def _works(self) -> None:
+        if self._logged is not None:
+            lasted = ""
+            if self._slow_since_s is not None:
+                lasted = f"; the disk had not answered for {self._monotonic_s() - self._slow_since_s:.0f} s"
+            self._log.info("writing works again%s; no longer true: %s", lasted, self._loss)
+        self._slow_since_s = self._logged = None
 
 
 def previous_generation(path: Path) -> Path:

@@ -9,7 +9,8 @@ What is written is handed to the system at once, so that it outlives a kill of a
 
 from __future__ import annotations
 
-import contextlib
+import errno
+import logging
 import os
 import queue
 import sys
@@ -25,6 +26,9 @@ SYNC_PERIOD_S = 0.1
 MOST_BYTES = 256 << 20
 """So much may wait for a disk that hangs; what comes beyond is not written."""
 MOST_TASKS = 10_000
+FULL_BYTES = 1 << 20
+"""With less room a disk counts as full: it takes no scan any more."""
+_log = logging.getLogger("afspm.disk")
 
 
 class DiskTimeout(OSError):
@@ -141,7 +145,11 @@ def run_bounded(work: Callable[[], T], within_s: float) -> T:
 
 
 class Syncer:
-    """Makes sure, in a thread, that what was written is on the disk a moment later."""
+    """Makes sure, in a thread, that what was written is on the disk a moment later.
+
+    A disk that refuses is logged, once until it syncs again. What it has refused is lost in a power cut, also if it
+    syncs later: the system forgets it with the error.
+    """
 
     def __init__(self, period_s: float = SYNC_PERIOD_S) -> None:
         self._period_s = period_s
@@ -149,6 +157,8 @@ class Syncer:
         self._written: dict[tuple[int, int], int] = {}
         self._urgent = False
         self._asked = self._done = 0
+        self._failure: OSError | None = None  # not raised yet
+        self._is_failing = False
         self._thread: threading.Thread | None = None
 
     def soon(self, file: int) -> None:
@@ -172,6 +182,7 @@ class Syncer:
 
         Raises:
             DiskTimeout: not in time.
+            OSError: some of what was written since the last call can't be made sure of.
         """
         with self._changed:
             if self._thread is None:
@@ -181,6 +192,9 @@ class Syncer:
             self._changed.notify_all()
             if not self._changed.wait_for(lambda: self._done >= asked, within_s):
                 raise DiskTimeout
+            failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
 
     def _run(self) -> None:
         while True:
@@ -189,17 +203,48 @@ class Syncer:
                 self._changed.wait_for(lambda: self._urgent, self._period_s)
                 written, self._written = self._written, {}
                 asked, self._urgent = self._asked, False
-            for descriptor in written.values():
-                with contextlib.suppress(OSError):  # a full disk is told of by who writes
-                    sync_data(descriptor)
-                os.close(descriptor)
+            failures = [error for descriptor in written.values() if (error := _sync_and_close(descriptor)) is not None]
+            if written:
+                self._tell(failures)
             with self._changed:
+                self._failure = self._failure or next(iter(failures), None)
                 self._done = asked
                 self._changed.notify_all()
+
+    def _tell(self, failures: list[OSError]) -> None:
+        was_failing, self._is_failing = self._is_failing, bool(failures)
+        if failures and not was_failing:
+            _log.critical("what was written in the last moment may not outlive a power cut: %s", failures[0])
+        elif was_failing and not failures:
+            _log.info("the disk syncs again")
+
+
+def is_full(folder: Path) -> bool:
+    """Return whether a disk has no room for a file any more; False also if that can't be told."""
+    import shutil  # imported late: it is asked when something has failed
+
+    try:
+        return shutil.disk_usage(folder).free < FULL_BYTES
+    except OSError:
+        return False
 
 
 SYNCER = Syncer()
 """Of this process."""
+
+
+_CAN_NOT_SYNC = (errno.EINVAL, errno.ENOTSUP)
+"""From file systems of other computers, for folders: there is nothing to be synced."""
+
+
+def _sync_and_close(descriptor: int) -> OSError | None:
+    try:
+        sync_data(descriptor)
+    except OSError as error:
+        return None if error.errno in _CAN_NOT_SYNC else error
+    finally:
+        os.close(descriptor)
+    return None
 
 
 def sync_data(descriptor: int) -> None:

@@ -62,6 +62,11 @@ class ActivityMonitor:
         self._works: bool | None = None
         self.again_s = -math.inf
 
+    @property
+    def processor_s(self) -> float | None:
+        """The processor time that the process has used in its life; None: that can't be told."""
+        return self._seen[-1][1].processor_s if self._seen else None
+
     def work(self, now_s: float) -> bool | None:
         """Return whether it works, in real monotonic time; None: that can't be told, or not yet."""
         if now_s >= self.again_s:

@@ -201,7 +201,7 @@ class _Connections:
                 network.close()
             self._into.found.append(diagnosis.of_handshake(address, shaken, owner, self._scheduler))
             if shaken is Handshake.DONE:
-                register_all(launch.messages)
+                register_all(self._experiment.resolved.messages)
                 self._listen(launch, listen_s)
         except AfspmError as error:
             self._into.found.append(Diagnosis("key-file", Severity.ERROR, error.where, error.what, error.hint))

@@ -16,14 +16,15 @@ from typing import TYPE_CHECKING, Literal, TextIO
 from afspm.clock import NS_PER_S, Clock, ExperimentClock
 from afspm.formatting import day_and_time, time_of_day
 from afspm.logic.supervisor_registry import LOGGED_AS
-from afspm.storage.disk import DEADLINE_S
+from afspm.storage.atomic import SLOW_S
+from afspm.storage.disk import SYNCER
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 CLOCK = ExperimentClock.real()
 MOST_UNSHOWN = 10_000
-_HANGS = "the disk has not answered: log.txt is written once it does, and the run goes on"
+_HANGS = "the disk has not answered for {:.0f} s: log.txt is written once it does, and the run goes on"
 SHOWN_WITHIN_S = 2.0
 COLOURS = ("cyan", "green", "magenta", "blue", "bright_cyan", "bright_green", "bright_magenta", "bright_blue")
 LEVEL_STYLES = {logging.WARNING: "yellow", logging.ERROR: "bold red", logging.CRITICAL: "bold red"}
@@ -91,9 +92,9 @@ class RunLog:
         stamp = f"{day_and_time(wall_ns)}.{wall_ns // 1_000_000 % 1000:03d}{self._experiment_time()}"
         self._file.add(stamp, f"{name:{self._widest}}", level, text)
         self._tell(name, level, text, wall_ns)
-        hung, self._hangs = self._hangs, self._file.hangs(DEADLINE_S)
+        hung, self._hangs = self._hangs, self._file.hangs(SLOW_S)
         if self._hangs and not hung:
-            self._tell(LOGGED_AS, logging.CRITICAL, _HANGS, wall_ns)
+            self._tell(LOGGED_AS, logging.WARNING, _HANGS.format(SLOW_S), wall_ns)
 
     def _tell(self, name: str, level: int, text: str, wall_ns: int) -> None:
         self.listener(name, level, text)
@@ -170,10 +171,12 @@ class _Shown:
 def _into(path: Path) -> tuple[Show, Callable[[], None]]:
     """Raises OSError: the file can't be opened."""
     file = path.open("a", encoding="utf-8", errors="replace")
+    SYNCER.folder_soon(path.parent)
 
     def show(stamp: str, name: str, level: int, text: str) -> None:
         file.write(f"{stamp} {logging.getLevelName(level):8} {name} {text}\n")
         file.flush()
+        SYNCER.soon(file.fileno())  # a power cut leaves what was before the last moment
 
     return show, file.close
 

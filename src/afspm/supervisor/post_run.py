@@ -88,7 +88,7 @@ def summary(outcome: RunOutcome, folder: Path) -> list[str]:
     except DiskTimeout as error:
         told.append(f"what was measured can't be counted: {error}")
     told.append(f"everything is in {folder}")
-    if outcome.why is EndReason.STOPPED:
+    if outcome.why in (EndReason.STOPPED, EndReason.PLANS_LOST):
         told.append(f"{resume_command(folder)} goes on with it")
     return told
 
@@ -157,7 +157,7 @@ def report(folder: Path, log: RunLog) -> None:
 
 def tell(ended: EndedRun, targets: Targets, on: tuple[str, ...], clock: Clock, log: RunLog) -> None:
     """Tell people that a run is over, and how. What fails is tried again, for half a minute."""
-    is_lost = ended.outcome.why is EndReason.LOST
+    is_lost = ended.outcome.why in (EndReason.LOST, EndReason.PLANS_LOST)
     what = GIVEN_UP if is_lost and GIVEN_UP in on else END
     if what not in on:
         return

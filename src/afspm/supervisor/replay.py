@@ -19,7 +19,6 @@ from afspm.errors import ConfigError, FileError
 from afspm.launch import Launch, Sockets
 from afspm.model import Frame, Packet
 from afspm.process import signals
-from afspm.process.message_types import register_all
 from afspm.record.run import Run, open_run
 from afspm.record.run_json import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR
 from afspm.record.run_lock import lock_run
@@ -63,8 +62,7 @@ def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> 
     """
     with open_run(where) as run:
         guest = _guest(run)
-        register_all(guest.messages)
-        _check(options.only)
+        _check(options.only, run)
         left_out: set[str] = set()
 
         def leave_out(why: str) -> None:
@@ -93,9 +91,10 @@ def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> 
         return replayer.count
 
 
-def _check(only: Sequence[str]) -> None:
+def _check(only: Sequence[str], run: Run) -> None:
+    # messages of its own are known by the record: their module is not imported, as it may be that of somebody else
     for name in only:
-        if name not in wire.known_messages():
+        if name not in wire.known_messages() and next(run.packets(messages=(name,)), None) is None:
             raise ConfigError(f"there is no message {name!r}", where="--only", hint="e.g. Scan2d,ControlState")
 
 

@@ -5,6 +5,7 @@ In a thread of its own: the supervisor hands over and goes on, whether the sched
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import os
@@ -21,11 +22,20 @@ from afspm.clock import Clock, ExperimentClock
 from afspm.errors import AfspmError, WireError
 from afspm.experiment import Experiment, ProcessStart, Role
 from afspm.launch import Launch, Sockets
-from afspm.logic.supervision.supervisor_events import RestartOrdered, SchedulerAnswered
+from afspm.logic.supervision.supervisor_events import (
+    AskUse,
+    EndExperiment,
+    EndRefused,
+    RestartOrdered,
+    SchedulerAnswered,
+    UseReported,
+)
 from afspm.logic.supervisor_registry import LONGEST, SUPERVISOR
 from afspm.model import (
+    CLOCK_REQUEST,
     OTHER_RUN_RESPONSE,
     RELAY_REQUEST,
+    ControlRequest,
     ControlResponse,
     LogLine,
     LogLines,
@@ -61,7 +71,8 @@ class ReportFailed:
     text: str
 
 
-ReporterEvent = RestartOrdered | ReportFailed | SchedulerAnswered
+ReporterEvent = RestartOrdered | ReportFailed | SchedulerAnswered | UseReported | EndRefused
+_REQUESTS = {AskUse: CLOCK_REQUEST, EndExperiment: int(ControlRequest.END_EXPERIMENT)}
 
 
 class ReportQueue:
@@ -148,6 +159,7 @@ class Reporter:
         self._thread = threading.Thread(target=self._run, name="reporter", daemon=True)
         self._request = _OpenRequest(launch.name, launch.run)
         self._failures: set[str] = set()
+        self._asked: deque[int] = deque()
 
     # --- of the supervisor, any thread ---
 
@@ -165,6 +177,11 @@ class Reporter:
         """Take a line of a process, or of the supervisor itself; `level` is that of `logging`."""
         if level > logging.DEBUG and self._queue.put_line(name, logging.getLevelName(level), text):
             self._wake()
+
+    def ask(self, wanted: AskUse | EndExperiment) -> None:
+        """Ask the scheduler, before the next report."""
+        self._asked.append(_REQUESTS[type(wanted)])
+        self._wake()
 
     def close(self) -> None:
         """Report no more. Takes a second at most."""
@@ -200,7 +217,11 @@ class Reporter:
         request, now_s = self._request, self._clock.monotonic_s()
         if not request.connected or (request.sent and now_s < request.sent_s + RESEND_AFTER_S):
             return
-        sent = request.sent or request.open(self._queue.take(self._supervisor))
+        if request.sent is None and self._asked:
+            request.open(self._asked.popleft())
+        elif request.sent is None and (message := self._queue.take(self._supervisor)) is not None:
+            request.open(RELAY_REQUEST, RelayedMessage(*wire.encode(message)))
+        sent = request.sent
         if sent is not None:
             request.sent_s = now_s
             port.send(wire.encode_request(sent))
@@ -209,7 +230,7 @@ class Reporter:
         request, now_s = self._request, self._clock.monotonic_s()
         if not request.connected:
             return STATES_PERIOD_S
-        due_s = request.sent_s + RESEND_AFTER_S if request.sent else self._queue.due_s()
+        due_s = request.sent_s + RESEND_AFTER_S if request.sent else now_s if self._asked else self._queue.due_s()
         return max(0.0, due_s - now_s)
 
     def _receive(self, incoming: Incoming) -> None:
@@ -219,13 +240,21 @@ class Reporter:
         elif isinstance(incoming, ControlDisconnected):
             request.connected = False
         elif isinstance(incoming, ReplyReceived) and request.sent and incoming.response.id == request.sent.id:
-            request.sent = None
+            kind, request.sent = request.sent.kind, None
             if not request.answered and incoming.response.code != OTHER_RUN_RESPONSE:
                 request.answered = True
                 self.post(SchedulerAnswered())
-            self._answered(incoming.response)
+            self._answered(kind, incoming.response)
 
-    def _answered(self, response: Response) -> None:
+    def _answered(self, kind: int, response: Response) -> None:
+        if kind == CLOCK_REQUEST:
+            if (why := _in_use(response)) is not None:
+                self.post(UseReported(why))
+            return
+        if kind == ControlRequest.END_EXPERIMENT:
+            if not response.ok:
+                self.post(EndRefused(response.reason))
+            return
         if not response.ok:
             self._is_closing = self._is_closing or response.code == ControlResponse.CMD_NOT_SUPPORTED
             self._fail(response.reason)
@@ -253,12 +282,18 @@ class _OpenRequest:
         self.sent_s = -math.inf
         self._name, self._session, self._count = name, new_session(run), 0
 
-    def open(self, message: ProcessStates | LogLines | None) -> Request | None:
-        if message is not None:
-            self._count += 1
-            relayed = RelayedMessage(*wire.encode(message))
-            self.sent = Request(RELAY_REQUEST, relayed, id=f"{self._name}/{self._session}/{self._count}")
-        return self.sent
+    def open(self, kind: int, subject: object = None) -> None:
+        self._count += 1
+        self.sent = Request(kind, subject, id=f"{self._name}/{self._session}/{self._count}")
+
+
+def _in_use(response: Response) -> str | None:
+    """Return by whom the microscope is in use; empty: it is not; None: a scheduler that can't say."""
+    try:
+        told = json.loads(response.payload) if response.ok else {}
+        return str(told["in_use"])
+    except (ValueError, KeyError, TypeError):  # an older scheduler
+        return None
 
 
 _LONGEST_COMPUTER_NAME = 60

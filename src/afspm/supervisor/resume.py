@@ -30,7 +30,7 @@ from afspm.supervisor.ports import require_free
 from afspm.supervisor.run import FILES, HOMES, HOW, ONLY, RUN, WITHOUT, FinishedRun, RunOptions
 from afspm.supervisor.run_identity import RunIdentity, new_identity
 
-_OVER = {EndReason.EXPERIMENT_ENDED.name.lower(), EndReason.ALL_DONE.name.lower()}
+_OVER = {reason.name.lower() for reason in EndReason if reason.is_final}
 _LOOPBACK = re.compile(r"tcp://(127\.0\.0\.1|localhost|\*|0\.0\.0\.0):(\d+)")
 ZMTP = b"\xff"
 """What a socket of ZeroMQ says first."""

@@ -19,7 +19,7 @@ from afspm.experiment import Experiment, ProcessStart, Role, run_metadata
 from afspm.formatting import counted
 from afspm.launch import Launch, Sockets
 from afspm.logic.supervisor_registry import LOGGED_AS
-from afspm.record.run_json import COMPUTER, ENDED, METADATA, STATE_DIR, run_json_or_empty
+from afspm.record.run_json import COMPUTER, ENDED, METADATA, REAL_S, STATE_DIR, run_json_or_empty
 from afspm.record.run_lock import lock_run
 from afspm.storage.disk import run_bounded
 from afspm.storage.packet_log import discard_if_recorded, expect_recorder, log_folder
@@ -117,6 +117,8 @@ def go(
         files = before.get(FILES) or list(map(str, experiment.files))
         facts = {**run_facts(name, starts, common), **facts_to_resume(experiment, starts, options), FILES: files}
         facts[METADATA] = before.get(METADATA) or run_metadata.of_run(experiment.resolved) | dict(options.metadata)
+        if before.get(ENDED) and REAL_S in before:
+            facts[REAL_S] = before[REAL_S]
         run_folder.write_run(folder, facts)
         if {start.launch.name for start in starts} & set(experiment.recorders):
             expect_recorder(log_folder(folder / STATE_DIR))
@@ -124,11 +126,15 @@ def go(
         handed = key_handout.hand_over(experiment, starts)
         reporter = reporter_of(experiment, starts, clock, common.run, handed.supervisor)
         tasks = [from_start(start) for start in handed.starts]
-        supervisor = Supervisor(tasks, log, clock, experiment.policy(), reporter)
+        ends_idle = experiment.ends_idle([task.name for task in tasks])
+        supervisor = Supervisor(tasks, log, clock, experiment.policy(), reporter, ends_idle=ends_idle)
         with handed.laid_down(folder):
             outcome = supervisor.run()
         try:
             ending = {**facts, ENDED: outcome.text, HOW: outcome.why.name.lower()}
+            if not before or REAL_S in facts:  # else a part was cut off, for an unknown time
+                so_far_s = before.get(REAL_S, 0.0)
+                ending[REAL_S] = round(so_far_s + outcome.duration_s, 1)
             run_bounded(lambda: run_folder.write_run(folder, ending), WRITTEN_WITHIN_S)
         except OSError as error:  # a full disk must not keep people from being told of the end
             log.write(LOGGED_AS, logging.ERROR, f"how it ended is not in run.json: {error}")

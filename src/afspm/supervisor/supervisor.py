@@ -24,7 +24,10 @@ from afspm.logic.supervision.supervised_child import ChildSpec, ProcessReport
 from afspm.logic.supervision.supervisor_core import SupervisorCore
 from afspm.logic.supervision.supervisor_events import (
     ActivitySeen,
+    AskUse,
     Beaten,
+    EndExperiment,
+    EndRefused,
     EndSignal,
     Exited,
     ProcessAction,
@@ -37,6 +40,7 @@ from afspm.logic.supervision.supervisor_events import (
     StartFailed,
     SupervisorEvent,
     TimePassed,
+    UseReported,
     WriteLog,
 )
 from afspm.logic.supervisor_registry import LOGGED_AS
@@ -59,7 +63,7 @@ REPORT_PERIOD_S = 0.1
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """The outcome of a run."""
+    """The outcome of a run; `duration_s` in real time, up to its end, without what components finish then."""
 
     why: EndReason
     text: str
@@ -82,6 +86,8 @@ class Supervisor:
         clock: ExperimentClock,
         policy: ChildPolicy,
         reporter: Reporter | None = None,
+        *,
+        ends_idle: bool = False,
     ) -> None:
         self._log = log
         self._reporter = reporter
@@ -102,7 +108,7 @@ class Supervisor:
         if not awaits_scheduler:
             self._may_begin.set()
         specs = [ChildSpec(task.name, task.role, task.beats, task.leaves_last, task.acts) for task in tasks]
-        self._core = SupervisorCore(specs, policy, awaits_scheduler=awaits_scheduler)
+        self._core = SupervisorCore(specs, policy, awaits_scheduler=awaits_scheduler, ends_idle=ends_idle)
 
     def _with_heartbeat(self, task: Task) -> Task:
         token = secrets.token_hex(16)
@@ -136,7 +142,7 @@ class Supervisor:
             self._reaper.close()
         ending = self._core.ending
         assert ending is not None
-        return RunOutcome(ending.why, ending.text, self._core.reports(), self._clock.monotonic_s() - began_s)
+        return RunOutcome(ending.why, ending.text, self._core.reports(), ending.began_s - began_s)
 
     def stop(self) -> None:
         """End the run as Ctrl-C does. From any thread; a second call kills at once."""
@@ -162,7 +168,7 @@ class Supervisor:
                     self._log.write(event.name, logging.WARNING, what)
                 case Exited():
                     self._on_exited(event)
-                case EndSignal() | RestartOrdered() | SchedulerAnswered():
+                case EndSignal() | RestartOrdered() | SchedulerAnswered() | UseReported() | EndRefused():
                     self._step(event)
                 case ReportFailed():
                     self._log.write(LOGGED_AS, logging.WARNING, event.text)
@@ -186,7 +192,7 @@ class Supervisor:
             self._step(replace(exited, last_error=self._lines[exited.name].last_error, fault=fault))
 
     def _look(self) -> None:
-        """Look at the clock on the wall, and from outside at processes whose beat is late."""
+        """Look at the clock on the wall, and from outside at processes whose beat is late, or that are to end."""
         if warning := self._clock_check.warning():
             self._log.write(LOGGED_AS, logging.WARNING, warning)
         now_s = self._clock.monotonic_s()
@@ -195,7 +201,7 @@ class Supervisor:
             name: self._monitors.get(name) or ActivityMonitor(pid, lately_s) for name, pid in overdue.items()
         }
         for name, monitor in self._monitors.items():
-            self._step(ActivitySeen(name, monitor.work(now_s)))
+            self._step(ActivitySeen(name, monitor.work(now_s), monitor.processor_s))
 
     def _report(self) -> None:
         """Hand the states of all processes to the reporter, now and then."""
@@ -215,6 +221,8 @@ class Supervisor:
                     self._log.write(name, logging.getLevelNamesMapping()[level], text)
                 case ReleaseComponents():
                     self._may_begin.set()
+                case AskUse() | EndExperiment() if self._reporter is not None:
+                    self._reporter.ask(effect)
                 case ProcessCommand(ProcessAction.START, name):
                     self._start(name)
                 case ProcessCommand(action, name) if name in self._processes:

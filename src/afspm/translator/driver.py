@@ -18,7 +18,7 @@ from afspm.plain_data import Plain, PlainMapping
 from afspm.translator.parameters import ParameterTable, Value
 from afspm.translator.polling import EAGER_S
 from afspm.translator.setting_groups import SettingsGroup
-from afspm.units import Duration
+from afspm.units import Duration, PollPeriod
 
 if TYPE_CHECKING:
     from afspm.process.context import ProcessContext
@@ -189,7 +189,7 @@ class Driver(ABC):
         *,
         parameters: Mapping[str, Mapping[str, object]] | None = None,
         actions: Mapping[str, Mapping[str, object]] | None = None,
-        poll_period_s: Duration = 0.1,
+        poll_period_s: PollPeriod = 0.1,
         result_timeout_s: Duration = 10.0,
         live_lines_s: Duration | None = None,
         trace: bool = False,
@@ -275,6 +275,16 @@ class Driver(ABC):
         Raises:
             FileError: it is not (yet) whole; asked for again until `result_timeout_s` is over.
         """
+
+    def followed(self) -> bool | None:
+        """Return whether a measurement was whole whose end `status` never reported, since another one followed at once.
+
+        To be written where a panel can repeat scans. Called after `results`, which have to list it by then.
+
+        Returns:
+            once for each of them: True if it was whole, False if it was broken off; None: there was none.
+        """
+        return None
 
     def lines(self, start: int) -> Sequence[ScanLines]:
         """Return the complete lines of a running scan beyond the first `start`, in the order in which they are scanned.

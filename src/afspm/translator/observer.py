@@ -12,9 +12,10 @@ from afspm import wire
 from afspm.clock import NS_PER_S
 from afspm.errors import AfspmError
 from afspm.model import ScopeState, ScopeStatus, names
+from afspm.storage.disk import is_full
 from afspm.translator import setting_groups
 from afspm.translator.driver import LOST, MEASURING, Driver
-from afspm.translator.outbox import Outbox
+from afspm.translator.outbox import Outbox, Outgoing
 from afspm.translator.parameters import Value
 from afspm.translator.polling import AdaptivePolling
 from afspm.translator.safe_exit import FeedbackWatch
@@ -106,27 +107,38 @@ class Observer:
         if is_over:
             self._polling.over(self._clock.monotonic_s())
         with self._clock.late() if is_over else nullcontext():
-            steps = self._state.sequence.observe(status, self._outbox.look(), self._clock.now_s())
-            if steps:
-                self._state.save()  # before anything is out: a restarted process must not tell an older story
-                self.play(steps)
+            results = self._outbox.look()
+            is_whole = self._driver.followed()
+            steps = [] if is_whole is None else self._state.sequence.follow(is_whole=is_whole)
+            steps += self._state.sequence.observe(status, results and not steps, self._clock.now_s())
+            self.play(steps)
 
     def play(self, steps: Sequence[SequenceStep]) -> None:
-        """Do the steps of a status sequence."""
+        """Do the steps of a status sequence: save all that they change at once, then publish.
+
+        A process killed in between publishes the results again, at the same times, before the state that follows them.
+        Were that state saved first, a restarted process would publish it without the results, and the component that
+        waits for the scan would take it a second time.
+        """
+        if not steps:
+            return
+        packets: list[Outgoing] = []
         for step in steps:
             if isinstance(step, PublishStatus):
-                self.publish(step.status)
-                self._poll_for(step.status.state)
+                packets.append(self._packet(step.status))
             elif isinstance(step, PublishResults):
-                packets = self._outbox.take()
-                self._state.save()  # a restart then publishes the same again, at the same times, and not anew
-                for packet in packets:
-                    self._port.publish(*packet)
+                packets += self._outbox.take()
             elif isinstance(step, DiscardResults):
                 self._outbox.discard()
-                self._state.save()
             elif isinstance(step, LogError):
-                self._log.error("%s", step.text)
+                why = f"; the disk of {self._driver.run_dir} is full" if is_full(self._driver.run_dir) else ""
+                self._log.error("%s%s", step.text, why)
+        self._state.save()
+        for packet in packets:
+            self._port.publish(*packet)
+        for step in steps:
+            if isinstance(step, PublishStatus):
+                self._poll_for(step.status.state)
 
     def publish_all(self) -> None:
         """Publish everything in force, for a scheduler that has just connected."""
@@ -141,8 +153,10 @@ class Observer:
 
     def publish(self, thing: setting_groups.Published | ScopeStatus) -> None:
         """Publish a message."""
-        name, payload = wire.encode(thing)
-        self._port.publish(name, payload, self._state.stamp()[0])
+        self._port.publish(*self._packet(thing))
+
+    def _packet(self, thing: setting_groups.Published | ScopeStatus) -> Outgoing:
+        return Outgoing(*wire.encode(thing), self._state.stamp()[0])
 
     def _status(self) -> ScopeStatus:
         """Return the state of the microscope, which is not asked while something is in force for a while."""

@@ -102,6 +102,8 @@ class Outbox:
     def _load(self, result: str) -> list[tuple[str, bytes]] | None:
         try:
             found: list[Scan | Spectrum] = list(self._microscope.load(result))
+            if blank := [one.channel for one in found if isinstance(one, Scan) and one.is_blank]:
+                self._log.warning("%s has no value in %s: NaN alone", result, ", ".join(blank))
             return [encode(one) for one in found]
         except Exception as error:  # whatever is wrong with a file, the microscope is to be commanded
             if result not in self._complained:

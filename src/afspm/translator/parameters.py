@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from afspm import units
 from afspm.errors import AfspmError, ConfigError, ErrorCollector, Refused, UnitError
+from afspm.formatting import unit_text
 from afspm.model import ControlResponse, names
 from afspm.plain_data import PlainMapping
 
@@ -183,7 +184,7 @@ class ParameterSpec:
         if isinstance(value, bool | str):
             return str(value)
         number = units.convert(float(value), self.si_unit, self.unit)
-        return f"{number:.6g} {self.unit}".rstrip()
+        return f"{number:.6g} {unit_text(self.unit)}".rstrip()
 
     def range_text(self) -> str:
         """The range for a person, and where it was set."""

@@ -11,7 +11,8 @@ from functools import partial
 from afspm import wire
 from afspm.errors import WireError
 from afspm.logic.fencing import Epoch, SchedulerFence
-from afspm.logic.sessions import run_of
+from afspm.logic.idempotency_cache import TOO_OLD, Floors
+from afspm.logic.sessions import number_of, run_of
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -22,6 +23,7 @@ from afspm.model import (
     names,
     request_name,
 )
+from afspm.plain_data import Plain
 from afspm.translator.commands import Commands
 from afspm.translator.connection import Connection
 from afspm.translator.driver import LOST, Driver
@@ -67,7 +69,7 @@ class RequestHandler:
         self._fence = fence
         self._is_connected = is_connected
         self._reply = reply
-        self._outcomes = RequestOutcomes(state.kept["ledger"], all_or_nothing=driver.memory_is_all)
+        self._outcomes = RequestOutcomes(state.kept, all_or_nothing=driver.memory_is_all)
         self.commands = Commands(driver, state.sequence, temporary, self._about_to_act, log)
         self._acting: Request | None = None
         self._commander = b""
@@ -171,26 +173,29 @@ def _only_asks(request: Request) -> bool:
 
 
 class RequestOutcomes:
-    """The outcomes of the last requests that had an id.
+    """The outcomes of the last requests that had an id. See `logic.idempotency_cache` for older ids.
 
     Args:
-        kept: the part of the translator's memory that this is written to; whoever owns it saves it, with every request.
-            So an entry is a text, which is quickly written: what was asked, and once it is known what came of it.
+        kept: the translator's memory; whoever owns it saves it, with every request. So an entry is a text, which is
+            quickly written: what was asked, and once it is known what came of it.
         all_or_nothing: the microscope's own state is saved together with the ledger: what has no outcome here
             was not done. Otherwise a request that was begun and has no outcome may have been done.
     """
 
-    def __init__(self, kept: dict[str, str], *, all_or_nothing: bool) -> None:
+    def __init__(self, kept: Plain, *, all_or_nothing: bool) -> None:
+        self._shelves: tuple[dict[str, str], ...] = kept.setdefault("ledger", {}), kept.setdefault("unnumbered", {})
         self._kept = kept
+        kept.setdefault("forgotten", {})
         if all_or_nothing:
-            for request_id in [key for key, entry in self._kept.items() if " " not in entry]:
-                del self._kept[request_id]
+            for shelf in self._shelves:
+                for request_id in [key for key, entry in shelf.items() if " " not in entry]:
+                    del shelf[request_id]
 
     def outcome(self, request: Request) -> Response | None:
         """Return how the request was answered before; None if it is new."""
-        entry = self._kept.get(request.id) if request.id else None
+        entry = self._shelf(request.id).get(request.id) if request.id else None
         if entry is None:
-            return None
+            return self._forgotten(request)
         asked, _, outcome = entry.partition(" ")
         if asked != _fingerprint(request):
             reason = "the id of this request was already used for another one"
@@ -203,20 +208,37 @@ class RequestOutcomes:
 
     def begin(self, request: Request) -> None:
         """The request is going to be carried out."""
-        if request.id:
-            self._kept[request.id] = _fingerprint(request)
-            while len(self._kept) > _CAPACITY:
-                del self._kept[next(iter(self._kept))]
+        if not request.id:
+            return
+        shelf = self._shelf(request.id)
+        shelf[request.id] = _fingerprint(request)
+        while len(shelf) > _CAPACITY:
+            oldest = next(iter(shelf))
+            del shelf[oldest]
+            self._kept["forgotten"] = dict(self._floors.forgetting("", [oldest]).numbers)
+
+    @property
+    def _floors(self) -> Floors:
+        return Floors(numbers=self._kept["forgotten"])
+
+    def _forgotten(self, request: Request) -> Response | None:
+        if not self._floors.is_below("", request.id):
+            return None
+        return Response(ControlResponse.NO_RESPONSE, b"", TOO_OLD, request.id, ResponseDetail.OUTCOME_UNKNOWN)
+
+    def _shelf(self, request_id: str) -> dict[str, str]:
+        return self._shelves[number_of(request_id) is None]
 
     def finish(self, request: Request, response: Response) -> None:
         """The request was carried out, with this outcome."""
         if request.id:
             payload = base64.b64encode(response.payload).decode()
-            self._kept[request.id] = f"{_fingerprint(request)} {int(response.code)} {payload} {response.reason}"
+            entry = f"{_fingerprint(request)} {int(response.code)} {payload} {response.reason}"
+            self._shelf(request.id)[request.id] = entry
 
     def forget(self, request: Request) -> None:
         """Nothing of the request was done: it may be asked again."""
-        self._kept.pop(request.id, None)
+        self._shelf(request.id).pop(request.id, None)
 
 
 def _fingerprint(request: Request) -> str:

@@ -64,6 +64,19 @@ class StatusSequence:
         """Note that what is running was told to stop."""
         return self._say(_INTERRUPTED)
 
+    def follow(self, *, is_whole: bool) -> list[SequenceStep]:
+        """Publish the end of a measurement that was never seen to end, since another one followed at once.
+
+        Args:
+            is_whole: False if it was broken off.
+        """
+        if self.said.state not in MEASURING:
+            return []
+        free = ScopeStatus(ScopeState.FREE)
+        if is_whole:
+            return [PublishResults(), *self._say(free)]
+        return [*self._say(_INTERRUPTED), DiscardResults(), *self._say(free)]
+
     def observe(self, seen: ScopeStatus, results: bool, now_s: float) -> list[SequenceStep]:
         """The controller was looked at.
 

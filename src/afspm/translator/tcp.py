@@ -69,6 +69,9 @@ class TcpConnection:
         monotonic_s: real time.
         hints: what to look at where nobody listens, and where no answer comes.
 
+    Attributes:
+        where: "HOST:PORT", as it was given; peer: the same in numbers.
+
     Raises:
         ControllerLost: nobody listens there.
     """
@@ -85,6 +88,7 @@ class TcpConnection:
         except OSError as error:
             raise ControllerLost(f"no connection: {error}", where=self.where, hint=hints[0]) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.peer = "{}:{}".format(*self._socket.getpeername()[:2])
         self._trace = TRACE.connection(TCP)
 
     def ask(

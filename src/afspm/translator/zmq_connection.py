@@ -86,6 +86,13 @@ class ZmqConnection:
         except zmq.ZMQError as error:
             raise self._lost(what, error) from error
 
+    def wait(self, within_s: float) -> None:
+        """Wait for the reply to `begin`, in real time. Raises ControllerLost."""
+        try:
+            self._socket.poll(max(0, round(within_s * 1000.0)))
+        except zmq.ZMQError as error:
+            raise self._lost("a reply", error) from error
+
     def reply(self, what: str) -> bytes | None:
         """Return the reply to what was begun, or None while there is none. Raises ControllerLost."""
         try:

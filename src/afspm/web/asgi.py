@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Collection, Mapping, MutableMapping
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 from afspm.web.passwords import is_loopback
 
@@ -28,15 +28,22 @@ def wrong_origin(
         allowed: origins of other pages that may ask.
     """
     host, origin = headers.get("host", ""), headers.get("origin")
-    if only_here and not is_loopback(_host_of(host)):
-        return f"this {what} serves only this computer, not {host!r}"
-    if origin is not None and origin not in allowed and urlsplit(origin).netloc != host:
-        return f"a page of {origin} may not send requests to this {what}"
+    asked = _parts(f"//{host}")
+    if asked is None:
+        return f"{host[:100]!r} can't be the name of a computer"
+    if only_here and not is_loopback(asked.hostname or ""):
+        return f"this {what} serves only this computer, not {host[:100]!r}"
+    if origin is not None and origin not in allowed:
+        page = _parts(origin)
+        if page is None or page.netloc != host:
+            return f"a page of {origin[:100]} may not send requests to this {what}"
     return None
 
 
-def _host_of(netloc: str) -> str:
+def _parts(url: str) -> SplitResult | None:
     try:
-        return urlsplit(f"//{netloc}").hostname or ""
+        parts = urlsplit(url)
+        parts.port  # noqa: B018  # raises, as the others do
     except ValueError:
-        return ""
+        return None
+    return parts

@@ -80,11 +80,11 @@ class WebComponent(Component):
         watch = Watch(self.clock, problems, archive.past(problems), lambda: cut_off_message(self.run_dir))
         return archive, watch
 
-    def serve(self, app: AsgiApp, bound: socket.socket, *, most_connections: int | None = None) -> None:
+    def serve(self, app: AsgiApp, bound: socket.socket, *, most_requests: int | None = None) -> None:
         """Start to serve, and note where."""
         self._server = WebServer(
             app, bound, self._certificate, self._certificate_key,
-            most_connections=most_connections, stalled_s=self.stalled_s,
+            most_requests=most_requests, stalled_s=self.stalled_s,
         )  # fmt: skip
         self._server.start()
         port = bound.getsockname()[1]

@@ -8,6 +8,7 @@ import hmac
 import ipaddress
 import os
 import re
+import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping
 
@@ -17,7 +18,10 @@ LONGEST_NAME = 40
 _COST = {"n": 2**14, "r": 8, "p": 1}
 _NAME = re.compile(r"[\w][\w .'-]*", re.UNICODE)
 _TRIES, _TRIES_WITHIN_S = 5, 60.0
-_MOST_ADDRESSES = 1000
+AGAIN_S = 3.0
+"""Real time between two tries that are looked at, after too many wrong ones. To refuse all would lock out the owner of
+the right password: anyone on the same computer could be wrong five times a minute in the same name."""
+_MOST_REMEMBERED = 1000
 
 
 def hashed(password: str) -> str:
@@ -76,8 +80,9 @@ class Passwords:
         self._hashes = {**people, "": password_hash}
         self._local = is_loopback(host)
         self._now_s = now_s
-        self._failures: OrderedDict[str, deque[float]] = OrderedDict()
-        self._proved: set[bytes] = set()
+        self._lock = threading.Lock()
+        self._tries: OrderedDict[_Prover, _Tries] = OrderedDict()
+        self._proved: OrderedDict[bytes, None] = OrderedDict()
 
     @property
     def is_unprotected(self) -> bool:
@@ -94,27 +99,38 @@ class Passwords:
         """True if everybody may look."""
         return self._local and not self._hashes[""]
 
-    def wait_s(self, address: str) -> float:
-        """Return how long an address that was wrong too often has to wait; 0 if it needn't."""
-        failures = self._failures.get(address)
-        if failures is None or len(failures) < _TRIES:
-            return 0.0
-        return max(0.0, failures[0] + _TRIES_WITHIN_S - self._now_s())
+    def wait_s(self, person: str, address: str) -> float:
+        """Return the real seconds until a password of a person is looked at again from an address; 0: it is now."""
+        with self._lock:
+            tries = self._tries.get(self._prover(person, address))
+            return 0.0 if tries is None else tries.wait_s(self._now_s())
 
     def proves(self, person: str, password: str, address: str) -> bool:
-        """Return whether a password is that of a person; False also if the address has to wait.
+        """Return whether a password is that of a person; False also if it is not looked at yet (see `wait_s`).
 
-        It takes some hundredths of a second. An address that has to wait is not even looked at.
+        It takes some hundredths of a second. A password that was right before, from the same address, is right at
+        once, however often others were wrong there.
         """
-        return not self.wait_s(address) and self._proves(person, password, address)
-
-    def knows(self, person: str) -> bool:
-        """Return whether there is a password of this person."""
-        return person in self._hashes
-
-    def forgive(self, address: str) -> None:
-        """Forget how often an address was wrong."""
-        self._failures.pop(address, None)
+        if self.is_open or (not person and self.lets_look):
+            return True
+        shown = hashlib.sha256(f"{address}\0{person}\0{password}".encode()).digest()
+        prover = self._prover(person, address)
+        with self._lock:
+            if shown in self._proved:
+                self._proved.move_to_end(shown)
+                return True
+            if not self._may_try(prover):
+                return False
+        # for a name that nobody has it takes as long as for the others
+        kept = self._hashes.get(person) or _NOBODYS
+        if not matches(password, kept) or kept is _NOBODYS:
+            return False
+        with self._lock:
+            self._tries.pop(prover, None)
+            self._proved[shown] = None
+            if len(self._proved) > _MOST_REMEMBERED:
+                self._proved.popitem(last=False)
+        return True
 
     def proof_of(self, person: str) -> str:
         """Return what stands for a person's password: with another one it is another."""
@@ -122,28 +138,40 @@ class Passwords:
             return ""
         return hashlib.sha256(self._hashes.get(person, "nobody").encode()).hexdigest()
 
-    def _proves(self, person: str, password: str, address: str) -> bool:
-        if self.is_open or (not person and self.lets_look):
-            return True
-        shown = hashlib.sha256(f"{person}\0{password}".encode()).digest()
-        if shown in self._proved:
-            return True
-        # for a name that nobody has it takes as long as for the others
-        kept = self._hashes.get(person) or _NOBODYS
-        if matches(password, kept) and kept is not _NOBODYS:
-            self._proved.add(shown)
-            return True
-        self._remember_failure(address)
-        return False
+    def _prover(self, person: str, address: str) -> _Prover:
+        # wrong passwords slow down neither other persons at the same address, nor the same person elsewhere
+        return address, person if person in self._hashes else None
 
-    def _remember_failure(self, address: str) -> None:
-        failures = self._failures.setdefault(address, deque(maxlen=_TRIES))
-        failures.append(self._now_s())
-        self._failures.move_to_end(address)
-        if len(self._failures) > _MOST_ADDRESSES:
-            self._failures.popitem(last=False)
-        while failures and failures[0] < self._now_s() - _TRIES_WITHIN_S:
-            failures.popleft()
+    def _may_try(self, prover: _Prover) -> bool:
+        # a try counts as wrong until its password is found to be right: many may come at once
+        tries = self._tries.setdefault(prover, _Tries())
+        self._tries.move_to_end(prover)
+        if len(self._tries) > _MOST_REMEMBERED:
+            self._tries.popitem(last=False)
+        now_s = self._now_s()
+        if tries.wait_s(now_s):
+            return False
+        tries.add(now_s)
+        return True
+
+
+_Prover = tuple[str, str | None]
+"""An address, and the person whose password is shown there; None: a name that nobody has."""
+
+
+class _Tries:
+    """The last tries, in real seconds."""
+
+    def __init__(self) -> None:
+        self._at_s: deque[float] = deque(maxlen=_TRIES + 1)
+
+    def wait_s(self, now_s: float) -> float:
+        """Return how long the next try has to wait; 0: not at all."""
+        lately = [at_s for at_s in self._at_s if now_s - at_s < _TRIES_WITHIN_S]
+        return max(0.0, lately[-1] + AGAIN_S - now_s) if len(lately) > _TRIES else 0.0
+
+    def add(self, now_s: float) -> None:
+        self._at_s.append(now_s)
 
 
 def _require_hash(person: str, kept: str) -> None:

@@ -15,12 +15,17 @@ from typing import TYPE_CHECKING
 from afspm.errors import ConfigError
 
 if TYPE_CHECKING:
-    from afspm.web.asgi import AsgiApp
+    from afspm.web.asgi import AsgiApp, Message, Receive, Send
 
 USUAL_PORT = 8080
 _STOPPED_S = 3.0
 STALLED_S = 60.0
-"""A client that takes nothing of what is sent to it for so long is disconnected."""
+"""Real time after which a client is disconnected that takes nothing of an answer, or sends no more of a body."""
+HEAD_S = 10.0
+"""Real time that a client has for the head of a request: before that is there, no password can be asked for."""
+MOST_HEAD_BYTES = 64 << 10
+MOST_UNFINISHED = 200
+"""Connections whose request has not come yet; with one more, the oldest is closed."""
 
 
 def listening(
@@ -71,12 +76,36 @@ def url_of(host: str, port: int, *, encrypted: bool) -> str:
     return f"{'https' if encrypted else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"
 
 
-def _impatient(stalled_s: float) -> type[asyncio.Protocol]:
+def _impatient(stalled_s: float, head_s: float) -> type[asyncio.Protocol]:
     """Return uvicorn's protocol, which disconnects clients that stall: they would keep their connections for ever."""
-    from uvicorn.protocols.http.auto import AutoHTTPProtocol
+    import h11
 
-    class ImpatientProtocol(AutoHTTPProtocol):  # type: ignore[valid-type, misc]
+    # the one that is written in Python: it bounds the head of a request, which its C sibling takes in without end
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+
+    waiting: dict[ImpatientProtocol, None] = {}
+
+    class ImpatientProtocol(H11Protocol):
         _stalled: asyncio.TimerHandle | None = None
+        _unfinished: asyncio.TimerHandle | None = None
+        _awaited: object = None
+
+        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+            super().connection_made(transport)
+            self._await(h11.IDLE)
+
+        def data_received(self, data: bytes) -> None:
+            if self._awaited is None and self.conn.their_state is h11.IDLE:
+                self._await(h11.IDLE)  # the first bytes of the next request
+            super().data_received(data)
+            is_upgraded = self.transport.get_protocol() is not self
+            state = None if is_upgraded else self.conn.their_state
+            if state is not self._awaited:
+                self._await(state if state is h11.SEND_BODY else None)
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            self._await(None)
+            super().connection_lost(exc)
 
         def pause_writing(self) -> None:
             super().pause_writing()
@@ -87,7 +116,46 @@ def _impatient(stalled_s: float) -> type[asyncio.Protocol]:
                 self._stalled.cancel()
             super().resume_writing()
 
+        def _await(self, state: object) -> None:
+            # IDLE: the rest of a head; SEND_BODY: that of a body; None: nothing
+            self._awaited = state
+            if self._unfinished is not None:
+                self._unfinished.cancel()
+                self._unfinished = None
+            waiting.pop(self, None)
+            if state is not None:
+                within_s = head_s if state is h11.IDLE else stalled_s
+                self._unfinished = asyncio.get_running_loop().call_later(within_s, self.transport.abort)
+                waiting[self] = None
+            if len(waiting) > MOST_UNFINISHED:
+                oldest = next(iter(waiting))  # those of honest clients last for milliseconds
+                oldest._await(None)
+                oldest.transport.abort()
+
     return ImpatientProtocol
+
+
+def _limited(app: AsgiApp, most: int) -> AsgiApp:
+    # connections that have asked for nothing yet do not count: anybody could open them, and keep all others out
+    running = 0
+
+    async def limited(scope: Message, receive: Receive, send: Send) -> None:
+        nonlocal running
+        if scope["type"] != "http":
+            await app(scope, receive, send)
+            return
+        if running >= most:
+            headers = [(b"content-type", b"text/plain"), (b"retry-after", b"1"), (b"connection", b"close")]
+            await send({"type": "http.response.start", "status": 503, "headers": headers})
+            await send({"type": "http.response.body", "body": f"{most} requests are being answered".encode()})
+            return
+        running += 1
+        try:
+            await app(scope, receive, send)
+        finally:
+            running -= 1
+
+    return limited
 
 
 class WebServer:
@@ -95,8 +163,8 @@ class WebServer:
 
     Args:
         certificate, key: PEM files, for https; None: http.
-        most_connections: at a time; those beyond hear 503. None: any number.
-        stalled_s: real; see `STALLED_S`.
+        most_requests: at a time; those beyond are answered 503. None: any number.
+        stalled_s, head_s: real; see `STALLED_S` and `HEAD_S`.
 
     Raises:
         ConfigError: the files are no certificate and its key.
@@ -109,21 +177,22 @@ class WebServer:
         certificate: Path | None,
         key: Path | None,
         *,
-        most_connections: int | None = None,
+        most_requests: int | None = None,
         stalled_s: float = STALLED_S,
+        head_s: float = HEAD_S,
     ) -> None:
         import uvicorn
 
         logging.getLogger("uvicorn").setLevel(logging.ERROR)  # what clients do wrong is theirs
         config = uvicorn.Config(
-            app,
+            app if most_requests is None else _limited(app, most_requests),
             log_config=None,
             access_log=False,
             lifespan="on",
             proxy_headers=False,  # what a request says of its origin is anybody's word, and passwords are tried by it
             timeout_graceful_shutdown=1,
-            limit_concurrency=most_connections,
-            http=_impatient(stalled_s),
+            http=_impatient(stalled_s, head_s),
+            h11_max_incomplete_event_size=MOST_HEAD_BYTES,
             ssl_certfile=certificate,
             ssl_keyfile=key,
         )

@@ -83,6 +83,11 @@ class Watch:
         """The recorded moment that is shown; None: it is now."""
         return None
 
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing of the run is left at the moment that is shown."""
+        return self.ended
+
     @contextlib.contextmanager
     def reading(self) -> Iterator[Overview]:
         """Keep everything as it is while in the block; be brief in it."""

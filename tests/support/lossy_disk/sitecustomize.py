@@ -12,8 +12,9 @@ import json
 import os
 import shutil
 import stat
+import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,8 @@ class Shadow:
         self._folder = folder
         root = Path(f"{folder}.disk")
         self._files, self._contents, self._names = root / "files", root / "contents", root / "names"
-        for each in (self._files, self._contents, self._names):
+        self._under_way = root / "under_way"
+        for each in (self._files, self._contents, self._names, self._under_way):
             each.mkdir(parents=True, exist_ok=True)
 
     def sync(self, descriptor: int) -> None:
@@ -45,6 +47,25 @@ class Shadow:
         if path.endswith(WAL):
             main = path.removesuffix(WAL)
             self._sync_content(main, os.stat(main).st_ino)  # noqa: PTH116
+
+    @contextlib.contextmanager
+    def syncing(self) -> Iterator[None]:
+        """Note that a sync is under way: here a sync copies the whole file, which takes far longer than a disk."""
+        mark = self._under_way / str(uuid.uuid4())
+        mark.write_text(str(time.monotonic()))
+        try:
+            yield
+        finally:
+            _unlink(mark)
+
+    def longest_under_way_s(self) -> float:
+        """Return for how long the oldest sync that was not finished had been under way, and forget them."""
+        now_s, longest_s = time.monotonic(), 0.0
+        for mark in self._under_way.iterdir():
+            began = mark.read_text()
+            longest_s = max(longest_s, now_s - float(began) if began else 0.0)
+            _unlink(mark)
+        return longest_s
 
     def _sync_content(self, path: str, number: int) -> None:
         name = self._content_of(number) or self._named(number)
@@ -116,8 +137,9 @@ def watch(shadow: Shadow) -> None:
 
     def syncing(call: Callable[[int], None]) -> Callable[[int], None]:
         def called(descriptor: int) -> None:
-            call(descriptor)
-            shadow.sync(descriptor)
+            with shadow.syncing():
+                call(descriptor)
+                shadow.sync(descriptor)
 
         return called
 

@@ -47,7 +47,8 @@ def test_requests_made_from_the_description_are_answered_as_it_says(started: Sta
     if program is None:
         pytest.skip("there is no schemathesis: `make test-gateway` installs it")
     people = f'people."tester" = "{hashed("secret")}"'
-    run = started(SERIES.format(every="1 min", scans=1), speed=600.0, settings=people)
+    more = SERIES.format(every="1 min", scans=1) + '[control]\nidle = "stay"\n'
+    run = started(more, speed=600.0, settings=people)
     seconds = os.environ.get("AFSPM_SCHEMATHESIS_S", "60")
     command = (
         program, "run", f"{run.url}/openapi.json", "--auth", "tester:secret", "--no-color", "--continue-on-failure",

@@ -10,10 +10,11 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from http.client import HTTPConnection
 from itertools import pairwise
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import psutil
@@ -23,6 +24,7 @@ from gateway_lab import EXPERIMENT, REGION, SERIES, Client, Event, GatewayRun
 
 import afspm
 from afspm.gateway.stream import MOST_STREAMS
+from afspm.web.passwords import hashed
 
 Started = Callable[..., GatewayRun]
 
@@ -185,6 +187,29 @@ def test_a_reader_that_stalls_is_dropped_and_goes_on_without_loss(started: Start
         got += [next(rest) for _ in range(len(notes) - len(got))]
         rest.close()
     assert [event.data["data"]["text"] for event in got] == notes
+    ada.done("POST", "/end")
+
+
+def test_strangers_take_neither_control_nor_its_lease_from_the_owner_of_a_token(started: Started) -> None:
+    run = started(settings=f"people.ada = {hashed('secret')!r}")
+    ada, guesser = run.client("ada", "secret"), run.client("ada", "guess")
+    address = urlsplit(run.url)
+    for _ in range(5):
+        assert guesser.ask("POST", "/control", {}).code == "unauthorized"
+    with ExitStack() as held:
+        for _ in range(205):
+            half = held.enter_context(socket.create_connection((address.hostname, address.port), DEADLINE_S))
+            with suppress(ConnectionError):  # the oldest may be closed already
+                half.sendall(b"GET /v1/state HTTP/1.1\r\nHost: 127.0.0.1\r\n")
+        assert ada.done("POST", "/control", {"lease_s": 30}) == {"holder": "gateway:ada", "lease_s": 30}
+        endless = held.enter_context(socket.create_connection((address.hostname, address.port), DEADLINE_S))
+        endless.sendall(b"GET /v1/state HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Long: ")
+        sent = 0
+        with suppress(ConnectionError):
+            while sent < 60 << 20:
+                sent += endless.send(b"a" * 65536)
+        assert sent < 16 << 20
+        assert ada.done("PUT", "/control", {"lease_s": 30}) == {"holder": "gateway:ada", "lease_s": 30}
     ada.done("POST", "/end")
 
 

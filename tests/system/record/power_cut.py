@@ -39,7 +39,7 @@ CLOCK = ExperimentClock.real()
 DEADLINE_S = 60.0
 LOSS_S = 1.5
 """What was published so short a time before a power cut may be lost. It is a tenth of a second that is promised; the
-others are for a busy machine."""
+others are for a busy machine. A sync that was under way adds its time: it copies whole files here."""
 LOSSY = Path(__file__).parents[2] / "support" / "lossy_disk"
 LONGEST_LIFE_S = 2.5
 """From the first scan of a life to the cut; of every fourth, from its first line."""
@@ -248,7 +248,7 @@ def power_cuts(folder: Path, cuts: int, seed: int, tell: Any = lambda text: None
     (folder / "experiment.toml").write_text(EXPERIMENT.format(seed=seed), encoding="utf-8")
     (folder / "tireless.py").write_text(COMPONENT, encoding="utf-8")
     witness = Witness()
-    cut_s: list[float] = []
+    cuts_s: list[tuple[float, float]] = []
     command: tuple[str, ...] = (*COMMAND, "experiment.toml")
     try:
         for number in range(cuts + 1):
@@ -264,9 +264,12 @@ def power_cuts(folder: Path, cuts: int, seed: int, tell: Any = lambda text: None
                     witness.wait_for_scan()
                 life.wait_for("never said", chance.uniform(0.0, LONGEST_LIFE_S))
                 life.cut()
-                cut_s.append(CLOCK.monotonic_s())
+                cut_s, loss_s = CLOCK.monotonic_s(), 0.0
                 if lossy:
-                    shadow(folder / "runs").restore()
+                    disk = shadow(folder / "runs")
+                    loss_s = LOSS_S + disk.longest_under_way_s()
+                    disk.restore()
+                cuts_s.append((cut_s - loss_s, cut_s))
                 tell(f"cut {number + 1} of {cuts}")
             else:
                 _end(life, run)
@@ -274,7 +277,7 @@ def power_cuts(folder: Path, cuts: int, seed: int, tell: Any = lambda text: None
         if life.process.poll() is None:
             life.cut()
         witness.close()
-    return _verdict(run, witness, cut_s, LOSS_S if lossy else 0.0)
+    return _verdict(run, witness, cuts_s, most_lost=cuts if lossy else 0)
 
 
 def shadow(folder: Path) -> Any:
@@ -302,10 +305,10 @@ def _end(life: Life, run: Path) -> None:
     assert life.process.wait(DEADLINE_S) == 0, "\n".join(life.lines)
 
 
-def _verdict(run: Path, witness: Witness, cut_s: list[float], loss_s: float) -> Verdict:
+def _verdict(run: Path, witness: Witness, cuts_s: list[tuple[float, float]], *, most_lost: int) -> Verdict:
     with afspm.open_run(run) as record:
-        wrong = list(_wrong(record, witness, cut_s, loss_s))
-        return Verdict(run, len(cut_s), len(witness.seen), len(record.scans), len(record.spectra), wrong)
+        wrong = list(_wrong(record, witness, cuts_s, most_lost))
+        return Verdict(run, len(cuts_s), len(witness.seen), len(record.scans), len(record.spectra), wrong)
 
 
 def _flags(witness: Witness) -> Iterator[tuple[int, str]]:
@@ -318,11 +321,17 @@ def _flags(witness: Witness) -> Iterator[tuple[int, str]]:
         before = problems
 
 
-def _wrong(record: Any, witness: Witness, cut_s: list[float], loss_s: float) -> Iterator[str]:
+def _wrong(record: Any, witness: Witness, cuts_s: list[tuple[float, float]], most_lost: int) -> Iterator[str]:
+    """Yield what is wrong.
+
+    Args:
+        cuts_s: between which moments packets may be lost, for each cut.
+        most_lost: files of measurements that may be lost.
+    """
     flags = set(_flags(witness))
 
     def may_be_lost(key: tuple[int, str]) -> bool:
-        return key not in flags and any(cut - loss_s <= witness.seen_s[key] <= cut for cut in cut_s)
+        return key not in flags and any(first <= witness.seen_s[key] <= cut for first, cut in cuts_s)
 
     if witness.contradicted:
         yield f"published twice at the same time, and not the same: {witness.contradicted[:3]}"
@@ -336,7 +345,6 @@ def _wrong(record: Any, witness: Witness, cut_s: list[float], loss_s: float) -> 
     whole = [row for row in record.scans if not row.interrupted]
     saved = Counter(file.name for file in (record.folder / "scans").glob("scan-*.nc"))
     found = Counter(Path(row.filename).name for row in whole)
-    most_lost = len(cut_s) if loss_s else 0
     if found - saved or (saved - found).total() > most_lost:
         yield f"scans recorded otherwise than measured: {found - saved} too often, {saved - found} missing"
     if len({row.channels for row in whole}) != 1:

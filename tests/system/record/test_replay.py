@@ -17,8 +17,10 @@ import afspm
 from afspm import wire
 from afspm.client.follower import Follower
 from afspm.errors import ConfigError, RequestError, TransportError
+from afspm.launch import Launch
 from afspm.model import ControlMode, ControlState, Packet, Region, Scan, ScopeState, ScopeStatus
 from afspm.record.store import RecordSettings, RecordStore
+from afspm.supervisor import replay as replay_module
 from afspm.supervisor import resume
 from afspm.supervisor.replay import ReplayOptions, _addresses, replay
 
@@ -138,6 +140,16 @@ def test_what_cannot_be_replayed_is_told(recorded: Path, tmp_path: Path) -> None
     for only, said in ((["Scan3d"], "no message 'Scan3d'"), (["Spec1d"], "nothing to replay")):
         with pytest.raises(ConfigError, match=said):
             replay(recorded, ReplayOptions(only=only, runs=tmp_path), lambda _: None)
+
+
+def test_replay_imports_no_module_that_the_recorded_run_names(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "beside_the_run.py").write_text("raise SystemExit('it was run')\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(replay_module, "_guest", lambda run: Launch("guest", messages=("beside_the_run",)))
+    options = ReplayOptions(speed=1e9, only=["ControlState"], runs=tmp_path / "runs")
+    assert replay(recorded, options, lambda _: None) == 1
 
 
 def test_the_addresses_of_the_experiment_file_are_taken(recorded: Path, tmp_path: Path) -> None:

@@ -70,7 +70,7 @@ def shown(overview: Overview, about: RunDescription = ABOUT, width: int = 140, s
         "tip-shape-changed for 37 s, flagged by judge",
         "scanning for 50 s",
         "50 % 50 s left (1 s real)",
-        "1 x 1 um, 64 x 128",
+        "1 x 1 µm, 64 x 128",
         "series: 1 of 5",
         "7 min 20 s left",
         "series (busy for 12 s)",

@@ -25,8 +25,8 @@ def test_a_frame_of_somebody_else_is_not_taken_for_what_ours_was_rounded_to(lab:
 @pytest.mark.parametrize(
     ("frame", "told"),
     [
-        (model.ScanParameters(OTHER_REGION, (8, 8)), r"1 x 1 um at \(5, 0\) um, 8 x 8 pixels"),
-        (model.ScanParameters(REGION, (4, 4)), r"1 x 1 um at \(0, 0\) nm, 4 x 4 pixels"),
+        (model.ScanParameters(OTHER_REGION, (8, 8)), r"1 x 1 µm at \(5, 0\) µm, 8 x 8 pixels"),
+        (model.ScanParameters(REGION, (4, 4)), r"1 x 1 µm at \(0, 0\) nm, 4 x 4 pixels"),
     ],
 )
 def test_a_scan_of_another_frame_is_not_ours_and_is_said_and_taken_again(

@@ -95,3 +95,21 @@ def test_who_can_not_read_what_it_kept_leaves_no_connection_behind(
     with pytest.raises(FileError):
         afspm.connect(folder)
     assert port.is_closed
+
+
+def test_module_that_a_run_folder_names_is_imported_only_if_the_caller_names_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The folder may come from somebody else, and the module with it."""
+    folder = run_folder(tmp_path, "night")
+    (tmp_path / "beside_the_run.py").write_text("raise SystemExit('it was run')\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    facts = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    facts[GUEST]["messages"] = ["beside_the_run"]
+    (folder / "run.json").write_text(json.dumps(facts), encoding="utf-8")
+    monkeypatch.setattr(connect, "open_port", lambda launch, clock: Port(ControlConnected(), CaughtUp(PUBLISHER)))
+    caplog.set_level("WARNING")
+    afspm.connect(folder)
+    assert "messages of beside_the_run are not read" in caplog.text
+    with pytest.raises(SystemExit, match="it was run"):
+        afspm.connect(folder, messages=["beside_the_run"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from client_lab import OTHER_REGION, REGION, SCAN_S, SOURCE, Lab, LabPort
 from afspm import model, wire
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
-from afspm.errors import ControlLost, ExperimentEnded, InvalidValue, NoResponse, Refused, UnitError
+from afspm.errors import ControlLost, ExperimentEnded, InvalidValue, MeasurementFailed, NoResponse, Refused, UnitError
 from afspm.model import (
     ControlMode,
     ControlRequest,
@@ -171,6 +172,51 @@ def test_channels_that_got_lost_with_the_translator_are_noticed(lab: Lab, scope:
     scans = scope.scan(REGION)
     assert list(scans) == ["Height", "Phase"]
     assert "without Phase" in scans.interruptions[0]
+
+
+def test_scan_of_nothing_but_nan_is_taken_again_and_given_up(lab: Lab, scope: Scope) -> None:
+    def publish(region: Region, shape: tuple[int, int] = (8, 8)) -> None:
+        for channel in lab.channels:
+            lab.publish(Scan(region, channel, "m", np.full(shape, np.nan), lab.clock.now_ns()))
+
+    measured, lab.publish_scan = lab.publish_scan, publish  # type: ignore[method-assign]
+    lab.at(150.0, lambda: setattr(lab, "publish_scan", measured))
+    scans = scope.scan(REGION)
+    assert "all are NaN" in scans.interruptions[0]
+    assert lab.begun_scans == 2
+    lab.publish_scan = publish  # type: ignore[method-assign]
+    with pytest.raises(MeasurementFailed, match="failed 5 times: no channel has any value, all are NaN"):
+        scope.scan(REGION)
+
+
+def test_channel_of_nothing_but_nan_is_logged(lab: Lab, scope: Scope, caplog: pytest.LogCaptureFixture) -> None:
+    def publish(region: Region, shape: tuple[int, int] = (8, 8)) -> None:
+        for channel, value in (("Height", 0.0), ("Phase", np.nan)):
+            lab.publish(Scan(region, channel, "m", np.full(shape, value), lab.clock.now_ns()))
+
+    lab.publish_scan = publish  # type: ignore[method-assign]
+    assert list(scope.scan(REGION)) == ["Height", "Phase"]
+    assert "scan without any value in Phase: NaN alone" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("how", "is_full", "said"),
+    [
+        ("stop", True, "the disk of the run is full"),
+        ("stop", False, "stopped at the microscope, or its file is missing"),
+        ("restart_translator", True, "the disk of the run is full"),
+        ("restart_translator", False, "was it restarted"),
+    ],
+)
+def test_scan_without_a_result_on_a_full_disk_says_so(
+    lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str, is_full: bool, said: str
+) -> None:
+    monkeypatch.setattr("afspm.client.keyed_results.is_full", lambda folder: is_full)
+    scope = Scope(ExperimentLink(LabPort(lab), lab.name, source=SOURCE), state_dir=tmp_path)
+    for i in range(20):
+        lab.at(50.0 * (i + 1), getattr(lab, how))
+    with pytest.raises(MeasurementFailed, match=said):
+        scope.scan(REGION)
 
 
 def test_a_channel_that_is_switched_off_costs_one_scan_and_no_more(lab: Lab, scope: Scope) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from afspm.components.feedback_metrics import (
+    FeedbackError,
     FeedbackLimits,
     FeedbackQuality,
     feedback_error,
@@ -213,3 +214,8 @@ def test_rows_that_were_not_taken_say_nothing() -> None:
 def test_settings_without_sense_are_refused(threshold: float | None, sensitivity: float | None) -> None:
     with pytest.raises(ConfigError):
         FeedbackSignal(threshold, sensitivity)
+
+
+def test_more_relief_in_the_error_than_in_the_height_is_a_multiple() -> None:
+    assert str(FeedbackError(0.05, 0.0, 0.5)).endswith("50% of the relief of the height in the error")
+    assert str(FeedbackError(0.05, 0.0, 8.75)).endswith("8.8 times the relief of the height in the error")

@@ -122,7 +122,7 @@ def test_too_many_scans_are_thinned_but_not_those_that_something_happened_to() -
     chosen = _chosen(record)
     assert len(chosen) <= MOST_SHOTS
     assert any(shot.holder == "tip_corrector" for shot in chosen)
-    assert any(record.verdict(shot) == BAD for shot in chosen)
+    assert record.bad_ns() <= {shot.time_ns for shot in chosen}
 
 
 def test_problems_that_overlap_are_one_episode() -> None:
@@ -236,3 +236,29 @@ def test_a_time_that_is_centuries_off_makes_no_million_ticks(
     record.add(control_entry(ControlState(holder="series", problems=(TIP,)), far_ns))
     draw(record, tmp_path / "night.png", {TIP: "tip-shape-changed"})
     assert max(ticks) < 20
+
+
+def test_the_scan_that_was_judged_bad_is_framed_and_a_scan_of_the_repair_is_not() -> None:
+    record = night()
+    assert record.bad_ns() == {12 * MINUTE_NS}
+    record.add(mark_entry("tip_classifier", "verdict", 13 * MINUTE_NS, 1.0, 12 * MINUTE_NS))
+    assert record.bad_ns() == frozenset()
+    record.marks = [mark for mark in record.marks if mark.of_ns is None]
+    assert record.bad_ns() == {52 * MINUTE_NS}, "without verdicts the scan before the flag"
+    drifted = NightRecord()
+    drifted.add(scan_entry(scan(5), 5, None, "series"))
+    drifted.add(control_entry(ControlState(problems=(int(Problem.THERMAL_DRIFT),)), 9))
+    assert drifted.bad_ns() == frozenset(), "drift says nothing about the scan before it"
+
+
+def test_all_times_in_the_picture_are_times_of_day(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from matplotlib.axes import Axes
+
+    labels: list[str] = []
+    of_axes = Axes.set_xticks
+    monkeypatch.setattr(
+        Axes, "set_xticks", lambda self, at, names, **more: labels.extend(names) or of_axes(self, at, names, **more)
+    )
+    draw(night(), tmp_path / "night.png", {TIP: "tip-shape-changed"})
+    assert len(labels) > 5
+    assert all(re.fullmatch(r"\d\d:\d\d(:\d\d)?", label) for label in labels), labels

@@ -13,6 +13,7 @@ from afspm import wire
 from afspm.client.component import Component
 from afspm.components.planned_scans import ScanList, ScanSeries
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
+from afspm.errors import ConfigError
 from afspm.exit_codes import ExitCode
 from afspm.model import RELAY_REQUEST, ControlRequest, Note, Problem, Progress, Request
 
@@ -282,3 +283,9 @@ def test_a_grid_of_spectra_tells_its_progress() -> None:
     lab = Lab("grid")
     run(SpectroscopyGrid(counts=(2, 1), spacing=(1e-9, 1e-9), end_when_done=True), lab)
     assert told_progress(lab) == [("grid", 1, 2), ("grid", 2, 2)]
+
+
+@pytest.mark.parametrize("every", [-1.0, float("inf"), float("nan")])
+def test_a_series_without_a_sensible_period_is_refused(every: float) -> None:
+    with pytest.raises(ConfigError, match="a period of"):
+        ScanSeries(size=(1e-6, 1e-6), every=every)

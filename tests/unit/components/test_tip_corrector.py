@@ -19,6 +19,7 @@ from afspm.components.tip_corrector import TipCorrector
 from afspm.components.tip_verdict import BAD, GOOD, MESSAGE, UNCLEAR, verdict_message
 from afspm.errors import ConfigError
 from afspm.exit_codes import ExitCode
+from afspm.formatting import position_text
 from afspm.model import (
     ControlMode,
     ControlRequest,
@@ -231,7 +232,7 @@ def test_a_test_scan_that_is_refused_is_told_and_the_next_taken_instead(caplog: 
     assert run(corrector(test_center=(0.0, 4e-6)), lab) == ExitCode.ENDED
     assert lab.finished == [REGION]
     assert lab.problems == ()
-    assert "no test scan at (0, 4000) nm" in caplog.text
+    assert "no test scan at (0, 4) µm" in caplog.text
 
 
 def test_a_tip_of_which_no_test_scan_can_be_taken_is_not_treated_any_further() -> None:
@@ -368,7 +369,7 @@ def test_a_probe_that_a_person_has_moved_is_moved_back_before_the_tip_is_treated
     ((action, (x, y)),) = lab.actions
     assert action == "x-pulse"
     assert x > 7e-6
-    assert f"pulse of +3 V, 50 ms at ({x * 1e9:.0f}, {y * 1e9:.0f}) nm" in caplog.text
+    assert f"pulse of +3 V, 50 ms at {position_text((x, y))}" in caplog.text
     assert lab.problems == ()
 
 
@@ -403,7 +404,7 @@ def test_nothing_is_done_where_the_probe_is_not_published_to_stand(caplog: pytes
     lab.intercept = somebody
     run(corrector(), lab)
     assert lab.actions == []
-    assert "pulse of +3 V, 50 ms was not done: the probe is at (0, 0) nm, and not at (8000, 0) nm" in caplog.text
+    assert "pulse of +3 V, 50 ms was not done: the probe is at (0, 0) nm, and not at (8, 0) µm" in caplog.text
     assert lab.problems == (TIP, MALFUNCTION)
 
 

@@ -10,13 +10,27 @@ import pytest
 
 from afspm import wire
 from afspm.dashboard.night import Night, NightContents, NightWatch
-from afspm.model import ControlMode, ControlState, LogLine, LogLines, Note, Packet, Region, Scan, Spectrum
+from afspm.model import (
+    ControlMode,
+    ControlState,
+    LogLine,
+    LogLines,
+    Note,
+    Packet,
+    ProcessCondition,
+    ProcessState,
+    ProcessStates,
+    Region,
+    Scan,
+    Spectrum,
+)
 from afspm.record.journal import SCHEDULER
 from afspm.record.notes import append_note
 from afspm.record.store import RecordSettings, RecordStore
 
 S = 1_000_000_000
 START = 1_773_518_400 * S
+PROCESS = ProcessState("series", "component", ProcessCondition.ALIVE, START, 0.0, 1, 7, "")
 FOUND = {"matrix": [1.0, 0.0, -30e-9, 0.0, 1.0, 10e-9], "center": [30e-9, -10e-9], "correcting": True}
 
 
@@ -38,6 +52,7 @@ def night(tmp_path: Path) -> Night:
     """Two scans, a spectrum, a change of control and a line of the log; the second scan has drifted."""
     things = [
         (0, ControlState(ControlMode.AUTOMATED, "series")),
+        (5, ProcessStates(START + 5 * S, "lab", (PROCESS,))),
         (10, scan(10)),
         (20, ControlState(ControlMode.MANUAL)),
         (25, LogLines((LogLine(START + 25 * S, "series", "INFO", "waits"),))),
@@ -65,6 +80,21 @@ def test_at_each_moment_it_is_as_it_was(night: Night) -> None:
     assert (len(watch.overview.log), watch.moment_ns) == (1, START + 35 * S)
     ((_, found),) = watch.spectra.newest()
     assert found.values.tolist() == np.ones((3, 2)).tolist()
+
+
+def test_when_the_run_is_over_no_process_is_alive(night: Night) -> None:
+    watch = NightWatch(night)
+    contents = NightContents(watch, None, "")
+    (process,) = contents.get().processes
+    assert (process.condition, process.since_ns) == (ProcessCondition.ENDED, watch.overview.newest_ns)
+    watch.go(START + 15 * S)
+    (process,) = contents.get().processes
+    assert process.condition is ProcessCondition.ALIVE
+
+
+def test_in_manual_mode_the_page_says_that_a_person_is_in_control(night: Night) -> None:
+    contents = NightContents(NightWatch(night), None, "")
+    assert "a person</b> is in control" in contents.get().status
 
 
 def test_forth_and_back_is_the_same(night: Night) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from afspm import wire
@@ -9,7 +11,16 @@ from afspm.dashboard.actions import unclear
 from afspm.dashboard.flags import flags
 from afspm.dashboard.scan_dialog import ScanChoice
 from afspm.errors import InvalidValue, UnitError
-from afspm.model import ControlMode, ControlState, Problem, Region, RescanKind
+from afspm.model import (
+    ControlEvent,
+    ControlMode,
+    ControlState,
+    JournalEntries,
+    JournalEntry,
+    Problem,
+    Region,
+    RescanKind,
+)
 from afspm.record.overview import Overview
 
 S = 1_000_000_000
@@ -36,6 +47,28 @@ def test_a_scan_is_edited_with_units_and_has_square_pixels() -> None:
     edited = CHOICE.edited("1 um", "500 nm", "128")
     assert edited.region == Region((1e-6, 2e-6), (1e-6, 5e-7), 0.3)
     assert edited.shape == (64, 128)
+
+
+def test_a_scan_is_turned_by_an_angle_with_its_unit() -> None:
+    assert CHOICE.edited("1 um", "1 um", "8", "-90 deg").region.angle_rad == pytest.approx(-math.pi / 2)
+    with pytest.raises(UnitError):
+        CHOICE.edited("1 um", "1 um", "8", "30")
+
+
+def test_a_person_is_in_control_in_manual_mode() -> None:
+    overview = Overview()
+    assert overview.in_control == ""
+    overview.take("ControlState", ControlState(ControlMode.AUTOMATED, "series"), S)
+    assert (overview.in_control, overview.control_since_ns) == ("series", S)
+    overview.take("ControlState", ControlState(ControlMode.MANUAL), 2 * S)
+    assert (overview.in_control, overview.control_since_ns) == ("a person", 2 * S)
+    changed = JournalEntry(
+        2 * S, "control", "dashboard:Ada", "", event=ControlEvent.MODE_CHANGED, mode=ControlMode.MANUAL
+    )
+    overview.take("JournalEntries", JournalEntries((changed,)), 2 * S + 1)
+    assert overview.in_control == "Ada"
+    overview.take("ControlState", ControlState(ControlMode.AUTOMATED), 3 * S)
+    assert overview.in_control == ""
 
 
 def test_a_scan_is_made_a_square_of_its_longer_side() -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -49,6 +51,52 @@ def test_what_ends_by_itself_is_seen_to_at_that_time_and_not_at_the_next_request
     assert (tmp_path / "scan.txt").exists()
     assert tiny.rig.scan is not None
     assert tiny.ended[0] >= tiny.rig.scan.end_s
+
+
+class WithButton(Tiny):
+    """Shows a button while it listens, and another one when that is pressed."""
+
+    def open(self) -> str:
+        self.pressed = threading.Event()
+        self.show_button("press-OK", "a dialog waits", self._press)
+        return super().open()
+
+    def _press(self) -> None:
+        self.pressed.set()
+        self.show_button("press-again", "another dialog waits", self._fail)
+
+    def _fail(self) -> None:
+        raise ValueError("what the button does fails")
+
+
+def until(condition: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + 10.0
+    while not condition():
+        assert time.monotonic() < deadline_s
+        threading.Event().wait(0.01)
+
+
+def test_button_of_the_screen_is_pressed_by_deleting_its_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    button, again = (tmp_path / f"delete-to-press-{name}.txt" for name in ("OK", "again"))
+    emulated = WithButton(port=0)
+    with emulated.running(tmp_path) as address:
+        assert "a dialog waits" in button.read_text(encoding="utf-8")
+        assert ask(address, "hello") == ["1"]
+        assert not emulated.pressed.is_set()
+        button.unlink()
+        until(again.exists)
+        assert emulated.pressed.is_set()
+        assert not button.exists()
+        again.unlink()
+        until(lambda: "what the button does fails" in caplog.text)
+        assert ask(address, "hello") == ["1"], "an error behind a button ends nothing else"
+    assert f"delete {button} to press the button" in caplog.text
+
+
+def test_button_is_gone_when_the_controller_ends(tmp_path: Path) -> None:
+    with WithButton(port=0).running(tmp_path):
+        assert list(tmp_path.glob("delete-to-*"))
+    assert not list(tmp_path.glob("delete-to-*"))
 
 
 def test_an_emulated_crash_closes_the_connection_without_an_answer(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from afspm.experiment.limits_section import to_settings
 from afspm.logic.limit_checker import LimitChecker
-from afspm.model import ControlRequest, ProblemNames, Request
+from afspm.model import ControlRequest, Feedback, Parameter, ProblemNames, Request
 from afspm.scheduler.settings import scheduler_settings
 
 from .conftest import Write, errors, line_of, only_error
@@ -107,11 +107,71 @@ def test_an_action_among_the_parameters_is_told_where_it_belongs(write: Write) -
     assert "[limits.actions.start-scan]" in only_error(write("[limits.start-scan]\nonly = []\n")).hint
 
 
-def test_a_limit_of_unknown_dimension_is_in_the_unit_given(write: Write) -> None:
-    experiment = write('[limits.zctrl-setpoint]\nmin = "0.1 V"\nmax = "500 mV"\n')
+SETPOINT = "[limits.zctrl-setpoint]\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ('min = "0.1 V"\nmax = "500 mV"\n', (0.1, 0.5, None, None, "V")),
+        ('max = "500 pA"\nstep = "0.1 nA"\n', (None, 5e-10, 1e-10, None, "A")),
+        ('min = 0\nmax = "500 pA"\n', (0.0, 5e-10, None, None, "A")),
+        ('rate = "1 nA/min"\n', (None, None, None, 1e-9 / 60, "A")),
+    ],
+)
+def test_a_limit_of_unknown_dimension_is_in_si_and_says_so(
+    write: Write, text: str, found: tuple[float | None, ...]
+) -> None:
+    experiment = write(SETPOINT + text)
     assert not errors(experiment)
+    (warning,) = [one for one in experiment.check() if "zctrl-setpoint" in one.what]
+    assert f"counts in {found[-1]}" in warning.what
     limit = experiment.resolved.limits.parameters["zctrl-setpoint"]
-    assert (limit.low, limit.high, limit.unit) == (0.1, 0.5, "V")
+    told = (limit.low, limit.high, limit.step, limit.rate_per_s)
+    for value, wanted in zip(told, found[:-1], strict=True):
+        assert value == (None if wanted is None else pytest.approx(wanted))
+    assert limit.unit == found[-1]
+
+
+@pytest.mark.parametrize("text", ["max = 500\n", "rate = 1\n", 'step = "0.1"\n'])
+def test_a_limit_of_unknown_unit_is_an_error(write: Write, text: str) -> None:
+    assert "has no unit" in only_error(write(SETPOINT + text)).what
+    assert not errors(write(SETPOINT + 'every = "1 s"\n'))
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("[limits.zctrl-pgain]", "V can't be converted to one without a unit"),
+        ("[limits.x-laser]", ""),
+    ],
+)
+def test_a_dimensionless_parameter_takes_no_limit_with_a_unit(write: Write, name: str, said: str) -> None:
+    experiment = write(f'{name}\nmax = "3 V"\n')
+    assert (said in only_error(experiment).what) if said else not errors(experiment)
+
+
+@pytest.mark.parametrize(
+    ("subject", "fits"),
+    [
+        (Feedback(setpoint=1e-6), False),
+        (Feedback(setpoint=4e-10), True),
+        (Parameter("zctrl-setpoint", "400"), False),
+        (Parameter("zctrl-setpoint", "4e-10"), True),
+        (Parameter("zctrl-setpoint", "400", "pA"), True),
+        (Parameter("zctrl-setpoint", "0.6", "nA"), False),
+        (Parameter("zctrl-setpoint", "0.4", "V"), False),
+        (Parameter("x-laser", "400"), False),
+        (Parameter("x-laser", "4e-10"), True),
+        (Parameter("x-number", "2"), True),
+        (Parameter("x-number", "2", "A"), False),
+    ],
+)
+def test_plain_numbers_are_compared_in_si_with_a_foreign_translator(write: Write, subject: object, fits: bool) -> None:
+    limited = SETPOINT + 'max = "500 pA"\n[limits.x-laser]\nmax = "500 pA"\n[limits.x-number]\nmax = 3\n'
+    limits = LimitChecker(write(limited).resolved.limits)
+    kind = ControlRequest.PARAM if isinstance(subject, Parameter) else ControlRequest.SET_ZCTRL_PARAMS
+    assert (limits.check("experiment", Request(int(kind), subject), 0) is None) is fits
 
 
 SIMULATED = '[scheduler]\ncomponent = true\nclass = "Scheduler"\n[microscope]\ncomponent = true\nclass = "Simulator"\n'

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +15,11 @@ from hypothesis import strategies as st
 from samples import DATA, WHOLE
 
 from afspm.errors import FileError
+from afspm.files import read
+from afspm.model import Region, Scan
+from afspm.record import nexus
 
-pytest.importorskip("h5py")
+h5py = pytest.importorskip("h5py")
 pytest.importorskip("scipy")
 
 SOME = [
@@ -85,3 +91,37 @@ def test_a_heap_of_texts_in_which_the_library_would_go_round_for_ever_is_refused
     damaged[second + 8 : second + 16] = size.to_bytes(8, "little")
     with pytest.raises(FileError, match="do not add up"):
         reading(bytes(damaged), "nsid.h5")
+
+
+def _by_link(file: Any, name: str, secret: Path) -> None:
+    file[name] = h5py.ExternalLink(secret.name, "/values")
+
+
+def _by_external_storage(file: Any, name: str, secret: Path) -> None:
+    file.create_dataset(name, (2, 4), "f8", external=[(secret.name, 0, 64)])
+
+
+def _by_virtual_dataset(file: Any, name: str, secret: Path) -> None:
+    layout = h5py.VirtualLayout((2, 4), "f8")
+    layout[:] = h5py.VirtualSource(secret.name, "values", (2, 4))
+    file.create_virtual_dataset(name, layout)
+
+
+@pytest.mark.parametrize("elsewhere", [_by_link, _by_external_storage, _by_virtual_dataset])
+def test_values_that_are_in_another_file_are_refused(
+    elsewhere: Callable[[Any, str, Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a scan of somebody else, drawn or exported, would show what is in a file of this computer."""
+    monkeypatch.chdir(tmp_path)  # where external storage is looked for
+    with h5py.File(tmp_path / "secret.h5", "w") as secret:
+        secret["values"] = np.full((2, 4), 42.0)
+    scan = Scan(Region((0.0, 0.0), (1e-6, 1e-6)), "Height", "m", np.zeros((2, 4)), 5, "one.dat")
+    file = tmp_path / "scan.h5"
+    file.write_bytes(nexus.encode_scan([scan], nexus.FileProvenance(5, None, {}, {})))
+    assert read(file).scans[0].values.shape == (2, 4)
+    with h5py.File(file, "r+") as changed:
+        (name,) = (key for key, node in changed["entry/data"].items() if getattr(node, "ndim", 0) == 2)
+        del changed["entry/data"][name]
+        elsewhere(changed, f"entry/data/{name}", tmp_path / "secret.h5")
+    with pytest.raises(FileError, match="in another file"):
+        read(file)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import samples
 from samples import END_NS, HEIGHT_M, OTHER, REGION, WHOLE, gxsm3, gxsm4, sxm
 
 import afspm
@@ -136,6 +137,42 @@ def test_a_bias_spectrum_of_nanonis(tmp_path: Path) -> None:
     assert (curve.kind, curve.position_m) == ("bias spectroscopy", (300e-9, -200e-9))
     expected = [[-1.5, 2e-12, np.nan], [0, 0, 1e-12], [1.5, -2e-12, 1e-12]]
     np.testing.assert_array_equal(curve.values, expected)
+
+
+@pytest.mark.parametrize(
+    ("column", "name", "unit"),
+    [
+        ("Current PSD (A/sqrt(Hz))", "Current PSD", "A/sqrt(Hz)"),
+        ("Current PSD (A/sqrt(Hz)) [filt]", "Current PSD [filt]", "A/sqrt(Hz)"),
+        ("Input (left) (V)", "Input (left)", "V"),
+        ("Index", "Index", ""),
+    ],
+)
+def test_column_has_the_whole_unit_in_its_last_parentheses(column: str, name: str, unit: str, tmp_path: Path) -> None:
+    dat = samples.dat().replace(b"Current (A)\t", column.encode() + b"\t")
+    (tmp_path / "a.dat").write_bytes(dat)
+    (curve,) = afspm.read(tmp_path / "a.dat", zone=UTC).spectra
+    assert (curve.names[1], curve.units[1]) == (name, unit)
+
+
+def test_column_of_gxsm_keeps_a_unit_with_parentheses_in_it(tmp_path: Path) -> None:
+    (tmp_path / "a-VP001-VP.vpdata").write_bytes(samples.vpdata().replace(b"Z-mon (\xc3\x85)", b"PSD (V/sqrt(Hz))"))
+    (curve,) = afspm.read(tmp_path / "a-VP001-VP.vpdata", zone=UTC).spectra
+    assert (curve.names, curve.units) == (("Bias-mon", "PSD"), ("V", "V/sqrt(Hz)"))
+
+
+def test_unit_of_gxsm_is_the_unit_and_not_its_name_in_gxsms_own_list(tmp_path: Path) -> None:
+    import h5py
+    from scipy.io import netcdf_file
+
+    gxsm4(tmp_path / "4.nc")
+    with h5py.File(tmp_path / "4.nc", "r+") as file:
+        file["FloatField"].attrs.update({"ZSrcUnit": b"mV1", "unit": b"mV1", "var_unit": b"mV", "unit_x_dz": b"mV"})
+    gxsm3(tmp_path / "3.nc")
+    with netcdf_file(tmp_path / "3.nc", "a") as file:
+        file.variables["FloatField"].ZSrcUnit, file.variables["FloatField"].unit = b"mV1", b"mV"
+    for name in ("4.nc", "3.nc"):
+        assert afspm.read(tmp_path / name).scans[0].unit == "mV"
 
 
 def test_a_force_curve_of_asylum(tmp_path: Path) -> None:

@@ -52,17 +52,23 @@ def test_an_image_comes_back_as_it_was_scanned(tmp_path: Path, *, upwards: bool)
     assert content.end_ns == 1_700_000_000_000_000_000
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_the_makers_reader_finds_the_same(tmp_path: Path) -> None:
+@pytest.mark.filterwarnings("ignore")  # of the maker's reader, about pandas
+def test_nsfopen_reads_the_same_heights_and_curves(tmp_path: Path) -> None:
+    """It takes the range of each channel for one about zero, as it is in a file of a real Studio."""
     reading = pytest.importorskip("NSFopen.read")
-    path, _ = scanned(tmp_path)
+    path, rig = scanned(tmp_path)
+    assert rig.scan is not None
     data = reading.read(str(path)).data["Image"]
-    for scan in afspm.read(path).scans:
-        channel, way = scan.channel.rsplit(" ", 1)
-        theirs = np.asarray(data[way][channel], dtype=float)
-        # NSFopen leaves the middle of the range out
-        ours = scan.values - np.nanmean(scan.values)
-        np.testing.assert_allclose(theirs - theirs.mean(), ours, atol=1e-6 * np.ptp(scan.values))
+    for way, suffix in (("Forward", ""), ("Backward", " Retrace")):
+        heights = rig.scan.channels()[f"Height{suffix}"][1]
+        np.testing.assert_allclose(np.asarray(data[way]["Height"], float), heights, atol=1e-9 * np.ptp(heights))
+    taken = Rig({"surface": "steps"}, 3, ExperimentClock.starting_now()).start_spectrum("force")
+    path = tmp_path / "curve.nhf"
+    path.write_bytes(files.curves([taken], (1, 1), 1.7e9, "dynamic_mode"))
+    data = reading.read(str(path)).data["Image"]
+    deflection = taken.values[:, taken.names.index("Deflection")]
+    read = np.asarray(data["Forward"]["Deflection"], float).ravel()
+    np.testing.assert_allclose(read, deflection[::-1], atol=1e-9 * np.ptp(deflection))
 
 
 def test_lines_that_were_not_scanned_are_missing(tmp_path: Path) -> None:
@@ -79,7 +85,7 @@ def test_a_curve_goes_there_and_back(tmp_path: Path) -> None:
     rig = Rig({"surface": "steps"}, 3, ExperimentClock.starting_now())
     taken: SpectrumActivity = rig.start_spectrum("force")
     path = tmp_path / "curve.nhf"
-    path.write_bytes(files.curve(taken, 1.7e9, "dynamic_mode"))
+    path.write_bytes(files.curves([taken], (1, 1), 1.7e9, "dynamic_mode"))
     (curve,) = afspm.read(path).spectra
     z = taken.values[:, taken.names.index("Z")]
     np.testing.assert_allclose(curve["Z"], np.concatenate([z[::-1], z]), atol=1e-15)
@@ -124,3 +130,23 @@ def test_a_file_that_ends_early_is_refused(tmp_path: Path) -> None:
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(FileError, match="ends within DataSet-"):
         afspm.read(path)
+
+
+@pytest.mark.filterwarnings("ignore")  # of the maker's reader, about pandas
+def test_heights_of_a_real_studio_are_those_that_nsfopen_reads() -> None:
+    """Of format 1; its channels have a range about zero, as those of the emulator."""
+    nanosurf = importlib.util.find_spec("nanosurf")
+    folder = Path(nanosurf.origin if nanosurf is not None and nanosurf.origin else "/").parent
+    path = folder / "apps" / "wavemode_nma_analysis" / "example_data" / "SBS-PS_example_data.nhf"
+    if not path.is_file():
+        pytest.skip("nanosurf-apps, with a file of a real Studio, is not installed")
+    import h5py
+
+    with h5py.File(path) as file:
+        stored = file["measurement_0/segment_0/dataset_0"]
+        low, high = (float(stored.attrs[f"base_calibration_{end}"]) for end in ("min", "max"))
+        heights = stored[:].reshape(100, 100) * ((high - low) / 2 / (2**31 - 1))  # as in NSFopen 2.2.4
+    assert low == -high
+    (ours,) = [scan for scan in afspm.read(path).scans if scan.channel == "Topography Forward"]
+    np.testing.assert_allclose(ours.values, heights, atol=1e-14)
+    assert (ours.unit, ours.region.size_m) == ("m", (1e-5, 1e-5))

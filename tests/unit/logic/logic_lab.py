@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
 from tests.simulation.codec import TableCodec
@@ -24,6 +25,7 @@ from afspm.logic.events import (
     TranslatorReply,
     TranslatorUp,
 )
+from afspm.logic.limit_checker import is_get
 from afspm.logic.scheduler_core import SchedulerCore
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.state import KIND, VERSION, SavedState
@@ -33,8 +35,10 @@ from afspm.model import (
     ControlRequest,
     ControlResponse,
     JournalEntry,
+    LoggedPacket,
     Packet,
     PacketHeader,
+    Parameter,
     ProcessCondition,
     ProcessState,
     ProcessStates,
@@ -45,6 +49,7 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
+from afspm.model.names import BASE_PARAMETERS
 from afspm.model.snapshot import restored, snapshot
 
 NS = 10**9
@@ -59,11 +64,12 @@ class Lab:
         *,
         state: SavedState | None = None,
         codec: TableCodec | None = None,
+        packets: Sequence[LoggedPacket] = (),
+        now: tuple[float, int] = (100.0, 1_750_000_000 * NS),
     ) -> None:
         self.codec = codec or TableCodec()
         self.core = SchedulerCore(settings or SchedulerSettings(), self.codec)
-        self.now_s = 100.0
-        self.now_ns = 1_750_000_000 * NS
+        self.now_s, self.now_ns = now
         self.connections: dict[str, int] = {}
         self.effects: list[Effect] = []
         self.forwarded: list[Forward] = []
@@ -71,6 +77,7 @@ class Lab:
         self.entries_seen = 0
         if state is not None:
             self.core.restore(as_saved(state))
+            self.core.restore_cache(packets)
         self.effects += self.core.start(self.now_s, self.now_ns)
 
     def step(self, event: Input) -> list[Effect]:
@@ -115,6 +122,29 @@ class Lab:
     ) -> list[Effect]:
         response = Response(int(code), payload, reason, forward.request.id, detail)
         return self.step(TranslatorReply(forward.number, response))
+
+    def answer_reads(
+        self, lacking: ControlResponse = ControlResponse.PARAM_NOT_SUPPORTED, **values: str
+    ) -> list[Effect]:
+        """The microscope answers reads, in SI, until another request is sent.
+
+        Args:
+            lacking: its answer for a parameter that it does not have.
+            values: by name, with underscores; it does not have the others.
+        """
+        effects: list[Effect] = []
+        while (asked := self.in_flight()) is not None and is_get(asked.request):
+            name = asked.request.subject.name
+            value = values.get(name.replace("-", "_"))
+            payload = b"" if value is None else self.codec.encode(Parameter(name, value, BASE_PARAMETERS.get(name)))
+            code = lacking if value is None else ControlResponse.SUCCESS
+            effects = self.answer(asked, code, payload)
+        return effects
+
+    def in_flight(self) -> Forward | None:
+        """What the translator has and did not answer yet."""
+        flight = self.core.state.forwarder.flight
+        return None if flight is None else next(one for one in self.forwarded if one.number == flight.number)
 
     def ask(self, name: str, kind: int, subject: Any = None, id_: str = "", user: str | None = None) -> list[Effect]:
         connection = self.connections.get(name) or self.connect(name)
@@ -193,7 +223,7 @@ def in_control(settings: SchedulerSettings) -> Lab:
 def killed(lab: Lab, settings: SchedulerSettings) -> Lab:
     """The scheduler that is started with what was saved last."""
     saved = [effect.state for effect in lab.effects if isinstance(effect, SaveState)][-1]
-    again = Lab(settings, state=saved)
+    again = Lab(settings, state=saved, codec=lab.codec)
     again.now_s, again.now_ns = lab.now_s, lab.now_ns
     again.translator()
     return again

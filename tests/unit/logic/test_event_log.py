@@ -9,7 +9,7 @@ from logic_lab import Lab, published
 
 from afspm.logic import event_log
 from afspm.logic.descriptions import asked
-from afspm.logic.events import Kill, SaveState, Tick, Unreadable
+from afspm.logic.events import Effect, Forward, Kill, Publish, SaveState, Tick, Unreadable
 from afspm.model import (
     CLOCK_REQUEST,
     ControlMode,
@@ -17,6 +17,7 @@ from afspm.model import (
     ControlResponse,
     Feedback,
     JournalEntry,
+    LoggedPacket,
     Parameter,
     PositionChange,
     ProbePosition,
@@ -68,6 +69,51 @@ def test_a_measurement_is_written_down_with_its_key_and_the_time_at_which_it_was
     assert scan.sent_ns < scan.time_ns
     assert (control.key, control.sent_ns) == ("", None)
     assert (refused.key, refused.sent_ns) == ("tile-2", None)
+
+
+def test_key_outlives_a_scheduler_that_is_killed_right_after_it_passed_the_start_on(lab: Lab) -> None:
+    lab.take_control("survey")
+    lab.ask("survey", R.ACTION, "start-scan", "survey/key/tile-1/1")
+    sent_ns = lab.now_ns
+    after = killed_after(lab, Forward)
+    (start,) = (entry for entry in after.entries() if entry.what == "start-scan")
+    assert (start.who, start.key, start.sent_ns) == ("survey", "tile-1", sent_ns)
+    assert start.response == C.NO_RESPONSE
+    assert "restarted" in start.reason
+
+
+def test_start_that_is_repeated_after_a_kill_keeps_the_time_at_which_it_was_passed_on_first(lab: Lab) -> None:
+    lab.take_control("survey")
+    lab.ask("survey", R.ACTION, "start-scan", "survey/key/tile-1/1")
+    sent_ns = lab.now_ns
+    after = killed_after(lab, Forward)
+    after.later(1.0, 1.0)
+    after.ask("survey", R.ACTION, "start-scan", "survey/key/tile-1/1")
+    after.answer(after.forwarded[-1])
+    starts = [entry for entry in after.entries() if entry.what == "start-scan"]
+    assert [(entry.response, entry.key, entry.sent_ns) for entry in starts] == [
+        (C.NO_RESPONSE, "tile-1", sent_ns),
+        (C.SUCCESS, "tile-1", sent_ns),
+    ]
+
+
+def test_start_whose_entry_outlived_the_kill_is_not_written_down_again(lab: Lab) -> None:
+    lab.take_control("survey")
+    lab.ask("survey", R.ACTION, "start-scan", "survey/key/tile-1/1")
+    lab.answer(lab.forwarded[-1])
+    lab.entries()
+    assert "start-scan" not in [entry.what for entry in killed_after(lab, Publish).entries()]
+
+
+def killed_after(lab: Lab, kind: type[Effect]) -> Lab:
+    """Return the next life of a scheduler that carried out nothing after its last effect of a kind."""
+    last = max(n for n, effect in enumerate(lab.effects) if isinstance(effect, kind))
+    done = lab.effects[: last + 1]
+    saved = [effect.state for effect in done if isinstance(effect, SaveState)]
+    packets = [LoggedPacket(e.packet, e.source_ns, e.history) for e in done if isinstance(e, Publish)]
+    after = Lab(state=saved[-1], codec=lab.codec, packets=packets, now=(lab.now_s + 1.0, lab.now_ns + 10**9))
+    after.translator()
+    return after
 
 
 def test_a_refusal_is_written_down_with_its_reason(lab: Lab) -> None:
@@ -233,7 +279,7 @@ SQUARE = Region((0.0, 0.0), (5e-7, 5e-7))
     ("kind", "subject", "words"),
     [
         (R.ACTION, "start-scan", "start-scan"),
-        (R.PARAM, Parameter("scan-speed", "2", "um/s"), "scan-speed = 2 um/s"),
+        (R.PARAM, Parameter("scan-speed", "2", "um/s"), "scan-speed = 2 µm/s"),
         (R.PARAM, Parameter("scan-speed"), "reads scan-speed"),
         (R.PARAM, Parameter("zctrl-pgain", "3"), "zctrl-pgain = 3"),
         (
@@ -244,7 +290,7 @@ SQUARE = Region((0.0, 0.0), (5e-7, 5e-7))
         (
             R.SET_SCAN_PARAMS,
             ScanParameters(Region((1.5e-4, -2e-7), (2e-6, 1e-6), 0.5235987756)),
-            "scan parameters: 2 x 1 um at (150, -0.2) um, turned by 30 deg",
+            "scan parameters: 2 x 1 µm at (150, -0.2) µm, turned by 30 deg",
         ),
         (R.SET_SCAN_PARAMS, ScanParameters(RegionChange(width_m=1e-9)), "scan parameters: width 1 nm"),
         (R.SET_SCAN_PARAMS, ScanParameters(None, ShapeChange(rows=7)), "scan parameters: rows 7"),

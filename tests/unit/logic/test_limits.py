@@ -305,8 +305,10 @@ def test_an_interval_counts_from_the_sending_and_over_a_restart() -> None:
 def test_a_request_that_is_asked_again_is_not_too_soon_after_itself() -> None:
     g = checker(ExperimentLimits(actions={"x-pulse": Limit(interval_s=60.0)}))
     g.sending("corrector", act("x-pulse", "corrector/1"), 0)
-    assert not why(g, act("x-pulse", "corrector/1"), "corrector", NS)
-    assert why(g, act("x-pulse", "corrector/1"), "another", NS)
+    assert g.check("corrector", act("x-pulse", "corrector/1"), NS, is_repeated=True) is None
+    assert g.check("another", act("x-pulse", "corrector/1"), NS, is_repeated=True)
+    assert g.check("corrector", act("x-pulse", "corrector/2"), NS, is_repeated=True)
+    assert why(g, act("x-pulse", "corrector/1"), "corrector", NS)  # its first sending is not remembered any more
     assert why(g, act("x-pulse"), "corrector", NS)
 
 
@@ -429,7 +431,7 @@ def test_what_a_request_without_sense_would_have_set_is_still_known() -> None:
     g = guard(zctrl_setpoint=Limit(step=0.5))
     g.in_force(Feedback(setpoint=1.0), 0)
     assert why(g, set_("nan", None, "zctrl-setpoint"))
-    assert g.to_be_read(set_("nan", None, "zctrl-setpoint")) == []
+    assert g.depends_on(set_("nan", None, "zctrl-setpoint")) == []
     assert not why(g, set_("1.2", None, "zctrl-setpoint"))
 
 
@@ -471,14 +473,109 @@ def test_a_parameter_that_may_be_set_every_so_often_counts_from_when_it_is_sent(
     assert not why(g, other, now_ns=NS)
 
 
-def test_only_what_nobody_publishes_is_to_be_read_and_only_where_it_matters() -> None:
-    g = checker(
-        ExperimentLimits(
-            {BIAS: Limit(step=0.5), "scan-size-x": Limit(step=1e-6), "scan-speed": Limit(high=1.0)}, sets=HIGH
-        )
-    )
-    assert g.to_be_read(set_("1", "V")) == [BIAS]
-    assert g.to_be_read(Request(int(ControlRequest.ACTION), "x-high")) == [BIAS]
-    assert g.to_be_read(Request(int(ControlRequest.PARAM), Parameter(BIAS))) == []
-    assert g.to_be_read(set_("1e-6", "m/s", "scan-speed")) == []
-    assert g.to_be_read(scan(Region((0.0, 0.0), (1e-6, 1e-6)))) == []
+FRAME = {"scan-top-left-x", "scan-top-left-y", "scan-size-x", "scan-size-y", "scan-angle"}
+PROBE = {"probe-pos-x", "probe-pos-y"}
+PIXELS = {"scan-resolution-x", "scan-resolution-y"}
+
+
+def depends(g: Held[LimitChecker], request: Request, *, is_mapped: bool = False) -> set[str]:
+    return set(g.depends_on(request, is_mapped=is_mapped))
+
+
+def test_request_depends_on_values_with_a_limited_step_or_rate() -> None:
+    limits = {BIAS: Limit(step=0.5), "zctrl-setpoint": Limit(rate_per_s=1.0), "scan-speed": Limit(high=1.0)}
+    g = checker(ExperimentLimits(limits, sets=HIGH))
+    assert depends(g, set_("1", "V")) == depends(g, act("x-high")) == {BIAS}
+    assert depends(g, Request(int(ControlRequest.SET_ZCTRL_PARAMS), Feedback(setpoint=1.0))) == {"zctrl-setpoint"}
+    assert depends(g, Request(int(ControlRequest.PARAM), Parameter(BIAS))) == set()
+    assert depends(g, set_("1e-6", "m/s", "scan-speed")) == set()
+
+
+def test_part_of_a_place_and_action_there_depend_on_the_place() -> None:
+    g = checker(ExperimentLimits(region=STAGE))
+    assert depends(g, set_("1", "um", "scan-size-x")) == depends(g, scan(RegionChange(left_m=0.0))) == FRAME
+    assert depends(g, act("start-scan")) == FRAME
+    assert depends(g, set_("1", "um", "probe-pos-x")) == depends(g, act("start-spec")) == PROBE
+    assert depends(g, act("x-pulse")) == depends(g, act("x-crash")) == PROBE
+    whole = (scan(Region((0.0, 0.0), (1e-6, 1e-6))), probe(0.0, 0.0), act("stop-scan"), act("x-retract"))
+    for request in whole:
+        assert depends(g, request) == set()
+    assert depends(g, set_("128", "px", "scan-resolution-x")) == PIXELS
+    assert depends(g, scan(shape=(64, 64))) == set()
+
+
+def test_place_without_a_region_limit_matters_only_if_mapped() -> None:
+    g = checker()
+    for request, place in ((act("start-scan"), FRAME), (set_("1", "um", "probe-pos-x"), PROBE)):
+        assert depends(g, request) == set()
+        assert depends(g, request, is_mapped=True) == place
+
+
+def read_place(g: Held[LimitChecker], **values: str | None) -> None:
+    told = {name.replace("_", "-"): value for name, value in values.items()}
+    g.was_read({name: None if v is None else Parameter(name, v, "um") for name, v in told.items()}, 0)
+
+
+def test_read_place_replaces_the_published_one() -> None:
+    g = checker(ExperimentLimits(region=STAGE))
+    g.in_force(ScanParameters(Region((0, 0), (1e-6, 1e-6)), (8, 8)), 0)
+    read_place(g, scan_top_left_x="4.9", scan_top_left_y="0", scan_size_x="1", scan_size_y="1")
+    assert "corner" in here(g, "start-scan")
+    read_place(g, scan_top_left_x="4")
+    assert here(g, "start-scan") == ""
+
+
+@pytest.mark.parametrize("wrong", [None, "nan", "0"])
+def test_place_with_an_unreadable_part_is_unknown(wrong: str | None) -> None:
+    g = checker(ExperimentLimits(region=STAGE))
+    g.in_force(ScanParameters(Region((0, 0), (1e-6, 1e-6)), (8, 8)), 0)
+    read_place(g, scan_top_left_x="0", scan_top_left_y="0", scan_size_x=wrong, scan_size_y="1")
+    assert "not reported" in here(g, "start-scan")
+
+
+def test_place_is_unknown_after_an_unknown_outcome_until_it_is_read() -> None:
+    g = checker(ExperimentLimits(region=STAGE))
+    g.in_force(ScanParameters(Region((0, 0), (1e-6, 1e-6), 0.5), (8, 8)), 0)
+    g.in_force(ProbePosition((0.0, 0.0)), 0)
+    g.unknown(set_("9", "um", "scan-size-x"))
+    assert "not reported" in here(g, "start-scan")
+    assert here(g, "x-pulse") == ""
+    read_place(g, scan_top_left_x="0", scan_top_left_y="0", scan_size_x="1", scan_size_y="1")  # it can't be turned
+    assert here(g, "start-scan") == ""
+    g.unknown(probe(9e-6, 0.0))
+    assert "not reported" in here(g, "x-pulse")
+    read_place(g, probe_pos_x="9", probe_pos_y="0")
+    assert "outside the region" in here(g, "x-pulse")
+
+
+def test_pixels_are_read_together_after_an_unknown_outcome() -> None:
+    g = checker(ExperimentLimits(most_pixels=1000))
+    g.in_force(ScanParameters(STAGE, (10, 10)), 0)
+    g.unknown(set_("900", "px", "scan-resolution-y"))
+    told = {
+        "scan-resolution-x": Parameter("scan-resolution-x", "10"),
+        "scan-resolution-y": Parameter("scan-resolution-y", "90"),
+    }
+    g.was_read(told, 0)
+    assert "12 x 90" in why(g, set_("12", "px", "scan-resolution-x"))
+
+
+def test_rate_counts_from_the_reading_after_an_unknown_outcome() -> None:
+    g = guard(tip_bias_voltage=Limit(rate_per_s=0.1))
+    g.carried_out(set_("1", "V"), 0)
+    g.sending("experiment", set_("2", "V"), 20 * NS)
+    again = restarted(g.limits, g)  # killed before the answer
+    for one in (g, again):
+        one.unknown(set_("2", "V")) if one is g else None
+        one.was_read({BIAS: Parameter(BIAS, "2", "V")}, 30 * NS)
+        assert "per second" in why(one, set_("2.2", "V"), now_ns=31 * NS)
+        assert not why(one, set_("2.1", "V"), now_ns=31 * NS)
+
+
+def test_rate_counts_as_before_after_a_refused_change() -> None:
+    g = guard(tip_bias_voltage=Limit(rate_per_s=0.1))
+    g.carried_out(set_("1", "V"), 0)
+    g.sending("experiment", set_("2", "V"), 20 * NS)
+    assert "does not tell" in why(g, set_("2", "V"), now_ns=20 * NS)
+    g.not_done("experiment", set_("2", "V"))
+    assert not why(g, set_("3", "V"), now_ns=20 * NS)

@@ -518,7 +518,7 @@ def test_an_operator_commands_in_manual() -> None:
     lab.translator()
     assert lab.says("console", ACTION, "start-scan") is NOT_IN_CONTROL
     lab.mode("console", ControlMode.MANUAL)
-    assert kinds(lab.ask("console", ACTION, "start-scan")) == ["Forward"]
+    assert kinds(lab.ask("console", ACTION, "start-scan")) == ["SaveState", "Forward"]
 
 
 def test_only_what_the_file_names_is_adjusted_beside_the_holder() -> None:
@@ -596,4 +596,17 @@ def test_whoever_asks_is_told_the_time_of_the_experiment_and_how_it_passes() -> 
     answer = replies(lab.ask("elsewhere", CLOCK_REQUEST, id_="elsewhere/a/1"))[0].response
     assert (answer.code, answer.id) == (OK, "elsewhere/a/1")
     clock = {"origin_s": 5.0, "start_s": 7.0, "speed": 600.0, "now_ns": lab.now_ns}
-    assert json.loads(answer.payload) == {**clock, "run": "", "simulated": False, "versions": {}}
+    assert json.loads(answer.payload) == {**clock, "run": "", "simulated": False, "versions": {}, "in_use": ""}
+
+
+def test_the_answer_with_the_time_says_whether_the_microscope_is_in_use() -> None:
+    lab = Lab()
+
+    def in_use() -> str:
+        found: str = json.loads(replies(lab.ask("elsewhere", CLOCK_REQUEST))[0].response.payload)["in_use"]
+        return found
+
+    lab.ask("series", ControlRequest.REQUEST_CTRL, 0)
+    assert in_use() == "series is in control"
+    lab.mode("person", ControlMode.MANUAL)
+    assert in_use() == "the mode is MANUAL"

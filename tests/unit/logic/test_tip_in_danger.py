@@ -419,6 +419,20 @@ def test_a_run_that_is_stopped_with_nobody_there_to_retract_says_so() -> None:
     ]
 
 
+def test_end_that_is_asked_for_again_while_the_tip_is_seen_to_gets_one_answer_by_the_newest_connection() -> None:
+    lab = feedback_off()
+    lab.ask("experiment", END, None, "experiment/a/9")
+    lab.ask("experiment", END, None, "experiment/a/9")
+    lab.is_gone("experiment")
+    newest = lab.connect("experiment")
+    lab.ask("experiment", END, None, "experiment/a/9")
+    lab.effects.clear()
+    lab.answer(lab.forwarded[-1])
+    lab.step(Tick())
+    answers = [(reply.connection, reply.response.code) for reply in replies(lab.effects)]
+    assert answers == [(newest, ControlResponse.SUCCESS)]
+
+
 def test_the_experiment_ends_when_the_tip_is_out_of_danger() -> None:
     lab = feedback_off()
     lab.scope_is(ScopeState.SCANNING)

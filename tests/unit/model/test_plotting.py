@@ -22,7 +22,7 @@ def test_a_scan_is_drawn_where_it_is(kind: str) -> None:
     assert axes.get_ylim() == pytest.approx((1900e-9, 2100e-9), abs=80e-9)
     assert axes.get_xlabel() == "x / nm"
     if kind != "surface":
-        assert axes.figure.axes[1].get_ylabel() == "Height / nm"
+        assert axes.child_axes[0].get_ylabel() == "Height / nm"
         assert axes.texts[0].get_text().endswith("0 nm")
         assert "1000" in [label.get_text() for label in axes.get_xticklabels()]
     mpl.pyplot.close(axes.figure)
@@ -32,7 +32,7 @@ def test_a_scan_over_another_lies_where_it_was_taken_without_a_second_colour_bar
     axes = Scan(Region((0.0, 0.0), (5e-6, 5e-6)), "Height", "m", VALUES).plot()
     assert SCAN.plot(axes=axes) is axes
     axes.figure.canvas.draw()
-    assert len(axes.figure.axes) == 2
+    assert len(axes.child_axes) == 1
     assert axes.get_xlabel() == "x / µm"
     survey, zoom = axes.collections
     corners = np.asarray(zoom.get_coordinates()).reshape(-1, 2)
@@ -40,6 +40,25 @@ def test_a_scan_over_another_lies_where_it_was_taken_without_a_second_colour_bar
     assert np.ptp(corners[:, 0]) > 3e-7  # it is turned
     assert survey.get_zorder() <= zoom.get_zorder()
     mpl.pyplot.close(axes.figure)
+
+
+def test_the_colour_bar_is_as_high_as_the_picture() -> None:
+    figure, (wide, _) = mpl.pyplot.subplots(1, 2, figsize=(9, 6), layout="constrained")
+    flat = Scan(Region((0.0, 0.0), (3e-6, 1e-6)), "Height", "m", VALUES)
+    flat.plot(axes=wide)
+    figure.canvas.draw()
+    bar, picture = wide.child_axes[0].get_window_extent(), wide.get_window_extent()
+    assert (bar.y0, bar.y1) == pytest.approx((picture.y0, picture.y1), abs=1.0)
+    mpl.pyplot.close(figure)
+
+
+def test_a_scan_is_drawn_without_a_colour_bar_and_between_given_values() -> None:
+    axes = SCAN.plot(colorbar=False, vmin=-2e-9, vmax=20e-9)
+    assert not axes.child_axes
+    assert axes.collections[0].get_clim() == pytest.approx((-2.0, 20.0))
+    mpl.pyplot.close(axes.figure)
+    with pytest.raises(InvalidValue, match="colours from 2e-09 to 1e-09 m"):
+        SCAN.plot(vmin=2e-9, vmax=1e-9)
 
 
 def test_what_can_not_be_drawn_is_refused() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from contextlib import closing
 from datetime import date
 from pathlib import Path
 
@@ -139,3 +140,12 @@ def test_the_terminal_lists_them_without_columns_of_which_nothing_is_known(root:
     assert "problems" not in shown
     told = json.loads(CliRunner().invoke(app, ["runs", "--in", str(root), "--json"]).stdout)
     assert {run["folder"] for run in told} == {"gold-1", "spring/mica-1"}
+
+
+def test_index_that_is_not_ours_is_made_anew(root: Path) -> None:
+    find_runs(root)
+    with closing(sqlite3.connect(root / INDEX_FILE)) as index, index:
+        index.execute("DROP TABLE runs")
+        endless = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i FROM n) SELECT i, i, i FROM n"
+        index.execute(f"CREATE VIEW runs (folder, stamp, about) AS {endless}")
+    assert find_runs(root)

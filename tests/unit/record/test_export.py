@@ -202,6 +202,9 @@ def test_a_map_of_a_grid_is_a_scan(night: Night, store: RecordStore, tmp_path: P
     assert current.region.size_m == pytest.approx((4e-9, 3e-9))
     slope = spectra.map(lambda one: float(np.polyfit(one["Bias"], one["Current"], 1)[0]), unit="S")
     assert slope.values == pytest.approx(current.values)
+    assert slope.channel == "map"
+    assert spectra.map(lambda one: one["Current"].max(), unit="A", name="largest current").channel == "largest current"
+    assert spectra.map("Current", at=1.0, name="current").channel == "current"
 
 
 @pytest.mark.parametrize(

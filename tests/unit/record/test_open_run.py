@@ -302,3 +302,46 @@ def test_the_first_thermal_drift_is_not_among_the_problems(night: Night, store: 
     asked.timestamp.FromNanoseconds(night.now_ns)
     store.take([flagged, night.packet(asked), *night.whole_scan(1), night.control("series")])
     assert not afspm.open_run(tmp_path).problems
+
+
+def test_file_of_a_scan_outside_the_folder_of_the_run_is_refused(
+    night: Night, store: RecordStore, tmp_path: Path
+) -> None:
+    store.take(night.whole_scan(1))
+    store.close()
+    elsewhere = tmp_path.with_name(f"{tmp_path.name}-elsewhere.h5")
+    with afspm.open_run(tmp_path) as run:
+        elsewhere.write_bytes((tmp_path / run.scans[0].file).read_bytes())
+    for named in (str(elsewhere), f"../{elsewhere.name}"):
+        with closing(sqlite3.connect(tmp_path / JOURNAL_FILE)) as journal, journal:
+            journal.execute("UPDATE scans SET file = ?", (named,))
+        with afspm.open_run(tmp_path) as run:
+            with pytest.raises(FileError, match="not in the folder of the run"):
+                run.scan(-1)
+            with pytest.raises(FileError, match="not in the folder of the run"):
+                list(run.packets())
+
+
+ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i FROM n) SELECT i FROM n"
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        f"CREATE VIEW scans AS {ENDLESS}",
+        "CREATE VIRTUAL TABLE scans USING fts5(number)",
+        "CREATE TRIGGER t AFTER INSERT ON log BEGIN SELECT 1; END",
+    ],
+)
+def test_journal_with_anything_but_tables_is_refused(
+    night: Night, store: RecordStore, tmp_path: Path, statement: str
+) -> None:
+    """One of somebody else could hold a view that never ends, and `afspm runs` with it."""
+    store.take(night.whole_scan(1))
+    store.close()
+    with closing(sqlite3.connect(tmp_path / JOURNAL_FILE)) as journal, journal:
+        if "scans" in statement:
+            journal.execute("DROP TABLE scans")
+        journal.execute(statement)
+    with pytest.raises(FileError, match="is not a table"):
+        afspm.open_run(tmp_path)

@@ -305,7 +305,7 @@ STORY = [
 def test_who_comes_late_has_the_past_from_the_journal() -> None:
     late = seen(*STORY, ("ControlState", control(None, mode=ControlMode.MANUAL), 41))
     assert [(s.label, s.start_ns // S) for s in late.controls.spans] == [("series", 2), ("corrector", 26)]
-    assert late.control_since_ns == 36 * S
+    assert (late.in_control, late.control_since_ns) == ("ada", 40 * S)
     (flagged,) = late.problem_timelines[TIP].spans
     assert (flagged.by, flagged.start_ns, flagged.end_ns) == ("classifier", 22 * S, 35 * S)
     assert late.modes.now is not None
@@ -327,3 +327,18 @@ def test_what_the_journal_says_of_what_was_seen_changes_nothing() -> None:
         ),
     )  # type: ignore[attr-defined]
     assert [list(seen(*states).controls.spans)] == [list(with_journal.controls.spans)]
+
+
+def test_channels_of_a_scan_share_what_is_equal() -> None:
+    """A page that is open for weeks keeps a hundred thousand; each packet brings objects of its own."""
+    overview = Overview()
+    for number, channel in enumerate(("Height", "Phase", "Height_Retrace")):
+        message, payload = wire.encode(model.Scan(REGION, channel, "m", np.zeros((4, 4)), 14 * S, "scan-0001.nc"))
+        overview.take(message, wire.decode(message, payload), 14 * S + number, f"Scan2d_{channel}")
+    first, *others = overview.scans
+    assert len(others) == 2
+    for other in others:
+        assert other.region is first.region
+        assert (other.filename is first.filename, other.unit is first.unit, other.time_ns is first.time_ns) == (
+            True,
+        ) * 3

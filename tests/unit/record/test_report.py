@@ -17,6 +17,7 @@ import pytest
 from afspm import model, wire
 from afspm.errors import FileError
 from afspm.model import ControlMode, ControlState, ProcessCondition, RegistrationOutcome, ScopeState
+from afspm.record.bad_scans import BAD, VERDICT_MESSAGE
 from afspm.record.report import REPORT_FILE, page, pictures, story, write
 from afspm.record.run import open_run
 from afspm.record.store import RecordSettings, RecordStore
@@ -109,6 +110,7 @@ def recorded(into: Path) -> Path:
         "name": "night",
         "clock": {"origin_s": 0.0, "start_s": START / S, "speed": 60.0},
         "ended": "all components are done",
+        "real_s": 121.4,
     }
     (folder / "run.json").write_text(json.dumps(facts), encoding="utf-8")
     store = RecordStore(folder, RecordSettings({"experiment": "night", "simulated": True}))
@@ -183,7 +185,7 @@ def test_the_page_needs_nothing_else_and_is_whole(report: Path) -> None:
     [
         "SIMULATED",
         "3 scans, 1 interrupted, tip-shape-changed flagged once, 1 restart",
-        "1 h 00 min (1 min 00 s real); all components are done",
+        "1 h 00 min (2 min 01 s real); all components are done",
         "2 × pulse",
         "<b>interrupted</b>",
         "prefers-color-scheme:dark",
@@ -263,6 +265,51 @@ def test_a_problem_is_told_with_who_repaired_it(run: Path) -> None:
     assert told(run).repairs(problem) == ["corrector"]
 
 
+def test_a_run_lasts_until_the_experiment_ends_without_the_drawing_after_it(run: Path) -> None:
+    store = RecordStore(run, RecordSettings({}))
+    ended = model.JournalEntry(
+        START + 3601 * S, "control", "series", "ended", event=model.ControlEvent.EXPERIMENT_ENDED
+    )
+    drawn = model.LogLines((model.LogLine(START + 9000 * S, "night_picture", "INFO", "the night is drawn"),))
+    for at_s, thing in ((3602, model.JournalEntries((ended,))), (9000, drawn)):
+        name, payload = wire.encode(thing)
+        store.take([(model.Packet(name, payload, START + at_s * S), "")])
+    store.flush()
+    store.close()
+    story = told(run)
+    assert story.overview.newest_ns == START + 9000 * S
+    assert (story.end_ns, story.real_s) == (START + 3601 * S, 121.4)
+
+
+def framed(run: Path) -> list[int]:
+    """The numbers of the scans that the page frames."""
+    text = write(run).read_text(encoding="utf-8")
+    return [int(number) for number in re.findall(r'<figure id="scan-(\d+)" class="scan bad"', text)]
+
+
+def test_the_scan_before_a_flag_is_framed_and_an_interrupted_one(run: Path) -> None:
+    assert framed(run) == [3, 4]
+
+
+def test_page_and_picture_of_the_night_frame_the_same_scans_by_their_verdicts(run: Path) -> None:
+    store = RecordStore(run, RecordSettings({}))
+    with open_run(run) as opened:
+        whole = {row.number: row.time_ns for row in opened.scans}
+    for number, score in ((1, BAD), (2, BAD), (2, 1.0), (3, 0.5)):  # the last verdict counts
+        message: Any = wire.message_type(VERDICT_MESSAGE)(channel="Height Retrace")
+        message.timestamp.FromNanoseconds(whole[number])
+        message.spatials.add(score=score)
+        packet = model.Packet(f"{VERDICT_MESSAGE}_judge", message.SerializeToString(), whole[number] + int(score * S))
+        store.take([(packet, "tcp://127.0.0.1:9009")])
+    store.flush()
+    store.close()
+    assert framed(run) == [1, 4]
+    with open_run(run) as opened:
+        read = story.read(opened)
+        record = pictures.night_of(opened, read, pictures.of_scans(opened, read.scans))
+    assert record.bad_ns() == {whole[1], whole[4]}
+
+
 def test_times_of_more_than_a_day_have_the_day(tmp_path: Path) -> None:
     store = RecordStore(tmp_path, RecordSettings({"experiment": "days"}))
     for at_s in (0, 30 * 3600):
@@ -295,11 +342,11 @@ def test_time_is_shared_out(run: Path) -> None:
     assert shares["series <b>"] == (1498 + 2001) * S
 
 
-def test_of_many_scans_the_interrupted_and_some_between_are_shown(run: Path) -> None:
+def test_of_many_scans_the_bad_and_some_between_are_shown(run: Path) -> None:
     with open_run(run) as opened:
         row = opened.scans[0]
-    many = [type(row)(**{**fields_of(row), "number": k, "interrupted": k == 777}) for k in range(1000)]
-    shown = pictures.chosen(many)
+    many = [type(row)(**{**fields_of(row), "number": k, "time_ns": k}) for k in range(1000)]
+    shown = pictures.chosen(many, kept_ns={777})
     assert len(shown) == pictures.MOST
     assert {0, 777, 999} <= {one.number for one in shown}
     assert [one.number for one in shown] == sorted(one.number for one in shown)

@@ -26,7 +26,9 @@ from afspm.logic.events import (
     TranslatorReply,
     TranslatorUp,
 )
+from afspm.logic.limit_checker import is_get
 from afspm.logic.limits import ExperimentLimits
+from afspm.logic.positions import PROBE_CHANGES, REGION_CHANGES, scan_values
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.state import SavedState
 from afspm.model import (
@@ -44,6 +46,7 @@ from afspm.model import (
     ScanParameters,
     ScopeState,
     ScopeStatus,
+    names,
 )
 from afspm.scheduler.drift.codec import DriftWireCodec
 from afspm.scheduler.drift.core import DriftCore
@@ -126,6 +129,12 @@ def registered(
     )
 
 
+def _asks_for_a_place(effect: Effect) -> bool:
+    if not isinstance(effect, Forward) or effect.request.id or not is_get(effect.request):
+        return False
+    return effect.request.subject.name in REGION_CHANGES.keys() | PROBE_CHANGES.keys()
+
+
 def position_message(change: PositionChange) -> ProbePositionMessage:
     """Half a position, as a peer may ask for it."""
     message = ProbePositionMessage(units="m")
@@ -167,6 +176,7 @@ class Lab:
             self.core.restore(state)
         self.effects: list[Effect] = []
         self.asked = 0
+        self.places: dict[str, float] = {}
         self.connections: dict[str, int] = {}
         self.done(self.core.start(self.now_s, self.now_ns))
         if translator:
@@ -187,8 +197,29 @@ class Lab:
         return effects
 
     def step(self, event: Input) -> list[Effect]:
-        done = self.done(self.core.step(event, self.now_s, self.now_ns))
-        return done + self.follow()
+        done = self.done(self.core.step(event, self.now_s, self.now_ns)) + self.follow()
+        return done + self._answer_places()
+
+    def _answer_places(self) -> list[Effect]:
+        """The microscope answers where the scan and the probe are, when it is asked before a request is sent."""
+        done: list[Effect] = []
+        while (forward := next(filter(_asks_for_a_place, self.effects), None)) is not None:
+            assert isinstance(forward, Forward)
+            self.effects.remove(forward)
+            name, code, payload = forward.request.subject.name, ControlResponse.PARAM_NOT_SUPPORTED, b""
+            if name in self.places:
+                unit = "rad" if name == names.SCAN_ANGLE else "m"
+                payload = wire.encode(Parameter(name, repr(self.places[name]), unit))[1]
+                code = ControlResponse.SUCCESS
+            reply = TranslatorReply(forward.number, Response(int(code), payload))
+            done += self.done(self.core.step(reply, self.now_s, self.now_ns)) + self.follow()
+        return done
+
+    def _has_in_force(self, thing: Any) -> None:
+        if isinstance(thing, ScanParameters):
+            self.places.update(one for one in scan_values(thing) if one[0] in REGION_CHANGES)
+        elif isinstance(thing, ProbePosition):
+            self.places.update(zip(PROBE_CHANGES, thing.xy_m, strict=True))
 
     def follow(self) -> list[Effect]:
         """What is due at once, as whoever hosts the core would see to it."""
@@ -238,6 +269,8 @@ class Lab:
     def answer(
         self, forward: Forward, code: ControlResponse = ControlResponse.SUCCESS, told: Parameter | None = None
     ) -> list[Effect]:
+        if code is ControlResponse.SUCCESS:
+            self._has_in_force(forward.request.subject)
         payload = b"" if told is None else wire.encode(told)[1]
         response = Response(int(code), payload, "" if code is ControlResponse.SUCCESS else "no", forward.request.id)
         return self.step(TranslatorReply(forward.number, response))
@@ -245,6 +278,7 @@ class Lab:
     def publish(self, thing: Any, time_s: float | None = None) -> list[Effect]:
         """The translator publishes something."""
         self.now_s += 1e-3
+        self._has_in_force(thing)
         name, payload = wire.encode(thing)
         time_ns = self.now_ns if time_s is None else round(time_s * NS)
         return self.step(PacketIn(Packet(name, payload, time_ns), wire.header(name, payload)))

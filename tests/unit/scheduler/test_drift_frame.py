@@ -479,3 +479,56 @@ def test_an_action_that_was_sent_before_a_kill_is_asked_for_again_without_a_move
     again.forwards()
     again.ask(ControlRequest.ACTION, names.START_SCAN, id_="series/life/go")
     assert again.sent().request.id == "series/life/go"
+
+
+def region_of(lab: Lab) -> Region:
+    told = wire.decode("ScanParameters2d", lab.sent().request.payload)
+    assert isinstance(told.region, Region)
+    return told.region
+
+
+def test_parts_sent_without_waiting_are_put_onto_one_another(lab: Lab) -> None:
+    lab.ask(ControlRequest.PARAM, Parameter(names.SCAN_SIZE_X, "1", "um"))
+    lab.ask(ControlRequest.PARAM, Parameter(names.SCAN_TOP_LEFT_X, "0.5", "um"))
+    wider = lab.sent()
+    lab.knows(forecast((DRIFT[0] + 3e-9, DRIFT[1])))  # more is known of the drift when the second is sent
+    lab.answer(wider)
+    wanted = Region.from_top_left((0.5e-6, -1e-6), (1e-6, 2e-6))
+    same(region_of(lab), moved(wanted, (DRIFT[0] + 3e-9, DRIFT[1])))
+
+
+def test_burst_stays_in_the_region_in_sample_coordinates() -> None:
+    lab = limited()
+    set_region(lab, Region.from_top_left((-3e-6, -1e-6), (1e-6, 1e-6)))
+    lab.ask(ControlRequest.PARAM, Parameter(names.SCAN_SIZE_X, "2.5", "um"))  # each of the two fits by itself
+    lab.ask(ControlRequest.PARAM, Parameter(names.SCAN_TOP_LEFT_X, "-1.5", "um"))
+    lab.answer(lab.sent())
+    assert (lab.forwards(), lab.replies()[-1].code) == ([], ControlResponse.PARAM_ERROR)
+    assert "outside the region" in lab.replies()[-1].reason
+
+
+def test_place_is_read_again_after_the_move_before_an_action() -> None:
+    lab = limited()
+    lab.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(Region((-2e-6, 0.0), (1e-6, 1e-6))))
+    lab.answer(lab.sent())
+    lab.knows(forecast((1.4e-6, 0.0)))
+    lab.ask(ControlRequest.ACTION, names.START_SCAN)
+    lab.answer(lab.sent())
+    lab.places[names.SCAN_TOP_LEFT_X] = 2e-6  # somebody is at the panel
+    lab.scope_is(ScopeState.FREE)
+    assert lab.forwards() == []
+    assert "outside the region" in lab.replies()[-1].reason
+
+
+def test_request_that_reads_passes_while_the_microscope_moves_for_an_action(lab: Lab) -> None:
+    set_region(lab, HERE)
+    lab.knows(forecast((DRIFT[0] + 50e-9, DRIFT[1])))
+    lab.ask(ControlRequest.ACTION, names.START_SCAN, id_="series/life/go")
+    lab.answer(lab.sent())
+    lab.scope_is(ScopeState.MOVING)
+    lab.ask(ControlRequest.PARAM, Parameter(names.SCAN_SPEED), name="other")
+    read = lab.sent()
+    assert read.request.subject == Parameter(names.SCAN_SPEED)
+    lab.answer(read)
+    lab.scope_is(ScopeState.FREE)
+    assert lab.sent().request.id == "series/life/go"

@@ -176,3 +176,16 @@ def test_what_the_loop_does_not_follow_is_seen_in_the_frequency_shift() -> None:
         assert np.median(shift_hz) == pytest.approx(-20.0, abs=2.0)
         spreads.append(float(np.std(shift_hz)))
     assert spreads[1] > 2.0 * spreads[0]
+
+
+@pytest.mark.parametrize("direction", ["up", "down"])
+def test_a_tip_that_becomes_blunt_in_a_scan_is_attracted_more_from_then_on(direction: str) -> None:
+    feedback = {"mode": "current", "setpoint": 100e-12, "qplus": True, "sensor": {"oscillation_m": 100e-12}}
+    changes = {"schedule": [[20.0, "blunt"]]}
+    settings = {"surface": "lattice", "feedback": feedback, "tip_changes": changes}
+    region = Region((0.0, 0.0), (5e-9, 5e-9))
+    scan = World.from_settings(settings, 3, 0.0).scan(region, (32, 16), 1.0, 0.0, direction=direction)
+    rows = np.median(scan.channels()["Frequency Shift"][1], axis=1)
+    before, after = np.split(rows if direction == "up" else rows[::-1], [21])
+    assert before[1:-1] == pytest.approx(before[0], rel=0.1)
+    assert max(after) < 3.0 * before[0] < 0.0

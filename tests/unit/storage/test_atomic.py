@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import subprocess
@@ -17,8 +18,8 @@ from afspm.model import ControlMode
 from afspm.process.memory import Memory
 from afspm.scheduler.state_file import StateFile
 from afspm.storage import atomic
-from afspm.storage.atomic import CheckpointFile, load_checkpoint, previous_generation
-from afspm.storage.disk import SYNCER
+from afspm.storage.atomic import SLOW_S, CheckpointFile, OutageLog, load_checkpoint, previous_generation
+from afspm.storage.disk import SYNCER, DiskBacklogFull, DiskTimeout
 
 CUT = [b"", b"\0" * 40, b'{"control": {"mo']
 """What a power cut may leave of a file that was not synced."""
@@ -219,3 +220,65 @@ def test_what_is_saved_without_waiting_for_the_disk_has_a_generation_before(tmp_
     again = Memory(tmp_path / "microscope.json", synced=False)
     assert again["tip"] == "blunt"
     assert again.damage
+
+
+class Outage:
+    """An OutageLog, its clock, and the lines that it logged."""
+
+    def __init__(self, caplog: pytest.LogCaptureFixture) -> None:
+        self.now_s = 100.0
+        self._log = OutageLog("a crash would lose this", logging.getLogger("test"), lambda: self.now_s)
+        self._caplog = caplog
+        caplog.set_level(logging.INFO, "test")
+
+    def write(self, error: Exception | None = None) -> None:
+        with self._log.trying():
+            if error is not None:
+                raise error
+
+    @property
+    def lines(self) -> list[tuple[str, str]]:
+        return [(record.levelname, record.getMessage()) for record in self._caplog.records]
+
+
+@pytest.fixture
+def outage(caplog: pytest.LogCaptureFixture) -> Outage:
+    return Outage(caplog)
+
+
+def test_a_disk_that_is_busy_for_a_moment_is_not_logged(outage: Outage) -> None:
+    for late_s in (0.0, 1.0, SLOW_S - 0.1):
+        outage.now_s = 100.0 + late_s
+        outage.write(DiskTimeout())
+    outage.write()
+    outage.now_s += 1.0
+    outage.write(DiskTimeout())  # another moment, counted from its own beginning
+    assert outage.lines == []
+
+
+def test_a_disk_that_is_slow_is_one_warning_with_how_long(outage: Outage) -> None:
+    for late_s in (0.0, SLOW_S, 8.0, 11.0):
+        outage.now_s = 100.0 + late_s
+        outage.write(DiskTimeout())
+    outage.now_s = 112.0
+    outage.write()
+    assert outage.lines == [
+        ("WARNING", "a crash would lose this: the disk has not answered for 3 s"),
+        ("INFO", "writing works again; the disk had not answered for 12 s; no longer true: a crash would lose this"),
+    ]
+
+
+@pytest.mark.parametrize("error", [DiskBacklogFull(), OSError(errno.ENOSPC, "No space left"), FileError("is gone")])
+def test_what_is_not_written_at_all_is_critical_at_once(outage: Outage, error: Exception) -> None:
+    outage.write(error)
+    outage.write(error)
+    outage.write()
+    assert [level for level, _ in outage.lines] == ["CRITICAL", "INFO"]
+
+
+def test_a_slow_disk_that_then_refuses_to_write_is_critical_too(outage: Outage) -> None:
+    outage.write(DiskTimeout())
+    outage.now_s += SLOW_S
+    outage.write(DiskTimeout())
+    outage.write(OSError(errno.EIO, "Input/output error"))
+    assert [level for level, _ in outage.lines] == ["WARNING", "CRITICAL"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import threading
@@ -118,3 +119,34 @@ def test_a_disk_that_does_not_sync_is_told(tmp_path: Path, monkeypatch: pytest.M
         with pytest.raises(DiskTimeout):
             syncer.now(0.01)
     goes_on.set()
+
+
+def test_sync_that_the_disk_refuses_is_raised_to_the_next_that_waits_and_logged_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(descriptor: int) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    caplog.set_level("INFO")
+    syncer = Syncer(period_s=0.0)
+    with (tmp_path / "a").open("wb", buffering=0) as file:
+        with monkeypatch.context() as refusing:
+            refusing.setattr(disk, "sync_data", refuse)
+            for _ in range(3):
+                syncer.soon(file.fileno())
+                with pytest.raises(OSError, match="Input/output error"):
+                    syncer.now(DEADLINE_S)
+        syncer.now(DEADLINE_S)  # nothing was written since
+        syncer.soon(file.fileno())
+        syncer.now(DEADLINE_S)
+    assert [(record.levelname, record.message) for record in caplog.records] == [
+        ("CRITICAL", "what was written in the last moment may not outlive a power cut: [Errno 5] Input/output error"),
+        ("INFO", "the disk syncs again"),
+    ]
+
+
+def test_disk_is_full_when_no_scan_has_room_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not disk.is_full(tmp_path)
+    assert not disk.is_full(tmp_path / "gone")
+    monkeypatch.setattr(disk, "FULL_BYTES", 1 << 62)
+    assert disk.is_full(tmp_path)

@@ -10,9 +10,11 @@ from collections.abc import Callable
 import psutil
 import pytest
 
+from afspm.clock import ExperimentClock
 from afspm.supervisor.activity_monitor import LEAST_SHARE, ActivityMonitor, ActivitySample, of_process
 
 LATELY_S = 1.5
+CLOCK = ExperimentClock.real()
 
 
 def judged(signs: Callable[[float], ActivitySample | None], until_s: float = 10.0) -> bool | None:
@@ -94,7 +96,11 @@ def test_the_state_of_each_thread_is_seen() -> None:
     thread = threading.Thread(target=over.wait)
     thread.start()
     try:
-        states = {psutil.Process(one.id).status() for one in psutil.Process().threads()}
+        until_s = CLOCK.monotonic_s() + 10.0
+        states: set[str] = set()
+        while psutil.STATUS_SLEEPING not in states and CLOCK.monotonic_s() < until_s:  # it has just begun
+            states = {psutil.Process(one.id).status() for one in psutil.Process().threads()}
+            over.wait(0.01)
     finally:
         over.set()
         thread.join()

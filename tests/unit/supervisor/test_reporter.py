@@ -8,8 +8,9 @@ import pytest
 
 from afspm.clock import ExperimentClock
 from afspm.launch import Launch
+from afspm.logic.supervision.supervisor_events import EndRefused, UseReported
 from afspm.logic.supervisor_registry import LONGEST
-from afspm.model import ControlResponse, LogLines, Response
+from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlRequest, ControlResponse, LogLines, Response
 from afspm.supervisor import reporter as reporting
 from afspm.supervisor.reporter import Reporter
 from afspm.wire import encode
@@ -47,10 +48,41 @@ def test_what_is_for_developers_is_left_out(reporter: Reporter) -> None:
 def test_orders_that_can_not_be_read_are_told_and_do_not_end_it(reporter: Reporter) -> None:
     told: list[reporting.ReporterEvent] = []
     reporter.post = told.append
-    reporter._answered(Response(ControlResponse.SUCCESS, b"\xff"))
+    reporter._answered(RELAY_REQUEST, Response(ControlResponse.SUCCESS, b"\xff"))
     (complaint,) = told
     assert isinstance(complaint, reporting.ReportFailed)
     assert "Orders" in complaint.text
+
+
+@pytest.mark.parametrize(
+    ("response", "reported"),
+    [
+        (
+            Response(ControlResponse.SUCCESS, b'{"in_use": "series is in control"}'),
+            [UseReported("series is in control")],
+        ),
+        (Response(ControlResponse.SUCCESS, b'{"in_use": ""}'), [UseReported("")]),
+        (Response(ControlResponse.SUCCESS, b"{}"), []),  # an older scheduler can't say
+        (Response(ControlResponse.SUCCESS, b"\xff"), []),
+        (Response(ControlResponse.FAILURE, b"", "no"), []),
+    ],
+)
+def test_use_of_the_microscope_is_reported_only_where_the_scheduler_can_say(
+    reporter: Reporter, response: Response, reported: list[reporting.ReporterEvent]
+) -> None:
+    told: list[reporting.ReporterEvent] = []
+    reporter.post = told.append
+    reporter._answered(CLOCK_REQUEST, response)
+    assert told == reported
+
+
+def test_a_refusal_to_end_is_reported(reporter: Reporter) -> None:
+    told: list[reporting.ReporterEvent] = []
+    reporter.post = told.append
+    reporter._answered(ControlRequest.END_EXPERIMENT, Response(ControlResponse.SUCCESS))
+    assert told == []
+    reporter._answered(ControlRequest.END_EXPERIMENT, Response(ControlResponse.FAILURE, b"", "not now"))
+    assert told == [EndRefused("not now")]
 
 
 def test_one_that_was_not_started_can_be_closed(reporter: Reporter) -> None:

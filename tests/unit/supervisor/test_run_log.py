@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from afspm.clock import ExperimentClock
+from afspm.storage import disk
 from afspm.supervisor.log import COLOURS, LineReader, RunLog, colour_of
 
 
@@ -34,6 +35,24 @@ def test_a_word_that_only_begins_like_a_level_is_text() -> None:
 
 def test_what_a_component_prints_is_information() -> None:
     assert LineReader().read("stdout", "ERROR of 3 nm") == (logging.INFO, "ERROR of 3 nm")
+
+
+def test_file_is_synced_so_that_its_lines_outlive_a_power_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: dict[int, int] = {}
+
+    def note(descriptor: int) -> None:
+        found = os.fstat(descriptor)
+        synced[found.st_ino] = found.st_size
+
+    monkeypatch.setattr(disk, "sync_data", note)
+    log = RunLog(tmp_path / "log.txt", ExperimentClock.real(), terminal=io.StringIO())
+    log.write("scheduler", logging.ERROR, "the tip is in danger")
+    log.close()
+    disk.SYNCER.now(10.0)
+    on_disk = (tmp_path / "log.txt").stat()
+    assert synced[on_disk.st_ino] == on_disk.st_size > 0
+    if sys.platform != "win32":
+        assert tmp_path.stat().st_ino in synced
 
 
 def test_the_file_has_every_line_and_the_terminal_those_of_its_level(tmp_path: Path) -> None:
@@ -87,12 +106,12 @@ def test_a_terminal_that_takes_nothing_more_holds_up_nobody(tmp_path: Path, monk
 @pytest.mark.skipif(sys.platform == "win32", reason="a pipe that nobody reads stands in for a disk that hangs")
 def test_a_disk_that_hangs_holds_up_nobody_and_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("afspm.supervisor.log.SHOWN_WITHIN_S", 0.01)
-    monkeypatch.setattr("afspm.supervisor.log.DEADLINE_S", 0.05)
+    monkeypatch.setattr("afspm.supervisor.log.SLOW_S", 0.05)
     file, told = tmp_path / "log.txt", threading.Event()
     os.mkfifo(file)
     reader = os.open(file, os.O_RDONLY | os.O_NONBLOCK)
     log = RunLog(file, ExperimentClock.real(), terminal=io.StringIO())
-    log.listener = lambda name, level, text: told.set() if level == logging.CRITICAL else None
+    log.listener = lambda name, level, text: told.set() if level == logging.WARNING else None
 
     def write() -> None:
         while not told.wait(0.01):

@@ -69,3 +69,16 @@ def test_what_somebody_begins_after_something_was_broken_off_is_another_story() 
     assert sequence.observe(broken_off, False, 1.0) == [PublishStatus(broken_off)]
     assert sequence.observe(ScopeStatus(ScopeState.SPEC), False, 2.0) == [], "it has not stopped yet"
     assert sequence.observe(scanning, False, 3.0) == [DiscardResults(), PublishStatus(scanning)]
+
+
+def test_a_measurement_that_another_one_followed_is_a_story_of_its_own() -> None:
+    scanning, free = ScopeStatus(ScopeState.SCANNING), ScopeStatus(ScopeState.FREE)
+    for is_whole, end in (
+        (True, [PublishResults(), PublishStatus(free)]),
+        (False, [PublishStatus(ScopeStatus(ScopeState.INTERRUPTED)), DiscardResults(), PublishStatus(free)]),
+    ):
+        sequence = StatusSequence(scanning, result_timeout_s=10.0)
+        assert sequence.follow(is_whole=is_whole) == end
+        assert sequence.observe(scanning, False, 1.0) == [PublishStatus(scanning)]
+    at_rest = StatusSequence(free, result_timeout_s=10.0)
+    assert at_rest.follow(is_whole=True) == []

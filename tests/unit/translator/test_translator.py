@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import logging
 import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from afspm import wire
+from afspm.client.cycle import Cycle, CycleOutcome
 from afspm.errors import ConfigError, WireError
 from afspm.exit_codes import ExitCode
 from afspm.model import (
@@ -23,8 +27,10 @@ from afspm.model import (
     ResponseDetail,
     ScanParameters,
     ScopeState,
+    ScopeStatus,
     names,
 )
+from afspm.process.memory import Memory
 from afspm.process.parent import TIP_WITHIN_S
 from afspm.transport.port import ParentGone, RequestReceived, SubscriberJoined
 from afspm.wire.generated import feedback_pb2, scan_pb2
@@ -455,14 +461,14 @@ def test_a_turned_frame_whose_corner_is_out_of_reach_is_refused(bench: Any) -> N
 
 def test_the_reason_names_value_limit_and_where_it_was_set(bench: Any) -> None:
     reason = bench.ask(PARAM, Parameter("scan-speed", "200", "um/s")).reason
-    assert reason == "scan-speed: 200 um/s is outside 0.001 um/s to 100 um/s (set in parameters.toml)"
+    assert reason == "scan-speed: 200 µm/s is outside 0.001 µm/s to 100 µm/s (set in parameters.toml)"
 
 
 def test_what_the_controller_makes_something_else_of_is_refused_and_put_back(bench: Any) -> None:
     bench.microscope.stuck = {"Speed": 3.0}
     response = bench.ask(PARAM, Parameter("scan-speed", "5", "um/s"))
     assert response.code == PARAM_ERROR
-    assert "set 3 um/s instead of 5 um/s" in response.reason
+    assert "set 3 µm/s instead of 5 µm/s" in response.reason
     bench.microscope.stuck = {"Speed": 5.00005}  # its precision
     assert bench.ask(PARAM, Parameter("scan-speed", "5", "um/s")).code == OK
 
@@ -803,6 +809,21 @@ def test_a_repeated_id_is_answered_and_not_carried_out_again(bench: Any) -> None
     assert bench.microscope.set_calls == 1
 
 
+def test_forgotten_id_is_not_carried_out_again(bench: Any) -> None:
+    assert bench.ask(ACTION, names.RETRACT, "me/1/1").code == OK
+    assert bench.ask(ACTION, names.RETRACT, "me/key/tip/0").code == OK
+    for n in range(2, 332):
+        assert bench.ask(PARAM, Parameter("scan-speed", "2", "um/s"), f"me/1/{n}").code == OK
+    for _ in range(2):
+        response = bench.ask(ACTION, names.RETRACT, "me/1/1")
+        assert (response.code, response.detail) == (ControlResponse.NO_RESPONSE, ResponseDetail.OUTCOME_UNKNOWN)
+        assert "not above one that was forgotten" in response.reason
+        assert bench.ask(ACTION, names.RETRACT, "me/key/tip/0").code == OK
+        bench.start()
+    assert bench.microscope.done == ["retract", "retract"]
+    assert bench.ask(ACTION, names.RETRACT, "me/1/332").code == OK
+
+
 def test_a_request_that_was_refused_may_be_asked_again(bench: Any) -> None:
     bench.microscope.state = ScopeState.MOVING
     assert bench.ask(ACTION, names.START_SCAN, "me/1/1").code == NOT_FREE
@@ -855,6 +876,76 @@ def test_after_a_kill_the_last_results_are_published_again_at_the_same_times(ben
     after = [time_ns for name, _, time_ns in bench.port.packets if name == "Scan2d"]
     assert len(before) == 2
     assert after == before
+
+
+POINTS_TO_DIE_AT = 4
+"""One write and three packets; it is killed no more at the point after."""
+
+
+@pytest.mark.parametrize("at", range(POINTS_TO_DIE_AT + 1))
+def test_finished_scan_is_complete_and_once_wherever_the_translator_is_killed(
+    bench: Any, scan: Any, monkeypatch: pytest.MonkeyPatch, at: int
+) -> None:
+    """Killed after each write to the disk, and before each packet, from the end of a scan to its publication."""
+    cycle, published = Cycle(ScopeState.SCANNING, lambda result: True), dict[int, str]()
+    reached = itertools.count()
+
+    def take_in() -> None:
+        for name, thing, time_ns in bench.port.packets:
+            if isinstance(thing, ScopeStatus):
+                cycle.on_state(thing.state, time_ns)
+            elif name == "Scan2d" and time_ns not in published:
+                published[time_ns] = thing.channel
+                cycle.on_result(thing, time_ns)
+        bench.port.packets.clear()
+
+    def die_here(*_: Any, **__: Any) -> None:
+        if next(reached) == at:
+            raise Killed
+
+    bench.ask(ACTION, names.START_SCAN, "me/key/tile-1/1")
+    take_in()
+    bench.microscope.files["a"] = [scan("Height"), scan("Phase")]
+    bench.microscope.state = ScopeState.FREE
+    with monkeypatch.context() as patched:
+        save, publish = Memory.save, bench.port.publish
+        patched.setattr(Memory, "save", lambda self: (save(self), die_here())[0])
+        patched.setattr(bench.port, "publish", lambda *packet, **how: (die_here(), publish(*packet, **how))[1])
+        with contextlib.suppress(Killed):
+            bench.look()
+    take_in()
+    bench.clock.t_s += 5.0
+    bench.start()
+    bench.look()
+    take_in()
+    assert cycle.outcome is CycleOutcome.COMPLETED
+    assert sorted(published.values()) == ["Height", "Phase"]
+    assert (next(reached) > at) is (at < POINTS_TO_DIE_AT), "there are other points than those tried"
+
+
+@pytest.mark.parametrize("is_full", [True, False])
+def test_scan_without_a_file_is_logged_with_a_disk_that_is_full(
+    bench: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, is_full: bool
+) -> None:
+    monkeypatch.setattr("afspm.translator.observer.is_full", lambda folder: is_full)
+    bench.ask(ACTION, names.START_SCAN)
+    bench.microscope.state = ScopeState.FREE
+    bench.look()
+    bench.look(after_s=20)
+    assert "ended without a result" in caplog.text
+    assert ("is full" in caplog.text) is is_full
+
+
+def test_scan_of_nothing_but_nan_is_published_and_logged(
+    bench: Any, scan: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    bench.ask(ACTION, names.START_SCAN)
+    blank = replace(scan("Phase"), values=np.full((2, 3), np.nan))
+    bench.microscope.files["a"] = [scan("Height"), blank]
+    bench.microscope.state = ScopeState.FREE
+    bench.look()
+    assert bench.heard()[-3:] == ["Scan2d", "Scan2d", "FREE"]
+    assert "a has no value in Phase: NaN alone" in caplog.text
 
 
 def test_a_scan_that_did_not_survive_is_told_as_interrupted(bench: Any) -> None:

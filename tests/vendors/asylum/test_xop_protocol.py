@@ -262,6 +262,35 @@ def test_a_dialog_that_a_function_opened_blocks_everybody(client: Client) -> Non
     assert client.silent()
 
 
+def test_dialog_that_a_function_opened_is_closed_from_outside(client: Client, tmp_path: Path) -> None:
+    client.send(called("DoScanFunc", "Blah"))
+    assert client.silent()
+    client.send(called("TestFunction1Arg", 4, message_id="2"))
+    button = tmp_path / "delete-to-press-OK.txt"
+    assert "Something called DoScanFunc with an invalid CtrlName 'Blah'" in button.read_text(encoding="utf-8")
+    button.unlink()
+    assert client.receive()["result"]["value"] == 1, "as DoScanFunc gives after the dialog"
+    assert client.receive()["messageID"] == "2", "then Igor does what was asked meanwhile"
+    assert client.call("GV", "ScanStatus")["result"]["value"] == 0
+    client.send(called("DoScanFunc", "Blah"))
+    assert client.silent(), "the next dialog has a button of its own"
+    assert button.exists()
+
+
+def test_dialog_that_lasts_for_a_while_can_be_closed_before(tmp_path: Path) -> None:
+    faults = [Fault("dialog", 0.0, 1, 1e6), Fault("dialog", 0.0, 1, 0.3)]
+    with WithTestFunctions(port=0, faults=faults).running(tmp_path, ExperimentClock.starting_now()) as address:
+        client, button = Client(address), tmp_path / "delete-to-press-OK.txt"
+        client.send(called("TestFunction1Arg", 4))
+        assert client.silent()
+        button.unlink()
+        assert client.receive()["result"]["value"] == 4
+        assert client.call("TestFunction1Arg", 5)["result"]["value"] == 5, "after 0.3 s"
+        assert client.call("TestFunction1Arg", 6)["result"]["value"] == 6
+        assert not button.exists()
+        client.close()
+
+
 def test_a_name_is_cut_as_asylum_cuts_the_names_of_its_buttons(client: Client, igor: WithTestFunctions) -> None:
     assert client.call("DoScanFunc", "DownScanButton_3")["result"]["value"] == 0
     assert client.call("GV", "ScanStatus")["result"]["value"] == 1, "at once, though it begins later"

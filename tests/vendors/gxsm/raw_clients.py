@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import base64
+import hmac
 import json
 import mmap
 import os
 import pickle
+import secrets
 import select
 import signal
 import socket
@@ -19,17 +21,28 @@ import numpy as np
 
 
 class SocketClient:
-    """The secret, and then a line of JSON out, a line in."""
+    """Two proofs as the README describes them, and then a line of JSON out, a line in."""
 
     def __init__(self, address: str) -> None:
         host, _, port = address.rpartition(":")
         self._socket = socket.create_connection((host, int(port)), 10.0)
         self._lines = self._socket.makefile("rb")
-        self._socket.sendall(Path("~/.afspm/gxsm-bridge-secret").expanduser().read_bytes() + b"\n")
-        assert json.loads(self._lines.readline()) == {"value": "afspm bridge"}
+        secret = Path("~/.afspm/gxsm-bridge-secret").expanduser().read_bytes().strip()
+        mine = secrets.token_hex(32)
+        theirs, proof = self.call("challenge", mine)
+
+        def proves(side: str) -> str:
+            text = "\n".join(("afspm bridge 2", side, address, mine, theirs))
+            return hmac.new(secret, text.encode(), "sha256").hexdigest()
+
+        assert proof == proves("bridge")
+        assert self.call("response", proves("client")) == "afspm bridge 2"
 
     def call(self, method: str, *arguments: Any) -> Any:
-        self._socket.sendall(json.dumps([method, *arguments]).encode() + b"\n")
+        self.send(json.dumps([method, *arguments]).encode() + b"\n")
+        return self.reply()
+
+    def reply(self) -> Any:
         reply = json.loads(self._lines.readline())
         if "error" in reply:
             raise RuntimeError(reply["error"])
@@ -39,9 +52,12 @@ class SocketClient:
             return np.frombuffer(content, value["array"]).reshape(value["shape"])
         return value
 
+    def send(self, lines: bytes) -> None:
+        self._socket.sendall(lines)
+
     def sent_away(self, lines: bytes) -> bool:
         """Send these; whether the other end then closes without an answer."""
-        self._socket.sendall(lines)
+        self.send(lines)
         try:
             return not self._lines.readline()
         except ConnectionError:

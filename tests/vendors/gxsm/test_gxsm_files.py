@@ -50,7 +50,8 @@ def test_files_appear_after_the_end_one_by_one_the_last_first_and_in_parts(tmp_p
 def test_the_next_number_is_the_first_that_no_file_has(tmp_path: Path) -> None:
     saving = GxsmFileWriter(tmp_path, Faults([], FAULT_KINDS, START_S))
     (tmp_path / "scan001-Xp-a.nc").touch()
-    paths = [saving.free(ending) for ending in ("Xp-a.nc", "Xp-b.nc")]
+    number = saving.next_number()
+    paths = [saving.free(ending, number) for ending in ("Xp-a.nc", "Xp-b.nc")]
     assert [path.name for path in paths] == ["scan002-Xp-a.nc", "scan001-Xp-b.nc"]
     saving.counted(paths)
     assert saving.named("Xp-a.nc", saving.counter).name == "scan003-Xp-a.nc"
@@ -79,6 +80,27 @@ def written(folder: Path, version: int, label: str, real: Path) -> Path:
     path = folder / real.name
     path.write_bytes(files.netcdf3(saved) if version == 3 else files.netcdf4(saved))
     return path
+
+
+@pytest.mark.parametrize(
+    ("label", "name", "channel"),
+    [
+        ("I", "Xp-ADC0mITunnel", "ADC0-ITunnel"),
+        ("I", "Xm-ADC0mITunnel", "ADC0-ITunnel Backward"),
+        ("Z", "M-Xp-Topo", "Topo"),
+        ("Hz", "Xp-dFreq", "dFreq"),
+        ("U", "Xp-AmplPLL", "AmplPLL"),
+    ],
+)
+def test_the_dash_in_the_name_of_a_channel_is_restored(tmp_path: Path, label: str, name: str, channel: str) -> None:
+    """Gxsm3 has the name in that of the file only, with an "m" for each dash."""
+    path = tmp_path / f"scan001-{name}.nc"
+    image, frame = np.ones((3, 4), np.float32), (0.0, 0.0, 100.0, 100.0, 0.0)
+    saved = files.GxsmScanFile(
+        str(path), label, image, 1.0, ("nA", "nA"), frame, START_S, START_S + 9, "SPM-SIM:SPM", 1.0
+    )
+    path.write_bytes(files.netcdf3(saved))
+    assert [scan.channel for scan in read(path).scans] == [channel]
 
 
 @needs_data

@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,8 @@ from hypothesis import strategies as st
 from vendor_bench import answering
 
 from afspm.errors import ConfigError
-from afspm.microscopes.gxsm import pickles
+from afspm.microscopes.gxsm import bridge, pickles
+from afspm.microscopes.gxsm.activity import LineWatch
 from afspm.microscopes.gxsm.bridge_client import BridgeLink
 from afspm.microscopes.gxsm.errors import BadReply, GxsmError
 from afspm.microscopes.gxsm.hardware import Doing, Hardware, decoded, recognised
@@ -142,15 +144,33 @@ def test_damaged_pickles_are_a_value_or_refused(content: bytes, at: int, damage:
 
 @contextmanager
 def talking(*replies: bytes, silent: bool = False) -> Iterator[BridgeLink]:
-    """A link to somebody who answers each call with the next of these bytes, and then hangs up (or not)."""
+    """A link to a bridge that answers each call with the next of these bytes, and then hangs up (or not)."""
     secret = Path("~/secret").expanduser()
-    secret.touch(0o600)
-    with answering(b'{"value": "afspm bridge"}\n', *replies, silent=silent) as address:
-        link = BridgeLink(address, 0.3 if silent else 10.0, time.monotonic, secret)
+    secret.write_text("s" * 64)
+    secret.chmod(0o600)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        answers = Thread(target=_answer, args=(listener, secret.read_bytes(), replies, silent))
+        answers.start()
+        link = BridgeLink(listener.getsockname(), 0.3 if silent else 10.0, time.monotonic, secret)
         try:
             yield link
         finally:
             link.close()
+            answers.join()
+
+
+def _answer(listener: socket.socket, known: bytes, replies: tuple[bytes, ...], silent: bool) -> None:
+    client, _ = listener.accept()
+    with client, client.makefile("rb") as lines, suppress(OSError):
+        introduction = bridge.Introduction(known, "{}:{}".format(*client.getsockname()))
+        for _ in range(2):
+            client.sendall(introduction.reply(bridge.parsed(lines.readline())).encode() + b"\n")
+        for reply in replies:
+            lines.readline()
+            client.sendall(reply)
+        client.settimeout(10.0)
+        while silent and client.recv(1000):
+            pass
 
 
 def test_an_error_in_gxsm_leaves_the_connection_as_it_is() -> None:
@@ -184,19 +204,26 @@ def test_what_is_no_answer_ends_the_link(reply: bytes) -> None:
             link.call("y_current")
 
 
-def test_who_is_not_the_bridge_of_this_version_is_not_called(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("reply", "reason"),
+    [
+        (b"", "the connection was closed"),
+        (b'{"error": "JSONDecodeError: x"}\n', "JSONDecodeError: x"),
+        (b'{"value": "afspm bridge"}\n', "the bridge is of another version"),
+        (b'{"value": ["0", "\\ud800"]}\n', "does not know the bridge's secret"),
+    ],
+)
+def test_a_program_in_place_of_the_bridge_is_refused(tmp_path: Path, reply: bytes, reason: str) -> None:
     secret = tmp_path / "secret"
-    with pytest.raises(ControllerLost, match="the bridge's secret can't be read"), answering() as address:
-        BridgeLink(address, 10.0, time.monotonic, secret).call("get", "RangeX")
     secret.write_text("x" * 64)
     secret.chmod(0o600)
-    with (
-        pytest.raises(ControllerLost, match="the bridge is of another version"),
-        answering(b'{"error": "JSONDecodeError: x"}\n') as address,
-    ):
+    with pytest.raises(ControllerLost, match=reason), answering(reply) as address:
         BridgeLink(address, 10.0, time.monotonic, secret).call("get", "RangeX")
-    with pytest.raises(ControllerLost, match="the bridge refused the connection"), answering(b"") as address:
-        BridgeLink(address, 10.0, time.monotonic, secret).call("get", "RangeX")
+
+
+def test_a_missing_secret_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ControllerLost, match="the bridge's secret can't be read"), answering() as address:
+        BridgeLink(address, 10.0, time.monotonic, tmp_path / "secret").call("get", "RangeX")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="permissions as Unix has them")
@@ -383,3 +410,23 @@ def test_bits_are_read_as_the_hardware_means_them() -> None:
 def test_memory_that_nobody_has_written_is_no_set_of_bits(slots: list[float]) -> None:
     with pytest.raises(BadReply):
         decoded(Hardware.SRANGER, slots)
+
+
+# --- lines ---
+
+
+@pytest.mark.parametrize(
+    ("lines", "turns"),
+    [
+        ([119, -296, 0, 1, 5, 30, 59], 0),
+        ([119, 0, 1, 30, 59, 59, 0], 1),
+        ([30, 31, 40, 3, 7, 50, 2], 2),
+        ([0, 59, 58, 30, 1, 0], 0),
+        ([0, 59, 58, 30, 57, 40], 1),
+        ([12] * 5, 0),
+    ],
+    ids=["down", "down-again", "found-running", "up", "up-again", "still"],
+)
+def test_lines_against_their_direction_belong_to_another_scan(lines: list[int], turns: int) -> None:
+    watch = LineWatch(lines[0])
+    assert sum(watch.turned(line, 60) for line in lines[1:]) == turns

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -522,6 +524,89 @@ def test_a_scan_started_at_the_panel_is_published(bench: Make) -> None:
     heard = peer.until(FREE)
     assert states(heard) == ["SCANNING", "FREE"]
     assert {scan.region for scan in scans(heard)} == {TURNED}
+
+
+@pytest.mark.parametrize("saving", ["afspm", "gxsm"])
+@pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
+def test_scans_repeated_at_the_panel_are_published_one_by_one_and_a_stopped_one_is_not(
+    bench: Make, kind: dict[str, Any], saving: str
+) -> None:
+    """GXSM never stops scanning: the next one runs already."""
+    made = bench(speed=10.0, **kind)
+    peer = made.start(saving=saving)
+    ready(peer, shape=(24, 32))
+
+    def begin(emulator: Any) -> None:
+        emulator.program.repeats = True
+        emulator.program.start_scan()
+
+    made.at_panel(begin)
+    found: list[str] = []
+    for number in (1, 2, 3):
+        heard = peer.until(FREE)
+        assert states(heard) == ["SCANNING", "FREE"]
+        assert {Path(scan.filename).name[4:7] for scan in scans(heard)} == {f"00{number}"}
+        found += [scan.channel for scan in scans(heard)]
+    assert len(found) == 3 * len(set(found)), "each channel of each scan, once"
+    peer.until(ScopeState.SCANNING)
+    until_line(made, 8)
+    made.strike("panel-stop")
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"]
+    assert not scans(heard)
+
+
+def until_line(made: Bench, line: int) -> None:
+    """Until so many lines of the running scan are complete."""
+    last, pace = made.emulator.program.last, Event()
+    assert last is not None
+    while last.lines_done(made.clock.now_s()) < line:
+        pace.wait(0.005)
+
+
+def test_a_scan_that_a_person_begins_again_at_once_is_published_as_two(bench: Make) -> None:
+    """Stopped, and begun again before the translator has looked: the first is broken off, the second is whole."""
+    made = bench(speed=10.0)
+    peer = made.start()
+    ready(peer, shape=(24, 32))
+    scanned(peer)
+    made.at_panel(lambda emulator: emulator.program.start_scan())
+    peer.until(ScopeState.SCANNING)
+    until_line(made, 8)
+
+    def again(emulator: Any) -> None:
+        program = emulator.program
+        program.stop_scan()
+        program.advance(made.clock.now_s())
+        program.saving.advance(made.clock.now_s() + 1.0)
+        program.saving.done_s = 0.0
+        program.start_scan()
+        program.shows_s = 0.0
+
+    made.at_panel(again)
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"]
+    assert not scans(heard)
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "FREE"]
+    assert len(scans(heard)) == 4
+    made.until_said("its last row still holds the previous scan", "whether this one came to its end is unknown")
+
+
+def test_autosave_is_off_only_while_a_scan_of_the_translator_runs(bench: Make) -> None:
+    made = bench(speed=10.0, auto_save=False)
+    peer = made.start()
+    ready(peer, shape=(24, 32))
+    assert made.emulator.program.auto_save, "GXSM saves what is begun at its panel"
+    assert peer.act(names.START_SCAN).ok
+    assert not made.emulator.program.auto_save, "one that is stopped is not to be saved"
+    assert peer.act(names.STOP_SCAN).ok
+    peer.until(FREE)
+    assert made.emulator.program.auto_save
+    assert not list(made.data.glob("*.nc"))
+    scanned(peer)
+    assert made.emulator.program.auto_save
+    assert len(list(made.data.glob("*.nc"))) == 4, "saved once"
 
 
 def test_a_scan_ends_though_repeat_is_on_at_the_panel(bench: Make) -> None:

@@ -234,12 +234,70 @@ def test_the_end_of_each_line_is_waited_for(tmp_path: Path) -> None:
     with NanonisEmulator(port=0).running(tmp_path, ExperimentClock.starting_now(speed=20.0)) as address:
         buffer = struct.pack(">iiii", 1, 14, 16, 16)
         assert _asked(address, "Scan.BufferSet", buffer).endswith(bytes(8))
-        assert struct.unpack(">4I", _asked(address, "Scan.WaitEndOfLine", struct.pack(">i", 50))[:16])[0] == 1
+        timed_out = _asked(address, "Scan.WaitEndOfLine", struct.pack(">i", 50))
+        assert (len(timed_out), struct.unpack(">IiHi", timed_out[:-8])[0]) == (22, 1)
         _asked(address, "Scan.Action", struct.pack(">HI", 0, 1))
-        told = [struct.unpack(">4I", _asked(address, "Scan.WaitEndOfLine", b"\xff" * 4)[:16]) for _ in range(6)]
+        told = [struct.unpack(">IiHi", _asked(address, "Scan.WaitEndOfLine", b"\xff" * 4)[:-8]) for _ in range(6)]
     assert all(timed_out == 0 and 1 <= line <= 16 for timed_out, line, _, _ in told)
     passes = [2 * line + backward for _, line, backward, _ in told]
     assert passes == sorted(set(passes))
+
+
+def test_functions_that_the_makers_client_lacks_are_as_documented(tmp_path: Path) -> None:
+    """By the document of April 2025 (release 14718)."""
+    nan = float("nan")
+    with NanonisEmulator(port=0).running(tmp_path) as address:
+        for name, set_, got in (
+            ("BiasSpectr.SafeCond1", struct.pack(">HfiH", 3, 2e-9, 0, 1), struct.pack(">HfiH", 2, 2e-9, 0, 1)),
+            ("BiasSpectr.SafeCond1", struct.pack(">HfiH", 0, nan, -1, 2), struct.pack(">HfiH", 2, 2e-9, 0, 1)),
+            ("BiasSpectr.SafeCond2", struct.pack(">ifiH", 3, 1e-9, 18, 0), struct.pack(">ifiH", 3, 1e-9, 18, 0)),
+            ("BiasSpectr.SafeCond2", struct.pack(">ifiH", -1, nan, -1, 2), struct.pack(">ifiH", 3, 1e-9, 18, 0)),
+        ):
+            assert _asked(address, f"{name}Set", set_) == bytes(8)
+            assert _asked(address, f"{name}Get") == got + bytes(8)
+        _asked(address, "PLL.PhasCtrlGainSet", struct.pack(">iff", 1, 3.0, 0.5))
+        assert _asked(address, "PLL.PhasCtrlGainGet", struct.pack(">i", 1)) == struct.pack(
+            ">3f", 3.0, 0.5, 6.0
+        ) + bytes(8)
+        for name, sent in (
+            ("PLLQCtrl.AccessRequest", ">I"), ("PLLQCtrl.AccessGet", ""), ("PLLQCtrl.OnOffSet", ">I"),
+            ("PLLQCtrl.OnOffGet", ""), ("PLLQCtrl.QGainSet", ">f"), ("PLLQCtrl.QGainGet", ""),
+            ("PLLQCtrl.PhaseSet", ">if"), ("PLLQCtrl.PhaseGet", ""), ("DigLines.TTLValGet", ">I"),
+            ("DigLines.Pulse", ">IiBffiI"),
+        ):  # fmt: skip
+            arguments = (
+                struct.pack(">IiBffiI", 4, 1, 1, 0.1, 0.1, 1, 0) if "B" in sent else bytes(struct.calcsize(sent))
+            )
+            assert b"Module not available" in _asked(address, name, arguments), "modules that this instrument lacks"
+        assert b"not part of this emulator" in _asked(address, "PLL.PerfectPLLApply", struct.pack(">i", 1))
+
+
+def test_a_spectrum_that_was_saved_is_loaded_again(tmp_path: Path) -> None:
+    session = tmp_path / "session"
+    secret = tmp_path / "secret.dat"
+    secret.write_text("[DATA]\nx\n1\n")
+    with NanonisEmulator(port=0).running(session, ExperimentClock.starting_now(speed=20.0)) as address:
+
+        def loaded(path: Path, header_only: int) -> bytes:
+            text = str(path).encode()
+            return _asked(address, "File.datLoad", struct.pack(">i", len(text)) + text + struct.pack(">I", header_only))
+
+        _asked(address, "BiasSpectr.Open")
+        measured = _asked(address, "BiasSpectr.Start", struct.pack(">Ii", 1, 5) + b"curve")
+        whole, header = (loaded(session / "curve00001.dat", only) for only in (0, 1))
+        assert b"can't be loaded" in loaded(secret, 0)
+        assert b"can't be loaded" in loaded(session / "nothing.dat", 0)
+    assert _texts(whole) == _texts(measured)
+    at = 4 + struct.unpack_from(">i", whole)[0] + 4
+    rows, columns = struct.unpack_from(">ii", whole, at)
+    assert (rows, columns) == struct.unpack_from(">ii", measured, at)
+    there, back = (np.frombuffer(reply, ">f4", rows * columns, at + 8) for reply in (measured, whole))
+    np.testing.assert_allclose(back, there, rtol=1e-4, atol=1e-18)
+    lines, width = struct.unpack_from(">ii", whole, at + 8 + 4 * rows * columns)
+    assert (lines > 5, width) == (True, 2)
+    assert header == bytes(16) + whole[at + 8 + 4 * rows * columns :]
+    assert b"Experiment" in header
+    assert b"bias spectroscopy" in header
 
 
 def test_a_session_goes_on_in_a_folder_within_its_own(tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ def client(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Any]:
 
 @contextmanager
 def connected(folder: Path, speed: float, **settings: Any) -> Iterator[Any]:
-    emulator = NanonisEmulator(port=0, surface="lattice", **settings)
+    emulator = NanonisEmulator(port=0, **{"surface": "lattice", **settings})
     with emulator.running(folder, ExperimentClock.starting_now(speed=speed)) as address:
         host, port = address.split(":")
         with socket.create_connection((host, int(port)), timeout=20.0) as connection:
@@ -111,8 +111,10 @@ MISREAD = {
     "Marks_PointsGet": "texts counted by their bytes",
     "PLLSignalAnlzr_OsciDataGet": "a number for a length",
     "CPDComp_DataGet": "one length for two kinds of lists",
+    "PLL_PhasCtrlGainGet": "two of three numbers",
+    "DigLines_TTLValGet": "sends 16 bits of a port of 32",
 }
-"""What the client can't read, and how it reads it."""
+"""What the client can't read, and how it reads it; or sends otherwise than documented."""
 
 FUNCTIONS = [name for name, made in vars(Client).items() if isfunction(made) and "quickSend" in made.__code__.co_names]
 NOISE_M = 0.5e-9
@@ -320,13 +322,25 @@ def test_it_withdraws_pulses_shapes_and_walks(client: Any) -> None:
 
 
 def test_it_is_told_in_words_what_can_not_be(client: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    for function, arguments in (("Bias_Set", (99.0,)), ("Scan_FrameDataGrab", (99, 1)), ("Laser_PowerGet", ())):
+    for function, arguments in (
+        ("Bias_Set", (99.0,)),
+        ("Scan_FrameDataGrab", (99, 1)),
+        ("Scan_FrameSet", (0.0, 0.0, 1e-17, 1e-17, 0.0)),
+        ("Laser_PowerGet", ()),
+    ):
         error, *_ = getattr(client, function)(*arguments)
         assert error
     assert "The following error appeared" in capsys.readouterr().out
 
 
 # --- what lives ---
+
+
+def measured(client: Any) -> tuple[float, float, float]:
+    """Mean and standard deviation of the current, and the mean frequency shift."""
+    current, noise_a = mean_and_noise(client, "Current_Get")
+    names = ask(client, "Signals_NamesGet")[-1]
+    return current, noise_a, mean_and_noise(client, "Signals_ValGet", names.index("OC M1 Freq. Shift (Hz)"), 1)[0]
 
 
 def mean_and_noise(client: Any, getter: str, *arguments: Any, count: int = 30) -> tuple[float, float]:
@@ -366,6 +380,37 @@ def test_the_current_falls_when_the_tip_is_lifted_with_the_controller_off(client
     assert mean_and_noise(client, "Current_Get")[0] < before / 5
 
 
+@pytest.mark.parametrize("bias_v", [0.1, 0.25, 1.0, -1.0])
+def test_the_current_is_the_setpoint_at_any_bias(tmp_path: Path, bias_v: float) -> None:
+    """Of the emulator as it is by default."""
+    with connected(tmp_path, 100.0, surface="steps") as client:
+        ask(client, "Bias_Set", bias_v)
+        for setpoint_a in (ask(client, "ZCtrl_SetpntGet")[0], 50e-12, 1e-9):
+            ask(client, "ZCtrl_SetpntSet", setpoint_a)
+            current_a, _, _ = measured(client)
+            assert current_a == pytest.approx(math.copysign(setpoint_a, bias_v), abs=1e-12)
+            assert 10e-12 < setpoint_a < 10e-9
+
+
+def test_frequency_shift_current_and_z_tell_the_state_of_the_tip(tmp_path: Path) -> None:
+    """A check of the tip must find the difference, and a withdrawn tip must not pass it."""
+    found = {}
+    for condition in ("sharp", "blunt", "double", "contaminated"):
+        with connected(tmp_path / condition, 100.0, surface="steps", tip={"condition": condition}) as client:
+            found[condition] = *measured(client), mean_and_noise(client, "ZCtrl_ZPosGet")[0]
+            ask(client, "ZCtrl_Withdraw", 1, -1)
+            away = measured(client)
+            assert abs(away[0]) < 1e-13
+            assert abs(away[2]) < 0.1
+    sharp_hz, sharp_m = found["sharp"][2:]
+    assert -10.0 < sharp_hz < -1.0
+    assert found["blunt"][2] < 3.0 * sharp_hz
+    assert found["double"][2] < 1.2 * sharp_hz
+    assert found["contaminated"][2] < 1.5 * sharp_hz
+    assert found["contaminated"][1] > 10.0 * found["sharp"][1], "the current flickers"
+    assert all(abs(found[worse][3] - sharp_m) > 3e-11 for worse in ("blunt", "double"))
+
+
 # --- what is set and what it does ---
 
 
@@ -384,6 +429,7 @@ def test_the_current_falls_when_the_tip_is_lifted_with_the_controller_off(client
         ("LockIn_DemodLPFilterSet", "LockIn_DemodLPFilterGet", [1], [4, 100.0], [4, 100.0]),
         ("PLL_CenterFreqSet", "PLL_CenterFreqGet", [1], [31234.5], [31234.5]),
         ("PLL_AmpCtrlSetpntSet", "PLL_AmpCtrlSetpntGet", [1], [5e-11], [5e-11]),
+        ("PLL_AmpCtrlGainSet", "PLL_AmpCtrlGainGet", [1], [2.0, 0.5], [2.0, 0.5, 4.0]),
         ("UserOut_ModeSet", "UserOut_ModeGet", [3], [2], [2]),
         ("Motor_FreqAmpSet", "Motor_FreqAmpGet", [], [900.0, 120.0, 0], [900.0, 120.0]),
         ("Bias_RangeSet", "Bias_RangeGet", [], [1], [15, 2, ["10 V", "1 V"], 1]),

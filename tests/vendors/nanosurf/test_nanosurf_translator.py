@@ -11,7 +11,7 @@ import pytest
 from nanosurf_bench import Bench
 from vendor_bench import FLAT, TURNED, moved, ready, scanned, scans, small, states
 
-from afspm.emulators.program import MakerProgram
+from afspm.emulators.nanosurf.studio import StudioProgram
 from afspm.exit_codes import ExitCode
 from afspm.model import Region, Scan, ScanLines, ScopeState, Spectrum, names
 
@@ -111,6 +111,21 @@ def test_a_force_curve_is_taken_where_the_tip_was_sent(bench: Make) -> None:
     assert len(curve["Deflection"]) == 2 * len(taken.values)
 
 
+def test_a_force_curve_is_a_single_one_at_the_tip_with_any_grid_on_the_panel(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    for name, value in (("columns", 4), ("rows", 3), ("center_offset_x", 10e-6), ("width", 5e-6)):
+        made.at_panel(lambda emulator, name=name, value=value: emulator.program.put(f"spectroscopy.grid_{name}", value))
+    moved(peer, 120e-9, -40e-9)
+    assert peer.act(names.START_SPEC).ok
+    curves = [one for one in peer.until(FREE) if isinstance(one, Spectrum)]
+    assert [curve.position_m for curve in curves] == [(120e-9, -40e-9)]
+    taken = made.emulator.rig.spectrum
+    assert taken is not None
+    assert taken.position_m == pytest.approx((120e-9, -40e-9))
+
+
 def test_a_force_curve_can_be_stopped(bench: Make) -> None:
     made = bench(speed=1.0, force={"duration_s": 20.0})
     peer = small(made)
@@ -126,15 +141,15 @@ def test_a_stop_that_overtakes_the_start_of_its_curve_is_told_again(
     bench: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They go by two connections."""
-    stops: list[MakerProgram] = []
-    stop_curve = MakerProgram.stop_curve
+    stops: list[StudioProgram] = []
+    stop_curve = StudioProgram.stop_curve
 
-    def stop(program: MakerProgram) -> None:
+    def stop(program: StudioProgram) -> None:
         stops.append(program)
         if len(stops) > 1:
             stop_curve(program)
 
-    monkeypatch.setattr(MakerProgram, "stop_curve", stop)
+    monkeypatch.setattr(StudioProgram, "stop_curve", stop)
     made = bench(speed=1.0, force={"duration_s": 20.0})
     peer = small(made)
     assert peer.act(names.START_SPEC).ok

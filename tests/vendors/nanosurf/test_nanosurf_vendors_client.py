@@ -17,15 +17,24 @@ import pytest
 from nanosurf_bench import Emulated
 
 import afspm
+from afspm.clock import ExperimentClock
 
-Run = Callable[[str, str], dict[str, object]]
+Run = Callable[..., dict[str, object]]
 CLIENT = importlib.util.find_spec("nanosurf")
+SCRIPTS = Path(CLIENT.origin if CLIENT and CLIENT.origin else "/").parent / "apps" / "studio_scripting"
 BEGINS = """
 import json, sys
 from nanosurf.studio import Studio, StudioScriptError
 host, port = sys.argv[1].split(":")
 studio = Studio(host, int(port))
 """
+ELSEWHERE = """
+import json, runpy, socket, sys
+host, port = sys.argv[1].split(":")
+connect = socket.socket.connect
+socket.socket.connect = lambda made, _: connect(made, (host, int(port)))
+"""
+"""For programs that connect to Studio's usual port."""
 DEADLINE_S = 60.0
 
 
@@ -35,11 +44,12 @@ def client(tmp_path: Path) -> Run:
     if CLIENT is None or CLIENT.origin is None:
         pytest.skip("nanosurf-core is not installed")
     site = tmp_path / "site"
-    shutil.copytree(Path(CLIENT.origin).parent, site / "nanosurf")
+    large = shutil.ignore_patterns("example_data")
+    shutil.copytree(Path(CLIENT.origin).parent, site / "nanosurf", ignore=large)
 
-    def run(address: str, script: str) -> dict[str, object]:
+    def run(address: str, script: str, begins: str = BEGINS) -> dict[str, object]:
         done = subprocess.run(
-            [sys.executable, "-c", BEGINS + script, address],
+            [sys.executable, "-c", begins + script, address],
             capture_output=True,
             encoding="utf-8",
             timeout=DEADLINE_S,
@@ -102,6 +112,112 @@ print(json.dumps({
     assert (scan.shape, scan.region.size_m, scan.upwards) == ((12, 24), (2e-7, 1e-7), False)
     content = afspm.read(tmp_path / "gallery" / "demo_00001.nhf")
     np.testing.assert_allclose(content.scans[0].values, scan.channels()["Height"][1], atol=1e-15)
+
+
+def test_the_makers_demo_runs_to_its_end(tmp_path: Path, client: Run) -> None:
+    made = emulated()
+    with made.running(tmp_path / "gallery", ExperimentClock.starting_now(speed=1000.0)) as address:
+        told = client(
+            address,
+            f"""
+from contextlib import redirect_stdout
+from io import StringIO
+said = StringIO()
+with redirect_stdout(said):
+    runpy.run_path({str(SCRIPTS / "studio_scripting.py")!r}, run_name="__main__")
+print(json.dumps({{"said": said.getvalue()}}))
+""",
+            ELSEWHERE,
+        )
+        wait_for_files(tmp_path / "gallery", 1)
+    assert str(told["said"]).endswith("Session complete.\n"), told
+    assert "Studio error" not in str(told["said"])
+    (file,) = (tmp_path / "gallery").glob("demo_20??-??-??_00001.nhf")
+    assert afspm.read(file).scans[0].values.shape == (256, 256)
+
+
+def test_every_cell_of_the_makers_notebook_runs(tmp_path: Path, client: Run) -> None:
+    made = emulated()
+    with made.running(tmp_path / "gallery", ExperimentClock.starting_now(speed=1000.0)) as address:
+        told = client(
+            address,
+            f"""
+from pathlib import Path
+cells = json.loads(Path({str(SCRIPTS / "Studio_Scripting_Level_1.ipynb")!r}).read_text(encoding="utf-8"))["cells"]
+code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+names, failed = {{}}, []
+for number, source in enumerate(code, 1):
+    try:
+        exec(source, names)
+    except Exception as error:
+        failed.append(f"cell {{number}}: {{type(error).__name__}} {{error}}")
+studio = names["session"].workflow
+print(json.dumps({{
+    "failed": failed, "cells": len(code), "mode": studio.mode.name, "gain": studio.z_control.i_gain,
+    "setpoint": studio.z_control.setpoint, "queue": studio.automation.queue_size(),
+    "items": [studio.workspace.get_item_name(one) for one in studio.workspace.all_item_ids()],
+    "spring": studio.probe.current_spring_constant,
+}}))
+""",
+            ELSEWHERE,
+        )
+        content = [afspm.read(path) for path in sorted((tmp_path / "gallery").glob("*.nhf"))]
+    assert (told["failed"], told["cells"]) == ([], 62)
+    assert told["mode"] == "wavemode_nma"
+    assert told["queue"] == 0
+    assert told["setpoint"] == pytest.approx(0.3)
+    assert told["spring"] == pytest.approx(made.rig.world.settings.force.spring_n_per_m)
+    names = [
+        "Hello World",
+        "New Grid",
+        "My spec point",
+        *(f"{kind} {n}" for kind in ("Frame", "Point") for n in (1, 2, 3)),
+    ]
+    assert told["items"] == names
+    frames = [one.scans[0].region.center_m for one in content if one.scans]
+    points = [len(one.spectra) for one in content if one.spectra]
+    assert points == [256, 1, 1]
+    queued = [(-20e-6, 0.0), (0.0, 0.0), (20e-6, 0.0), *[(-20e-6, 0.0)] * 3]
+    np.testing.assert_allclose(frames[-6:], queued, atol=1e-12)
+
+
+def test_values_have_limits_and_the_setpoint_has_units(tmp_path: Path, client: Run) -> None:
+    with emulated().running(tmp_path / "gallery") as address:
+        told = client(
+            address,
+            """
+session = studio.select_measurement_session()
+control, calibration = session.workflow.z_control, session.workflow.probe.cantilever_calibration
+found = {"V": [control.setpoint, control.setpoint_min, control.setpoint_max], "units": control.setpoint_units}
+control.setpoint_unit = "m"
+found["m"] = [control.setpoint, control.setpoint_min, control.setpoint_max]
+control.setpoint = 30e-9
+control.setpoint_unit = "V"
+found["after"] = control.setpoint
+said = []
+for call in (
+    lambda: setattr(control, "setpoint_unit", "N"), calibration.apply,
+    lambda: session.workflow.spectroscopy.select_cycle_by_id("none"),
+    lambda: session.workflow.spectroscopy.select_cycle(7),
+    lambda: session.workflow.workspace.set_item_size("none", 1, 1),
+    lambda: session.workflow.workspace.load_from_file("../../outside.txt"),
+    lambda: session.workflow.workspace.load_from_file("C:\\temp\\none.xml"),
+    lambda: session.workflow.automation.add_to_queue("none"),
+    lambda: session.workflow.workspace.add_point("x" * 1000, 0, 0),
+):
+    try:
+        call()
+    except StudioScriptError as error:
+        said.append(str(error))
+print(json.dumps({**found, "said": said}))
+""",
+        )
+    sensitivity = 60e-9 * 1.2  # that of the maker of the cantilever, before it is calibrated
+    assert told["V"] == [0.7, -10.0, 10.0]
+    assert told["m"] == pytest.approx([0.7 * sensitivity, -10.0 * sensitivity, 10.0 * sensitivity])
+    assert told["after"] == pytest.approx(30e-9 / sensitivity)
+    assert told["units"] == ["V", "m"]
+    assert len(told["said"]) == 9  # type: ignore[arg-type]
 
 
 def test_an_error_of_a_script_is_an_error_of_the_client(tmp_path: Path, client: Run) -> None:

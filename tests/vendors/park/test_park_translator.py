@@ -111,6 +111,7 @@ def test_withdrawing_ends_a_scan_and_lifts_the_stage(bench: Make) -> None:
     peer.until(FREE)
     assert not made.emulator.rig.engaged
     assert made.emulator.program.stage_um[2] == pytest.approx(250.0)  # type: ignore[attr-defined]
+    assert not made.emulator.rig.world.sample.marks, "it went up"
 
 
 @pytest.mark.parametrize("scanning", [True, False])
@@ -291,3 +292,19 @@ def test_a_curve_without_a_file_is_told_to_be_missing(bench: Make, kind: str) ->
     made.strike("late-file", duration_s=100.0)
     assert peer.act(names.START_SPEC).ok
     assert [one.kind for one in peer.until(FREE) if isinstance(one, Spectrum)] == ["force"]
+
+
+@pytest.mark.parametrize("replies", ["at-end", "at-once"])
+def test_command_that_takes_long_keeps_the_microscope_busy_and_connected(bench: Make, replies: str) -> None:
+    made = bench(speed=1.0, replies=replies)  # a sweep takes 3 s, and a reply may take one
+    peer = small(made, actions={"x-sweep": {"command": "spm.ncm.sweepAutoFullRange()"}}, reply_timeout_s=1.0)
+    assert peer.act("x-sweep").ok
+    assert states(peer.until(FREE)) == ["COARSE_MOTOR", "FREE"]
+    assert not made.emulator.rig.busy(made.clock.now_s())
+
+
+def test_command_that_smartscan_does_not_know_is_refused_in_its_words(bench: Make) -> None:
+    peer = small(bench(), actions={"x-mode": {"command": "spm.head.setMode('ncm')"}})
+    response = peer.act("x-mode")
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "SmartScan: TypeError: " in response.reason

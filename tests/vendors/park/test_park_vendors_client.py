@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 from park_bench import Emulated
 
+from afspm.clock import ExperimentClock
+
 Run = Callable[[str, str], dict[str, object]]
 BEGINS = """
 import json, sys
@@ -113,3 +115,69 @@ def test_what_is_computed_needs_no_instrument(tmp_path: Path, client: Run) -> No
     with Emulated(seed=2, values="native").running(tmp_path / "data") as address:
         told = client(address, """print(json.dumps({"sum": remote.run("[1, 2, 3].map(x => x * x)")["value"]}))""")
     assert told == {"sum": [1, 4, 9]}
+
+
+TAKEN = (
+    "chs = spm.scan.channels.names()\nfor (var i = 0; i < chs.length; i++) {\nspm.scan.channels.remove(chs[i]) }",
+    "spm.scan.channels.add({'name': 'ChannelZHeight', 'unit': 'um'})",
+    "spm.scan.channels.add('ncmamplitude')",
+    "spm.scan.channels.remove('ncmamplitude')",
+    "spm.addChannel('current')",
+    "spm.scan.options = {'twoWay': true, 'sineScan': false, 'overScan': {'enable': true, 'percent': 5}}",
+    "spm.scan.rate = 60",
+    "spm.zservo.enable = true\nspm.zservo.setpoint.normalized = true",
+    "spm.zservo.gain = {'z+': 1, 'z-': 1, 'p': 0.5, 'i': 0.5}\nspm.zservo.setpoint.normValue = 1",
+    "spm.zservo.nomalized = false",
+    "spm.zservo.setpoint.value",
+    "spm.approach.start('q+s')",
+    "spm.approach.state",
+    "spm.approach.stop()",
+    "spm.scan.triggerLineScan()",
+    "spm.scan.stop()",
+    "spm.zscanner.moveTo(spm.zscanner.fullyRetractedPos)",
+    "spm.zscanner.moveTo(5.0, 0.5)",
+    "spm.zscanner.pos",
+    "spm.zstage.move(10, 0.8)",
+    "spm.zstage.moveTo(spm.zstage.pos - 2, 0.5)",
+    "spm.zstage.reset()",
+    "spm.xystage.moveTo(20, -5, 1, 1)",
+    "spm.xystage.reset()",
+    "spm.focusstage.moveTo(12, 1)",
+    "spm.focusstage.pos",
+    "spm.focusstage.reset()",
+    "spm.ncm.sweepAuto(25, 10, 1000, 9)",
+    "spm.ncm.sweepAutoFullRange()",
+    "spm.readChannel('current').value",
+    "spm.readChannel('ncmamplitude').unit",
+    "spm.readChannel('ncmamplitude').rawValue",
+    "spm.readChannelAveraged('ncmamplitude', 10, 5)",
+    "spm.sleep(100)",
+    "spm.zscanner.retractAll()",
+)
+"""Lines of users' scripts and wrappers that measure, move, or set what a measurement needs."""
+
+REFUSED = (
+    "spm.head.setMode('ncm')",
+    "spm.xyservo.mode = 'on'",
+    "spm.approach.setOption({'targetPos': 0, 'quickSpeed': 100})",
+    "spm.zscanner.changeRangeTo(70)",
+    "spm.xyscanner.changeRangeTo(100)",
+    "spm.fx.analyzer.autoAlign()",
+    "app.save(['a'], 'C:/a.csv')",
+)
+"""Lines that change the instrument instead: there is nothing that they could change here."""
+
+
+def test_lines_of_users_scripts_are_carried_out_or_refused(tmp_path: Path, client: Run) -> None:
+    made = Emulated(seed=2, errors="result")
+    with made.running(tmp_path / "data", ExperimentClock.starting_now(speed=50.0)) as address:
+        replies = client(
+            address, f"print(json.dumps({{line: remote.send_script(line) for line in {[*TAKEN, *REFUSED]!r}}}))"
+        )
+    answers = {line: (reply["result"], reply["value"]) for line, reply in replies.items()}  # type: ignore[index]
+    assert {line: answers[line] for line in TAKEN if answers[line][0] != "Done"} == {}
+    assert {line: answers[line] for line in REFUSED if answers[line][0] != "Error"} == {}
+    assert all("Error: " in answers[line][1] for line in REFUSED), "in the words of JavaScript"
+    assert answers["spm.zscanner.pos"][1] == "5"
+    assert answers["spm.readChannel('ncmamplitude').unit"][1] == "V"
+    assert answers["spm.focusstage.pos"][1] == "12"

@@ -49,6 +49,13 @@ export class Geometry {
     return [this.head.center[0] + cos * u - sin * v, this.head.center[1] + sin * u + cos * v];
   }
 
+  /** The place (u, v) of a place in the experiment's coordinates. */
+  local([x, y]) {
+    const [dx, dy] = [x - this.head.center[0], y - this.head.center[1]];
+    const cos = Math.cos(this.head.angle), sin = Math.sin(this.head.angle);
+    return [cos * dx + sin * dy, cos * dy - sin * dx];
+  }
+
   /** From and to along both axes of what is to be seen, in u and v. */
   range() {
     const half = [this.box.width / this.perMetre / 2, this.box.height / this.perMetre / 2];

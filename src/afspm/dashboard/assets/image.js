@@ -17,7 +17,7 @@ export class ImageView {
     this.head = this.bitmap = this.geometry = this.line = this.drag = this.cursor = this.profile = null;
     this.view = { u: 0, v: 0, zoom: 1 };
     this.tool = "look";
-    this.pinned = null;
+    this.pinned = this.wanted = null;
     this.bar = new Image();
     this.bar.onload = () => this.draw();
     this.pictures = new Pictures((head, bitmap) => this.show(head, bitmap), (text) => this.say(text));
@@ -87,6 +87,12 @@ export class ImageView {
 
   say(text) {
     this.find("caption").textContent = text;
+  }
+
+  /** The scan that a dialog asks about: {x, y, width, height, angle}; null: none. */
+  want(scan) {
+    this.wanted = scan;
+    this.draw();
   }
 
   choose(tool) {
@@ -234,13 +240,54 @@ export class ImageView {
   }
 
   #drawMarks({ context }) {
+    const scan = this.#scanRectangle();
     context.save();
     // white within black is seen on any colour
     for (const [colour, width] of [["rgba(0,0,0,0.7)", 3.5], ["#fff", 1.4]]) {
       context.strokeStyle = colour;
       context.lineWidth = width;
       context.stroke(this.#marks());
+      if (scan) context.stroke(scan.path);
     }
+    context.restore();
+    if (scan) this.#label(context, scan);
+  }
+
+  /** The rectangle of a scan that is drawn, asked about, or would be taken at the cross: its outline, place and name. */
+  #scanRectangle() {
+    if (!this.wanted && this.tool !== "scan") return null;
+    const { size: all, angle } = this.head;
+    let [centre, size, turn] = [null, all, 0];
+    if (this.wanted) {
+      centre = this.geometry.local([this.wanted.x, this.wanted.y]);
+      [size, turn] = [[this.wanted.width, this.wanted.height], this.wanted.angle - angle];
+    } else if (this.line && this.drag?.moved) {
+      const [a, b] = this.line;
+      [centre, size] = [[(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], [Math.abs(a[0] - b[0]), Math.abs(a[1] - b[1])]];
+    } else if (this.cursor) centre = this.geometry.fromPixel(this.cursor);
+    if (!centre) return null;
+    const cos = Math.cos(turn), sin = Math.sin(turn), path = new Path2D();
+    const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([i, j]) => [i * size[0] / 2, j * size[1] / 2]);
+    const places = corners.map(([u, v]) => this.geometry.toScreen([centre[0] + cos * u - sin * v, centre[1] + sin * u + cos * v]));
+    places.forEach((place, i) => (i ? path.lineTo(...place) : path.moveTo(...place)));
+    path.closePath();
+    const { factor, unit } = scale(Math.max(...size), "m");
+    const degrees = ((angle + turn) * 180) / Math.PI;
+    const text = `${plain(size[0] * factor)} × ${plain(size[1] * factor)} ${unit}, ${plain(degrees)}°`;
+    return { path, text, at: this.geometry.toScreen(centre) };
+  }
+
+  #label(context, { text, at }) {
+    const { box } = this.geometry;
+    context.save();
+    context.textAlign = "center";
+    const half = context.measureText(text).width / 2 + 6;
+    const x = Math.min(box.x + box.width - half, Math.max(box.x + half, at[0]));
+    const y = Math.min(box.y + box.height - 8, Math.max(box.y + 22, at[1] + 22));
+    context.fillStyle = "rgba(0,0,0,0.75)";
+    context.fillRect(x - half, y - 13, 2 * half, 18);
+    context.fillStyle = "#fff";
+    context.fillText(text, x, y);
     context.restore();
   }
 
@@ -248,8 +295,7 @@ export class ImageView {
     const path = new Path2D();
     if (this.line) {
       const [a, b] = this.line.map((place) => this.geometry.toScreen(place));
-      if (this.tool === "scan") path.rect(Math.min(a[0], b[0]), Math.min(a[1], b[1]), Math.abs(a[0] - b[0]), Math.abs(a[1] - b[1]));
-      else {
+      if (this.tool === "profile") {
         path.moveTo(...a);
         path.lineTo(...b);
       }
@@ -291,7 +337,9 @@ export class ImageView {
     const [x, y] = this.geometry.place(place);
     const { size: all, angle, shape } = this.head;
     const name = this.tool === "scan" ? "scan_here" : "spectrum_here";
-    emitEvent(name, { x, y, width: size?.[0] ?? all[0], height: size?.[1] ?? all[1], angle, rows: shape[0], columns: shape[1] });
+    const [width, height] = size ?? all;
+    if (this.tool === "scan") this.wanted = { x, y, width, height, angle };
+    emitEvent(name, { x, y, width, height, angle, rows: shape[0], columns: shape[1] });
   }
 
   #listen() {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Final
 
 from afspm.emulators.asylum import wire
@@ -125,6 +125,8 @@ class AsylumEmulator(Emulator):
 
     def tick(self, now_s: float) -> float | None:
         """Advance Asylum's software, and send delayed replies."""
+        if not self._locked():
+            self.take_button_away()  # of a dialog that lasted for a while
         while self._delayed and self._delayed[0].at_s <= now_s:
             delayed = self._delayed.popleft()
             self._server.send(delayed.client, delayed.payload)
@@ -172,7 +174,7 @@ class AsylumEmulator(Emulator):
             return
         dialog = self.faults.strikes("dialog", now_s)
         if dialog is not None:
-            self._wait_for_somebody(dialog.duration_s)
+            self._open_dialog("an emulated dialog", dialog.duration_s)
         if self._locked():
             self._delayed.append(DelayedMessage(queued.client, payload, self._locked_until_s))
         else:
@@ -193,8 +195,7 @@ class AsylumEmulator(Emulator):
         except wire.CallFailed:
             raise
         except DialogOpen as dialog:
-            self.log.warning("a dialog waits for OK: %s", dialog)
-            self._wait_for_somebody(math.inf)
+            self._open_dialog(str(dialog), math.inf)
             given = dialog.result
         except Exception as error:  # whatever a client asks for, Igor stays
             if not isinstance(error, AfspmError):
@@ -204,8 +205,16 @@ class AsylumEmulator(Emulator):
             given += "\udcb0"
         return wire.success(function, given, call.message_id)
 
-    def _wait_for_somebody(self, lasts_s: float) -> None:
+    def _open_dialog(self, says: str, lasts_s: float) -> None:
+        """Do nothing more until OK is pressed, or for so long."""
         self._locked_until_s = self.clock.now_s() + lasts_s
+        self.show_button("press-OK", f"a dialog waits for OK: {says}", self._close_dialog)
+
+    def _close_dialog(self) -> None:
+        """Reply to the call that has opened the dialog, and go on."""
+        opened, now_s = self._locked_until_s, self.clock.now_s()
+        self._locked_until_s = now_s
+        self._delayed = deque(replace(one, at_s=now_s) if one.at_s == opened else one for one in self._delayed)
 
     def _reply(self, queued: QueuedCall, payload: bytes, now_s: float) -> None:
         """A reply, or what goes wrong with it."""

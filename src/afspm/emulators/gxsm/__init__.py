@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Final
 from afspm.emulators.emulator import Crashed, Emulator
 from afspm.emulators.gxsm import block, calls, file_writer, files, program
 from afspm.emulators.gxsm.block import SharedMemoryBlock
-from afspm.emulators.gxsm.calls import GxsmFunctions, NoAnswer
+from afspm.emulators.gxsm.calls import GxsmFunctions, NoAnswer, WrongArguments
 from afspm.emulators.gxsm.console import SCRIPT, ScriptCall, ScriptConsole
 from afspm.emulators.gxsm.entries import USER_UNITS
 from afspm.emulators.gxsm.program import GxsmProgram
@@ -113,6 +113,7 @@ class GxsmEmulator(Emulator):
 
     def run_script(self) -> str:
         """Run the script in the console, as a user does. Returns where it listens."""
+        self.take_button_away()
         before = self._console
         if before is not None:
             before.end()
@@ -145,6 +146,7 @@ class GxsmEmulator(Emulator):
         if self._console is not None and self._listens and not self._console.runs:
             self._listens = False
             self.listening("")
+            self.show_button("run-the-script-again", "the script in the console has ended", self.run_script)
         if self.faults.strikes("script-stopped", now_s):
             self.program.entries.put("script-control", 0.0)
         next_s = self.program.advance(now_s)
@@ -167,11 +169,14 @@ class GxsmEmulator(Emulator):
     def _answer_all(self) -> None:
         while self.unanswered and not self.silent and not self.faults.lasts("wedge", self.clock.now_s()):
             call = self.unanswered.popleft()
+            self.program.advance(self.clock.now_s())  # GXSM does one thing after the other
             try:
                 found = self._calls.answer(call.method, call.arguments)
             except NoAnswer:
                 self.silent = True
                 return
+            except WrongArguments as error:
+                found = SystemError(str(error)) if self._block is None else error.value
             except (NameError, SystemError) as error:  # what a script of the user's is to see
                 found = error
             except Exception as error:

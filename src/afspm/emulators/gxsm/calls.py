@@ -10,7 +10,7 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from afspm.emulators.gxsm.program import ANGSTROM_M, SHOWS_S, GxsmProgram
+from afspm.emulators.gxsm.program import ANGSTROM_M, GxsmProgram
 from afspm.emulators.rig import RigBusy
 
 FAULT_KINDS: Final[Mapping[str, str]] = {
@@ -63,6 +63,18 @@ class NoAnswer(Exception):
     """There is no answer, to this call or any other, until GXSM is started anew."""
 
 
+class WrongArguments(SystemError):
+    """C does not convert these arguments.
+
+    Attributes:
+        value: that Gxsm4 gives instead, through its shared memory.
+    """
+
+    def __init__(self, method: str) -> None:
+        super().__init__(f"<built-in function {method}> returned a result with an exception set")
+        self.value: object = (0.0, 0.0, 0.0) if method == "rtquery" else -1
+
+
 class Uninitialised:
     """A value that the real program leaves uninitialised."""
 
@@ -92,7 +104,7 @@ class GxsmFunctions:
             raise SystemError("an emulated error")
         function, signature = _FUNCTIONS[method]
         if not _fits(signature, arguments):
-            raise SystemError(f"<built-in function {method}> returned a result with an exception set")
+            raise WrongArguments(method)
         try:
             found = function(self, *arguments)
         except RigBusy as busy:
@@ -171,7 +183,7 @@ class GxsmFunctions:
         elif name == "DSP_CMD_AUTOAPP":
             rig.engage()
         elif name == "DSP_CMD_STOPALL":
-            rig.stop_scan()
+            program.stop_scan()
 
     # --- what goes on ---
 
@@ -207,7 +219,7 @@ class GxsmFunctions:
     def _bits(self, now_s: float) -> int:
         program = self._program
         doing, scan = program.rig.doing(now_s), program.rig.scan
-        scanning = doing == "scan" and scan is not None and now_s >= scan.start_s + SHOWS_S
+        scanning = doing == "scan" and scan is not None and now_s >= scan.start_s + program.shows_s
         paused, probing = scanning and scan is not None and scan.paused, doing == "spectrum"
         feedback = bool(program.rig.setup.feedback.on)
         if program.card == "RPSPMC":
@@ -229,7 +241,7 @@ class GxsmFunctions:
 
     @_function
     def _stopscan(self) -> int:
-        self._program.rig.stop_scan()
+        self._program.stop_scan()
         return 0
 
     @_function
@@ -259,26 +271,31 @@ class GxsmFunctions:
 
     @_function
     def _get_geometry(self, channel: int) -> tuple[float, ...]:
+        if not self._has(channel):
+            return (0.0,) * 5
         x, y, width, height, angle_deg = self._program.last_frame
         return (width, height, x, y, angle_deg)
 
     @_function
     def _get_dimensions(self, channel: int) -> tuple[int, ...]:
         scan = self._program.last
-        return (_NOBODY,) * 4 if scan is None else (scan.shape[1], scan.shape[0], 1, 1)
+        return (_NOBODY,) * 4 if scan is None or not self._has(channel) else (scan.shape[1], scan.shape[0], 1, 1)
 
     @_function
-    def _get_differentials(self, channel: int) -> tuple[float, ...] | int:
-        if not 0 <= channel < len(self._program.channels):
-            return -1
+    def _get_differentials(self, channel: int) -> tuple[float, ...]:
+        if not self._has(channel):
+            return (0.0,) * 4
         _, _, width, height, _ = self._program.last_frame
         columns, rows, _, _ = self._get_dimensions(channel)
         return (width / (columns - 1), height / (rows - 1), self._program.channels[channel].dz, 10.0)
 
+    def _has(self, channel: int) -> bool:
+        return 0 <= channel < len(self._program.channels)
+
     @_function
     def _get_slice(self, channel: int, value: int, time: int, first: int, count: int) -> object:
         program = self._program
-        if program.last is None or not 0 <= channel < len(program.channels):
+        if program.last is None or not self._has(channel):
             return -1
         one = program.channels[channel]
         image = program.image(one)

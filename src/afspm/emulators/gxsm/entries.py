@@ -15,6 +15,7 @@ USER_UNITS: Final = {"Å": 1.0, "nm": 10.0, "µm": 1e4}
 _FLOAT: Final = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _ANGSTROM: Final = "Å"
 _PADDING: Final = " " * 4
+_NO_UNIT: Final = " " * 5
 _DAC_STEP: Final = 0.422
 """In ångström: a range is never less."""
 
@@ -142,8 +143,8 @@ def lengths(reach: float, told: Callable[[str], Callable[[float], None]]) -> dic
     return {
         "RangeX": extent(1e4, "{:.1f}"),
         "RangeY": extent(1e4, "{:.1f}"),
-        "PointsX": GxsmEntry(64.0, 2.0, 20_000.0, whole=True),
-        "PointsY": GxsmEntry(64.0, 2.0, 20_000.0, whole=True),
+        "PointsX": GxsmEntry(64.0, 2.0, 20_000.0, _NO_UNIT, whole=True),
+        "PointsY": GxsmEntry(64.0, 2.0, 20_000.0, _NO_UNIT, whole=True),
         "StepsX": extent(1e4 / 63, "{:.3f}"),
         "StepsY": extent(1e4 / 63, "{:.3f}"),
         "OffsetX": length("OffsetX", 0.0, -reach, reach),

@@ -29,6 +29,7 @@ class GxsmFileWriter:
 
     Attributes:
         folder: of scans and spectra; somebody at the panel may choose another.
+        done_s: when all files are written, unless something goes wrong.
     """
 
     def __init__(self, folder: Path, faults: Faults) -> None:
@@ -37,14 +38,20 @@ class GxsmFileWriter:
         self._writes: list[_Write] = []
         self.counter = 1
         """Of the next scan: it begins anew with each start of GXSM, whatever files there are."""
+        self.done_s = 0.0
+
+    def next_number(self) -> int:
+        """A scan begins: it takes the counter's number, whether or not it is ever saved."""
+        self.counter += 1
+        return self.counter - 1
 
     def named(self, ending: str, counter: int) -> Path:
         """A scan's file."""
         return self.folder / f"scan{counter:03d}-{ending}"
 
-    def free(self, ending: str) -> Path:
-        """The first file, from the counter on, that is not there yet: each channel counts by itself."""
-        counter = self.counter
+    def free(self, ending: str, number: int) -> Path:
+        """The first file, from a number on, that is not there yet: each channel counts by itself."""
+        counter = number
         while (path := self.named(ending, counter)).exists() or any(write.path == path for write in self._writes):
             counter += 1
         return path
@@ -52,12 +59,13 @@ class GxsmFileWriter:
     def counted(self, files: list[Path]) -> None:
         """A scan was saved: the next has the next number."""
         numbers = (int(file.name.removeprefix("scan").partition("-")[0]) for file in files)
-        self.counter = max(numbers, default=self.counter) + 1
+        self.counter = max(self.counter, *(number + 1 for number in numbers))
 
     def write(self, contents: list[tuple[Path, bytes]], now_s: float) -> None:
         """Begin to write files, the last one first."""
         for k, (path, content) in enumerate(reversed(contents)):
             at_s = now_s + _FIRST_S + k * _APART_S
+            self.done_s = at_s + _HALF_S
             if self._faults.strikes("file-missing", now_s):
                 continue
             late, half = self._faults.strikes("file-late", now_s), self._faults.strikes("half-file", now_s)

@@ -39,8 +39,8 @@ UNFINISHED_S: Final = 0.25
 """So long after the end of a scan GXSM is not done with it: a file that is saved then has no end in it."""
 _PIXELS_S: Final = 0.045
 """What its own simulator takes for a line besides its pixels."""
-_EARLY_LINE_S, _EARLY_S = 0.2, 1.0
-"""It ends a scan with lines longer than this after so long, and tells nobody."""
+_NEVER_WRITTEN: Final = -296
+"""The line that Gxsm4's simulator reports at the start of its first scan."""
 _PULSE_S: Final = 1.0
 _MIXER: Final = ("dsp-fbs-mx0-current-set", "nA", 1.0)
 _MIXERS: Final = {
@@ -72,7 +72,7 @@ class GxsmProgram:
         channels: that a scan records.
         dialogs: what dialogs on the screen say.
         behind_s: how much the clock of its computer, which files tell, is behind; it may be set at any time.
-        repeats: a scan is followed by the next.
+        repeats: a scan that comes to its end is followed by the next.
     """
 
     def __init__(self, rig: Rig, faults: Faults, clock: Clock, folder: Path, settings: GxsmSettings) -> None:
@@ -91,7 +91,9 @@ class GxsmProgram:
         self.last: ScanActivity | None = None
         self.last_frame = (0.0, 0.0, 0.0, 0.0, 0.0)
         self.curve: SpectrumActivity | None = None
-        self._scanning = self._saved = False
+        self.shows_s = SHOWS_S
+        self._scanning = self._saved = self._next = self._follows = False
+        self._number = 0
         self._before: list[Path] | None = None
         self._y_before = 0
         self._bias_since_s = -math.inf
@@ -161,27 +163,41 @@ class GxsmProgram:
 
     def advance(self, now_s: float) -> float | None:
         """Up to now; returns when a file is to be written."""
-        if self._scanning and (self.faults.strikes("panel-stop", now_s) or self._ends_early(now_s)):
+        if self._scanning and self.faults.strikes("panel-stop", now_s):
             self.rig.stop_scan()
         if self._scanning and self.last is not None and not self.last.running(now_s):
             self._scanning = False
             if self.auto_save:
                 self.save(now_s, finished=True)
-            if self.repeats:
-                self.start_scan()
+            self._next = self._follows = self.repeats and self.last.stopped_s is None
         if self.curve is not None and not self.curve.running(now_s):
             curve, self.curve = self.curve, None
             if self.probe_auto_save:
                 self._save_curve(curve, now_s)
-        return self.saving.advance(now_s)
+        next_s = self.saving.advance(now_s)
+        if self._next and now_s >= self.saving.done_s:
+            self.start_scan()
+        return min(next_s or math.inf, self.saving.done_s) if self._next else next_s
+
+    def stop_scan(self) -> None:
+        """Break off the scan that runs, or is to begin."""
+        self._next = False
+        self.rig.stop_scan()
 
     # --- scans ---
 
     def start_scan(self) -> None:
-        """If it can; nobody is told whether."""
+        """If it can; there is no answer. While files are written GXSM does nothing else."""
         now_s = self.clock.now_s()
+        self._next = now_s < self.saving.done_s
+        if self._next:
+            return
+        follows, self._follows = self._follows, False
         self.rig.stop_move()
-        if self.rig.busy(now_s) or not self.channels or self.faults.strikes("no-start", now_s):
+        if self.rig.busy(now_s) or self.faults.strikes("no-start", now_s):
+            return
+        if not self.channels:
+            self.dialogs.append("no channel is set")
             return
         entries, columns, rows = self.entries, int(self.entries["PointsX"]), int(self.entries["PointsY"])
         region = self.frame()
@@ -198,19 +214,14 @@ class GxsmProgram:
             self.dialogs.append(str(error))
             return
         self._memory = {one: _resized(self.image(one), (rows, columns)) for one in self.channels}
-        self._y_before = self.y_current(now_s)
-        self._before, self._own = self.names(now_s), []
+        is_first = self.last is None and self.card == "simulator" and self.version == 4
+        self._y_before = _NEVER_WRITTEN if is_first else self.y_current(now_s)
+        self._before, self._own = None if follows else self.names(now_s), []
+        self._number = self.saving.next_number()
+        self.shows_s = 0.0 if follows else SHOWS_S
         self.last = started
         self.last_frame = tuple(entries[ref] for ref in ("OffsetX", "OffsetY", "RangeX", "RangeY", "Rotation"))  # type: ignore[assignment]
         self._scanning, self._saved = True, False
-
-    def _ends_early(self, now_s: float) -> bool:
-        return (
-            self.card == "simulator"
-            and self.last is not None
-            and self.last.line_s > _EARLY_LINE_S
-            and now_s >= self.last.start_s + _EARLY_S
-        )
 
     def y_current(self, now_s: float) -> int:
         """The last line that is complete: that of the scan before until the first is; the very last after a stop."""
@@ -235,7 +246,7 @@ class GxsmProgram:
             return self._before
         if self._own:
             return self._own
-        return [self.saving.named(ending, self.saving.counter) for ending in self._endings()]
+        return [self.saving.named(ending, self._number) for ending in self._endings()]
 
     def shown(self, path: Path) -> str:
         """Return a path as it is told: a GXSM whose user has chosen no folder saves to ".", wherever it was started."""
@@ -261,7 +272,7 @@ class GxsmProgram:
             return
         if self._saved:
             self._own = []
-        own = [self.saving.free(ending) for ending in self._endings()]
+        own = [self.saving.free(ending, self._number) for ending in self._endings()]
         finished = finished or now_s >= self.last.end_s + UNFINISHED_S
         pairs = zip(own, self.channels, strict=True)
         self.saving.write([(path, self._file(one, path, finished=finished)) for path, one in pairs], now_s)

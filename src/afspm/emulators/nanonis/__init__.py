@@ -17,6 +17,7 @@ from afspm.emulators.nanonis.software import NanonisSoftware
 from afspm.emulators.rig import RigBusy
 from afspm.emulators.tcp_server import ClientConnection, TcpServer
 from afspm.errors import ConfigError, InvalidValue
+from afspm.plain_data import PlainMapping
 from afspm.units import Length
 
 RELEASES: Final = {"2021": 10862, "2022": 11798, "2023": 13742, "2024": 14429, "2025": 14573}
@@ -25,6 +26,8 @@ _ACTS: Final = ("Start", "Action", "Set", "Pulse", "Withdraw", "StartMove", "Hom
 _LOGS_EVERY_S: Final = 0.005
 """Real time between two looks at what the TCP Logger has to send."""
 _OTHER_NAME: Final = "Util.RTFreqGet"
+_QPLUS: Final[PlainMapping] = {"resonance_hz": 30e3, "spring_n_per_m": 1800.0, "oscillation_m": 100e-12}
+_STM: Final[PlainMapping] = {"mode": "current", "setpoint": 100e-12, "qplus": True}
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ class DelayedReply:
 
 
 class NanonisEmulator(Emulator):
-    """The emulated controller.
+    """The emulated controller: of an STM with a qPlus sensor, unless `feedback` has another mode.
 
     Args:
         release: of its software: a year of `RELEASES`, or the number itself.
@@ -93,7 +96,7 @@ class NanonisEmulator(Emulator):
         grabbed_rows: str = "top-first",
         **settings: Any,
     ) -> None:
-        super().__init__(**settings)
+        super().__init__(**{**settings, "feedback": _of_stm(settings.get("feedback", {}))})
         self.release = _release(release)
         self._ports = ports
         self.logger_port = logger_port
@@ -292,6 +295,14 @@ class NanonisEmulator(Emulator):
             connection.waits_for = DelayedReply(content, now_s + slow.duration_s)
             return
         self._server.send(connection, content)
+
+
+def _of_stm(feedback: object) -> object:
+    """Complete the settings of the feedback; those of another mode, or no table at all, stay as they are."""
+    if not isinstance(feedback, Mapping) or feedback.get("mode", "current") != "current":
+        return feedback
+    sensor = feedback.get("sensor", {})
+    return {**_STM, **feedback, "sensor": {**_QPLUS, **sensor} if isinstance(sensor, Mapping) else sensor}
 
 
 def _release(given: str | int) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Final
 
 from afspm.clock import Clock
 from afspm.emulators.faults import Faults
@@ -12,6 +13,13 @@ from afspm.emulators.nanonis.registers import Registers
 from afspm.emulators.nanonis.session import SessionFolder
 from afspm.emulators.rig import Rig
 from afspm.plain_data import Plain
+
+_Z_CONTROLLERS: Final = {
+    "current": ("log Current", "A"),
+    "frequency-shift": ("OC M1 Freq. Shift", "Hz"),
+    "amplitude": ("Amplitude", "V"),
+}
+"""By the mode of the simulated feedback."""
 
 
 @dataclass
@@ -47,7 +55,7 @@ class NanonisCore:
     @property
     def z_controller_name(self) -> tuple[str, str]:
         """Name of the z controller and unit of its setpoint."""
-        return ("OC M1 Freq. Shift", "Hz") if self.measures_frequency_shift else ("log Current", "A")
+        return _Z_CONTROLLERS[self.rig.world.settings.feedback.mode]
 
     def experiment_s(self, real_s: float) -> float:
         """Convert real to experiment seconds."""

@@ -16,7 +16,7 @@ from afspm.emulators.nanonis.registers import Registers
 Results = tuple[object, ...]
 _STORED: Final = (
     "Bias", "BiasSpectr", "Current", "ZCtrl", "SafeTip", "AutoApproach", "ZSpectr", "Piezo", "Scan", "FolMe", "Pattern",
-    "TipShaper", "Motor", "AtomTrack", "LockIn", "PLL", "Signals", "UserIn", "UserOut", "TCPLog", "Util",
+    "TipShaper", "Motor", "AtomTrack", "LockIn", "PLL", "Signals", "UserIn", "UserOut", "TCPLog", "Util", "File",
 )  # fmt: skip
 """Modules of the real software: of functions without a handler, what is set in them is at least got again."""
 _KEEPS_NAN: Final = ("BiasSpectr.PropsSet",)

@@ -82,6 +82,26 @@ def dat(header: Mapping[str, str], columns: Sequence[str], values: np.ndarray) -
     return "".join(f"{line}\r\n" for line in [*lines, "", "[DATA]", *table]).encode("latin-1", "replace")
 
 
+@dataclass(frozen=True)
+class DatContent:
+    """The content of a spectrum's file: lines of the header, split at tabs, and values [points, columns]."""
+
+    header: Sequence[Sequence[str]]
+    columns: Sequence[str]
+    values: np.ndarray
+
+
+def read_dat(content: bytes) -> DatContent:
+    """Read what `dat` writes. Raises ValueError: there is no such table."""
+    head, found, table = content.decode("latin-1").partition("[DATA]")
+    names, *rows = table.strip().splitlines() or [""]
+    if not found or not names:
+        raise ValueError("no [DATA] in it")
+    header = [line.rstrip("\t").split("\t") for line in head.splitlines() if line]
+    values = np.array([[float(value) for value in row.split("\t")] for row in rows])
+    return DatContent(header, names.split("\t"), values.reshape(len(rows), -1))
+
+
 def moment(time_s: float) -> str:
     """Date and time on the clock of the controller's computer."""
     return f"{_local(time_s):%d.%m.%Y %H:%M:%S}"

@@ -24,6 +24,8 @@ _PIXELS_AT_ONCE: Final = 16
 _WAITED: Final = "waited"
 """Memory of a client: how many scans had ended, and when, before it waits for the next end."""
 _PASTES: Final = (0, 1, 2)
+_SMALLEST_M: Final = 2e-12
+"""Of a frame: half of it, in two lines, is what the simulated scanner can just scan."""
 _AUTOSAVE: Final = ("all", "next", "off")
 
 
@@ -264,9 +266,12 @@ class ScanModule:
 
     @answers("Scan.FrameSet")
     def set_frame(self, x: float, y: float, width: float, height: float, angle_deg: float) -> Answer:
-        """Set the frame, moved into the scanner's range as the real one does."""
-        if not (min(width, height) > 0.0 and all(map(math.isfinite, (x, y, width, height, angle_deg)))):
-            raise FunctionRefused("the frame is empty")
+        """Set the frame, moved into the scanner's range as the real one does.
+
+        (!) What the real one does with a frame smaller than an atom is not known: here it is refused.
+        """
+        if not (min(width, height) >= _SMALLEST_M and all(map(math.isfinite, (x, y, width, height, angle_deg)))):
+            raise FunctionRefused(f"a frame of {width:g} m x {height:g} m can't be scanned: from {_SMALLEST_M:g} m")
         range_m = self._core.range_m[:2]
         width, height = min(width, range_m[0]), min(height, range_m[1])
         x, y = (

@@ -62,6 +62,13 @@ class SessionFolder:
             self._late.append((now_s + fault.duration_s, path, content))
         return late is not None or self._write(path, content[: len(content) // 2] if half else content)
 
+    def read(self, path: str) -> bytes:
+        """Return a file of the folder, by the path that the controller announces. Raises OSError, InvalidValue."""
+        name = PureWindowsPath(path).name
+        if path != self.path_of(name):
+            raise InvalidValue(f"{path!r} is not in the session folder", hint=self.path)
+        return (self.folder / checked_name(name)).read_bytes()
+
     def write_late(self, now_s: float) -> float | None:
         """Write the late files that are due; return when the next one is."""
         due = [late for late in self._late if late[0] <= now_s]

@@ -151,6 +151,12 @@ class Signals:
             return tuple(self.values([CHANNELS["Frequency Shift"]], self._core.now_s))
         return self._registers.got("PLL.FreqShiftGet", [modulator])
 
+    @answers("PLL.AmpCtrlGainGet", "PLL.PhasCtrlGainGet")
+    def _gain(self, name: str, modulator: int) -> Answer:
+        """Return P and T, which can be set, and I = P / T."""
+        proportional, time_s, _ = self._registers.got(name, [modulator])
+        return proportional, time_s, proportional / time_s if time_s else 0.0
+
     @answers("PLL.FreqShiftAutoCenter")
     def _center_frequency(self, modulator: int) -> Answer:
         """Move the centre to where the frequency has shifted to."""

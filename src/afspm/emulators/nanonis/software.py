@@ -6,10 +6,13 @@ import logging
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from afspm.clock import Clock
 from afspm.emulators.faults import Faults
 from afspm.emulators.nanonis.core import NanonisCore
 from afspm.emulators.nanonis.dispatch import Answer, Dispatcher, FunctionRefused, answers, chosen
+from afspm.emulators.nanonis.files import read_dat
 from afspm.emulators.nanonis.scans import ScanModule
 from afspm.emulators.nanonis.session import SessionFolder, checked_name
 from afspm.emulators.nanonis.signals import Signals
@@ -138,6 +141,15 @@ class Utilities:
     @answers("Util.VersionGet")
     def _version(self) -> Answer:
         return "Nanonis SPM Control Software", "Generic 5", self._core.release, self._core.release
+
+    @answers("File.datLoad")
+    def _load(self, path: str, header_only: int) -> Answer:
+        """Return the content of a file in the session folder; (!) each row of the data is taken to be a channel."""
+        try:
+            found = read_dat(self._core.session.read(path))
+        except (OSError, ValueError) as error:
+            raise FunctionRefused(f"{path!r} can't be loaded: {error}") from error
+        return ([], np.zeros((0, 0)), found.header) if header_only else (found.columns, found.values.T, found.header)
 
     @answers("Util.Lock", "Util.UnLock")
     def _lock(self) -> Answer:

@@ -51,7 +51,7 @@ class NanosurfEmulator(ScriptedEmulator):
         self._levels: dict[Client, int | None] = {}
         self._client: Client = None
         program = StudioProgram(self.rig, self.faults, self.folder, self.log, **self._times)
-        self._tree = CommandTree(program, self._release, self._image_buffer, self._select)
+        self._tree = CommandTree(program, self._release, self._image_buffer, self._select, self.log)
         return program
 
     def open_wire(self, port: int, on_request: OnRequest) -> ScriptWire:

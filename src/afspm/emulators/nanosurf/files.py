@@ -47,12 +47,35 @@ def image(scan: ScanActivity, now_s: float, mode: str) -> bytes:
     return _file({**facts, "measurement_mode": mode}, frame, [forward, backward], now_s)
 
 
-def curve(spectrum: SpectrumActivity, now_s: float, mode: str) -> bytes:
-    """The file of a force curve: a segment towards the sample, another back."""
-    return _file({"group_type": "spectroscopy", "measurement_mode": mode}, {}, spectrum.both_ways(), now_s)
+def curves(spectra: Sequence[SpectrumActivity], shape: tuple[int, int], now_s: float, mode: str) -> bytes:
+    """The file of force curves: a segment towards the sample, another back; (!) its axes are a line for each curve.
+
+    Args:
+        shape: of the grid: (rows, columns).
+    """
+    facts = {
+        "group_type": "spectroscopy",
+        "measurement_mode": mode,
+        "grid_number_of_rows": np.uint32(shape[0]),
+        "grid_number_of_columns": np.uint32(shape[1]),
+    }
+    axes = {"rect_axis_size": np.array([len(spectra), len(spectra[0].values)], np.uint32)}
+    ways = zip(*(spectrum.both_ways() for spectrum in spectra), strict=True)
+    segments = [
+        {name: (unit, np.concatenate([one[name][1] for one in way])) for name, (unit, _) in way[0].items()}
+        for way in ways
+    ]
+    return _file(facts, axes, segments, now_s, blocks=[len(spectrum.values) for spectrum in spectra])
 
 
-def _file(facts: PlainMapping, frame: PlainMapping, segments: Sequence[SegmentChannels], now_s: float) -> bytes:
+def _file(
+    facts: PlainMapping,
+    axes: PlainMapping,
+    segments: Sequence[SegmentChannels],
+    now_s: float,
+    *,
+    blocks: Sequence[int] = (),
+) -> bytes:
     import h5py
 
     content = io.BytesIO()
@@ -64,36 +87,32 @@ def _file(facts: PlainMapping, frame: PlainMapping, segments: Sequence[SegmentCh
         group.attrs.update(measurement_name="SIMULATED", created=written, modified=written)
         for number, (name, channels) in enumerate(zip(_SEGMENTS, segments, strict=True)):
             segment = group.create_group(f"segment_{number:04d}")
-            segment.attrs.update(frame)
+            segment.attrs.update(axes)
             segment.attrs["segment_name"] = name
             for index, (signal, (unit, values)) in enumerate(channels.items()):
                 _add(segment, f"dataset_{index:04d}", signal, unit, values)
-            if not frame:
-                _add_blocks(segment, channels)
+            if blocks:
+                _add_blocks(segment, blocks)
         file.create_group("group_0001").attrs["group_type"] = "calibration"
     return content.getvalue()
 
 
 def _add(segment: Any, name: str, signal: str, unit: str, values: Array) -> None:
-    """A channel: integers over the range that its values take."""
-    present = values[np.isfinite(values)]
-    low, high = (float(present.min()), float(present.max())) if present.size else (0.0, 1.0)
-    high = high if high > low else low + max(abs(low), 1e-12)
-    scaled = np.rint((values - low) / (high - low) * (2.0 * _LARGEST)) - _LARGEST
-    integers = np.where(np.isfinite(values), scaled, _MISSING).astype(np.int32)
+    """Add a channel: integers over a range about zero, as in real files; NSFopen relies on it."""
+    largest = float(np.max(np.abs(values), initial=0.0, where=np.isfinite(values))) or 1.0
+    integers = np.where(np.isfinite(values), np.rint(values / largest * _LARGEST), _MISSING).astype(np.int32)
     dataset = segment.create_dataset(name, data=integers.ravel(), fillvalue=_MISSING)
     dataset.attrs.update(
         signal_name=signal,
         signal_unit=unit,
         signal_calibration_unit=unit,
-        signal_calibration_min=low,
-        signal_calibration_max=high,
+        signal_calibration_min=-largest,
+        signal_calibration_max=largest,
         dataset_element_type="int32",
         dataset_block_size_source=_BLOCKS,
     )
 
 
-def _add_blocks(segment: Any, channels: Mapping[str, tuple[str, Array]]) -> None:
-    sizes = [len(values) for _, values in channels.values()][:1]
+def _add_blocks(segment: Any, sizes: Sequence[int]) -> None:
     dataset = segment.create_dataset("dataset_blocks", data=np.array(sizes, np.uint32))
     dataset.attrs["dataset_block_size_id"] = _BLOCKS

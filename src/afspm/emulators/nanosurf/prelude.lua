@@ -1,9 +1,10 @@
 -- Runs the scripts of clients, each in a coroutine, and writes what they return as Studio does. Called with Python's
 -- functions; returns start(text, environment), step(script) and helpers.
 local fire_limit = 5000000
+local format, gsub, find, concat, pack = string.format, string.gsub, string.find, table.concat, table.pack
 
 local function key_text(key)
-  if type(key) == "string" then return string.format("[%q]", key) end
+  if type(key) == "string" then return format("[%q]", key) end
   return "[" .. tostring(key) .. "]"
 end
 
@@ -13,23 +14,27 @@ local function written(value, depth)
   if kind == "float" then
     if value ~= value then return "(0/0)" end
     if value == math.huge then return "math.huge" elseif value == -math.huge then return "-math.huge" end
-    local text = string.format("%.17g", value)
-    return text:find("[%.eE]") and text or text .. ".0"
+    local text = format("%.17g", value)
+    return find(text, "[%.eE]") and text or text .. ".0"
   end
   kind = type(value)
-  if kind == "string" then return (string.format("%q", value):gsub("\\\n", "\\n")) end
+  if kind == "string" then return (gsub(format("%q", value), "\\\n", "\\n")) end
   if kind == "function" then return "function() end" end
   if kind ~= "table" then return (kind == "boolean" or kind == "nil") and tostring(value) or "nil" end
   if depth > 20 then error("a table is too deep") end
   local parts = {}
   for key, inner in pairs(value) do parts[#parts + 1] = key_text(key) .. "=" .. written(inner, depth + 1) end
-  return "{" .. table.concat(parts, ",") .. "}"
+  return "{" .. concat(parts, ",") .. "}"
 end
 
 local safe = {}
-for _, name in ipairs({"pairs", "ipairs", "next", "type", "tostring", "tonumber", "select", "pcall", "error", "rawget",
-                       "math", "string", "table"}) do
+for _, name in ipairs({"pairs", "ipairs", "next", "type", "tostring", "tonumber", "select", "pcall", "error", "rawget"}) do
   safe[name] = _G[name]
+end
+-- Copies: what a script does to them leaves alone what replies are written with.
+for _, name in ipairs({"math", "string", "table"}) do
+  safe[name] = {}
+  for key, value in pairs(_G[name]) do safe[name][key] = value end
 end
 
 -- Scripts may add globals, which last; what is there they can't replace.
@@ -44,24 +49,32 @@ local function environment(root)
   })
 end
 
+-- A script that catches the error is ended by the next instruction, and so on until nothing catches it.
+local function limited(thread)
+  local function too_long()
+    debug.sethook(thread, too_long, "", 1)
+    error("the script runs too long", 0)
+  end
+  debug.sethook(thread, too_long, "", fire_limit)
+  return thread
+end
+
 local function start(text, env)
   local chunk, problem = load(text, "=script", "t", env)
   if not chunk then return nil, "{1,{" .. written(tostring(problem), 0) .. "}}" end
-  local thread = coroutine.create(chunk)
-  debug.sethook(thread, function() error("the script runs too long", 0) end, "", fire_limit)
-  return {thread = thread}
+  return {thread = limited(coroutine.create(chunk))}
 end
 
 -- Returns nil while the script waits for the instrument, else the reply.
 local function step(script)
   local thread = script.thread
-  local results = table.pack(coroutine.resume(thread))
+  local results = pack(coroutine.resume(thread))
   if not results[1] then return "{1,{" .. written(tostring(results[2]), 0) .. "}}" end
   if coroutine.status(thread) ~= "dead" then return nil end
   local fine, text = pcall(function()
     local parts = {}
     for i = 2, results.n do parts[#parts + 1] = written(results[i], 0) end
-    return "{0,{" .. table.concat(parts, ",") .. "}}"
+    return "{0,{" .. concat(parts, ",") .. "}}"
   end)
   return fine and text or "{1,{" .. written(tostring(text), 0) .. "}}"
 end
@@ -107,9 +120,13 @@ local function signal()
   function node.connect(handler) handlers[#handlers + 1] = handler end
   node.connect_extended = node.connect
   function node.empty() return #handlers == 0 end
-  function node.call(...) for _, handler in ipairs(handlers) do pcall(handler, ...) end end
+  function node.call(...)
+    for _, handler in ipairs(handlers) do
+      if type(handler) == "function" then coroutine.resume(limited(coroutine.create(handler)), ...) end
+    end
+  end
   return node
 end
 
-return {start = start, step = step, environment = environment, as_function = as_function, blocking = blocking,
-        property = property, signal = signal}
+return {start = start, step = step, collect = function() collectgarbage() end, environment = environment,
+        as_function = as_function, blocking = blocking, property = property, signal = signal}

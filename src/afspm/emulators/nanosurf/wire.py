@@ -11,6 +11,8 @@ from afspm.emulators.tcp_server import ClientConnection, TcpServer
 
 _LENGTH: Final = struct.Struct("<I")
 LONGEST_SCRIPT: Final = 1 << 20
+_MOST_UNREAD: Final = 64 << 20
+"""Bytes of replies that a client may leave unread: after that its connection ends."""
 
 
 class StudioWire:
@@ -35,6 +37,8 @@ class StudioWire:
         connection = cast(ClientConnection, client)
         if connection in self._server.connections:
             self._server.send(connection, _LENGTH.pack(len(reply)) + reply)
+            if len(connection.sending) > _MOST_UNREAD:
+                self._server.cut(connection)
 
     def send_half(self, client: Client, reply: bytes) -> None:
         """Half a reply, after which the connection ends."""

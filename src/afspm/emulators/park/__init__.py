@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import Any, ClassVar, Final, Literal
+from typing import Any, ClassVar, Final, Literal, NoReturn
 
 from afspm.emulators.park.engine import Script
 from afspm.emulators.park.smartscan import GEOMETRY, SmartScanProgram
@@ -12,11 +12,12 @@ from afspm.emulators.park.wire import SmartRemoteWire
 from afspm.emulators.program import MakerProgram
 from afspm.emulators.scripted import Client, OnRequest, ScriptedEmulator, ScriptFailed, ScriptWire, Unfinished
 from afspm.errors import AfspmError
-from afspm.plain_data import PlainMapping
+from afspm.plain_data import Plain, PlainMapping
 from afspm.units import Duration
 
 _DONE: Final = "Done"
 _FAILED: Final = -32000
+_NO_JSON: Final = -32700
 
 
 class ParkEmulator(ScriptedEmulator):
@@ -68,15 +69,17 @@ class ParkEmulator(ScriptedEmulator):
 
     def answer(self, client: Client, request: bytes) -> bytes | Unfinished:
         """Run a script, or answer a query."""
-        asked = json.loads(request)
-        if not isinstance(asked, dict):
-            raise ScriptFailed("a request is no object")
+        asked = _parsed(request)
+        if asked is None:
+            raise ScriptFailed("a request is no object of JSON")
         if asked.get("method") == "js_cmd":
             return self._run(request, str(asked.get("params", "")))
         return _reply(request, result=self._queried(str(asked.get("method"))))
 
     def failure(self, request: bytes, reason: str) -> bytes:
-        """The words of an error, where `errors` says."""
+        """The words of an error, where `errors` says; JSON-RPC says how a request is refused that is none."""
+        if _parsed(request) is None:
+            return _reply(request, error={"code": _NO_JSON, "message": reason})
         if self._errors == "rpc":
             return _reply(request, error={"code": _FAILED, "message": reason})
         if self._errors == "result":
@@ -97,7 +100,8 @@ class ParkEmulator(ScriptedEmulator):
                 ended = True
             if ended:
                 del self._scripts[script]
-        return super().tick(now_s)
+        times = super().tick(now_s), self._smartscan.next_waking_s(now_s)
+        return min((at_s for at_s in times if at_s is not None), default=None)
 
     def abandon(self) -> None:
         """End the scripts, too."""
@@ -152,12 +156,23 @@ class ParkEmulator(ScriptedEmulator):
 
 
 def _reply(request: bytes, **fields: object) -> bytes:
-    try:
-        asked = json.loads(request)
-    except ValueError:
-        asked = None
-    number = asked.get("id") if isinstance(asked, dict) else None
+    asked = _parsed(request)
+    number = None if asked is None else asked.get("id")
     return json.dumps({"jsonrpc": "2.0", **fields, "id": number}).encode()
+
+
+def _parsed(request: bytes) -> Plain | None:
+    """Return the object of a request; None if it is none, or a text in it can't be encoded."""
+    try:
+        asked = json.loads(request, parse_constant=_no_constant)
+        json.dumps(asked, ensure_ascii=False).encode()
+    except (ValueError, RecursionError):
+        return None
+    return asked if isinstance(asked, dict) else None
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not JSON")
 
 
 EMULATOR = ParkEmulator

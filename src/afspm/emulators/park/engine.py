@@ -21,18 +21,20 @@ LONGEST_S: Final = 5.0
 """Real seconds of computing after which a script is given up."""
 _MEMORY: Final = 64 << 20
 _PRELUDE: Final = Path(__file__).with_name("prelude.js")
+_REFUSALS: Final = (AfspmError, ArithmeticError, TypeError, ValueError)
 _END: Final = json.dumps({"error": "the script was ended"})
 
 
 @dataclass(frozen=True)
 class Wait:
-    """What a method returns that takes its time: the script waits until `waiting` is false."""
+    """What a method returns that takes its time: the script waits until `waiting` is false, and then has the value."""
 
     waiting: Callable[[], bool]
+    value: Callable[[], object] = lambda: None
 
 
 Ask = Callable[[str, str, list[Any]], object]
-"""Does what a script asks for: "get", "set" or "call", a path below `spm`, and what is given. Raises AfspmError."""
+"""Answers a script: "get", "set" or "call", a path below `spm`, arguments; "now" gives ms. Raises AfspmError."""
 
 
 class Script:
@@ -55,8 +57,8 @@ class Script:
         if self._wait is not None:
             if self._wait.waiting():
                 return None
-            self._wait = None
-            self._answers.put(json.dumps({"value": None}))
+            ended, self._wait = self._wait, None
+            self._answer(ended)
         while True:
             try:
                 kind, content = self._asks.get(timeout=LONGEST_S)
@@ -79,15 +81,22 @@ class Script:
     def _answered(self, content: str) -> bool:
         """Do what was asked for; return False if the script waits for it."""
         try:
-            value = self._ask(*json.loads(content))
-        except (AfspmError, ArithmeticError, TypeError, ValueError) as error:
+            found = self._ask(*json.loads(content))
+        except _REFUSALS as error:
             self._answers.put(json.dumps({"error": str(error)}))
             return True
-        if isinstance(value, Wait) and value.waiting():
-            self._wait = value
+        wait = found if isinstance(found, Wait) else Wait(lambda: False, lambda: found)
+        if wait.waiting():
+            self._wait = wait
             return False
-        self._answers.put(json.dumps({"value": None if isinstance(value, Wait) else value}))
+        self._answer(wait)
         return True
+
+    def _answer(self, wait: Wait) -> None:
+        try:
+            self._answers.put(json.dumps({"value": wait.value()}))
+        except _REFUSALS as error:
+            self._answers.put(json.dumps({"error": str(error)}))
 
     # -- in the script's thread
 
@@ -102,7 +111,8 @@ class Script:
             context.eval(_PRELUDE.read_text(encoding="utf-8"))
             context.set("__source", source)
             self._asks.put(("done", context.eval("__run(__source)")))
-        except (quickjs.JSException, quickjs.StackOverflow, MemoryError, UnicodeError, ValueError) as error:
+        # an engine that fails in any other way must end its script, too: the emulator waits for it
+        except Exception as error:
             self._asks.put(("failed", str(error).partition("\n")[0]))
 
     def _asked(self, content: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -42,11 +42,19 @@ _ROWS_PER_STRIP = 278
 Picture = np.ndarray[tuple[int, int], np.dtype[np.uint8]]
 
 
-def images(scan: ScanActivity, now_s: float, mode: str) -> Iterator[tuple[str, bytes]]:
-    """Yield the name of each channel with its direction, and its file."""
+def images(
+    scan: ScanActivity, now_s: float, mode: str, recorded: Collection[str] | None = None
+) -> Iterator[tuple[str, bytes]]:
+    """Yield the name of each channel with its direction, and its file.
+
+    Args:
+        recorded: the channels that are saved; None: all.
+    """
     for name, (unit, values) in scan.channels(scan.end_s if scan.stopped_s is not None else None).items():
         forward = not name.endswith(RETRACE)
         source = name.removesuffix(RETRACE)
+        if recorded is not None and source not in recorded:
+            continue
         way = "Forward" if forward else "Backward"
         yield f"{source}_{way}", _image(scan, source, unit, values, now_s, mode, forward=forward)
 

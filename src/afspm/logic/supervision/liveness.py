@@ -85,6 +85,7 @@ class Liveness:
     def closing(self, now_s: float) -> None:
         """Take in that it is closing on purpose."""
         self._vital = ProcessHealth.NOT_CLOSING
+        self._step_began_s, self._longest_s = now_s, self._policy.longest_step_s
         self._deadline_s = now_s + self._policy.closing_s
 
     def check(self, now_s: float, *, works: bool | None = None) -> ProcessHealth:
@@ -104,8 +105,10 @@ class Liveness:
             return ProcessHealth.ALIVE
         if now_s < self._deadline_s:
             return ProcessHealth.STARTING if self._vital is ProcessHealth.STARTING else ProcessHealth.ALIVE
+        if works and self._vital is not ProcessHealth.STARTING and now_s - self._step_began_s <= self._longest_s:
+            return ProcessHealth.BUSY
         if works and self._vital is ProcessHealth.ALIVE:
-            return ProcessHealth.BUSY if now_s - self._step_began_s <= self._longest_s else ProcessHealth.FROZEN
+            return ProcessHealth.FROZEN
         return {ProcessHealth.STARTING: ProcessHealth.SLOW_START, ProcessHealth.ALIVE: ProcessHealth.SILENT}.get(
             self._vital, self._vital
         )

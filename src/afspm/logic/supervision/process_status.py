@@ -26,6 +26,7 @@ class ProcessStatus:
     def __init__(self, liveness: LivenessPolicy) -> None:
         self._liveness = liveness
         self._since: dict[str, tuple[tuple[object, ...], int]] = {}
+        self._alive: dict[str, tuple[int, int]] = {}
 
     def states(
         self, children: Iterable[SupervisedChild], now_s: float, now_ns: int
@@ -43,11 +44,19 @@ class ProcessStatus:
             before, since_ns = self._since.get(name, ((), 0))
             if facts != before:
                 since_ns = since_ns if before[:1] == facts[:1] else now_ns
+                if condition in (ProcessCondition.ALIVE, ProcessCondition.BUSY):
+                    since_ns = self._alive_since_ns(name, pid, now_ns)
                 self._since[name], changed = (facts, since_ns), True
             age_s = _step_age_s(child.life, now_s) if condition is ProcessCondition.BUSY else 0.0
             role = child.spec.role.value
             found.append(ProcessState(name, role, condition, since_ns, age_s, child.starts, pid, child.last_exit))
         return tuple(found), changed
+
+    def _alive_since_ns(self, name: str, pid: int, now_ns: int) -> int:
+        """Return since when a process is alive: one at work on a step, or late with a beat, was alive as well."""
+        if self._alive.get(name, (0, 0))[0] != pid:
+            self._alive[name] = (pid, now_ns)
+        return self._alive[name][1]
 
 
 def condition_of(child: SupervisedChild, now_s: float, liveness: LivenessPolicy) -> ProcessCondition:

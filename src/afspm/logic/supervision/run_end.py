@@ -15,7 +15,7 @@ OWN_PACE_S = 1.5  # after the end of the experiment: everybody has heard it, and
 AGAIN_S = 0.25  # somebody is busy with a step that it may take: ask later
 FAREWELL_S = 60.0  # but not for ever
 KILL_AFTER_S = 1.5  # after being asked, or after having finished what may be finished then
-TIP_S = 15.0  # after being asked: a process that retracts the tip ends by itself before
+TIP_S = 15.0  # after being asked: a process that retracts the tip, or works on its end, ends by itself before
 LEAVE_AFTER_S = 3.0  # after being killed
 
 
@@ -27,16 +27,35 @@ class EndReason(Enum):
     STOPPED = auto()
     LOST = auto()
     """A process that the experiment can't do without was given up, or all were."""
+    PLANS_DONE = auto()
+    """All components that act are done, and none of them ended the experiment."""
+    PLANS_LOST = auto()
+    """Nothing that acts is left, as a component that does was given up."""
+
+    @property
+    def is_announced(self) -> bool:
+        """Return whether all processes know of the end by the scheduler, and finish by themselves."""
+        return self in (EndReason.EXPERIMENT_ENDED, EndReason.PLANS_DONE)
 
     @property
     def is_final(self) -> bool:
         """Return whether there is nothing to resume."""
-        return self in (EndReason.EXPERIMENT_ENDED, EndReason.ALL_DONE)
+        return self in (EndReason.EXPERIMENT_ENDED, EndReason.ALL_DONE, EndReason.PLANS_DONE)
 
     @property
     def exit_code(self) -> int:
         """Of `afspm run`."""
-        return {EndReason.EXPERIMENT_ENDED: 0, EndReason.ALL_DONE: 0, EndReason.STOPPED: 130, EndReason.LOST: 1}[self]
+        return _EXIT_CODES[self]
+
+
+_EXIT_CODES = {
+    EndReason.EXPERIMENT_ENDED: 0,
+    EndReason.ALL_DONE: 0,
+    EndReason.LOST: 1,
+    EndReason.PLANS_DONE: 3,
+    EndReason.PLANS_LOST: 4,
+    EndReason.STOPPED: 130,
+}
 
 
 class EndStep(Enum):
@@ -59,6 +78,7 @@ class RunEnd:
         last: what has been done already.
         in_haste: somebody wants it to be over now.
         busy_s: when somebody was last seen to be busy after being asked.
+        began_s: when it began to end.
     """
 
     why: EndReason
@@ -69,14 +89,15 @@ class RunEnd:
     last: EndStep | None = None
     in_haste: bool = False
     busy_s: float = -math.inf
+    began_s: float = 0.0
 
     @classmethod
     def begin(cls, why: EndReason, text: str, now_s: float) -> RunEnd:
         """Begin to end. Where the experiment itself ended, all know and close by themselves: not disturbed at first."""
-        if why is not EndReason.EXPERIMENT_ENDED:
-            return cls(why, text, ask_s=now_s, kill_s=now_s + KILL_AFTER_S, latest_s=now_s)
+        if not why.is_announced:
+            return cls(why, text, ask_s=now_s, kill_s=now_s + KILL_AFTER_S, latest_s=now_s, began_s=now_s)
         ask_s = now_s + OWN_PACE_S
-        return cls(why, text, ask_s, ask_s + KILL_AFTER_S, latest_s=now_s + FAREWELL_S)
+        return cls(why, text, ask_s, ask_s + KILL_AFTER_S, latest_s=now_s + FAREWELL_S, began_s=now_s)
 
     def hurried(self, now_s: float) -> RunEnd:
         """Return the end in haste: those not asked yet are, those that were are killed."""
@@ -103,7 +124,8 @@ class RunEnd:
 
         Args:
             busy: somebody still works on a step, within what it declared: before they are asked, a component (a picture
-                of the night, say), and then a translator, which does not leave before the tip is safe.
+                of the night, say), and then a translator, which does not leave before the tip is safe, or any process
+                that is seen to work on its end.
         """
         deadline_s = self.deadline_s()
         seen = replace(self, busy_s=now_s) if busy and self.last is EndStep.ASK else self
@@ -124,13 +146,15 @@ def unfinished(
     ending: RunEnd, children: Mapping[str, SupervisedChild], now_s: float, liveness: LivenessPolicy
 ) -> list[str]:
     """Return which processes have something to finish; a translator may have it after it was asked to end: the tip."""
-    is_asked, has_ended = ending.last is not None, ending.why is EndReason.EXPERIMENT_ENDED
+    is_asked, has_ended = ending.last is not None, ending.why.is_announced
     # a scheduler on another computer may be there
     can_hear = all(child.life for child in children.values() if child.spec.role is Role.SCHEDULER)
     found = []
     for name, child in children.items():
         is_busy = child.life is not None and child.life.is_busy(now_s, liveness)
         may_finish = has_ended and child.may_still_finish(now_s, liveness, can_hear=can_hear)
-        if (is_busy or may_finish) if not is_asked else (is_busy and child.spec.role is Role.TRANSLATOR):
+        sees_to_tip = is_busy and child.spec.role is Role.TRANSLATOR
+        is_ending = child.life is not None and child.life.is_ending
+        if (sees_to_tip or is_ending) if is_asked else (is_busy or may_finish):
             found.append(name)
     return found

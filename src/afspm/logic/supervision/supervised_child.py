@@ -9,7 +9,10 @@ from afspm.logic.supervision.liveness import LivenessPolicy
 from afspm.model import Role
 
 LATE_START_S = 15.0
-"""Time that a process started at the end has to come up, and to hear what it missed."""
+"""Time that a process started at the end has to come up, while it is not seen to work; and then to hear what it
+missed."""
+CLOSES_WITHIN_S = 1.5
+"""Processor time that a process has for its end, after it was asked to."""
 
 
 @dataclass(frozen=True)
@@ -40,22 +43,29 @@ class ChildLife:
 
     Attributes:
         beat: its last heartbeat, at `beat_s`; None before the first.
+        first_beat_s: when the first came.
         works: whether it is seen to work though it does not beat; None: that is not known.
+        processor_s: the processor time that it has used; `asked_processor_s`: had used when it was asked to end.
     """
 
     pid: int
     started_s: float
     beat: HeartbeatReport | None = None
     beat_s: float = 0.0
+    first_beat_s: float = 0.0
     works: bool | None = None
+    processor_s: float | None = None
+    asked_processor_s: float | None = None
 
     @property
     def is_closing(self) -> bool:
         return self.beat is not None and self.beat.closing
 
     def overdue_s(self, liveness: LivenessPolicy) -> float | None:
-        """Return when its next beat is so late that the operating system is asked what it does; None: never."""
-        return None if self.beat is None or self.beat.closing else self.beat_s + liveness.silence_s / 2.0
+        """Return when its next beat, or its end, is so late that the operating system is asked what it does."""
+        if self.beat is None:
+            return None
+        return self.beat_s + (liveness.closing_s if self.beat.closing else liveness.silence_s) / 2.0
 
     def is_overdue(self, now_s: float, liveness: LivenessPolicy) -> bool:
         """Return whether that time has come."""
@@ -71,6 +81,16 @@ class ChildLife:
         if silent_s >= liveness.silence_s:
             return bool(self.works) and age_s + silent_s <= longest_s
         return 0.0 < age_s <= longest_s
+
+    @property
+    def is_ending(self) -> bool:
+        """Return whether it still works on its end: on a busy computer what takes a second may take ten.
+
+        One that goes round for ever uses up its processor time at once where the computer is idle.
+        """
+        if not self.works or self.processor_s is None or self.asked_processor_s is None:
+            return False
+        return self.processor_s - self.asked_processor_s < CLOSES_WITHIN_S
 
     def is_silent(self, now_s: float, liveness: LivenessPolicy) -> bool:
         """Return whether it should have beaten long ago, and does not work either."""
@@ -111,10 +131,10 @@ class SupervisedChild:
         if life is None or not self.spec.beats or self.spec.role is not Role.COMPONENT:
             return False
         if life.beat is None:
-            return now_s - life.started_s < LATE_START_S
+            return bool(life.works) or now_s - life.started_s < LATE_START_S
         given_up = self.rescued and life.is_silent(now_s, liveness)
         # between two steps of its start it looks as if it had nothing to do
-        begins_anew = can_hear and self.starts > 1 and now_s - life.started_s < LATE_START_S
+        begins_anew = can_hear and self.starts > 1 and now_s - life.first_beat_s < LATE_START_S
         is_late = now_s - life.beat_s > 1.5 * liveness.beat_period_s
         return not life.is_closing and not given_up and (begins_anew or is_late)
 

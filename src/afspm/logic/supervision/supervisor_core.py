@@ -17,11 +17,15 @@ from afspm.logic.supervision.child import (
     KillChild,
     StartChild,
 )
+from afspm.logic.supervision.idle import IDLE_AFTER_S, IdleWatch, describe_idle
 from afspm.logic.supervision.run_end import EndReason, EndStep, RunEnd, unfinished
 from afspm.logic.supervision.supervised_child import ChildLife, ChildSpec, ProcessReport, SupervisedChild
 from afspm.logic.supervision.supervisor_events import (
     ActivitySeen,
+    AskUse,
     Beaten,
+    EndExperiment,
+    EndRefused,
     EndSignal,
     Exited,
     ProcessAction,
@@ -35,6 +39,7 @@ from afspm.logic.supervision.supervisor_events import (
     SupervisorEffect,
     SupervisorEvent,
     TimePassed,
+    UseReported,
     WriteLog,
     describe_exit,
 )
@@ -50,18 +55,27 @@ class SupervisorCore:
 
     Args:
         awaits_scheduler: components begin only when the scheduler has answered.
+        ends_idle: whether the run ends when nothing that acts is left.
 
     Attributes:
         ending: how the run ends; None while it goes on.
     """
 
-    def __init__(self, specs: Iterable[ChildSpec], policy: ChildPolicy, *, awaits_scheduler: bool = False) -> None:
+    def __init__(
+        self,
+        specs: Iterable[ChildSpec],
+        policy: ChildPolicy,
+        *,
+        awaits_scheduler: bool = False,
+        ends_idle: bool = False,
+    ) -> None:
         self.children = {
             spec.name: SupervisedChild(spec, ChildWatch(replace(policy, beats=spec.beats))) for spec in specs
         }
         self.ending: RunEnd | None = None
         self._liveness = policy.liveness
         self._awaits_scheduler = awaits_scheduler
+        self._idle = IdleWatch(ends_idle)
         self._has_told_waiting = False
         self._effects: list[SupervisorEffect] = []
         self._now_s = 0.0
@@ -89,9 +103,8 @@ class SupervisorCore:
                 self._apply(child, child.watch.start_failed(why, now_s))
             case Beaten(name, report):
                 self._on_beat(self.children[name], report)
-            case ActivitySeen(name, works):
-                if (life := self.children[name].life) is not None:
-                    life.works = works
+            case ActivitySeen():
+                self._on_activity(self.children[event.name], event)
             case Exited():
                 self._on_exit(self.children[event.name], event)
             case EndSignal() if self.ending is None:
@@ -103,6 +116,11 @@ class SupervisorCore:
                 self._on_order(name)
             case SchedulerAnswered():
                 self._release()
+            case UseReported(why):
+                self._on_use(why)
+            case EndRefused(why):
+                self._idle.is_ending = False
+                self._log(LOGGED_AS, "WARNING", f"the scheduler refuses to end the experiment: {why}")
             case TimePassed():
                 self._on_time()
         effects, self._effects = self._effects, []
@@ -117,19 +135,23 @@ class SupervisorCore:
         if self.ending is not None:
             found = [self.ending.deadline_s()]
         else:
-            found = [child.watch.deadline_s() for child in self.children.values()]
+            found = [self._idle.deadline_s(), *(child.watch.deadline_s() for child in self.children.values())]
         for child in self.children.values():
             if child.life is not None and not child.life.is_overdue(self._now_s, self._liveness):
                 found.append(child.life.overdue_s(self._liveness))
         return min((s for s in found if s is not None), default=None)
 
     def overdue(self, now_s: float) -> tuple[dict[str, int], float]:
-        """Return the processes whose beat is late, with their ids, and over which time to judge whether they work."""
+        """Return the processes to be looked at from outside, with their ids, and the time over which to judge them.
+
+        Those are whose beat is late, at the end of a run also those that start, and all that were asked to end.
+        """
         overdue: dict[str, int] = {}
         for name, child in self.children.items():
             if child.life is None:
                 continue
-            if child.life.is_overdue(now_s, self._liveness):
+            is_late_to_finish = self.ending is not None and (self._is_asked or child.life.beat is None)
+            if is_late_to_finish or child.life.is_overdue(now_s, self._liveness):
                 overdue[name] = child.life.pid
             else:
                 child.life.works = None
@@ -144,10 +166,22 @@ class SupervisorCore:
 
     # --- events ---
 
+    @property
+    def _is_asked(self) -> bool:
+        return self.ending is not None and self.ending.last is EndStep.ASK
+
+    def _on_activity(self, child: SupervisedChild, seen: ActivitySeen) -> None:
+        if child.life is None:
+            return
+        child.life.works, child.life.processor_s = seen.works, seen.processor_s
+        if self._is_asked and child.life.asked_processor_s is None:
+            child.life.asked_processor_s = seen.processor_s
+
     def _on_beat(self, child: SupervisedChild, report: HeartbeatReport) -> None:
         if child.life is not None:
             if child.life.beat is None:
                 self._log(child.spec.name, "DEBUG", "is up")
+                child.life.first_beat_s = self._now_s
             child.life.beat, child.life.beat_s = report, self._now_s
         self._apply(child, child.watch.beat(report, self._now_s))
 
@@ -172,18 +206,41 @@ class SupervisorCore:
         else:
             self._apply(child, child.watch.exited(code, self._now_s, how, exited.fault))
             if code == ExitCode.ENDED:
-                self._end(EndReason.EXPERIMENT_ENDED, "the experiment has ended")
+                self._end_announced()
             elif code == ExitCode.CONFIG:
                 self._give_up(child, exited.last_error or "its settings can't work")
             elif code == ExitCode.DONE and child.spec.essential:
                 self._end(EndReason.EXPERIMENT_ENDED, f"{child.spec.name} is done")
-            self._tell_if_nothing_is_left(child)
 
-    def _tell_if_nothing_is_left(self, last: SupervisedChild) -> None:
-        """Tell that all plans are done, if the last has just ended: the experiment itself goes on until it is ended."""
-        plans_are_over = all(child.is_over for child in self.children.values() if child.spec.acts)
-        if self.ending is None and last.spec.acts and plans_are_over:
-            self._log(LOGGED_AS, "INFO", "nothing is left to run; Ctrl-C or `afspm end` ends the experiment")
+    def _end_announced(self) -> None:
+        if self._idle.is_ending:
+            self._end(EndReason.PLANS_DONE, f"nothing was left to run: {describe_idle(self.children.values())}")
+        else:
+            self._end(EndReason.EXPERIMENT_ENDED, "the experiment has ended")
+
+    def _look_whether_idle(self) -> None:
+        """End a run in which nothing that acts is left, unless the microscope is in use, or the file says to stay."""
+        if not self._idle.look(self.children.values(), self._now_s, self._liveness):
+            return
+        if not self._idle.is_logged:
+            self._idle.is_logged = True
+            then = "" if self._idle.ends else "; Ctrl-C or `afspm end` ends the experiment"
+            self._log(LOGGED_AS, "INFO", f"nothing is left to run: {describe_idle(self.children.values())}{then}")
+        if self._idle.asks(self._now_s):
+            self._effects.append(AskUse())
+
+    def _on_use(self, why: str) -> None:
+        if self.ending is not None or not self._idle.is_logged or self._idle.is_ending:
+            return
+        if why:
+            if not self._idle.is_postponed:
+                self._idle.is_postponed = True
+                self._log(LOGGED_AS, "INFO", f"the experiment goes on as long as it is in use: {why}")
+        elif any(child.given_up for child in self.children.values() if child.spec.acts):
+            self._end(EndReason.PLANS_LOST, f"nothing is left to run: {describe_idle(self.children.values())}")
+        else:
+            self._idle.is_ending = True
+            self._effects.append(EndExperiment())
 
     def _on_order(self, name: str) -> None:
         child = self.children.get(name)
@@ -205,6 +262,8 @@ class SupervisorCore:
                 self._end(EndReason.LOST, "all processes are given up")
             else:
                 self._end(EndReason.ALL_DONE, "all components are done")
+        if self.ending is None:
+            self._look_whether_idle()
 
     def _await_scheduler(self) -> None:
         """A scheduler that beats and does not answer us, for want of a key perhaps, may answer components."""
@@ -243,7 +302,9 @@ class SupervisorCore:
             self._end(EndReason.LOST, what)
         else:
             again = f"`afspm restart {name}` starts it again, Ctrl-C ends the run"
-            self._log(LOGGED_AS, "CRITICAL", f"gave up {name}; the rest goes on: {why}; {again}")
+            is_last = child.spec.acts and all(other.is_over for other in self.children.values() if other.spec.acts)
+            rest = f"the run ends in {IDLE_AFTER_S:.0f} s" if is_last and self._idle.ends else "the rest goes on"
+            self._log(LOGGED_AS, "CRITICAL", f"gave up {name}; {rest}: {why}; {again}")
 
     def _end(self, why: EndReason, text: str) -> None:
         self._release()
@@ -259,8 +320,8 @@ class SupervisorCore:
             if child.spec.role is Role.TRANSLATOR and child.life:
                 self._command(ProcessAction.CLOSE_INPUT, child)
         # a run that ended as it should is told of by its summary, in a moment
-        level = {EndReason.STOPPED: "INFO", EndReason.LOST: "CRITICAL"}.get(why, "DEBUG")
-        self._log(LOGGED_AS, level, text)
+        levels = {EndReason.STOPPED: "INFO", EndReason.LOST: "CRITICAL", EndReason.PLANS_LOST: "CRITICAL"}
+        self._log(LOGGED_AS, levels.get(why, "DEBUG"), text)
 
     # --- the end ---
 
@@ -272,7 +333,7 @@ class SupervisorCore:
     def _has_just_ended(self) -> bool:
         """True while the experiment itself has ended, and nobody has been asked to leave."""
         ending = self.ending
-        return ending is not None and ending.why is EndReason.EXPERIMENT_ENDED and ending.last is None
+        return ending is not None and ending.why.is_announced and ending.last is None
 
     def _rescue(self, child: SupervisedChild) -> None:
         child.rescued = True

@@ -42,10 +42,15 @@ class Beaten:
 
 @dataclass(frozen=True, slots=True)
 class ActivitySeen:
-    """The operating system was asked whether a process that does not beat works; None: it can't tell."""
+    """The operating system was asked whether a process that does not beat works; None: it can't tell.
+
+    Attributes:
+        processor_s: the processor time that it has used in its life; None: that is not known.
+    """
 
     name: str
     works: bool | None
+    processor_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +88,20 @@ class SchedulerAnswered:
 
 
 @dataclass(frozen=True, slots=True)
+class UseReported:
+    """The scheduler answered whether the microscope is in use; `why`: empty if it is not."""
+
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class EndRefused:
+    """The scheduler refused to end the experiment."""
+
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
 class TimePassed:
     """The deadline came, or anything else happened."""
 
@@ -97,6 +116,8 @@ SupervisorEvent = (
     | EndSignal
     | RestartOrdered
     | SchedulerAnswered
+    | UseReported
+    | EndRefused
     | TimePassed
 )
 
@@ -128,6 +149,16 @@ class ReleaseComponents:
 
 
 @dataclass(frozen=True, slots=True)
+class AskUse:
+    """Ask the scheduler whether the microscope is in use; `UseReported` follows if the scheduler can say."""
+
+
+@dataclass(frozen=True, slots=True)
+class EndExperiment:
+    """Have the scheduler end the experiment; `EndRefused` follows if it does not."""
+
+
+@dataclass(frozen=True, slots=True)
 class WriteLog:
     """Write a line to the log in the name of a process; `level` is a name of the logging module."""
 
@@ -136,7 +167,7 @@ class WriteLog:
     text: str
 
 
-SupervisorEffect = ProcessCommand | ReleaseComponents | WriteLog
+SupervisorEffect = ProcessCommand | ReleaseComponents | AskUse | EndExperiment | WriteLog
 
 
 _EXIT_REASONS = {

@@ -13,7 +13,7 @@ from afspm.microscopes.gxsm.activity import SHOWS_S, Activity, Saving
 from afspm.microscopes.gxsm.hardware import (
     ABORT,
     APPROACH,
-    AUTOSAVE_OFF,
+    AUTOSAVE,
     REPEAT_OFF,
     Hardware,
     Offered,
@@ -50,8 +50,8 @@ class Gxsm(Driver):
     Args:
         address: "HOST:PORT" of `bridge.py` in GXSM's console; "shm" for the shared memory of a Gxsm4 on this computer,
             "shm:BLOCK@PROCESS" if that or its process is not called as usual.
-        saving: "afspm": GXSM's Auto Save is switched off, and it is told to save once after each scan; "gxsm": its
-            Auto Save is left on, and its files are waited for.
+        saving: "afspm": while a scan of this translator runs, GXSM's Auto Save is off, and the translator has GXSM save
+            once at its end; else Auto Save is on. "gxsm": Auto Save is left on, and its files are waited for.
         hardware: "SRanger", "RPSPMC" or "simulator", if the kind that is found is wrong.
         scan_dir, probe_dir: where scans and spectra are saved, if not where GXSM says that it saves channels.
         feedback_actions: GXSM's actions that switch the feedback on and off, where its hardware has such.
@@ -123,9 +123,7 @@ class Gxsm(Driver):
         self._find_parameters()
         self.lacking = self._missing_actions()
         scan_frame = ScanFrame(ask, user_unit_m(ask))
-        if self._saving.by_us and AUTOSAVE_OFF in self._offered.actions:
-            ask.call("action", AUTOSAVE_OFF)
-            self.log.info("GXSM's Auto Save of scans was switched off and stays off (see the setting saving)")
+        switches_autosave = self._saving.by_us and self._offered.actions.issuperset(AUTOSAVE.values())
         self._kept.kept_in(self.memory)
         self._files = GxsmFiles(
             self.memory,
@@ -133,7 +131,6 @@ class Gxsm(Driver):
             patience_s=self.patience_s(self.result_timeout_s / 2),
             soon_s=self.patience_s(SOON_S),
             late_s=self.patience_s(LATE_S),
-            rewritten=not self._saving.by_us,
         )
         self._activity = Activity(
             ask,
@@ -146,6 +143,7 @@ class Gxsm(Driver):
             set_frame=lambda: frame(self.in_force(FRAME)),
             shows_s=self.patience_s(SHOWS_S),
             saving=self._saving,
+            switches_autosave=switches_autosave,
         )
         self._tip = TipPlace(scan_frame, self.memory, self._sets_out)
         own = FrameSettings(scan_frame, self._tip, is_led=self._offered.hardware is Hardware.RPSPMC)
@@ -227,6 +225,9 @@ class Gxsm(Driver):
 
     def results(self) -> Sequence[str]:
         return self._files.results(self.clock.now_s())
+
+    def followed(self) -> bool | None:
+        return self._files.followed()
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         return self._files.load(result)

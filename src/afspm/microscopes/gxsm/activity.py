@@ -10,10 +10,10 @@ from typing import Final
 
 from afspm.clock import Clock
 from afspm.microscopes.gxsm.errors import GxsmError
-from afspm.microscopes.gxsm.hardware import ABORT, STATUS, Doing, Hardware, decoded, execute
+from afspm.microscopes.gxsm.hardware import ABORT, AUTOSAVE, STATUS, Doing, Hardware, decoded, execute
 from afspm.microscopes.gxsm.link import Asking
 from afspm.microscopes.gxsm.result_files import GxsmFiles, endings
-from afspm.microscopes.gxsm.scan_memory import Rows, is_unfinished, looked_at
+from afspm.microscopes.gxsm.scan_memory import Rows, is_unfinished, looked_at, only
 from afspm.microscopes.gxsm.settings import ScanFrame
 from afspm.model import Region, ScopeState, ScopeStatus
 from afspm.translator.result_files import SCAN, as_list
@@ -32,7 +32,7 @@ class Saving:
     """The way that scans and spectra are saved.
 
     Attributes:
-        by_us: True if GXSM is told to save a scan at its end; if not, it does so by itself.
+        by_us: True if the translator has GXSM save its own scans at their end. GXSM saves all others by itself.
         scan_dir, probe_dir: where files are, if not where GXSM says that it saves channels.
     """
 
@@ -42,14 +42,51 @@ class Saving:
 
 
 @dataclass
+class LineWatch:
+    """The last line that GXSM reported, and the direction of the lines: one against it belongs to another scan.
+
+    The first change shows no direction: until the first line is complete, GXSM reports the last one of the scan before.
+    """
+
+    line: int
+    has_moved: bool = False
+    step: int = 0
+
+    def turned(self, line: int, rows: int) -> bool:
+        """Take in a line. Return True if it goes against the direction."""
+        if line == self.line or not 0 <= line < rows:  # at the start of a scan Gxsm4 once reported line -296
+            return False
+        step = 1 if line > self.line else -1
+        self.line, turned = line, self.step not in (0, step)
+        if self.has_moved:
+            self.step = 0 if turned else step
+        self.has_moved = True
+        return turned
+
+
+@dataclass
 class ScanProgress:
-    """The running scan as it was seen: its channels, its line, and since when it has ended."""
+    """The running scan as it was seen.
+
+    Attributes:
+        endings: of the files of its channels.
+        name: of its first file, in which GXSM raises the number with each scan; empty before the first look.
+        watch: of its lines; None before the first look.
+        goes_up: whether its last row is the first of the picture; None: not seen yet.
+        settles_until_s, ended_ns: when GXSM is done with it, and when it has ended.
+        y_before, y_moved: the line of the scan before, and whether GXSM has reported another one since.
+        follows: it was begun before the one before it was seen to end.
+    """
 
     endings: list[str] = field(default_factory=list)
+    name: str = ""
+    watch: LineWatch | None = None
+    goes_up: bool | None = None
     settles_until_s: float = 0.0
     ended_ns: int = 0
     y_before: int | None = None
     y_moved: bool = False
+    follows: bool = False
 
 
 class Activity:
@@ -60,6 +97,7 @@ class Activity:
         frame: of the next scan; `set_frame` gives the same, as it was set, and (rows, columns).
         kept: JSON-able, and lasts: when the tip arrives that was sent away.
         shows_s: how long what was begun may take to be seen running, in experiment time.
+        switches_autosave: GXSM's Auto Save is off while a scan of the translator's runs.
     """
 
     def __init__(
@@ -75,6 +113,7 @@ class Activity:
         set_frame: Callable[[], tuple[Region, tuple[int, int]]],
         shows_s: float,
         saving: Saving,
+        switches_autosave: bool,
     ) -> None:
         self._ask = ask
         self._hardware = hardware
@@ -85,10 +124,12 @@ class Activity:
         self._log = log
         self._shows_s = shows_s
         self._saving = saving
+        self._switches_autosave = switches_autosave
+        self._autosave: bool | None = None  # as it was set by this translator
         self._stopping = False
         self._execute = ""
         self._kept = kept
-        self._idle_ns = 0  # when it was last seen to measure nothing
+        self._looked_ns = 0  # at the last look
         self._shows_until_s = 0.0
         self._scan = ScanProgress()
         self._seen_last: tuple[tuple[int, int], Rows | None] = (0, 0), None
@@ -97,10 +138,12 @@ class Activity:
 
     def start_scan(self) -> None:
         """Scan the frame."""
-        self._begin_scan(self._clock.now_ns())
+        self._autosave = None  # a person may have switched it at the panel
+        self._switch_autosave(on=False)
+        self._begin_scan(self._clock.now_ns(), own=True)
         self._scan.y_before = int(self._ask.number("y_current"))
         rows, columns = self._set_frame()[1]
-        self._files.before = looked_at(self._ask, len(self._channels()), (0, rows - 1), columns)
+        self._files.looked(looked_at(self._ask, len(self._channels()), (0, rows - 1), columns), None)
         self._shows_until_s = self._clock.now_s() + self._shows_s
         self._ask.call("startscan")
 
@@ -181,9 +224,10 @@ class Activity:
             return ScopeStatus(ScopeState.SPEC)
         if doing.measuring and not (led and not self._files.what):
             return self._measuring(doing)
-        self._idle_ns = self._clock.now_ns()
+        self._looked_ns = self._clock.now_ns()
         moving = doing.moving or now_s < self._arrives_s
-        if self._stopping and moving:  # a spectrum that was to be taken at the end of the way
+        # a stopped spectrum may still be at the tip's way to it
+        if self._stopping and (moving or (self._autosave is False and not self._is_settled(now_s))):
             return ScopeStatus(ScopeState.INTERRUPTED)
         self._stopping = False
         what = self._files.what
@@ -193,6 +237,7 @@ class Activity:
             return ScopeStatus(ScopeState.SCANNING)
         if what:
             self._end(what)
+        self._switch_autosave(on=True)
         if doing.approaching:
             return ScopeStatus(ScopeState.COARSE_MOTOR)
         if moving:
@@ -200,23 +245,81 @@ class Activity:
         return ScopeStatus(ScopeState.INTERRUPTED if self._files.broken_off else ScopeState.FREE)
 
     def _measuring(self, doing: Doing) -> ScopeStatus:
+        if self._files.what == SCAN and doing.scanning and self._is_another():
+            self._follow()
         self._shows_until_s = self._scan.settles_until_s = 0.0
         if not self._files.what and not self._stopping:  # somebody began it at the panel
             if doing.scanning:
-                self._begin_scan(self._idle_ns)
+                self._begin_scan(self._looked_ns, own=False)
+                self._switch_autosave(on=True)
+                self._is_another()  # the first look, which later ones are compared with
             else:
                 self._begin_curve("VP", self._frame.tip())
         if self._files.what == SCAN and self._files.before is None:
-            self._files.before = self._last_row()
+            self._look_at_memory()
+        self._looked_ns = self._clock.now_ns()
         curve = doing.probing and (self._files.what not in ("", SCAN) or not doing.scanning)
         return ScopeStatus(ScopeState.SPEC if curve else ScopeState.SCANNING, doing.paused or None)
 
-    def _last_row(self) -> Rows | None:
-        """Return what is in the last row of a scan that was found running; None once it may have been scanned."""
+    def _is_another(self) -> bool:
+        """Return whether another scan runs than at the last look, though none was seen to end.
+
+        Repeated by GXSM, or by a person, scans follow in less time than passes between two looks. GXSM then has a new
+        number in the names of the files, and begins with its lines again.
+        """
+        before, name = self._scan.name, self._ask.text("chfname", 0)
+        self._scan.name = name
+        # once GXSM has saved, it reports another number in place of one that was taken
+        is_another = bool(before) and name != before and not self._files.is_written(Path(self._absolute(name)))
+        if self._files.is_own:  # Repeat was switched off for it
+            return is_another
+        line, watch = int(self._ask.number("y_current")), self._scan.watch
+        if watch is None:
+            self._scan.watch = LineWatch(line)
+            return is_another
+        if watch.step:
+            self._scan.goes_up = watch.step < 0
+        return watch.turned(line, self._files.scanning[1][0]) or is_another
+
+    def _follow(self) -> None:
+        """End a scan that another one has followed. Only its files, if GXSM saved it, show whether it was whole."""
+        self._log.warning("another scan was begun at GXSM's panel before the last one was seen to end")
+        channels, folder, before = self._channels(), self._folder(), self._before()
+        name, ended_ns, now_ns = self._scan.name, self._scan.ended_ns, self._clock.now_ns()
+        self._files.end(ended_ns or now_ns, now_ns, channels, folder, is_whole=None, before=before)
+        self._begin_scan(self._looked_ns, own=False)
+        self._switch_autosave(on=True)
+        self._scan.name, self._scan.follows = name, True
+        self._seen_last = (0, 0), None
+
+    def _look_at_memory(self) -> None:
+        """Keep the first and last row of a scan that was found running, unless its last line may have been scanned."""
         rows, columns = self._files.scanning[1]
-        last = 0 if self._files.upwards else rows - 1
-        found = looked_at(self._ask, len(self._channels()), [last], columns)
-        return found if abs(int(self._ask.number("y_current")) - last) > 1 else None
+        found = looked_at(self._ask, len(self._channels()), (0, rows - 1), columns)
+        line = int(self._ask.number("y_current"))
+        if abs(line - self._last_row()) > 1:
+            self._files.looked(found, line)
+
+    def _last_row(self) -> int:
+        """Return the row that is scanned last, as far as is known of a scan that the panel has begun."""
+        goes_up = self._files.upwards if self._scan.goes_up is None else self._scan.goes_up
+        return 0 if goes_up else self._files.scanning[1][0] - 1
+
+    def _before(self) -> Rows | None:
+        """Return the rows that the running scan found in GXSM's memory, and has to have replaced at its end."""
+        if self._files.before is None:
+            return None
+        rows, line = self._files.before
+        if line is None:
+            return rows
+        last = self._last_row()
+        return only(rows, last) if abs(line - last) > 1 else None
+
+    def _switch_autosave(self, *, on: bool) -> None:
+        """Switch GXSM's Auto Save: on for scans of its panel, off while a scan of the translator's may be stopped."""
+        if self._switches_autosave and self._autosave is not on:
+            self._ask.call("action", AUTOSAVE[on])
+            self._autosave = on
 
     def _is_settled(self, now_s: float) -> bool:
         """Return whether GXSM is done with the scan that has just ended."""
@@ -236,11 +339,12 @@ class Activity:
         self._shows_until_s = now_s + self._shows_s
         self._ask.call("action", action)
 
-    def _begin_scan(self, begun_ns: int) -> None:
+    def _begin_scan(self, begun_ns: int, *, own: bool) -> None:
         self._stopping, self._scan = False, ScanProgress()
         region, shape = self._set_frame()
         taken = {"frame": as_list(region), "shape": list(shape)}
-        self._files.begin(SCAN, self._folder(), begun_ns, taken)
+        by_gxsm = not (own and self._saving.by_us)
+        self._files.begin(SCAN, self._folder(), begun_ns, taken, own=own, by_gxsm=by_gxsm)
 
     def _begin_curve(self, kind: str, position_m: tuple[float, float]) -> None:
         self._stopping = False
@@ -258,7 +362,7 @@ class Activity:
             self._files.end(now_ns, now_ns)
             return
         is_whole = self._is_whole()
-        if is_whole and self._saving.by_us:
+        if is_whole and not self._files.is_saved_by_gxsm:
             try:
                 self._ask.call("autosave")
             except GxsmError as error:
@@ -267,15 +371,20 @@ class Activity:
         channels, folder = self._channels(), self._folder()
         self._files.end(self._scan.ended_ns, self._clock.now_ns(), channels, folder, is_whole=is_whole)
 
-    def _is_whole(self) -> bool:
-        """Return whether the scan that has ended came to its end, as far as GXSM's memory tells."""
-        before, (_, shape) = self._files.before, self._files.scanning
+    def _is_whole(self) -> bool | None:
+        """Return whether the scan that has ended came to its end, as far as GXSM's memory shows.
+
+        None: it followed another one at once, and was seen too late to know what it found there.
+        """
+        before, (_, shape) = self._before(), self._files.scanning
         if before is None and self._seen_last[0] == shape:  # somebody began it, and it was soon over
             before = self._seen_last[1]
         columns = shape[1] if before is None else before["columns"]
         after = looked_at(self._ask, len(self._channels()), (0, shape[0] - 1), columns)
         self._seen_last = shape, after
-        return before is None or not is_unfinished(before, after)
+        if before is None:
+            return None if self._scan.follows else True
+        return not is_unfinished(before, after)
 
     def _folder(self) -> Path | None:
         """Return where GXSM saves; before its first scan it does not say, and saves where it was started."""

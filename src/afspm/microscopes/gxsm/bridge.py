@@ -1,9 +1,10 @@
 """Lets afspm call GXSM: run this in GXSM's Python console, and leave it running.
 
-It listens on this computer only, for one client at a time, and passes on calls of the functions named below and no
-others. A client first sends a secret, which is in a file that only this user can read; a line that is neither that nor
-a call ends the connection, so that no page in a browser can command GXSM. Set `script-control` to 0 to end it. Nothing
-but Python itself is needed here.
+The bridge listens on this computer only, and passes on calls of the functions named below and no others. A client and
+the bridge first prove to each other that they know a secret, which is in a file that only this user can read. The
+secret itself is never sent, so a program that listens here in place of the bridge learns nothing (`Introduction`).
+A line that is neither a proof nor a call ends its connection, so that no page in a browser can command GXSM. Several
+clients are served, one call at a time. Set `script-control` to 0 to end the bridge. Nothing but Python is needed here.
 """
 
 from __future__ import annotations
@@ -13,24 +14,26 @@ import hmac
 import json
 import os
 import secrets
-import select
+import selectors
 import socket
+import time
 from pathlib import Path
 
 HOST, PORT = "127.0.0.1", globals().get("PORT", 65431)  # if it is in use: another number here and in `address`
-SECRET = Path("~/.afspm/gxsm-bridge-secret").expanduser()
+SECRET = "~/.afspm/gxsm-bridge-secret"
 FOLDER = globals().get("FOLDER", str(Path.cwd()))
-WELCOME = "afspm bridge"
+WELCOME = "afspm bridge 2"
 METHODS = {
     *("set", "get", "gets", "list_refnames", "list_actions", "action", "rtquery", "y_current"),
     *("startscan", "stopscan", "autosave", "chfname", "moveto_scan_xy"),
     *("get_geometry", "get_dimensions", "get_differentials", "get_slice", "get_probe_event"),
 }
-LONGEST = 10_000
-CALLS_A_LOOK = 50  # at script-control
-LOOK_S = 0.5
-STRANGER_LOOKS = 2
-SILENT_LOOKS = 20  # one that says nothing for so long is gone if another comes: its connection may have been lost
+LONGEST, LONGEST_PROOF = 10_000, 200  # bytes of a line
+LOOK_S, WAIT_S = 0.5, 0.1  # between two looks at script-control, and at what clients owe
+PROVES_S = 2.0  # since it connected, however much a client sends meanwhile
+TAKES_S = 10.0  # for a client to take an answer; and a client that is silent so long makes room for another
+MOST_STRANGERS, MOST_CLIENTS = 64, 8
+NONCE = 64  # hexadecimal digits
 gxsm = globals().get("gxsm")  # the console has it
 
 
@@ -41,16 +44,56 @@ def packed(value):  # type: ignore[no-untyped-def]
 
 def secret() -> bytes:
     """Return the secret, made when this is run for the first time."""
-    SECRET.parent.mkdir(mode=0o700, exist_ok=True)
-    if not SECRET.exists():
-        with os.fdopen(os.open(SECRET, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+    path = Path(SECRET).expanduser()
+    path.parent.mkdir(mode=0o700, exist_ok=True)
+    if not path.exists():
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
             file.write(secrets.token_hex(32).encode())
-    if os.name == "posix" and SECRET.stat().st_mode & 0o077:
-        raise PermissionError(f"other users can read {SECRET}: chmod 600 {SECRET}")
-    found = SECRET.read_bytes().strip()
+    if os.name == "posix" and path.stat().st_mode & 0o077:
+        raise PermissionError(f"other users can read {path}: chmod 600 {path}")
+    found = path.read_bytes().strip()
     if len(found) < 32:
-        raise ValueError(f"{SECRET} is damaged: delete it, and run this again")
+        raise ValueError(f"{path} is damaged: delete it, and run this again")
     return found
+
+
+def proof(known: bytes, side: str, address: str, client_nonce: str, bridge_nonce: str) -> str:
+    """Return the proof that a side ("bridge", "client") knows the secret, for the random numbers of both.
+
+    The address of the bridge is part of it, as both ends of the connection see it. A program in between that listens
+    somewhere else can therefore not pass a proof on.
+    """
+    facts = "\n".join((WELCOME, side, address, client_nonce, bridge_nonce))
+    return hmac.new(known, facts.encode("utf-8", "replace"), "sha256").hexdigest()
+
+
+class Introduction:
+    """The first two lines of a connection: the bridge proves that it knows the secret, then the client does.
+
+        client: ["challenge", nonce]     bridge: {"value": [nonce, proof]}
+        client: ["response", proof]      bridge: {"value": "afspm bridge 2"}
+
+    Attributes:
+        is_over: True once the client has proven that it knows the secret.
+    """
+
+    def __init__(self, known: bytes, address: str) -> None:
+        self._known, self._address, self._expected = known, address, ""
+        self.is_over = False
+
+    def reply(self, call) -> str:  # type: ignore[no-untyped-def]
+        """Return the answer to a line (`parsed`); empty: hang up."""
+        step, *arguments = call or [""]
+        text = arguments[0] if len(arguments) == 1 and isinstance(arguments[0], str) else ""
+        if step == "challenge" and len(text) == NONCE and not self._expected:
+            nonce = secrets.token_hex(NONCE // 2)
+            self._expected = proof(self._known, "client", self._address, text, nonce)
+            return json.dumps({"value": [nonce, proof(self._known, "bridge", self._address, text, nonce)]})
+        expected = self._expected.encode()
+        if step == "response" and expected and hmac.compare_digest(expected, text.encode("utf-8", "replace")):
+            self.is_over = True
+            return json.dumps({"value": WELCOME})
+        return ""
 
 
 def parsed(line: bytes):  # type: ignore[no-untyped-def]
@@ -73,7 +116,7 @@ def answer(method, arguments) -> str:  # type: ignore[no-untyped-def]
         value = getattr(gxsm, method)(*arguments)
         # what `action` returns in Gxsm3 is not initialised: it must not be looked at
         return json.dumps({"value": None if method == "action" else value}, default=packed)
-    except Exception as error:
+    except Exception as error:  # what a call raises is the client's to handle: the bridge goes on
         return json.dumps({"error": f"{type(error).__name__}: {error}"})
 
 
@@ -82,32 +125,164 @@ def wanted() -> bool:
     return gxsm is not None and gxsm.get("script-control") > 0.5
 
 
-def serve(client: socket.socket, listener: socket.socket, known: bytes) -> None:
-    """Answer one client until it goes, says what is no call, or the script is to end."""
-    received, calls, silent, welcome = b"", 0, 0, False
-    while calls % CALLS_A_LOOK or wanted():
-        if not select.select([client], [], [], LOOK_S)[0]:
-            calls, silent = 0, silent + 1
-            if silent >= (SILENT_LOOKS if welcome else STRANGER_LOOKS) and select.select([listener], [], [], 0.0)[0]:
-                return
-            continue
-        silent = 0
-        part = client.recv(65536)
-        received += part
-        if not part or len(received) > LONGEST:
+class Client:
+    """A connection. Times are monotonic.
+
+    Attributes:
+        until_s: when it is dropped, unless it has proven itself, or taken its answer, by then.
+        active_s: when it last sent something.
+        is_open: False from when it should be dropped.
+    """
+
+    def __init__(self, connection: socket.socket, known: bytes, now_s: float) -> None:
+        self.connection = connection
+        connection.settimeout(0.0)
+        self._introduction = Introduction(known, "{}:{}".format(*connection.getsockname()))
+        self._received = self._unsent = b""
+        self.until_s, self.active_s = now_s + PROVES_S, now_s
+        self.is_open = True
+
+    @property
+    def is_stranger(self) -> bool:
+        return not self._introduction.is_over
+
+    @property
+    def has_line(self) -> bool:
+        """True if there is a line that can be answered now."""
+        return self.is_open and not self._unsent and b"\n" in self._received
+
+    @property
+    def events(self) -> int:
+        """What to wait for: more is read when the last answer has been taken."""
+        return selectors.EVENT_WRITE if self._unsent else selectors.EVENT_READ
+
+    def exchange(self, now_s: float) -> None:
+        """Send the rest of an answer, or receive. Too long a line ends the connection."""
+        if self._unsent:
+            self.send("", now_s)
+        elif not self.has_line:
+            part = self.connection.recv(65536)
+            self._received, self.active_s = self._received + part, now_s
+            longest = LONGEST_PROOF if self.is_stranger else LONGEST
+            self.is_open = bool(part) and len(self._received) <= longest
+
+    def reply(self) -> str:
+        """Return the answer to the next line; empty: hang up."""
+        line, self._received = self._received.split(b"\n", 1)
+        call = parsed(line)
+        if self.is_stranger:
+            return self._introduction.reply(call)
+        return answer(call[0], call[1:]) if call else ""
+
+    def send(self, reply: str, now_s: float) -> None:
+        """Send an answer, as much of it as the connection takes now."""
+        self._unsent += reply.encode()
+        try:
+            sent = self.connection.send(self._unsent)
+        except BlockingIOError:
+            sent = 0
+        self._unsent = self._unsent[sent:]
+        if not self.is_stranger and (reply or sent):
+            self.until_s = now_s + TAKES_S
+
+    def is_late(self, now_s: float) -> bool:
+        """Return True if it has not proven itself, or not taken its answer, in time."""
+        return now_s >= self.until_s and (self.is_stranger or bool(self._unsent))
+
+
+class Bridge:
+    """Serves the connections to one listening socket."""
+
+    def __init__(self, listener: socket.socket, known: bytes) -> None:
+        self._listener, self._known = listener, known
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(listener, selectors.EVENT_READ)
+        self._clients: list[Client] = []
+        self._refused, self._shown_s = 0, 0.0
+
+    def serve(self) -> None:
+        """Answer clients until script-control is 0."""
+        look_s = time.monotonic()
+        while True:
+            if time.monotonic() >= look_s:
+                if not wanted():
+                    return
+                look_s = time.monotonic() + LOOK_S
+            for key, _ in self._selector.select(0.0 if any(one.has_line for one in self._clients) else WAIT_S):
+                if key.fileobj is self._listener:
+                    self._accept()
+                else:
+                    self._guarded(key.data, key.data.exchange)
+            for client in [one for one in self._clients if one.has_line]:
+                self._guarded(client, lambda now_s, one=client: self._answer(one, now_s))
+            now_s = time.monotonic()
+            for client in [one for one in self._clients if not one.is_open or one.is_late(now_s)]:
+                if client.is_open and client.is_stranger:
+                    self._refuse("no proof in time")
+                self._drop(client)
+
+    def close(self) -> None:
+        """End all connections."""
+        for client in list(self._clients):
+            self._drop(client)
+        self._selector.close()
+
+    def _accept(self) -> None:
+        try:
+            client = Client(self._listener.accept()[0], self._known, time.monotonic())
+        except OSError:  # it has gone before it was served
             return
-        while b"\n" in received:
-            line, received = received.split(b"\n", 1)
-            call = parsed(line) if welcome else None
-            if call is not None:
-                reply = answer(call[0], call[1:])
-            elif not welcome and hmac.compare_digest(line, known):
-                welcome, reply = True, json.dumps({"value": WELCOME})
-            else:
-                print("afspm bridge: refused a client that sent neither the secret nor a call")  # noqa: T201
-                return
-            client.sendall(reply.encode() + b"\n")
-            calls += 1
+        self._clients.append(client)
+        self._selector.register(client.connection, client.events, client)
+        strangers = [one for one in self._clients if one.is_stranger]
+        if len(strangers) > MOST_STRANGERS:
+            self._drop(strangers[0])
+
+    def _guarded(self, client: Client, act) -> None:  # type: ignore[no-untyped-def]
+        if not client.is_open:
+            return
+        try:
+            act(time.monotonic())
+        except OSError as error:
+            client.is_open = False
+            if not client.is_stranger:
+                print(f"afspm bridge: lost a client: {error}")  # noqa: T201
+        self._selector.modify(client.connection, client.events, client)
+
+    def _answer(self, client: Client, now_s: float) -> None:
+        was_stranger, reply = client.is_stranger, client.reply()
+        if not reply:
+            client.is_open = False
+            self._refuse("neither a proof nor a call")
+            return
+        if was_stranger and not client.is_stranger and not self._has_room(client, now_s):
+            client.is_open = False
+            reply = json.dumps({"error": f"the bridge serves {MOST_CLIENTS} clients already: end one of them"})
+        client.send(reply + "\n", now_s)
+
+    def _has_room(self, client: Client, now_s: float) -> bool:
+        """Return True if one more client can be served. The one that is silent longest may have lost its connection."""
+        others = [one for one in self._clients if one is not client and not one.is_stranger]
+        if len(others) < MOST_CLIENTS:
+            return True
+        silent = min(others, key=lambda one: one.active_s)
+        if now_s < silent.active_s + TAKES_S:
+            return False
+        self._drop(silent)
+        return True
+
+    def _refuse(self, why: str) -> None:
+        """Show refusals, at most a line in ten seconds: a stranger must not fill GXSM's console."""
+        self._refused += 1
+        if time.monotonic() >= self._shown_s + 10.0:
+            print(f"afspm bridge: refused connections: {self._refused}, the last for {why}")  # noqa: T201
+            self._shown_s = time.monotonic()
+
+    def _drop(self, client: Client) -> None:
+        client.is_open = False
+        self._clients.remove(client)
+        self._selector.unregister(client.connection)
+        client.connection.close()
 
 
 def run() -> None:
@@ -118,17 +293,13 @@ def run() -> None:
     with socket.socket() as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((HOST, PORT))
-        listener.listen(1)
+        listener.listen(MOST_STRANGERS)
         print("afspm bridge: listening at {}:{}".format(*listener.getsockname()))  # noqa: T201
-        while wanted():
-            if select.select([listener], [], [], LOOK_S)[0]:
-                client, _ = listener.accept()
-                client.settimeout(10.0)  # one that does not take its answers is let go
-                try:
-                    with client:
-                        serve(client, listener, known)
-                except OSError as error:
-                    print(f"afspm bridge: lost the client: {error}")  # noqa: T201
+        bridge = Bridge(listener, known)
+        try:
+            bridge.serve()
+        finally:
+            bridge.close()
     print("afspm bridge: ended")  # noqa: T201
 
 

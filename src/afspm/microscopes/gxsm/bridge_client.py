@@ -1,11 +1,13 @@
-"""The link to GXSM by way of the script in its console (`bridge.py`): a secret, and then lines of JSON, over TCP."""
+"""The link to GXSM by way of the script in its console (`bridge.py`): two proofs, and then lines of JSON, over TCP."""
 
 from __future__ import annotations
 
 import base64
+import hmac
 import json
 import math
 import os
+import secrets
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -13,14 +15,13 @@ from typing import Final
 
 import numpy as np
 
+from afspm.microscopes.gxsm.bridge import NONCE, SECRET, WELCOME, proof
 from afspm.microscopes.gxsm.errors import BadReply, GxsmError
 from afspm.translator.driver import ControllerLost
 from afspm.translator.tcp import Receiver, TcpConnection
 
 _LONGEST: Final = 1 << 29
 _TYPES: Final = {f"<{kind}" for kind in ("f8", "f4", "i8", "i4", "u8", "u4", "i2", "u2")} | {"|u1", "|i1"}
-_SECRET: Final = "~/.afspm/gxsm-bridge-secret"
-WELCOME: Final = {"value": "afspm bridge"}
 _HINT: Final = "is bridge.py running in GXSM's console? Nothing is answered while a call of it blocks"
 
 
@@ -39,7 +40,7 @@ class BridgeLink:
         secret_file: Path | None = None,
     ) -> None:
         self._tcp = TcpConnection(address, timeout_s, monotonic_s, (_HINT, _HINT))
-        self._secret_file = secret_file or Path(_SECRET).expanduser()
+        self._secret_file = secret_file or Path(SECRET).expanduser()
         self._is_welcome = False
         self.close = self._tcp.close
 
@@ -57,25 +58,49 @@ class BridgeLink:
         return Path(str(self.call("getcwd")))
 
     def _introduce(self) -> None:
-        """Send the secret, before the first call. Raises ControllerLost: there is none, or not what the bridge has."""
-        secret_file, where = self._secret_file, self._tcp.where
-        hint = f"run the bridge.py of this version, and use its ~/.afspm/{secret_file.name} (secret_file)"
+        """Have the bridge prove that it knows the secret, then prove the same to it.
+
+        Raises:
+            ControllerLost: there is no secret here, or the other end does not know it, or refuses this proof.
+        """
+        known, nonce = self._secret(), secrets.token_hex(NONCE // 2)
         try:
-            if os.name == "posix" and secret_file.stat().st_mode & 0o077:
-                raise ControllerLost(
-                    "other users can read the bridge's secret", where=str(secret_file), hint="chmod 600"
-                )
-            reply = self._tcp.ask("the secret", secret_file.read_bytes().strip() + b"\n", _read, is_secret=True)
-        except OSError as error:
-            self.close()
-            raise ControllerLost(f"the bridge's secret can't be read: {error}", hint=hint) from error
+            answer = self._step("challenge", nonce)
+            if not (isinstance(answer, list) and len(answer) == 2 and all(isinstance(one, str) for one in answer)):
+                raise BadReply("the bridge is of another version of afspm")
+            nonces, address = (nonce, answer[0]), self._tcp.peer
+            if not hmac.compare_digest(
+                answer[1].encode("utf-8", "replace"), proof(known, "bridge", address, *nonces).encode()
+            ):
+                raise ControllerLost("the program that listens there does not know the bridge's secret")
+            if self._step("response", proof(known, "client", address, *nonces)) != WELCOME:
+                raise BadReply("the bridge is of another version of afspm")
         except ControllerLost as error:
             self.close()
-            raise ControllerLost(f"the bridge refused the connection: {error}", where=where, hint=hint) from error
-        if reply != WELCOME:
-            self.close()
-            raise ControllerLost("the bridge is of another version of afspm", where=where, hint=hint)
+            hint = (
+                f"run the bridge.py of this version, and use its {SECRET} (secret_file); a tunnel needs the bridge's "
+                "port number at both ends"
+            )
+            raise ControllerLost(f"no connection to the bridge: {error}", where=self._tcp.where, hint=hint) from error
         self._is_welcome = True
+
+    def _step(self, step: str, text: str) -> object:
+        reply = self._tcp.ask(f"the {step}", json.dumps([step, text]).encode() + b"\n", _read, is_secret=True)
+        if "error" in reply:
+            raise ControllerLost(str(reply["error"]))
+        return reply["value"]
+
+    def _secret(self) -> bytes:
+        file = self._secret_file
+        try:
+            if os.name == "posix" and file.stat().st_mode & 0o077:
+                self.close()
+                raise ControllerLost("other users can read the bridge's secret", where=str(file), hint="chmod 600")
+            return file.read_bytes().strip()
+        except OSError as error:
+            self.close()
+            hint = f"run bridge.py once, or give a copy of its {SECRET} as secret_file"
+            raise ControllerLost(f"the bridge's secret can't be read: {error}", hint=hint) from error
 
 
 def _read(receiver: Receiver) -> dict[str, object]:
@@ -101,6 +126,11 @@ def message(method: str, *arguments: str | int | float) -> bytes:
 def value_line(value: object) -> bytes:
     """Return the line by which the bridge gives a value."""
     return json.dumps({"value": value}, default=_packed).encode() + b"\n"
+
+
+def value_of(line: bytes) -> object:
+    """Return the value of such a line. Raises BadReply: it has none."""
+    return _reply(line)["value"]
 
 
 def _packed(value: object) -> object:

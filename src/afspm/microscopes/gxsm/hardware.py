@@ -13,7 +13,8 @@ from afspm.microscopes.gxsm.errors import BadReply
 STATUS: Final = "s"
 ABORT: Final = "DSP_VP_ABORT_EXECUTE"
 APPROACH: Final = "DSP_CMD_AUTOAPP"
-AUTOSAVE_OFF: Final = "UNCHECK-MainAutoSave"
+AUTOSAVE: Final = {True: "CHECK-MainAutoSave", False: "UNCHECK-MainAutoSave"}
+"""The actions that switch it on and off."""
 REPEAT_OFF: Final = "UNCHECK-SCAN-REPEAT"
 _MODES: Final = {"force": "FZ"}  # other kinds of spectra are called as GXSM calls them
 _MOST_BITS: Final = 1 << 24

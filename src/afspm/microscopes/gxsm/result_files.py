@@ -11,7 +11,7 @@ from typing import Final
 from afspm.clock import NS_PER_S
 from afspm.errors import AfspmError
 from afspm.files.content import FileContent
-from afspm.microscopes.gxsm.scan_memory import Rows
+from afspm.microscopes.gxsm.scan_memory import Rows, in_files, is_unfinished
 from afspm.model import Region
 from afspm.translator.result_files import (
     SCAN,
@@ -21,6 +21,7 @@ from afspm.translator.result_files import (
     ResultFiles,
     as_region,
     lines_missing,
+    modified_ns,
     read_result,
 )
 
@@ -41,7 +42,6 @@ class GxsmFiles(ResultFiles):
         patience_s: how long all files may take, in experiment time like the others.
         soon_s: how long those of channels may that did not come before.
         late_s: how much later than another a scan may begin, after it was asked for.
-        rewritten: files may be there before the scan is over, and be written again.
     """
 
     def __init__(
@@ -52,16 +52,15 @@ class GxsmFiles(ResultFiles):
         patience_s: float,
         soon_s: float,
         late_s: float,
-        rewritten: bool,
     ) -> None:
         super().__init__(kept, log)
         self._patience_s = patience_s
         self._soon_s = soon_s
         self._late_ns = round(late_s * NS_PER_S)
-        self._rewritten = rewritten
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._before: set[int] = set()
         self._whole: dict[Path, FileContent] = {}
+        self._outcome: bool | None = None  # of a measurement that another one followed at once
         self.upwards = False
         kept.setdefault("absent", [])
         kept.setdefault("channels", {})
@@ -76,14 +75,31 @@ class GxsmFiles(ResultFiles):
         return as_region(self._kept["running"]["frame"]), (rows, columns)
 
     @property
-    def before(self) -> Rows | None:
-        """The rows in GXSM's memory before the running scan; None: nobody has looked."""
-        found: Rows | None = self._kept["running"]["before"]
-        return found
+    def is_own(self) -> bool:
+        """True if the translator began the running scan."""
+        return bool(self._kept["running"]["own"])
 
-    @before.setter
-    def before(self, rows: Rows | None) -> None:
-        self._kept["running"]["before"] = rows
+    @property
+    def is_saved_by_gxsm(self) -> bool:
+        """True if GXSM saves the running scan by itself."""
+        return bool(self._kept["running"]["by_gxsm"])
+
+    @property
+    def before(self) -> tuple[Rows, int | None] | None:
+        """The rows in GXSM's memory before the running scan, with the line that was being scanned when they were read.
+
+        The line is None if the scan had not begun. None: no rows were read.
+        """
+        found = self._kept["running"]["before"]
+        return None if found is None else (found["rows"], found["line"])
+
+    def looked(self, rows: Rows, line: int | None) -> None:
+        """Keep these for `before`."""
+        self._kept["running"]["before"] = {"rows": rows, "line": line}
+
+    def is_written(self, file: Path) -> bool:
+        """Return True if a file was written since the running measurement began."""
+        return modified_ns(file) > int(self._kept["running"]["newest_ns"])
 
     @property
     def channels(self) -> dict[str, list[str]]:
@@ -97,18 +113,29 @@ class GxsmFiles(ResultFiles):
         found: str = self._kept["program"]
         return found
 
-    def begin(self, what: str, folder: Path | None, begun_ns: int, taken: Entry) -> None:
-        """A measurement begins.
+    def begin(
+        self, what: str, folder: Path | None, begun_ns: int, taken: Entry, *, own: bool = False, by_gxsm: bool = False
+    ) -> None:
+        """A measurement begins. One that has ended, and whose files were not read yet, is still waited for.
 
         Args:
             folder: where its files will be; None: GXSM does not say yet.
             begun_ns: not before this; 0: it was found running, and nobody knows since when.
             taken: "frame" and "shape" of a scan, "position" of a spectrum.
+            own: the translator has begun it.
+            by_gxsm: GXSM saves it by itself: its files may be there before it is over, and be written again.
         """
+        self._hurry(begun_ns / NS_PER_S)
+        followed = self._kept["ended"]
         newest = max((file.stat().st_mtime_ns for file in _files(folder, what)), default=0)
         place = None if folder is None else str(folder)
         facts = {"folder": place, "newest_ns": newest, "begun_ns": begun_ns, "before": None}
-        self._begins(what, {**facts, **taken})
+        self._begins(what, {**facts, "own": own, "by_gxsm": by_gxsm, **taken})
+        if followed is not None:
+            # GXSM saves a scan before it begins the next: all that is there now is of the one that has ended
+            there = _files(_folder(followed), followed["what"])
+            names = [str(file) for file in there if modified_ns(file) > followed["newest_ns"]]
+            self._kept["ended"] = {**followed, "names": sorted(names)}
 
     def end(
         self,
@@ -117,26 +144,52 @@ class GxsmFiles(ResultFiles):
         channels: Iterable[str] = (),
         folder: Path | None = None,
         *,
-        is_whole: bool = True,
+        is_whole: bool | None = True,
+        before: Rows | None = None,
     ) -> None:
         """It has ended, and its files are awaited from now on.
 
         Args:
             channels: where GXSM says that it saves each channel of a scan.
             folder: of them, which may be another than at the beginning.
-            is_whole: a scan came to its last row.
+            is_whole: a scan came to its last row; None: unknown until its files are compared with the rows `before`.
         """
-        paths = [Path(path) for path in channels]
+        order = [next(iter(endings([Path(path)])), "") for path in channels]
         now_s = now_ns / NS_PER_S
+        self._hurry(now_s)
         awaited = {"soon_s": now_s + self._soon_s, "until_s": now_s + self._patience_s}
-        self._ends({"end_ns": end_ns, **awaited, "channels": sorted(endings(paths))})
+        self._ends({"end_ns": end_ns, **awaited, "channels": order, "before": before, "is_whole": is_whole})
         ended = self._kept["ended"]
         if folder is not None and str(folder) != ended["folder"]:  # old scans in there are told by when they began
             ended["folder"] = str(folder)
             ended["begun_ns"] = ended["begun_ns"] or end_ns
         self._sizes, self._whole, self._before = {}, {}, set()
-        if not is_whole:
+        if is_whole is False:
             self._give_up("it was stopped or never began: GXSM's first or last row still holds the previous scan")
+
+    def _hurry(self, now_s: float) -> None:
+        """Read now, or not at all, the files of a measurement that another one followed."""
+        for _ in range(2):  # they are read when they have not grown since the last look
+            if self._is_followed:
+                self.results(now_s)
+        if self._is_followed:
+            self._give_up("the next one was over before its files could be read")
+
+    @property
+    def _is_followed(self) -> bool:
+        return self._kept["ended"] is not None and "names" in self._kept["ended"]
+
+    def followed(self) -> bool | None:
+        """Return, once, whether a measurement is whole that another one followed at once; None: there was none."""
+        found, self._outcome = self._outcome, None
+        return found
+
+    def forget(self) -> None:
+        """Forget what is running or has ended: it was broken off."""
+        if self._is_followed:
+            self._give_up("the one that followed it was stopped before its files were read")
+        self._outcome = None
+        super().forget()
 
     def next_s(self) -> float | None:
         """When to look again at the latest."""
@@ -149,17 +202,32 @@ class GxsmFiles(ResultFiles):
         ended = self._kept["ended"]
         if ended is not None:
             files = self._new(ended)
-            over = now_s >= ended["until_s"]
+            is_followed = "names" in ended
+            over = now_s >= ended["until_s"] or (is_followed and not ended["names"])
             gaps = [file for file, content in files.items() if lines_missing(content)]
             if not any(scan.values.any() for content in files.values() for scan in content.scans):
                 gaps = [file for file in files if ended["what"] == SCAN]  # stopped in its first line
-            if gaps and (over or not self._rewritten):
+            if gaps and (over or is_followed or not ended["by_gxsm"]):
                 self._give_up(f"it was stopped: {gaps[0]} lacks lines")
             elif files and not gaps and (over or self._all(ended, files, now_s)):
-                self._take(ended, files)
+                why = self._why_unfinished(ended, files) if ended["is_whole"] is None else ""
+                if why:
+                    self._give_up(why)
+                else:
+                    self._take(ended, files)
             elif over:
                 self._give_up(self._missing(ended))
         return self._listed()
+
+    def _why_unfinished(self, ended: Entry, files: Mapping[Path, FileContent]) -> str:
+        """Return why a scan is not published that another one followed; empty: it came to its end."""
+        before, named = ended["before"], endings(files)
+        if before is None:
+            return "one scan followed the other at once, and whether this one came to its end is unknown"
+        numbered = {k: files[named[ending]] for k, ending in enumerate(ended["channels"]) if ending in named}
+        if is_unfinished(before, in_files(numbered, before)):
+            return "it was stopped: its last row still holds the previous scan"
+        return ""
 
     def read(self, entry: Entry) -> Content:
         contents = [self._whole.get(Path(file)) or read_result(file) for file in entry["files"]]
@@ -168,7 +236,9 @@ class GxsmFiles(ResultFiles):
     def _new(self, ended: Entry) -> dict[Path, FileContent]:
         """The files of what has ended that are whole: they have stopped growing, and can be read."""
         found = {}
-        for file in sorted(_files(_folder(ended), ended["what"])):
+        names = ended.get("names")
+        there = _files(_folder(ended), ended["what"]) if names is None else [Path(name) for name in names]
+        for file in sorted(file for file in there if file.exists()):
             stat = file.stat()
             if stat.st_mtime_ns <= ended["newest_ns"]:
                 continue
@@ -214,10 +284,14 @@ class GxsmFiles(ResultFiles):
 
     def _all(self, ended: Entry, files: Iterable[Path], now_s: float) -> bool:
         """Return True if no file is missing; those that the scan before did not have are not waited for as long."""
-        missing = set(ended["channels"]) - endings(files).keys()
+        if "names" in ended:
+            return all(Path(name) in self._whole for name in ended["names"])
+        missing = set(ended["channels"]) - endings(files).keys() - {""}
         return not missing or (missing <= set(self._kept["absent"]) and now_s >= ended["soon_s"])
 
     def _missing(self, ended: Entry) -> str:
+        if "names" in ended:
+            return "another one began before it was saved"
         folder = _folder(ended)
         if folder is None:
             return "GXSM does not say where it saves: check that it began and that a channel is set"
@@ -238,11 +312,14 @@ class GxsmFiles(ResultFiles):
         self._log.error("the %s has no result: %s", ended["what"], why)
         if self._before:
             self._saw(ended, self._before)
-        self.broken_off = True
+        if "names" in ended:
+            self._outcome = False
+        else:
+            self.broken_off = True
 
     def _take(self, ended: Entry, files: Mapping[Path, FileContent]) -> None:
         if ended["what"] == SCAN:
-            absent = sorted(set(ended["channels"]) - endings(files).keys())
+            absent = sorted(set(ended["channels"]) - endings(files).keys() - {""})
             if set(absent) - set(self._kept["absent"]):
                 self._log.warning(
                     "GXSM did not save %s; the translator waits less long for it from now on", ", ".join(absent)
@@ -259,6 +336,8 @@ class GxsmFiles(ResultFiles):
         content = [_PRECISION.as_set(one, ended) for file in files.values() for one in file]
         self._add(f"{names[0]} ({ended['end_ns']})", ended, {"files": names}, content)
         self._kept["ended"] = None
+        if "names" in ended:
+            self._outcome = True
 
 
 def endings(files: Iterable[Path]) -> dict[str, Path]:

@@ -13,6 +13,7 @@ from typing import Any, TypedDict
 
 import numpy as np
 
+from afspm.files.content import FileContent
 from afspm.microscopes.gxsm.link import Asking
 from afspm.microscopes.gxsm.settings import ANGSTROM_M
 from afspm.model import Region, ScanLines
@@ -56,6 +57,34 @@ def looked_at(ask: Asking, channels: int, rows: Collection[int], columns: int) -
             for channel, (shape, dz) in there.items()
         },
     )
+
+
+def in_files(files: Mapping[int, FileContent], like: Rows) -> Rows:
+    """Return what files have in the rows that were looked at in GXSM's memory; by the number of their channel."""
+    return Rows(
+        columns=like["columns"],
+        digests={
+            channel: {
+                row: _digest(_stored(files[int(channel)])[int(row)][: like["columns"]])
+                for row in rows
+                if int(row) < len(files[int(channel)].scans[0].values)
+            }
+            for channel, rows in like["digests"].items()
+            if int(channel) in files
+        },
+    )
+
+
+def _stored(file: FileContent) -> np.ndarray:
+    """Return the values as GXSM has them in its memory, rows from the top."""
+    scan, dz = file.scans[0], float(str(file.header["dz"]))
+    return scan.values[::-1] / (ANGSTROM_M if scan.unit == "m" else 1.0) / dz
+
+
+def only(rows: Rows, row: int) -> Rows:
+    """Return one of the rows that were looked at, of each channel."""
+    digests = {channel: {str(row): there[str(row)]} for channel, there in rows["digests"].items() if str(row) in there}
+    return Rows(columns=rows["columns"], digests=digests)
 
 
 def is_unfinished(before: Rows, after: Rows) -> bool:

@@ -77,8 +77,6 @@ class SharedMemoryLink:
         self._memory = self._mapped(path)
         # traced as if the bridge had passed the calls on: it is one form for both, and can be played back anywhere
         self._trace = TRACE.connection(TCP)
-        with self._trace.asking("the secret", None) as traced:
-            traced.add(bridge_client.value_line(bridge_client.WELCOME["value"]))
 
     def _mapped(self, path: Path) -> mmap.mmap:
         try:

@@ -121,7 +121,15 @@ class Activity:
         self._takes_on_arrival = True
 
     def _take_curve(self) -> None:
-        self._files.begin(FORCE, self._folder(), {"position": list(self._place.xy_m())})
+        """Take one curve where the tip is: Studio takes those of its grid, wherever that is on the panel."""
+        x, y = self._place.xy_m()
+        try:
+            self._session.put(dict(zip(commands.GRID, (x, y, 1, 1), strict=True)))
+        except Refused as refused:
+            self._log.error("no curve was taken: %s", refused)
+            self._failed = True
+            return
+        self._files.begin(FORCE, self._folder(), {"position": [x, y]})
         self._call = self._session.begin(FORCE, commands.TAKE_CURVE)
 
     def approach(self) -> None:

@@ -20,8 +20,10 @@ STARTED, FINISHED = "imaging.scanning_started", "imaging.scanning_finished"
 APPROACH, WITHDRAW = "approach.approach", "approach.withdraw"
 TAKE_CURVE, STOP_CURVE = "spectroscopy.acquire", "spectroscopy.stop"
 MOVE: Final = "scanner.move_to_target_offsets"
+GRID: Final = tuple(f"spectroscopy.grid_{name}" for name in ("center_offset_x", "center_offset_y", "columns", "rows"))
+"""Of the curves that are taken: where its centre is, and how many there are."""
 
-_ALWAYS: Final = (START, STOP, APPROACH, WITHDRAW, TAKE_CURVE, STOP_CURVE, MOVE)
+_ALWAYS: Final = (START, STOP, APPROACH, WITHDRAW, TAKE_CURVE, STOP_CURVE, MOVE, *GRID)
 _SIGNALS: Final = (f"{STARTED}.connect", f"{STARTED}.empty", f"{FINISHED}.connect")
 
 WATCH: Final = f"""

@@ -159,9 +159,9 @@ class Park(Driver):
         self._doing.approach()
 
     def command(self, text: str) -> None:
-        """Evaluate an expression, e.g. `spm.ncm.sweepAutoFullRange()`."""
+        """Evaluate an expression, e.g. `spm.ncm.sweepAutoFullRange()`; one that takes long keeps it busy."""
         try:
-            self._smartscan().run(f"({text}, 0)")
+            self._doing.evaluate(text)
         except SmartScanError as error:
             raise Refused(ControlResponse.ACTION_ERROR, f"SmartScan: {error}") from error
 

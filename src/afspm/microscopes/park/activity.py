@@ -24,6 +24,8 @@ CURVES: Final = {"force": "fd", "IV": "iv"}
 APPROACH: Final = '(spm.approach.start("q+s"), 0)'
 _ENDED_FIRST: Final = ("scan.stop", "spect.stop", "approach.stop")
 _STATES: Final = {MOVE: ScopeState.MOVING, **dict.fromkeys(CURVES, ScopeState.SPEC)}
+_ANSWERS_S: Final = 0.5
+"""So long, in real time, an expression may take before it counts as one that takes long: an error has come by then."""
 _SETTLES_S: Final = 2.0
 """So long, in real time, a scan that was begun may take to be seen running."""
 
@@ -92,6 +94,19 @@ class Activity:
     def approach(self) -> None:
         """Bring the tip to the sample."""
         self.begun(self._session.begin("approach", APPROACH))
+
+    def evaluate(self, expression: str) -> None:
+        """Evaluate an expression; one that has no value soon keeps the microscope busy. Raises SmartScanError."""
+        call = self._session.begin("command", f"({expression}, 0)", _ANSWERS_S)
+        try:
+            goes_on = call.running()
+        except BaseException:
+            call.close()
+            raise
+        if goes_on:
+            self.begun(call)
+        else:
+            call.close()
 
     def withdraw(self, lift_um: float) -> None:
         """Take the tip away, whatever is going on: the scanner first, and then the stage."""

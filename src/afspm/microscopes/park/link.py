@@ -62,6 +62,10 @@ class Link:
         """Have a script run that takes its time. Raises ControllerLost."""
         self._connection.begin(shown(expression), _request(RUN_SCRIPT, wrapped(expression)))
 
+    def wait(self, within_s: float) -> None:
+        """Wait for the reply to `begin`, in real time. Raises ControllerLost."""
+        self._connection.wait(within_s)
+
     def reply(self, what: str) -> tuple[bool, Any]:
         """Return whether a reply has come to what was begun, and the value in it, None if it has none.
 

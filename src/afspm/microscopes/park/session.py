@@ -100,8 +100,8 @@ class Session:
         """Return whether a script runs. Raises ControllerLost: SmartScan says neither."""
         return self._word(SCRIPT_RUNS, TRUE, FALSE, "report it, with a trace")
 
-    def begin(self, what: str, expression: str) -> LongCall:
-        """Begin what takes long, on a connection of its own. Raises ControllerLost.
+    def begin(self, what: str, expression: str, wait_s: float = 0.0) -> LongCall:
+        """Begin what takes long, on a connection of its own, and wait a little for a reply. Raises ControllerLost.
 
         Whether its reply comes at its end, or at once and without a value, is not known: in the second case SmartScan
         is asked whether a script runs.
@@ -109,6 +109,7 @@ class Session:
         link = self._open_link()
         try:
             link.begin(expression)
+            link.wait(wait_s)
         except BaseException:
             link.close()
             raise

@@ -25,7 +25,7 @@ from afspm.simulation.settings import build
 from afspm.simulation.world import read_settings
 from afspm.translator.driver import Action, Driver, action
 from afspm.translator.parameters import FEEDBACK_ON, Value
-from afspm.units import Duration
+from afspm.units import Duration, PollPeriod
 
 if TYPE_CHECKING:
     from afspm.process.context import ProcessContext
@@ -130,7 +130,7 @@ class Simulator(Driver):
         panel: list[Table] | None = None,
         parameters: Rows | None = None,
         actions: Rows | None = None,
-        poll_period_s: Duration = 0.25,
+        poll_period_s: PollPeriod = 0.25,
         result_timeout_s: Duration = 10.0,
         live_lines_s: Duration | None = None,
     ) -> None:
@@ -154,6 +154,8 @@ class Simulator(Driver):
         self._faults_settings = _made(Fault, faults or [], "faults", errors)
         self._panel = _made(PanelEvent, panel or [], "panel", errors)
         self._fault_action, self._approach_s = fault_action, approach_s
+        self.initial: Mapping[str, Value] = {}
+        self.scan_speed_m_s: float | None = None
         loop = _loop_of(self._world_settings)
         with errors:
             super().__init__(
@@ -180,6 +182,9 @@ class Simulator(Driver):
         at_first = {name: value for name, value in {**_AT_FIRST, **in_force}.items() if name in self.table}
         with errors:
             self._initial = self.table.written({**at_first, **initial}, where="initial")
+            self.initial = {name: self._initial[name] for name in initial}
+            speed = self._initial.get(names.SCAN_SPEED)
+            self.scan_speed_m_s = speed if isinstance(speed, float) else None
         for i, event in enumerate(self._panel):
             with errors:
                 self.table.written(event.set or {}, where=f"panel[{i}].set")

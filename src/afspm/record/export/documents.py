@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from uuid import NAMESPACE_URL, uuid5
 
 from afspm.clock import NS_PER_S
+from afspm.record.journal import measured_file
 from afspm.record.nexus import field_names
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
@@ -135,6 +136,7 @@ class _Stream:
 
     def event(self, row: ScanRow | SpectrumRow) -> Iterator[Document]:
         number, self.count = self.count, self.count + 1
+        file = measured_file(self.run.folder, row.file)
         for one, *_ in self._arrays():
             resource = _uid(self.run, self.name, str(number), one)
             yield (
@@ -143,7 +145,7 @@ class _Stream:
                     "uid": resource,
                     "data_key": one,
                     "mimetype": "application/x-hdf5",
-                    "uri": (self.run.folder / row.file).resolve().as_uri().replace("file:///", "file://localhost/"),
+                    "uri": file.resolve().as_uri().replace("file:///", "file://localhost/"),
                     "parameters": {"dataset": f"/entry/data/{one}", "chunk_shape": []},
                     "run_start": self.start,
                 },

@@ -12,6 +12,7 @@ import numpy as np
 from afspm.clock import iso_utc
 from afspm.files.nexus import ABOUT, GRID
 from afspm.model.spectrum_stack import SpectrumStack, mean_over_repeats
+from afspm.record.journal import measured_file
 from afspm.record.nexus import field_names
 from afspm.record.nxspm import group, values
 from afspm.record.run import Run
@@ -70,7 +71,7 @@ def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
     import h5py
 
     run.about(row)  # raises where the file is damaged
-    content = io.BytesIO((run.folder / row.file).read_bytes())
+    content = io.BytesIO(measured_file(run.folder, row.file).read_bytes())
     with h5py.File(content, "r+") as file:
         if row.key:
             file["entry"]["afspm"].attrs["key"] = row.key

@@ -27,7 +27,8 @@ def write(folder: str | Path) -> Path:
     """
     with open_run(folder) as run:
         told = story.read(run)
-        shown = pictures.of_scans(run, told.scans)
+        bad_ns = pictures.bad_ns(run, told)
+        shown = pictures.of_scans(run, pictures.chosen(told.scans, kept_ns=bad_ns), bad_ns)
         target = run.folder / REPORT_FILE
         try:
             pictures.draw(run, told, shown)

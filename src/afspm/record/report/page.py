@@ -10,6 +10,8 @@ from afspm.clock import NS_PER_S
 from afspm.drawing import timeline
 from afspm.drawing.image_html import data_url
 from afspm.formatting import counted, day, duration_text, quantity
+from afspm.logic.supervisor_registry import SUPERVISOR
+from afspm.model import component_of
 from afspm.record.overview import ROUTINE
 from afspm.record.report import curves, markup, sample
 from afspm.record.report.curves import SpectrumGroup
@@ -72,11 +74,11 @@ def _what(story: RunStory) -> str:
 
 def _when(story: RunStory, clock: PageTimes) -> str:
     told = f"{clock.period()}, {duration_text(story.lasted_ns / NS_PER_S)}"
-    if story.speed != 1.0:
-        told += f" ({duration_text(story.lasted_ns / NS_PER_S / story.speed)} real)"
+    if story.speed != 1.0 and story.real_s is not None:
+        told += f" ({duration_text(story.real_s)} real)"
     end = story.end
     ended = story.ended
-    if end is not None:
+    if end is not None and component_of(end.who) != SUPERVISOR:  # else nothing was left to run, as `ended` says
         reason = f": {end.reason}" if end.reason else ""
         ended = f"{end.who} ended the experiment at {clock.whole(end.time_ns)}{reason}"
     return f"<p>{escape(told)}; {escape(ended)}</p>"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import io
 import logging
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from afspm.drawing.image_html import Shown, shown
 from afspm.drawing.levelling import Levelling, levelled
 from afspm.errors import AfspmError
 from afspm.model import ControlMode, ControlState, ScanSet, names
+from afspm.record.bad_scans import bad_scans
 from afspm.record.night_record import NightMark, NightRecord, Shot, thumbnail
 from afspm.record.report.story import RunStory
 from afspm.record.run import Run
@@ -40,6 +41,7 @@ class TopographyPicture:
     Attributes:
         image: in colour, levelled.
         grey: for the figure of the night, [y, x] with y upwards.
+        is_bad: whether it is framed.
     """
 
     row: ScanRow
@@ -47,11 +49,7 @@ class TopographyPicture:
     unit: str = ""
     image: Shown | None = None
     grey: NDArray[np.uint8] | None = None
-
-    @property
-    def is_bad(self) -> bool:
-        """Return whether a problem was flagged, or it was interrupted."""
-        return self.row.interrupted or bool(self.row.problems)
+    is_bad: bool = False
 
 
 @dataclass(frozen=True)
@@ -63,16 +61,24 @@ class FigurePicture:
     ratio: float
 
 
-def of_scans(run: Run, rows: Sequence[ScanRow]) -> list[TopographyPicture]:
-    """All scans, or of too many the interrupted ones and some evenly among the rest."""
-    return list(_read(run, chosen(rows)))
+def of_scans(run: Run, rows: Sequence[ScanRow], bad_ns: Collection[int] = ()) -> list[TopographyPicture]:
+    """Return the scans with pictures; `bad_ns`: the times of the scans to frame."""
+    return [replace(one, is_bad=one.row.time_ns in bad_ns) for one in _read(run, rows)]
 
 
-def chosen(rows: Sequence[ScanRow], most: int = MOST) -> list[ScanRow]:
-    """At most so many rows, in their order."""
+def bad_ns(run: Run, story: RunStory) -> frozenset[int]:
+    """Return the times of the scans that are bad."""
+    lanes = story.overview.problem_timelines.items()
+    flagged_ns = {number: [span.start_ns for span in lane.spans] for number, lane in lanes}
+    interrupted_ns = [row.time_ns for row in story.scans if row.interrupted]
+    return bad_scans([row.time_ns for row in story.scans], run.verdicts(), flagged_ns, interrupted_ns)
+
+
+def chosen(rows: Sequence[ScanRow], most: int = MOST, kept_ns: Collection[int] = ()) -> list[ScanRow]:
+    """Return at most `most` rows in their order: the scans of these times, and some evenly among the rest."""
     if len(rows) <= most:
         return list(rows)
-    odd = [k for k, row in enumerate(rows) if row.interrupted][: most // 2]
+    odd = [k for k, row in enumerate(rows) if row.time_ns in kept_ns][: most // 2]
     rest = sorted(set(range(len(rows))) - set(odd))
     even = [rest[k] for k in np.linspace(0, len(rest) - 1, most - len(odd)).round().astype(int)]
     return [rows[k] for k in sorted({*odd, *even})]
@@ -136,7 +142,9 @@ def night_of(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -
         (story.start_ns, ControlState(ControlMode.UNDEFINED))
     ]
     record.routine = [span.start_ns for span in story.overview.routine_spans]
-    record.marks = [
+    record.interruptions = [row.time_ns for row in story.scans if row.interrupted]
+    record.marks = [NightMark(of_ns, "", "verdict", score, of_ns) for of_ns, score in run.verdicts()]
+    record.marks += [
         NightMark(entry.time_ns, entry.who, entry.what)
         for entry in run.journal
         if entry.what in (names.PULSE, names.CRASH) and entry.response == 0

@@ -22,9 +22,9 @@ from afspm.record.report.story import RunStory, colours
 from afspm.record.tables import ScanRow
 
 _LEGEND = (
-    "Click a picture to enlarge it. The bar below it has the colour of who was in control; framed: a problem was "
-    "flagged, or it was interrupted; refused, failed, new: its place on the sample is dead reckoning. Topography, rows "
-    "brought to one height, without its plane."
+    "Click a picture to enlarge it. The bar below it has the colour of who was in control; framed: "
+    "bad or interrupted; refused, failed, new: its place on the sample is dead reckoning. Topography, rows brought to "
+    "one height, without its plane."
 )
 _MARGIN = 0.04
 _HIDDEN_BEHIND = 40  # places of a run that are drawn at most where one lies over the other

@@ -21,6 +21,7 @@ from afspm.model import (
 )
 from afspm.record.overview import Overview, ProcessRestart
 from afspm.record.run import Run
+from afspm.record.run_json import REAL_S
 from afspm.record.run_lock import describe_state
 from afspm.record.tables import NoteRow, ScanRow
 from afspm.record.timeline import Span, Timeline
@@ -49,6 +50,7 @@ class RunStory:
     Attributes:
         start_ns: the first that is known of it.
         speed: experiment seconds in a real second.
+        real_s: how long it took in real time; None: that is not known.
         ended: how it ended, in words; that it goes on, or was cut off.
         frame: of all places.
         problems: spans of all problems in the order of time, but for routine ones.
@@ -62,6 +64,7 @@ class RunStory:
     simulated: bool
     start_ns: int
     speed: float
+    real_s: float | None
     ended: str
     frame: Frame
     overview: Overview
@@ -74,8 +77,8 @@ class RunStory:
 
     @property
     def end_ns(self) -> int:
-        """The last that is known of it."""
-        return max(self.overview.newest_ns, self.start_ns)
+        """When the experiment ended, else the last that is known of it; the drawing at the end is no part of it."""
+        return max(self.overview.ended_ns or self.overview.newest_ns, self.start_ns)
 
     @property
     def lasted_ns(self) -> int:
@@ -157,6 +160,7 @@ def read(run: Run) -> RunStory:
         simulated=run.simulated,
         start_ns=start_ns,
         speed=float(clock.get("speed", 1.0)),
+        real_s=run.facts.get(REAL_S),
         ended=describe_state(run.folder),
         frame=run.frame,
         overview=overview,

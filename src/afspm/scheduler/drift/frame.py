@@ -88,6 +88,20 @@ class DriftFrame:
 
     # --- requests ---
 
+    def maps(self, now_ns: int) -> bool:
+        return self._mapping_at(now_ns * 1e-9) is not None
+
+    def in_force(self, place: Region | ProbePosition, now_ns: int) -> None:
+        mapping = self._mapping_at(now_ns * 1e-9)
+        if isinstance(place, Region):
+            if self.region.told(place) is None:
+                region = place if mapping is None else mapping.to_sample(place)
+                said, sent = (self._codec.encode(ScanParameters(one)) for one in (region, place))
+                self.region.current = PositionPair(region, said, place, sent)
+        elif self.probe.told(place) is None:
+            probe = place if mapping is None else _position(mapping, place.xy_m)
+            self.probe.current = PositionPair(probe, self._codec.encode(probe), place, self._codec.encode(place))
+
     def outgoing(self, who: str, request: Request, now_ns: int) -> MappedRequest | Response | None:
         now_s = now_ns * 1e-9
         mapping = self._mapping_at(now_s)

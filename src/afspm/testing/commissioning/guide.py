@@ -25,8 +25,8 @@ class Prompts(Protocol):
     def text(self, question: str) -> str:
         """Ask for a line, which may be empty."""
 
-    def choose(self, question: str, options: Sequence[str]) -> str:
-        """Ask for one of the options."""
+    def choose(self, question: str, options: Sequence[str], default: str = "") -> str:
+        """Ask for one of the options; an empty answer is the default, if there is one."""
 
 
 class StepDeclined(Exception):
@@ -34,6 +34,7 @@ class StepDeclined(Exception):
 
 
 UNSEEN = "unseen"
+NO_PANEL = "a simulated microscope has no panel"
 
 
 @dataclass
@@ -42,14 +43,16 @@ class Guide:
 
     Attributes:
         folder: of the run, for pictures.
+        has_panel: True of a real controller. Without a panel, each question about it is shown and skipped.
+        program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
         in_contact: the person has approached; the tip is withdrawn when the steps at the sample are over.
-        has_panel: True of a real controller; what has none can't be compared with it.
     """
 
     kit: CheckMeasurements
     prompts: Prompts
     folder: Path
     has_panel: bool = True
+    program_s: float = 0.0
     in_contact: bool = False
 
     def unseen(self) -> str:
@@ -64,9 +67,20 @@ class Guide:
         if not self.prompts.confirm(question):
             raise Failed(expected, "the person says no")
 
+    def require_at_panel(self, question: str, expected: str) -> None:
+        """Ask the person about the panel, if there is one; Failed unless it is so."""
+        if self._can_be_seen(question):
+            self.require(question, expected)
+
+    def at_panel(self, question: str) -> str | None:
+        """Ask for a line about the panel. Return None if there is no panel."""
+        return self.prompts.text(question) if self._can_be_seen(question) else None
+
     def require_choice(self, question: str, right: str, wrong: Sequence[str], what: str) -> bool:
-        """Ask for what is seen. Return False if it can't be seen; Failed if it is something else."""
-        seen = self.prompts.choose(question, [right, *wrong, UNSEEN])
+        """Ask for what the panel shows. Return False if it can't be seen; Failed if it is something else."""
+        if not self._can_be_seen(question):
+            return False
+        seen = self.prompts.choose(question, [right, *wrong, UNSEEN], UNSEEN)
         if seen not in (right, UNSEEN):
             raise Failed(f"{what}: {right}", f"{seen} at the panel")
         return seen == right
@@ -77,8 +91,11 @@ class Guide:
         The person types it before afspm's is shown: so a wrong one is not read as the right one.
         """
         shown = f"{value:.6g} {unit}".rstrip()
+        question = f"{what}, as the panel shows it{f', e.g. in {unit}' if unit else ''}"
+        if not self._can_be_seen(question):
+            return False
         while True:
-            typed = self.prompts.text(f"{what}, as the panel shows it{f', e.g. in {unit}' if unit else ''}")
+            typed = self.prompts.text(question)
             if not typed.strip():
                 return False
             try:
@@ -91,6 +108,11 @@ class Guide:
                 return True
             if self.prompts.confirm(f"  afspm reads {shown}, which is not {typed}. Is {typed} what the panel shows?"):
                 raise Failed(f"{what} as at the panel, {typed}", shown)
+
+    def _can_be_seen(self, question: str) -> bool:
+        if not self.has_panel:
+            self.prompts.show(f"  {question} – skipped: {NO_PANEL}")
+        return self.has_panel
 
 
 def _in_unit(typed: str, unit: str) -> float:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from afspm.experiment.tracing import trace_overlay
 from afspm.model import names
-from afspm.testing.commissioning.guide import Guide, Prompts, StepDeclined
+from afspm.testing.commissioning.guide import NO_PANEL, Guide, Prompts, StepDeclined
 from afspm.testing.commissioning.progress import CommissioningProgress, CommissioningStep, StepOutcome, StepResult
 from afspm.testing.commissioning.report import InstrumentReport, steps_of
 from afspm.testing.commissioning.steps import all_steps
@@ -44,7 +44,13 @@ class CommissioningResult:
 
 
 def commission(
-    options: CheckOptions, prompts: Prompts, file: Path, tried_on: str, before: InstrumentReport | None = None
+    options: CheckOptions,
+    prompts: Prompts,
+    file: Path,
+    tried_on: str,
+    before: InstrumentReport | None = None,
+    *,
+    has_panel: bool | None = None,
 ) -> CommissioningResult:
     """Take a person through all steps.
 
@@ -52,6 +58,7 @@ def commission(
         file: for the report, written after each step.
         tried_on: see `TRIED_ON`.
         before: the report of an unfinished commissioning of the same controller, to go on with.
+        has_panel: False skips questions about the panel; None: a simulated microscope has no panel.
 
     Raises:
         ConfigError: the experiment file is wrong; nothing was started.
@@ -62,13 +69,17 @@ def commission(
         with ExitStack() as stack:
             session = stack.enter_context(opened(_traced(options, stack)))
             result.folder = session.folder
-            _in_session(session, prompts, result, tried_on)
+            if has_panel is None:
+                has_panel = not session.simulated
+            _in_session(session, prompts, result, tried_on, has_panel=has_panel)
     except Lost as lost:
         result.lost = str(lost)
     return result
 
 
-def _in_session(session: CheckSession, prompts: Prompts, result: CommissioningResult, tried_on: str) -> None:
+def _in_session(
+    session: CheckSession, prompts: Prompts, result: CommissioningResult, tried_on: str, *, has_panel: bool
+) -> None:
     checks = begin_report(session)
 
     def write() -> None:
@@ -76,7 +87,8 @@ def _in_session(session: CheckSession, prompts: Prompts, result: CommissioningRe
 
     try:
         with restored(session, checks) as kit:
-            walk = _Walk(Guide(kit, prompts, session.folder, has_panel=not session.simulated), result.progress, write)
+            guide = Guide(kit, prompts, session.folder, has_panel=has_panel, program_s=session.program_s)
+            walk = _Walk(guide, result.progress, write)
             try:
                 walk.through()
             finally:
@@ -124,6 +136,8 @@ class _Walk:
             return StepResult(StepOutcome.UNSUPPORTED, ", ".join(missing))
         prompts = self._guide.prompts
         prompts.show(f"\n{step.title}\n{step.explained}")
+        if step.needs_panel and not self._guide.has_panel:
+            return StepResult(StepOutcome.SKIPPED, NO_PANEL)
         if step.moves and not prompts.confirm("Shall afspm do this now?"):
             return StepResult(StepOutcome.DECLINED, "not confirmed")
         try:

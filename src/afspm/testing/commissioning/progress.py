@@ -45,6 +45,7 @@ class CommissioningStep:
         remedy: what to do if it does not pass.
         after: the steps that come first: none of them may have found a mismatch, or have been declined.
         moves: it acts on the microscope, which the person has confirmed before.
+        needs_panel: the person has to do something at the panel; skipped where there is none.
         contact: the tip is at the sample: it is withdrawn when the step is over.
         remembered: a resumed commissioning need not do it again; what concerns the tip is asked each time.
         operations: of the public matrix, that it tries.
@@ -58,6 +59,7 @@ class CommissioningStep:
     do: Callable[[Guide], str]
     after: tuple[str, ...] = ()
     moves: bool = True
+    needs_panel: bool = False
     contact: bool = False
     remembered: bool = True
     operations: tuple[str, ...] = ()

@@ -255,9 +255,24 @@ class CheckMeasurements:
     def move_probe(self, xy_m: tuple[float, float]) -> list[Observation]:
         """Move the probe; what is published of it."""
         self.client.come_to_rest()
+        self._set_whole()
         mark = self.client.observations.mark()
         self.client.asked(ControlRequest.SET_PROBE_POS, ProbePosition(xy_m), "moving the probe")
         return self.client.settled(mark)
+
+    def _set_whole(self) -> None:
+        """Set the first frame, unless it is in force: a scan that failed leaves its own.
+
+        Some controllers move the probe within the scan frame only.
+        """
+        newest, whole = self.client.observations.newest(ScanParameters), self.frames.whole
+        if newest is None or not isinstance(newest.region, Region) or not isinstance(newest.shape, tuple):
+            return
+        if difference(whole, newest.region):
+            mark = self.client.observations.mark()
+            request = FrameSetting(whole, newest.shape).request(self.support)
+            self.client.asked(ControlRequest.SET_SCAN_PARAMS, request, "setting the first frame again")
+            self.client.settled(mark)
 
     # --- both ---
 

@@ -87,6 +87,7 @@ class CheckSession:
         folder: of this run.
         excused: checks that this controller can't pass, with the reason.
         complaints: the warnings and errors that were logged; it grows.
+        program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
     """
 
     client: CheckClient
@@ -98,6 +99,7 @@ class CheckSession:
     excused: Mapping[str, str]
     complaints: Sequence[str]
     maker: str = ""
+    program_s: float = 0.0
 
 
 def prepare(options: CheckOptions) -> Experiment:
@@ -144,10 +146,11 @@ def opened(options: CheckOptions) -> Iterator[CheckSession]:
         support = find_out(client, sorted(actions), sorted(parameters))
         named = translator.class_path or " ".join(translator.part.command)
         excused: Mapping[str, str] = {}
-        maker = ""
+        maker, program_s = "", 0.0
         if translator.component is not None and issubclass(translator.component, Driver):
-            excused, maker = translator.component.excused(support.controller), translator.component.maker
-        yield CheckSession(client, support, named, simulated, folder, options, excused, complaints, maker)
+            driver = translator.component
+            excused, maker, program_s = driver.excused(support.controller), driver.maker, driver.program_s
+        yield CheckSession(client, support, named, simulated, folder, options, excused, complaints, maker, program_s)
 
 
 @contextmanager

@@ -97,12 +97,17 @@ def test_a_beat_after_closing_takes_it_back() -> None:
     assert [type(effect) for effect in watch.tick(30.0)] == [ChildLog, KillChild]
 
 
-def test_work_does_not_excuse_from_a_first_beat_or_from_closing() -> None:
-    life = Liveness(QUICK, 0.0)
-    assert checked(life, 10.0, works=True) is ProcessHealth.SLOW_START
+def test_work_does_not_excuse_from_a_first_beat() -> None:
+    assert checked(Liveness(QUICK, 0.0), 10.0, works=True) is ProcessHealth.SLOW_START
+
+
+def test_process_that_works_on_its_end_has_as_long_as_a_step_may_take() -> None:
+    life = Liveness(QUICK, 10.0)
     life.beat(10.0)
     life.closing(11.0)
-    assert checked(life, 16.0, 10.0, works=True) is ProcessHealth.NOT_CLOSING
+    assert checked(life, 16.0, 11.0, works=True) is ProcessHealth.BUSY
+    assert checked(life, 41.0, 16.0, works=True) is ProcessHealth.BUSY
+    assert checked(life, 41.1, 41.0, works=True) is ProcessHealth.NOT_CLOSING
 
 
 def test_while_we_slept_a_busy_step_did_not_go_on() -> None:

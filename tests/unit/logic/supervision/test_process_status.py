@@ -101,3 +101,25 @@ def test_a_change_is_told_once_and_since_when_it_is_so() -> None:
     child.beats(2.0, step_age_s=1.25)
     (busy,), changed = status.states([child], 2.0, 30)
     assert (busy.since_ns, busy.step_age_s, changed) == (20, 1.25, False)
+
+
+def test_a_process_at_work_on_a_step_or_late_with_a_beat_is_alive_since_it_came_up() -> None:
+    child, status = Child(), ProcessStatus(POLICY.liveness)
+
+    def since_s(now_s: float) -> int:
+        ((state,), _) = status.states([child], now_s, int(now_s))
+        return state.since_ns
+
+    child.start(7)
+    assert since_s(1.0) == 1
+    child.beats(2.0)
+    assert since_s(2.0) == 2
+    child.beats(10.0, step_age_s=0.5)
+    assert since_s(10.0) == 2
+    assert since_s(13.0) == 13, "silent"
+    child.beats(14.0)
+    assert since_s(14.0) == 2
+    child.ends(1, 15.0)
+    child.start(8)
+    child.beats(16.0)
+    assert since_s(16.0) == 16

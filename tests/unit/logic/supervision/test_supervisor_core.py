@@ -9,14 +9,18 @@ import pytest
 
 from afspm.exit_codes import ExitCode
 from afspm.logic.supervision.child import ChildPolicy
+from afspm.logic.supervision.idle import ASK_AGAIN_S, IDLE_AFTER_S
 from afspm.logic.supervision.liveness import LivenessPolicy
 from afspm.logic.supervision.restart import RestartPolicy
-from afspm.logic.supervision.run_end import KILL_AFTER_S, OWN_PACE_S, EndReason
-from afspm.logic.supervision.supervised_child import ChildSpec
+from afspm.logic.supervision.run_end import KILL_AFTER_S, OWN_PACE_S, TIP_S, EndReason
+from afspm.logic.supervision.supervised_child import CLOSES_WITHIN_S, ChildSpec
 from afspm.logic.supervision.supervisor_core import SCHEDULER_ANSWERS_WITHIN_S, SupervisorCore
 from afspm.logic.supervision.supervisor_events import (
     ActivitySeen,
+    AskUse,
     Beaten,
+    EndExperiment,
+    EndRefused,
     EndSignal,
     Exited,
     ProcessAction,
@@ -30,6 +34,7 @@ from afspm.logic.supervision.supervisor_events import (
     SupervisorEffect,
     SupervisorEvent,
     TimePassed,
+    UseReported,
     WriteLog,
     describe_exit,
 )
@@ -49,8 +54,8 @@ class Beat(NamedTuple):
 class Run:
     """A run whose processes start at once; its commands are kept."""
 
-    def __init__(self, *specs: ChildSpec, awaits_scheduler: bool = False) -> None:
-        self.core = SupervisorCore(specs or SPECS, POLICY, awaits_scheduler=awaits_scheduler)
+    def __init__(self, *specs: ChildSpec, awaits_scheduler: bool = False, ends_idle: bool = False) -> None:
+        self.core = SupervisorCore(specs or SPECS, POLICY, awaits_scheduler=awaits_scheduler, ends_idle=ends_idle)
         self.pids: dict[str, int] = {}
         self.now_s = 100.0
         self.commands: list[tuple[ProcessAction, str]] = []
@@ -231,20 +236,110 @@ def test_exits_are_described() -> None:
     assert describe_exit(0xC0000005) == "killed by Windows: access violation (0xC0000005)"
 
 
-def test_when_the_last_plan_is_done_it_is_said_how_to_end_the_experiment() -> None:
-    def said() -> int:
-        return sum("nothing is left to run" in line.text for line in run.lines)
+PLANS = (ChildSpec("series", acts=True), ChildSpec("grid", acts=True))
 
-    plans = [ChildSpec("series", acts=True), ChildSpec("grid", acts=True)]
-    run = Run(*SPECS[:2], *plans, ChildSpec("classifier"))
+
+class IdleRun(Run):
+    """A run of two plans and a classifier; `rest` lets time pass while everything else is at rest."""
+
+    def __init__(self, *, ends_idle: bool) -> None:
+        super().__init__(*SPECS[:2], *PLANS, ChildSpec("classifier"), ends_idle=ends_idle)
+        self.rest(1.0)
+
+    def rest(self, for_s: float) -> None:
+        until_s = self.now_s + for_s
+        while self.now_s < until_s:
+            self.beat(*(name for name, child in self.core.children.items() if child.life))
+            self.step(TimePassed(), 0.5)
+
+    def logged(self, text: str) -> int:
+        return sum(text in line.text for line in self.lines)
+
+
+def test_nothing_left_to_run_is_logged_when_the_last_plan_is_done() -> None:
+    run = IdleRun(ends_idle=False)
     run.exits("series", ExitCode.DONE)
-    assert said() == 0
     run.exits("grid", ExitCode.CRASHED)
-    assert said() == 0
+    run.rest(2 * IDLE_AFTER_S)
+    assert run.logged("nothing is left to run") == 0
     run.exits("grid", ExitCode.DONE)
-    run.exits("classifier", ExitCode.DONE)
-    assert said() == 1
+    run.rest(0.9 * IDLE_AFTER_S)
+    assert run.logged("nothing is left to run") == 0
+    run.rest(2 * IDLE_AFTER_S)
+    assert run.logged("nothing is left to run: series is done, grid is done; Ctrl-C or `afspm end`") == 1
+    assert run.others == []
     assert run.core.ending is None
+
+
+def test_nothing_left_to_run_is_not_logged_after_a_component_has_ended_the_experiment() -> None:
+    run = IdleRun(ends_idle=True)
+    run.exits("series", ExitCode.DONE)
+    run.exits("grid", ExitCode.DONE)
+    run.exits("classifier", ExitCode.ENDED)
+    run.rest(2 * IDLE_AFTER_S)
+    assert run.logged("nothing is left to run") == 0
+    assert run.core.ending is not None
+    assert run.core.ending.why is EndReason.EXPERIMENT_ENDED
+
+
+def test_a_run_whose_plans_are_done_ends_once_the_microscope_is_not_in_use() -> None:
+    run = IdleRun(ends_idle=True)
+    run.exits("series", ExitCode.DONE)
+    run.exits("grid", ExitCode.DONE)
+    run.rest(IDLE_AFTER_S + 1.0)
+    assert run.others == [AskUse()]
+    run.step(UseReported("Ada is in control"))
+    run.rest(2 * ASK_AGAIN_S)
+    assert run.logged("Ada is in control") == 1
+    assert set(run.others) == {AskUse()}
+    run.step(UseReported(""))
+    assert run.others[-1] == EndExperiment()
+    run.step(Beaten("classifier", Beat(step_age_s=0.5)))  # it finishes something
+    run.step(TimePassed(), 0.5)
+    run.exits("classifier", ExitCode.ENDED)
+    assert run.core.ending is not None
+    assert run.core.ending.why is EndReason.PLANS_DONE
+    assert run.core.ending.text == "nothing was left to run: series is done, grid is done"
+    assert (run.core.ending.why.exit_code, run.core.ending.why.is_final) == (3, True)
+
+
+def test_a_run_whose_last_plan_was_given_up_ends_and_can_be_resumed() -> None:
+    run = IdleRun(ends_idle=True)
+    run.exits("series", ExitCode.DONE)
+    run.exits("grid", ExitCode.CONFIG, "no such channel")
+    assert "gave up grid; the run ends in 10 s: no such channel" in run.lines[-1].text
+    run.rest(IDLE_AFTER_S + 1.0)
+    run.step(UseReported(""))
+    assert run.core.ending is not None
+    assert run.core.ending.why is EndReason.PLANS_LOST
+    assert "series is done, grid was given up" in run.lines[-1].text
+    assert (run.core.ending.why.exit_code, run.core.ending.why.is_final) == (4, False)
+    assert (CLOSE, "classifier") in run.step(TimePassed())
+
+
+def test_a_run_does_not_end_while_a_component_starts_again_or_a_plan_is_restarted() -> None:
+    run = IdleRun(ends_idle=True)
+    run.exits("series", ExitCode.DONE)
+    run.exits("grid", ExitCode.DONE)
+    run.rest(IDLE_AFTER_S - 1.0)
+    run.exits("classifier", ExitCode.CRASHED)
+    run.rest(IDLE_AFTER_S - 1.0)
+    assert run.others == []
+    run.step(RestartOrdered("grid"))
+    run.rest(2 * IDLE_AFTER_S)
+    assert run.others == []
+
+
+def test_a_scheduler_that_refuses_to_end_is_asked_again() -> None:
+    run = IdleRun(ends_idle=True)
+    run.exits("series", ExitCode.DONE)
+    run.exits("grid", ExitCode.DONE)
+    run.rest(IDLE_AFTER_S + 1.0)
+    run.step(UseReported(""))
+    run.step(EndRefused("not now"))
+    assert run.logged("refuses to end the experiment: not now") == 1
+    run.rest(2 * ASK_AGAIN_S)
+    assert run.others[-1] == AskUse()
 
 
 def test_the_recorder_leaves_after_the_other_components_and_before_the_scheduler() -> None:
@@ -259,3 +354,49 @@ def test_the_recorder_leaves_after_the_other_components_and_before_the_scheduler
     assert run.step(TimePassed()) == [(CLOSE, "recorder")]
     run.exits("recorder", ExitCode.ENDED)
     assert run.step(TimePassed()) == [(CLOSE, "scheduler")]
+
+
+def killed_after_s(run: Run, processor_share: float, *, works: bool | None = True) -> float:
+    """Return how long after it was asked to end `series` is killed, which gets a share of a processor."""
+    run.step(EndSignal(signal.SIGINT))
+    assert run.step(TimePassed()) == [(CLOSE, "series")]
+    asked_s = run.now_s
+    while run.now_s < asked_s + 60.0:
+        assert run.core.overdue(run.now_s)[0] == {"series": run.pids["series"]}
+        run.step(ActivitySeen("series", works, 7.0 + processor_share * (run.now_s - asked_s)))
+        if run.step(TimePassed(), 0.1):
+            return run.now_s - asked_s
+    raise AssertionError("it is never killed")
+
+
+def test_process_that_works_on_its_end_has_longer_on_a_busy_computer_but_not_for_ever() -> None:
+    assert killed_after_s(_only_series(), 0.0, works=False) == pytest.approx(KILL_AFTER_S, abs=0.2)
+    assert killed_after_s(_only_series(), 0.0, works=None) == pytest.approx(KILL_AFTER_S, abs=0.2)
+    slow = killed_after_s(_only_series(), CLOSES_WITHIN_S / 8.0)
+    assert slow == pytest.approx(8.0 + KILL_AFTER_S, abs=0.3)
+    assert killed_after_s(_only_series(), CLOSES_WITHIN_S / 60.0) == pytest.approx(TIP_S, abs=0.3)
+
+
+def test_process_that_goes_round_for_ever_is_killed_soon_where_the_computer_is_idle() -> None:
+    assert killed_after_s(_only_series(), 1.0) <= CLOSES_WITHIN_S + KILL_AFTER_S + 0.2
+
+
+def _only_series() -> Run:
+    run = Run(ChildSpec("series"))
+    run.beat("series")
+    return run
+
+
+def test_component_that_is_started_again_at_the_end_has_time_on_a_busy_computer() -> None:
+    """Four seconds before the end it was killed: it starts slowly, then draws the night."""
+    run = Run()
+    run.beat()
+    run.exits("series", -9)
+    run.step(TimePassed(), 4.0)
+    run.exits("scope", ExitCode.ENDED)
+    for _ in range(200):
+        run.step(ActivitySeen("series", True))
+        assert (CLOSE, "series") not in run.step(TimePassed(), 0.1)
+    assert run.core.overdue(run.now_s)[0]["series"] == run.pids["series"]
+    run.beat("series", "scheduler")
+    assert (CLOSE, "series") not in run.step(TimePassed(), 1.0), "it has yet to hear what it missed"

@@ -1,0 +1,52 @@
+"""The one rule by which a scan is marked as bad: in the report, on its map, and in pictures of the night."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from afspm.model import Problem
+
+BAD = 0.0
+"""The score of a scan that was judged to show a bad tip."""
+VERDICT_MESSAGE = "SpatialROIWithScoreList"
+_SAME_SCAN_NS = 1_000_000_000  # channels of one scan are stamped one after the other
+_NOT_OF_A_SCAN = frozenset({int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFUNCTION)})
+"""Problems that say nothing about the scan before them: where the sample is, and whether the controller answers."""
+
+
+def read_verdict(message: Any) -> tuple[int, float] | None:
+    """Return (time of the scan in ns, score) of a verdict message; None if it is not about a scan."""
+    if not message.spatials or not message.HasField("timestamp"):
+        return None
+    return message.timestamp.ToNanoseconds(), float(message.spatials[0].score)
+
+
+def bad_scans(
+    times_ns: Sequence[int],
+    verdicts: Iterable[tuple[int, float]],
+    flagged_ns: Mapping[int, Iterable[int]],
+    interrupted_ns: Iterable[int] = (),
+) -> frozenset[int]:
+    """Return the times of the scans that are bad.
+
+    A scan is bad if it was interrupted, or if the last verdict on it is bad. In a run without verdicts, the newest scan
+    is bad when a problem is flagged.
+
+    Args:
+        times_ns: when scans were finished, or interrupted.
+        verdicts: time of the scan and score, in the order in which they came.
+        flagged_ns: when each problem was flagged, by its number.
+    """
+    judged: dict[int, float] = {}
+    for of_ns, score in verdicts:
+        near = [time_ns for time_ns in times_ns if abs(time_ns - of_ns) <= _SAME_SCAN_NS]
+        judged |= dict.fromkeys(near, score)
+    bad = {time_ns for time_ns, score in judged.items() if score == BAD}
+    bad |= set(times_ns) & set(interrupted_ns)
+    if judged:
+        return frozenset(bad)
+    for flag_ns in (flag for number, flags in flagged_ns.items() if number not in _NOT_OF_A_SCAN for flag in flags):
+        newest_ns = max((time_ns for time_ns in times_ns if time_ns <= flag_ns), default=None)
+        bad |= set() if newest_ns is None else {newest_ns}
+    return frozenset(bad)

@@ -1,0 +1,74 @@
+"""What the scheduler's shell writes down around the end of an experiment, with the real decisions and the real log."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
+
+from fake_clock import FakeClock
+
+from afspm import wire
+from afspm.logic.scheduler_core import SchedulerCore
+from afspm.logic.settings import SchedulerSettings
+from afspm.model import (
+    RELAY_REQUEST,
+    ControlRequest,
+    ProcessCondition,
+    ProcessState,
+    ProcessStates,
+    RelayedMessage,
+    Request,
+)
+from afspm.scheduler.shell import SchedulerShell
+from afspm.scheduler.state_file import StateFile
+from afspm.scheduler.wire_codec import WireCodec
+from afspm.scheduler.write_ahead import WriteAhead
+from afspm.storage.packet_log import PacketLog, cached_packets, logged_packets
+from afspm.transport.rate_limited_log import RateLimitedLog
+from afspm.transport.router import PeerAsked, PeerConnected
+
+LOG = logging.getLogger("scheduler")
+
+
+class Lab:
+    """A shell without sockets: what peers ask is handed to it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.log = folder / "packets"
+        self.clock = FakeClock()
+        self.sockets: Any = MagicMock()
+        core = SchedulerCore(SchedulerSettings(), WireCodec())
+        state = StateFile(folder / "scheduler.json", LOG)
+        self.writes = WriteAhead(state, PacketLog(self.log), core.cached, LOG)
+        warnings = RateLimitedLog(LOG, self.clock)
+        self.shell = SchedulerShell(core, self.sockets, self.clock, self.writes, warnings, LOG)
+        self.shell.start()
+        self._asked = 0
+
+    def ask(self, name: str, kind: int, subject: object = None) -> None:
+        self._asked += 1
+        frames = wire.encode_request(Request(kind, subject, id=f"{name}/session/{self._asked}"))
+        events = [PeerConnected(self._asked), PeerAsked(self._asked, name, None, frames)]
+        self.sockets.router.receive.return_value = events
+        self.shell.handle([self.sockets.router])
+
+
+def states_of(name: str) -> bytes:
+    alive = ProcessState(name, "component", ProcessCondition.ALIVE, 1)
+    return wire.encode(ProcessStates(1, "supervisor", (alive,)))[1]
+
+
+def test_last_words_after_the_end_are_recorded_and_not_in_the_cache_of_a_restarted_scheduler(tmp_path: Path) -> None:
+    lab = Lab(tmp_path)
+    before, after = states_of("before"), states_of("after")
+    lab.ask("supervisor", RELAY_REQUEST, RelayedMessage("ProcessStates", before))
+    lab.ask("experiment", ControlRequest.END_EXPERIMENT)
+    assert lab.shell.ended
+    lab.ask("supervisor", RELAY_REQUEST, RelayedMessage("ProcessStates", after))
+    lab.writes.close()
+    logged = [bytes(entry.packet.payload) for entry in logged_packets(lab.log)]
+    cached = [bytes(entry.packet.payload) for entry in cached_packets(lab.log)]
+    assert (before in logged, after in logged) == (True, True)
+    assert (before in cached, after in cached) == (True, False)

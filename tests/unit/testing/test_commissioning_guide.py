@@ -1,0 +1,81 @@
+"""The questions of a commissioning: about a panel that there is, and about one that there is not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from afspm.testing.commissioning.guide import UNSEEN, Guide
+from afspm.testing.verdicts import Failed, Skipped
+
+
+@dataclass
+class Person:
+    answers: dict[str, str] = field(default_factory=dict)
+    shown: list[str] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)
+
+    def show(self, text: str) -> None:
+        self.shown.append(text)
+
+    def confirm(self, question: str) -> bool:
+        return self._answer(question, "y") == "y"
+
+    def text(self, question: str) -> str:
+        return self._answer(question, "")
+
+    def choose(self, question: str, options: Sequence[str], default: str = "") -> str:
+        return self._answer(question, default)
+
+    def _answer(self, question: str, default: str) -> str:
+        self.asked.append(question)
+        return next((answer for words, answer in self.answers.items() if words in question), default)
+
+
+def guide(person: Person, *, has_panel: bool) -> Guide:
+    kit: Any = None  # no question needs it
+    return Guide(kit, person, Path(), has_panel=has_panel)
+
+
+PANEL_QUESTIONS: dict[str, Callable[[Guide], object]] = {
+    "has it stopped": lambda guide: guide.require_at_panel("has it stopped", "a panel that has stopped"),
+    "press Enter": lambda guide: guide.at_panel("press Enter"),
+    "which way": lambda guide: guide.require_choice("which way", "up", ["down"], "a frame"),
+    "width": lambda guide: guide.compare("width", 1000.0, "nm"),
+}
+
+
+@pytest.mark.parametrize("words", PANEL_QUESTIONS)
+def test_question_about_a_missing_panel_is_shown_and_not_asked(words: str) -> None:
+    person = Person({words: "no"})
+    assert not PANEL_QUESTIONS[words](guide(person, has_panel=False))
+    assert not person.asked
+    (line,) = person.shown
+    assert line.startswith(f"  {words}")
+    assert line.endswith("skipped: a simulated microscope has no panel")
+
+
+@pytest.mark.parametrize("words", PANEL_QUESTIONS)
+def test_question_about_a_panel_is_asked(words: str) -> None:
+    person = Person()
+    PANEL_QUESTIONS[words](guide(person, has_panel=True))
+    assert [one.startswith(words) for one in person.asked] == [True]
+
+
+def test_choice_without_an_answer_is_unseen_and_a_wrong_one_fails() -> None:
+    ask = PANEL_QUESTIONS["which way"]
+    assert ask(guide(Person(), has_panel=True)) is False
+    assert ask(guide(Person({"which way": "up"}), has_panel=True)) is True
+    with pytest.raises(Failed, match="down at the panel"):
+        ask(guide(Person({"which way": "down"}), has_panel=True))
+    assert UNSEEN == "unseen"
+
+
+def test_what_a_panel_would_show_and_was_not_seen_is_skipped_and_without_a_panel_passes() -> None:
+    with pytest.raises(Skipped, match="not seen at the panel"):
+        guide(Person(), has_panel=True).unseen()
+    assert "set and read back" in guide(Person(), has_panel=False).unseen()
