@@ -11,7 +11,8 @@ import numpy as np
 from afspm.drift.mapping import Mapping
 from afspm.drift.trackers.paper import PaperForecast
 from afspm.logic.events import Effect, Publish
-from afspm.model import Packet, Region, Scan, ScanParameters, ScopeState
+from afspm.model import Packet, Region, RegistrationOutcome, Scan, ScanParameters, ScopeState
+from afspm.model.geometry import XY
 from afspm.scheduler.drift.core import DriftCore
 from afspm.scheduler.drift.messages import Forecasted, Registered, RescanWanted, ScanJob, WorkerGone, WorkerSaid
 from afspm.scheduler.drift.settings import DriftCompensationSettings, RescanRule
@@ -61,7 +62,7 @@ class DriftTable(TableCodec):
             return self.encode(replace(thing, sample=there.region))
         return self.encode(replace(thing, region=there.region) if isinstance(thing, ScanParameters) else there)
 
-    def encode_mapping(self, registered: Registered, scan: ScanJob, *, correcting: bool) -> bytes:
+    def encode_mapping(self, registered: Registered, filename: str, center_m: XY, *, correcting: bool) -> bytes:
         return self.encode(("mapping", registered.key, str(registered.matrix)))
 
     def encode_rescan(self, wanted: RescanWanted) -> bytes:
@@ -140,8 +141,9 @@ class PlayedWorker:
         plain = zero.tolist()
         matrix = mapping.matrix.tolist()
         return Registered(
-            job.key, middle_s, matrix, plain, rate_m_s.tolist(), plain, True, False, "", [0.0, 0.0], [], "", forecast
-        )
+            job.key, middle_s, matrix, plain, rate_m_s.tolist(), plain, RegistrationOutcome.REGISTERED, False, "",
+            [0.0, 0.0], [], "", forecast, [],
+        )  # fmt: skip
 
     def _say(self, said: WorkerSaid) -> None:
         host: SchedulerHost | None = getattr(self._night, "scheduler", None)

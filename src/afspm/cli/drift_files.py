@@ -26,6 +26,7 @@ from afspm.drift.trackers import tracker
 from afspm.errors import AfspmError, FileError, InvalidValue
 from afspm.files import FORMATS, FileContent, read
 from afspm.formatting import counted, day_and_time
+from afspm.model import RegistrationOutcome
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.measured_files import SUFFIX as RECORDED
 from afspm.study.scan_series import Series, series
@@ -72,6 +73,7 @@ def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Pa
     console.print(f"{counted(len(found.scans), 'scan')} of {found.channel} from {begun} on", markup=False)
     analysis = analysed(found.scans, by, following, jobs, aside)
     console.print(as_table(analysis.record))
+    console.print(analysis.record.summary())
     truth_m = true_drift(paths[0], found.scans) if len(paths) == 1 else None  # of one simulated run
     for path in written(found, analysis, truth_m, output, aside):
         console.print(str(path), markup=False, soft_wrap=True)
@@ -129,7 +131,7 @@ def _pairs(scans: Sequence[DriftScan], by: str, jobs: int, done: Callable[[], No
     tasks = [(by, scans[0], scan) for scan in scans[1:]]
     pairs = [Registration.refused("")] * len(tasks)
     for outcome in on_cores(register_pair, tasks, jobs=jobs):
-        pairs[outcome.index] = Registration.refused(outcome.error) if outcome.error else outcome.value
+        pairs[outcome.index] = Registration.failed(outcome.error) if outcome.error else outcome.value
         done()
     return tuple(pairs)
 
@@ -145,7 +147,10 @@ def as_table(record: DriftRecord) -> Table:
     for k, key in enumerate(record.keys):
         numbers = (*record.drift_m[k] * NM, record.sd_m[k].max() * NM, *record.rate_m_s[k] * NM_PER_MIN)
         texts = (f"{value:.2f}" if abs(value) < 1e5 else f"{value:.1e}" for value in numbers)
-        accepted = "yes" if record.matched[k] else f"no: {record.reasons[k]}"
+        outcome = record.outcomes[k]
+        accepted = "yes" if record.matched[k] else "no"
+        if outcome is not RegistrationOutcome.REGISTERED:
+            accepted += f", {outcome.label}: {record.reasons[k]}"
         table.add_row(Path(key).name, f"{hours[k]:.2f}", *texts, accepted)
     return table
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from afspm.clock import NS_PER_S, utc_time
 from afspm.formatting import area_text, day_and_time, duration_text, time_of_day
 from afspm.model import LogLine, ProcessCondition, ProcessState, Region, ScopeState
-from afspm.record.overview import OLD_S, OVER, Overview
+from afspm.record.overview import OLD_S, OVER, ROUTINE, Overview
 from afspm.record.timeline import Span
 
 if TYPE_CHECKING:
@@ -80,7 +80,8 @@ class StatusText:
         if silent_s > OLD_S:
             told = f"no news for {duration_text(silent_s)}: the scheduler is restarting, or can't be reached"
             lines.append(Text(told, "bold yellow"))
-        lines += [self._control(), *self._problems(), self._scanning(), *self._progress(), *self._processes()]
+        lines += [self._control(), *self._problems(), self._scanning(), *self._progress(), *self._drift()]
+        lines += self._processes()
         lines += self._refusals()
         lines += self._notes()
         lines += map(log_line, list(self._seen.log)[-log_lines:] if log_lines > 0 else ())
@@ -120,9 +121,12 @@ class StatusText:
 
     def _problems(self) -> Iterator[Text]:
         for _, name, span in flagged(self._seen):
-            line = _label("problem").append(name, "bold red")
+            is_routine = self._seen.is_routine(span)
+            line = _label("problem").append(name, "" if is_routine else "bold red")
             if span is not None:
                 line.append(f"{self._since(span.start_ns)}{f', flagged by {span.by}' if span.by else ''}")
+            if is_routine:
+                line.append(f": {ROUTINE}", "dim")
             yield line
 
     def _microscope(self) -> Text:
@@ -165,6 +169,10 @@ class StatusText:
             left = "longer than expected" if left_ns == 0 else self._left(left_ns)
             said = f"{told.name}: {told.done} of {told.of}  {self._bar(told.done / told.of)} "
             yield _label("progress").append(said + ("done" if told.done >= told.of else left))
+
+    def _drift(self) -> Iterator[Text]:
+        if registered := self._seen.registration:
+            yield _label("drift").append(registered)
 
     def _processes(self) -> Iterator[Text]:
         """Yield those that are well in one line; each of the others in its own."""

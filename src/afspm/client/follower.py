@@ -20,7 +20,7 @@ from afspm.transport.zmq_port import open_port
 
 SMALL = (
     "ScopeStateMsg", "ControlState", "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "DriftMapping",
-    "JournalEntries", "ProcessStates", "LogLines", "Progress", "Note",
+    "DriftRescan", "JournalEntries", "ProcessStates", "LogLines", "Progress", "Note",
 )  # fmt: skip
 """Envelopes of what carries no values of scans and spectra."""
 LINES = "ScanLines"

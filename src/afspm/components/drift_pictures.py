@@ -187,7 +187,8 @@ class DriftPictures(DriftTable):
         pair = (first.file, other.file)
         if pair not in self._pairs:
             try:
-                self._pairs[pair] = estimator(self.estimator).register(self._scan(first), self._scan(other))
+                comparing = estimator(self.estimator, lambda failure: self.log.error("%s", failure))
+                self._pairs[pair] = comparing.register(self._scan(first), self._scan(other))
             except FileError as error:
                 self._tell(error)
                 self._pairs[pair] = Registration.refused(str(error))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,6 +14,7 @@ from afspm.clock import iso_utc
 from afspm.components.line_file import LineFile, csv_line
 from afspm.drift.record import COLUMNS as RECORD
 from afspm.drift.record import drift_at
+from afspm.model import RegistrationOutcome
 
 COLUMNS = ("datetime", "filename", "offset_x", "offset_y", "rate_x", "rate_y", "units", *RECORD, "lost", "correcting")
 
@@ -20,8 +22,10 @@ COLUMNS = ("datetime", "filename", "offset_x", "offset_y", "rate_x", "rate_y", "
 class DriftTable(Component):
     """Writes `drift_correction.csv`: for each scan the offset between tip and sample coordinates, and its rate.
 
-    The offset is x_sample - x_tip. The columns from `scan` to `reason` are those of `afspm.drift.record`, which reads
-    the table. Whatever is killed, there is one header and no row is there twice.
+    The offset is x_sample - x_tip. The columns from `scan` to `failures` are those of `afspm.drift.record`, which reads
+    the table. `outcome` says how the position of a scan is known: registered, coarse, or by dead reckoning (refused,
+    failed, new), with the variances that it then has. Whatever is killed, there is one header and no row is there
+    twice.
 
     Args:
         file: its name in the run folder.
@@ -48,17 +52,19 @@ def drift_row(message: Any) -> list[str]:
     """A DriftMapping as a row."""
     time_ns = message.timestamp.ToNanoseconds()
     drift_x, drift_y = drift_at(np.array(message.matrix).reshape(2, 3), message.center)
-    xx, xy, _, yy = message.covariance
-    numbers = (*message.center, drift_x, drift_y, xx, yy, xy, *message.rate)
+    xx, xy, _, yy = message.covariance or (math.nan,) * 4  # of a scan before anything was known
+    rate = message.rate or (math.nan,) * 2
+    outcome = RegistrationOutcome.of(message.outcome, matched=message.matched)
+    numbers = (*message.center, drift_x, drift_y, xx, yy, xy, *rate)
     return [
         iso_utc(time_ns),
         message.filename,
-        *(_text(value) for value in (-drift_x, -drift_y, *message.rate)),
+        *(_text(value) for value in (-drift_x, -drift_y, *rate)),
         "m; m/s",
         message.filename,
         f"{time_ns * 1e-9:.6f}",
         *(_text(value) for value in numbers),
-        *("yes" if message.matched else "no", message.reason),
+        *("yes" if message.matched else "no", message.reason, outcome.label, str(message.failures)),
         *("yes" if flag else "no" for flag in (message.lost, message.correcting)),
     ]
 

@@ -11,7 +11,7 @@ from typing import Any
 from afspm.client.component import Component
 from afspm.components import tip_verdict
 from afspm.components.line_file import LineFile
-from afspm.model import ControlState, Scan, ScopeState, ScopeStatus
+from afspm.model import ControlState, RescanKind, Scan, ScopeState, ScopeStatus
 from afspm.plain_data import Plain
 from afspm.record.night_record import NightRecord, control_entry, mark_entry, scan_entry
 
@@ -61,7 +61,9 @@ class NightPicture(Component):
 
     def on_message(self, envelope: str, message: Any) -> None:
         by = envelope.partition("_")[2]
-        if envelope.startswith("ActionMsg"):
+        if envelope.startswith("DriftRescan") and message.kind == RescanKind.OPPOSITE:
+            self._add({"kind": "routine", "time_ns": message.timestamp.ToNanoseconds()})
+        elif envelope.startswith("ActionMsg"):
             self._add(mark_entry(by, message.action, self._packet_ns()))
         elif envelope.startswith(tip_verdict.MESSAGE) and (verdict := tip_verdict.read_verdict(message)) is not None:
             of_ns, score = verdict

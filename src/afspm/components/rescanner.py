@@ -183,9 +183,8 @@ class Rescanner(Component):
         if mapping is None:
             self.log.warning("the scheduler reported no drift for the scan")
             return False
-        if kind == RescanKind.SEARCH:
-            return not mapping.lost
-        return bool(mapping.matched and not mapping.lost and (kind == RescanKind.OPPOSITE or not mapping.rescan))
+        is_enough = kind in (RescanKind.OPPOSITE, RescanKind.SEARCH)  # for these the place need not be exact
+        return bool(mapping.matched and not mapping.lost and (is_enough or not mapping.rescan))
 
     def _forget(self, told: Events) -> None:
         """Drop the drift mappings of earlier scans."""

@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from afspm.client.component import Component
+from afspm.client.events import Events
 from afspm.client.keyed_results import check_key
 from afspm.components.planned_scans import FRAME, Pixels, checked_parameters, pair, shape_of
 from afspm.components.scan_plan import XY, ScanPlan
 from afspm.components.target_finder import TargetFinder
+from afspm.drift.record import drift_knowledge
 from afspm.errors import ConfigError, Refused
 from afspm.formatting import area_text, counted, lengths_text, position_text
-from afspm.model import Region, Scan, ScanSet, names
+from afspm.model import Region, RegistrationOutcome, Scan, ScanSet, names, registration_summary
 from afspm.storage.atomic import OutageLog
 from afspm.survey.record import Outcome, SurveyRecord, Visit
 from afspm.survey.targets import Target, lowest_beside
 from afspm.units import Angle, Length
+
+MAPPING = "DriftMapping"
+LEAST_ZOOM_PX = 20
+"""Least width of a zoom in pixels of the survey: narrower ones are often refused, and below 8 px nothing is tried."""
+USUAL_PX, MOST_PX, _STEP_PX = 128, 512, 16
 
 
 class Survey(Component):
@@ -42,7 +50,8 @@ class Survey(Component):
         count: the most targets that are visited.
         center: (x, y) of the middle of the survey.
         angle: of survey and zooms, counter-clockwise.
-        pixels: (columns, rows) of the survey.
+        pixels: (columns, rows) of the survey. By default 128, or as many as it takes, up to 512, for a zoom to be 20
+            pixels of the survey wide: with fewer it can't be relied on that drift is followed from survey to zoom.
         zoom_pixels: (columns, rows) of each zoom.
         channel: that targets are found in.
         min_height: of a particle above the ground around it; by default six times the noise.
@@ -56,6 +65,8 @@ class Survey(Component):
         file: name of the table and of the picture in the run folder, without `.csv` and `.png`.
     """
 
+    drift_doubts: tuple[ConfigError, ...]
+    """What `afspm check` warns of where drift is corrected."""
     requires = ("afspm[features]",)
     needs_actions: tuple[str, ...] = (names.START_SCAN,)
     _outage = OutageLog("the table of targets can't be written", logging.getLogger("afspm.records"))
@@ -69,7 +80,7 @@ class Survey(Component):
         count: int = 10,
         center: tuple[Length, Length] = (0.0, 0.0),
         angle: Angle = 0.0,
-        pixels: Pixels = (128, 128),
+        pixels: Pixels | None = None,
         zoom_pixels: Pixels = (128, 128),
         channel: str = "Height",
         min_height: Length | None = None,
@@ -83,14 +94,15 @@ class Survey(Component):
     ) -> None:
         self.parameters = checked_parameters(parameters, "parameters")
         self.zoom_parameters = checked_parameters(zoom_parameters, "zoom_parameters")
-        self._wide = _ScanSetup(Region(pair(center), _both(size), angle), shape_of(pixels), self.parameters)
-        self._closer = _ScanSetup(
-            Region((0.0, 0.0), _both(zoom), angle), shape_of(zoom_pixels, "zoom_pixels"), self.zoom_parameters
-        )
-        for zoom_m, whole_m in zip(self._closer.region.size_m, self._wide.region.size_m, strict=True):
+        wide, closer = Region(pair(center), _both(size), angle), Region((0.0, 0.0), _both(zoom), angle)
+        for zoom_m, whole_m in zip(closer.size_m, wide.size_m, strict=True):
             if zoom_m > whole_m:
-                what = f"a zoom of {area_text(self._closer.region.size_m)} is larger than the survey"
-                raise ConfigError(what, where="zoom", hint=f"at most {area_text(self._wide.region.size_m)}")
+                what = f"a zoom of {area_text(closer.size_m)} is larger than the survey"
+                raise ConfigError(what, where="zoom", hint=f"at most {area_text(wide.size_m)}")
+        chosen = _fine_enough(wide, closer) if pixels is None else pixels
+        self._wide = _ScanSetup(wide, shape_of(chosen), self.parameters)
+        self._closer = _ScanSetup(closer, shape_of(zoom_pixels, "zoom_pixels"), self.zoom_parameters)
+        self.drift_doubts = tuple(_too_coarse(wide, chosen, closer, is_given=pixels is not None))
         self.plan = ScanPlan((self._wide.region,), self._wide.shape)  # the part that `afspm check` can look at
         half_m = min(self._closer.region.size_m) / 2
         self.curves = {name: _place(name, place, half_m) for name, place in (curves or {}).items()}
@@ -121,6 +133,10 @@ class Survey(Component):
         self.finder.check()
 
     def run(self) -> None:
+        with self.scope.events(MAPPING, timeout_s=0.0) as mappings:
+            self._run(mappings)
+
+    def _run(self, mappings: Events) -> None:
         self._set(self._wide.parameters)
         survey = self._channel(self.scope.scan(self._wide.region, shape=self._wide.shape, key="survey"))
         self._record = SurveyRecord(survey, self._targets(survey), tuple(self.curves))
@@ -128,13 +144,17 @@ class Survey(Component):
         visits = self._record.visits
         self._set(self._closer.parameters if visits else {})
         for visit in visits:
-            self._visit(visit)
+            self._visit(visit, mappings)
             self._keep(self._record)
             self.scope.progress(visit.number, len(visits))
             if visit.number > int(self.memory.get("done", 0)):  # else it was told in an earlier life
                 self._tell(visit, self._record.outcome(visit))
                 self.memory["done"] = visit.number
                 self.memory.save()
+        registered = [visit.registration for visit in visits if visit.registration]
+        if registered:
+            level = logging.INFO if all(one.is_registered for one in registered) else logging.WARNING
+            self.log.log(level, "zooms: %s", registration_summary(registered))
         if self.end_when_done:
             self.scope.end_experiment()
 
@@ -166,7 +186,7 @@ class Survey(Component):
                 self.log.warning("no target found in the survey: nothing is zoomed")
         return [Target((x, y), height) for x, y, height in self.memory["targets"]]
 
-    def _visit(self, visit: Visit) -> None:
+    def _visit(self, visit: Visit, mappings: Events) -> None:
         """Take the zoom and the curves of a target; what is refused is noted."""
         region = self._closer.region.moved_to(visit.target.position_m)
         try:
@@ -175,6 +195,7 @@ class Survey(Component):
             visit.refusals.append(f"zoom: {refused.reason}")
             return
         visit.zoom = self._channel(scans)
+        visit.registration, visit.position_sd_m = self._position(visit, scans, mappings)
         visit.center_m = self._center(visit, visit.zoom)
         for name, place in self.curves.items():
             at_m = place.of(visit.center_m, visit.zoom)
@@ -183,6 +204,19 @@ class Survey(Component):
                 visit.curves[name] = self.scope.spectrum(at_m, kind=self.kind, key=f"curve-{key}")
             except Refused as refused:
                 visit.refusals.append(f"{name}: {refused.reason}")
+
+    def _position(
+        self, visit: Visit, scans: ScanSet, mappings: Events
+    ) -> tuple[RegistrationOutcome | None, float | None]:
+        """Return how the position of a zoom is known, by what the scheduler published just before it."""
+        kept = self.memory.setdefault("positions", {})
+        files = {scan.filename for scan in scans.values() if scan.filename}
+        for event in mappings:
+            if event.message.filename in files:
+                kept[str(visit.number)] = drift_knowledge(event.message)
+                self.memory.save()
+        outcome, sd_m = kept.get(str(visit.number), (None, None))
+        return None if outcome is None else RegistrationOutcome(outcome), sd_m
 
     def _center(self, visit: Visit, zoom: Scan) -> XY:
         """Return where the target lies in its zoom, in every life the same."""
@@ -211,8 +245,43 @@ class Survey(Component):
         where, of = position_text(visit.center_m), len(self._record.visits) if self._record else 0
         if outcome is Outcome.REFUSED:
             self.log.warning("target %d of %d at %s refused: %s", visit.number, of, where, "; ".join(visit.refusals))
-        else:
-            self.log.info("target %d of %d at %s measured", visit.number, of, where)
+            return
+        registration, sd_m = visit.registration, visit.position_sd_m
+        how = ""
+        if registration is not None and not registration.is_registered:
+            sd = "unknown" if sd_m is None else f"± {lengths_text([float(f'{sd_m:.2g}')])}"
+            how = f", its position by dead reckoning ({sd}): the zoom is {registration.label}"
+        self.log.info("target %d of %d at %s measured%s", visit.number, of, where, how)
+
+
+def _fine_enough(wide: Region, closer: Region) -> Pixels:
+    """Return the pixels of a survey in which a zoom is wide enough to be recognised."""
+    needed = max(LEAST_ZOOM_PX * large / small for large, small in zip(wide.size_m, closer.size_m, strict=True))
+    side = min(max(USUAL_PX, math.ceil((needed + 1) / _STEP_PX) * _STEP_PX), MOST_PX)
+    return side, side
+
+
+def _zoom_px(wide: Region, pixels: Pixels, closer: Region) -> float:
+    """Return how many pixels of the survey the shorter side of a zoom is wide."""
+    sides = zip(closer.size_m, wide.size_m, pixels, strict=True)
+    return min(small / large * (n - 1) for small, large, n in sides)
+
+
+def _too_coarse(wide: Region, pixels: Pixels, closer: Region, *, is_given: bool) -> Iterator[ConfigError]:
+    """Yield why a zoom may not be recognised in the survey, where drift is to be followed."""
+    if (zoom_px := _zoom_px(wide, pixels, closer)) >= LEAST_ZOOM_PX:
+        return
+    finer = _fine_enough(wide, closer)
+    cure = f"pixels = [{finer[0]}, {finer[1]}]"
+    if _zoom_px(wide, finer, closer) < LEAST_ZOOM_PX:
+        least_m = LEAST_ZOOM_PX * max(large / (n - 1) for large, n in zip(wide.size_m, finer, strict=True))
+        larger = f'zoom = "{math.ceil(least_m * 1e9)} nm"'
+        cure = f"{larger} with {cure}" if is_given else larger
+    yield ConfigError(
+        f"a zoom is {zoom_px:.1f} pixels of the survey wide: drift may not be followed from the survey to its zooms",
+        where="pixels" if is_given else "zoom",
+        hint=f"{LEAST_ZOOM_PX} pixels are enough: {cure}",
+    )
 
 
 @dataclass(frozen=True)

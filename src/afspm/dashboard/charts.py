@@ -11,7 +11,7 @@ import numpy as np
 
 from afspm.drawing.curves import Array, thinned
 from afspm.formatting import quantity, scale, time_of_day, typeset_position
-from afspm.model import Spectrum
+from afspm.model import RegistrationOutcome, Spectrum, registration_summary
 from afspm.plain_data import Plain
 from afspm.record.overview import DriftPoint
 
@@ -32,9 +32,10 @@ class Chart:
 
 
 def drift_chart(points: Sequence[DriftPoint]) -> Chart:
-    """Return where the sample has drifted to, and how fast, against time: figure 7 of the paper."""
+    """Return the drift of the sample, and its velocity, against time: figure 7 of the paper."""
     if not points:
         return Chart('<p class="nothing">This experiment does not track drift.</p>')
+    registered = registration_summary(point.outcome for point in points)
     points = points[-MOST_DRIFT:]
     time_ms = np.array([point.time_ns / 1e6 for point in points])
     xy = np.array([point.translation_m for point in points])
@@ -48,16 +49,21 @@ def drift_chart(points: Sequence[DriftPoint]) -> Chart:
         dots = {"type": "scatter", "name": "predicted only", "symbolSize": 5, "itemStyle": {"color": "var(--bad)"}}
         series.append({**dots, "data": _pairs(np.tile(time_ms[guessed], 2), either)})
     options = _options(series, {"type": "time"}, f"drift of the sample [{unit}]")
-    return Chart(_drift_words(points[-1]), {**options, "legend": _LEGEND})
+    return Chart(_drift_words(points[-1], registered), {**options, "legend": _LEGEND})
 
 
-def _drift_words(point: DriftPoint) -> str:
+def _drift_words(point: DriftPoint, registered: str) -> str:
+    count = f"<p>{registered[0].upper()}{registered[1:]}.</p>"
     speed = math.hypot(*point.rate_m_s) * 60
     if point.lost:
-        return f'<p class="alarm">The sample is lost: {escape(point.reason) or "no scan fits"}</p>'
+        return f'<p class="alarm">The sample is lost: {escape(point.reason) or "no scan fits"}</p>{count}'
     how = "corrected" if point.correcting else "not corrected yet"
-    word = "" if point.matched else f"; the last scan did not fit ({escape(point.reason)})"
-    return f"<p>{typeset_position(point.translation_m)}, moving at {quantity(speed, 'm')}/min, {how}{word}</p>"
+    at = f"{typeset_position(point.translation_m)}, moving at {quantity(speed, 'm')}/min, {how}"
+    if point.outcome is RegistrationOutcome.REGISTERED:
+        return f"<p>{at}</p>{count}"
+    sd = "" if point.sd_m is None else f" (standard deviation {quantity(point.sd_m, 'm', 2)})"
+    what = "known coarsely" if point.matched else "predicted"
+    return f'<p>{at}</p><p class="alarm">The last scan is {what}{sd}: {escape(point.reason)}</p>{count}'
 
 
 def spectrum_chart(spectra: Sequence[tuple[int, Spectrum]], variable: str) -> Chart:

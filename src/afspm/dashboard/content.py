@@ -209,7 +209,9 @@ def rows_of(overview: Overview, silent: Mapping[str, int], *, unfolded: bool = T
     yield TimelineRow("microscope", overview.states.spans, lambda label: f"state-{label.replace('_', '-')}")
     for number, lane in sorted(overview.problem_timelines.items()):
         if lane.spans:
-            yield TimelineRow(overview.problems.name(number), lane.spans, lambda label: "problem")
+            is_routine = all(map(overview.is_routine, lane.spans))
+            style = (lambda _: "marked") if is_routine else (lambda _: "problem")
+            yield TimelineRow(overview.problems.name(number), lane.spans, style)
     rows = {
         name: tuple(_until_told(lane, overview.processes_told_ns[name]) if name in silent else lane.spans)
         for name, lane in overview.process_timelines.items()

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from afspm.model import ControlMode, ControlState, Problem
-from afspm.record.overview import Overview
+from afspm.record.overview import ROUTINE, Overview
 
 _ADVICE = {
     Problem.TIP_SHAPE_CHANGED: "condition or change the tip, then clear the problem.",
@@ -34,7 +34,8 @@ def flags(overview: Overview) -> Iterator[Flag]:
     for number in control.problems if control else ():
         now = overview.problem_timelines[number].now if number in overview.problem_timelines else None
         name, by, since_ns = overview.problems.name(number), now.by if now else "", now.start_ns if now else None
-        yield Flag(number, name, by, since_ns, advice_for(number, control) if control else "")
+        advice = f"{ROUTINE}." if overview.is_routine(now) else advice_for(number, control) if control else ""
+        yield Flag(number, name, by, since_ns, advice)
 
 
 def advice_for(problem: int, control: ControlState) -> str:

@@ -15,7 +15,7 @@ from afspm.drift.registration import DriftScan, Registration
 from afspm.drift.shear import delay_per_length_s_m, row_delay_s
 from afspm.drift.tracking import Tracker, Update
 from afspm.errors import FileError, InvalidValue
-from afspm.model import Frame, Region
+from afspm.model import Frame, Region, RegistrationOutcome
 
 Array = NDArray[np.float64]
 
@@ -49,6 +49,8 @@ def against_first(record: DriftRecord, scans: Sequence[DriftScan], pairs: Sequen
         covariance_m2=np.array(covariance),
         matched=np.array([True, *(pair.accepted for pair in pairs)]),
         reasons=("", *(pair.reason for pair in pairs)),
+        outcomes=(RegistrationOutcome.REGISTERED, *(pair.outcome for pair in pairs)),
+        failures=(0, *(int(bool(pair.failure)) for pair in pairs)),
     )
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +15,13 @@ from numpy.typing import NDArray
 from afspm.drift.registration import DriftScan
 from afspm.drift.tracking import Update
 from afspm.errors import FileError
+from afspm.model import RegistrationOutcome, registration_summary
 
 Array = NDArray[np.float64]
 
 COLUMNS = (
     "scan", "time_s", "center_x_m", "center_y_m", "drift_x_m", "drift_y_m", "var_x_m2", "var_y_m2", "cov_xy_m2",
-    "rate_x_m_s", "rate_y_m_s", "matched", "reason",
+    "rate_x_m_s", "rate_y_m_s", "matched", "reason", "outcome", "failures",
 )  # fmt: skip
 
 
@@ -35,6 +38,8 @@ class DriftRecord:
         rate_m_s: (n, 2) velocity of the sample then; after the first scan none is known, which is told as zero.
         matched: (n,) whether the scan could be registered; where not, the drift is predicted.
         reasons: why it could not, for a person.
+        outcomes: how the position of each scan is known.
+        failures: the number of errors of the estimator over each scan.
     """
 
     keys: tuple[str, ...]
@@ -45,6 +50,8 @@ class DriftRecord:
     rate_m_s: Array
     matched: NDArray[np.bool_]
     reasons: tuple[str, ...]
+    outcomes: tuple[RegistrationOutcome, ...]
+    failures: tuple[int, ...]
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -59,7 +66,12 @@ class DriftRecord:
         return DriftRecord(
             tuple(self.keys[k] for k in at), self.time_s[at], self.center_m[at], self.drift_m[at],
             self.covariance_m2[at], self.rate_m_s[at], self.matched[at], tuple(self.reasons[k] for k in at),
+            tuple(self.outcomes[k] for k in at), tuple(self.failures[k] for k in at),
         )  # fmt: skip
+
+    def summary(self) -> str:
+        """Return how many scans were registered, for people."""
+        return registration_summary(self.outcomes)
 
     @property
     def sd_m(self) -> Array:
@@ -96,6 +108,8 @@ class DriftRecord:
             rate_m_s=np.array([one.rate_m_s for one in after]).reshape(-1, 2),
             matched=np.array([update.matched for update in updates], dtype=bool),
             reasons=tuple(update.reason for update in updates),
+            outcomes=tuple(update.outcome for update in updates),
+            failures=tuple(sum(bool(one.failure) for one in u.registrations.values()) for u in updates),
         )
 
     def write(self, path: Path) -> None:
@@ -117,7 +131,8 @@ class DriftRecord:
             (xx, xy), (_, yy) = self.covariance_m2[k]
             numbers = (*self.center_m[k], *self.drift_m[k], xx, yy, xy, *self.rate_m_s[k])
             told = [f"{self.time_s[k]:.6f}", *(f"{number:.9g}" for number in numbers)]
-            yield [key, *told, "yes" if self.matched[k] else "no", self.reasons[k]]
+            how = (self.outcomes[k].label, str(self.failures[k]))
+            yield [key, *told, "yes" if self.matched[k] else "no", self.reasons[k], *how]
 
     @classmethod
     def read(cls, path: Path) -> DriftRecord:
@@ -145,6 +160,8 @@ class DriftRecord:
                 rate_m_s=numbers("rate_x_m_s", "rate_y_m_s"),
                 matched=np.array([row["matched"] == "yes" for row in rows], dtype=bool),
                 reasons=tuple(row["reason"] for row in rows),
+                outcomes=tuple(RegistrationOutcome.from_label(row["outcome"]) for row in rows),
+                failures=tuple(int(row["failures"]) for row in rows),
             )
         except (KeyError, ValueError, TypeError) as error:
             raise FileError(f"is not a table of drift: {error}", where=str(path)) from error
@@ -155,3 +172,13 @@ def drift_at(matrix: Array, center_m: Sequence[float]) -> Array:
     at = np.asarray(center_m, dtype=np.float64)
     drift: Array = at - (matrix[:2, :2] @ at + matrix[:2, 2])
     return drift
+
+
+def drift_knowledge(message: Any) -> tuple[RegistrationOutcome, float | None]:
+    """Return how a DriftMapping knows the position of its scan, and its standard deviation along the axis where it is
+    largest; None: not known."""
+    outcome = RegistrationOutcome.of(message.outcome, matched=message.matched)
+    if len(message.covariance) != 4:
+        return outcome, None
+    largest = float(np.linalg.eigvalsh(np.array(message.covariance).reshape(2, 2))[-1])
+    return outcome, math.sqrt(max(largest, 0.0))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping as Table
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.errors import InvalidValue
-from afspm.model import Region
+from afspm.model import Region, RegistrationOutcome
 
 Array = NDArray[np.float64]
 
@@ -115,6 +115,9 @@ class Registration:
         quality: figures of merit by name (overlap, correlation, …), for a person and for studies.
         matches: of estimators that match features.
         linear_seen: of estimators that know how uncertain the linear part is.
+        failure: the error of an estimator that raised, or gave no usable result; empty if there was none. An error says
+            nothing about the scans. The result is accepted nevertheless where a coarse estimate took its place; its
+            linear part is then unknown.
     """
 
     accepted: bool
@@ -126,6 +129,7 @@ class Registration:
     quality: Table[str, float] = field(default_factory=dict)
     matches: Matches | None = None
     linear_seen: LinearSeen | None = None
+    failure: str = ""
 
     @classmethod
     def refused(cls, reason: str, quality: Table[str, float] | None = None) -> Registration:
@@ -140,6 +144,18 @@ class Registration:
             center_m=none,
             quality=quality or {},
         )
+
+    @classmethod
+    def failed(cls, failure: str) -> Registration:
+        """Return the result of an estimator that raised, or whose result is unusable."""
+        return replace(cls.refused(failure), failure=failure)
+
+    @property
+    def outcome(self) -> RegistrationOutcome:
+        """Return what became of the pair."""
+        if self.accepted:
+            return RegistrationOutcome.COARSE if self.failure else RegistrationOutcome.REGISTERED
+        return RegistrationOutcome.FAILED if self.failure else RegistrationOutcome.REFUSED
 
     @property
     def sd_m(self) -> float:

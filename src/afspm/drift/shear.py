@@ -95,10 +95,12 @@ def velocity_by_shear(reference: DriftScan, scan: DriftScan, found: Registration
     sqrt(12) / h of what the displacement is known to.
 
     Returns:
-        None where both were sheared alike, a direction is not known, or nothing was found.
+        None where both were sheared alike, a direction is not known, or nothing was found but coarsely.
     """
     first, second = delay_per_length_s_m(reference), delay_per_length_s_m(scan)
     if first is None or second is None or not np.isfinite(found.covariance_m2).all():
+        return None
+    if found.failure:  # a coarse estimate knows no shear
         return None
     difference = second - first
     if abs(difference) < 0.1 * max(abs(first), abs(second)):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from afspm.drift.mapping import Mapping
 from afspm.drift.registration import DriftScan, Registration
 from afspm.errors import InvalidValue
+from afspm.model import RegistrationOutcome
 from afspm.plain_data import Plain, PlainMapping
 
 Array = NDArray[np.float64]
@@ -65,7 +66,7 @@ class Update:
         before: what had been predicted for the middle of the scan.
         after: what is known now of the same time.
         matched: whether any reference could be registered with it (the first scan of all counts as matched).
-        reason: why not, for a person.
+        reason: why not, or why only coarsely, for a person.
         lost: the tracker does not know any more where it is.
         registrations: by the key of the reference.
         forecast: of what is known now.
@@ -80,6 +81,19 @@ class Update:
     registrations: Table[str, Registration]
     forecast: Forecast
     quality: Table[str, float] = field(default_factory=dict)
+
+    @property
+    def outcome(self) -> RegistrationOutcome:
+        """Return how the position of the scan is known."""
+        found = self.registrations.values()
+        if self.matched:
+            accepted = [one for one in found if one.accepted]
+            is_coarse = bool(accepted) and all(one.failure for one in accepted)
+            return RegistrationOutcome.COARSE if is_coarse else RegistrationOutcome.REGISTERED
+        if not found:
+            return RegistrationOutcome.NEW
+        is_failed = any(one.failure for one in found)
+        return RegistrationOutcome.FAILED if is_failed else RegistrationOutcome.REFUSED
 
 
 def require_newer(scan: DriftScan, newest_s: float | None) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from afspm.client.parameter_values import to_parameter
+from afspm.errors import AfspmError
 from afspm.experiment.toml_lines import Table
 from afspm.formatting import duration_text, lengths_text, quantity
 from afspm.logic.limit_checker import LimitChecker
@@ -29,6 +30,7 @@ class PlannedMeasurements:
     """The measurements of a plan, and what the microscope must have for them.
 
     Attributes:
+        drift_doubts: what to warn of where drift is corrected; `where` names the setting.
         parameters: values to set, by the setting that gives them: {"zoom_parameters": (Parameter("scan-speed", …),)}.
         period_s: between the beginnings of two rounds; 0: no pause.
         scan_speed_m_s: of a microscope that knows the speed of its first scan.
@@ -44,6 +46,7 @@ class PlannedMeasurements:
     period_s: float = 0.0
     scan_speed_m_s: float | None = None
     is_listed: bool = False
+    drift_doubts: tuple[AfspmError, ...] = ()
 
     def frame(self) -> Iterator[Parameter]:
         """Yield the parameters that its scans set: sizes, places and pixels."""
@@ -95,6 +98,7 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
         getattr(made, "beat_s", 0.0),
         getattr(made, "scan_speed_m_s", None),
         isinstance(settings.get("regions"), list),
+        tuple(getattr(made, "drift_doubts", ())),
     )
 
 

@@ -36,6 +36,8 @@ from afspm.model import Parameter, ProblemNames, Role
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 FROM_SECTIONS = ("control", "limits", "cache")
 """Arguments of a scheduler's constructor that come from sections of these names."""
+DRIFT = "DriftMapping"
+"""Published by a scheduler that corrects drift."""
 
 
 @dataclass
@@ -321,6 +323,9 @@ def _resolve_plan(
     for refusal in planned_measurements.refusals(name, plan, resolved.limits):
         what = f"[{name}] plans what its limits refuse: {refusal.reason}"
         resolved.document.error(what, name, *refusal.where, hint=refusal.hint)
+    if any(DRIFT in scheduler.declared.publishes for scheduler in resolved.with_role(Role.SCHEDULER)):
+        for doubt in plan.drift_doubts:
+            resolved.document.warning(f"[{name}] {doubt.what}", name, doubt.where, hint=doubt.hint)
     if has is None:
         return
     wanted: list[tuple[tuple[str, ...], Parameter]] = [((name,), one) for one in plan.frame()]

@@ -22,6 +22,7 @@ from afspm.model.events import (
 from afspm.model.geometry import Frame, Region, RegionChange
 from afspm.model.packet import LoggedPacket, Packet, PacketHeader
 from afspm.model.problems import Problem, ProblemNames
+from afspm.model.registration_outcome import RegistrationOutcome, registration_summary
 from afspm.model.requests import (
     CLOCK_REQUEST,
     HAS_ENDED,
@@ -89,6 +90,7 @@ __all__ = [
     "Progress",
     "Region",
     "RegionChange",
+    "RegistrationOutcome",
     "RelayedMessage",
     "Request",
     "RescanKind",
@@ -105,5 +107,6 @@ __all__ = [
     "Spectrum",
     "component_of",
     "is_process_name",
+    "registration_summary",
     "request_name",
 ]

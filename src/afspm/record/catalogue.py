@@ -211,7 +211,7 @@ def _summary(folder: Path) -> RunSummary:
 
 
 def _read(run: Run) -> RunSummary:
-    overview = run.overview(("ControlState", "JournalEntries"))
+    overview = run.overview(("ControlState", "JournalEntries", "DriftRescan"))
     began = next(iter(overview.controls.spans), None)
     return RunSummary(
         folder="",
@@ -223,6 +223,6 @@ def _read(run: Run) -> RunSummary:
         simulated=run.simulated,
         scans=sum(not scan.interrupted for scan in run.scans),
         spectra=len(run.spectra),
-        problems=tuple(sorted(overview.problems.name(number) for number in overview.problem_timelines)),
+        problems=tuple(sorted({span.label for span in overview.problem_spans})),
         notes=tuple(note.text for note in run.notes),
     )

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
-from afspm.errors import NoSuchItem
-from afspm.model import Frame, Region, Spectrum, names
+from afspm import wire
+from afspm.drift.record import drift_knowledge
+from afspm.errors import NoSuchItem, WireError
+from afspm.model import Frame, Region, RegistrationOutcome, Spectrum, names
 from afspm.record.tables import ScanRow, SpectrumRow, Table
 
 if TYPE_CHECKING:
@@ -134,7 +137,9 @@ def read_scans(query: Query) -> KeyedTable[ScanRow]:
     """Return all scans of a journal."""
     found = query("SELECT * FROM scans ORDER BY number")
     keys = _keys(query, "scans", names.START_SCAN, found)
-    return KeyedTable((scan_row(row, keys.get(row[0], "")) for row in found), ScanRow)
+    positions = _positions(query)
+    rows = (scan_row(row, keys.get(row[0], ""), *positions.get(row[0], (None, None))) for row in found)
+    return KeyedTable(rows, ScanRow)
 
 
 def read_spectra(query: Query, read: Callable[[SpectrumRow], Spectrum]) -> SpectrumTable:
@@ -159,13 +164,33 @@ def _keys(query: Query, table: str, action: str, rows: Sequence[Row]) -> dict[in
     return keys
 
 
+def _positions(query: Query) -> dict[int, tuple[RegistrationOutcome, float | None]]:
+    """Return how the position of each scan is known, by its number: the mapping that was published just before it."""
+    mappings = query("SELECT time_ns, payload FROM packets WHERE message = 'DriftMapping' ORDER BY time_ns DESC")
+    if not mappings:
+        return {}
+    found, after_ns = {}, -1
+    for number, published_ns in sorted(query(_PUBLISHED["scans"]), key=itemgetter(1)):
+        payload = None
+        while mappings and mappings[-1][0] <= published_ns:
+            time_ns, newest = mappings.pop()
+            payload = newest if time_ns > after_ns else payload
+        after_ns = published_ns
+        if number is not None and payload is not None:
+            with suppress(WireError):  # of a peer that writes it in another way
+                found[number] = drift_knowledge(wire.decode("DriftMapping", payload))
+    return found
+
+
 def _told(keys: Sequence[str]) -> str:
     if not keys:
         return "nothing was measured under a key"
     return f"there are {', '.join(keys[:20])}{' …' if len(keys) > 20 else ''}"
 
 
-def scan_row(row: Row, key: str = "") -> ScanRow:
+def scan_row(
+    row: Row, key: str = "", registration: RegistrationOutcome | None = None, position_sd_m: float | None = None
+) -> ScanRow:
     """Return a row of the journal as an object."""
     (
         number, time_ns, began_ns, filename, file, interrupted, x, y, width, height, angle, frame, rows, columns,
@@ -186,6 +211,8 @@ def scan_row(row: Row, key: str = "") -> ScanRow:
         filename,
         file,
         key,
+        registration,
+        position_sd_m,
     )
 
 

@@ -10,9 +10,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.model import ControlMode, ControlState, Scan
+from afspm.model import ControlMode, ControlState, Problem, Scan
 from afspm.plain_data import Plain
 from afspm.record.bad_scans import bad_scans
+from afspm.record.overview import SOON_NS
 from afspm.record.timeline import Span, Timeline
 
 THUMBNAIL_PX = 64
@@ -44,6 +45,7 @@ class NightRecord:
     """Everything that the picture shows.
 
     Attributes:
+        routine: times at which thermal-drift was flagged in the normal course of a run; see `Overview.is_routine`.
         scans_taken: how many scans there were, if not all are among `shots`.
     """
 
@@ -51,6 +53,7 @@ class NightRecord:
     control: list[tuple[int, ControlState]] = field(default_factory=list)
     marks: list[NightMark] = field(default_factory=list)
     interruptions: list[int] = field(default_factory=list)
+    routine: list[int] = field(default_factory=list)
     end_ns: int = 0
     scans_taken: int | None = None
     _known: set[str] = field(default_factory=set, repr=False)
@@ -83,6 +86,8 @@ class NightRecord:
             self.marks.append(NightMark(time_ns, entry["by"], entry["what"], entry["score"], entry["of_ns"]))
         elif kind == "interrupted":
             self.interruptions.append(time_ns)
+        elif kind == "routine":
+            self.routine.append(time_ns)
         else:
             raise ValueError(kind)
         self._known.add(identity)
@@ -107,8 +112,9 @@ class NightRecord:
 
     @property
     def problems(self) -> list[int]:
-        """Return all problems in the order in which they were flagged."""
-        return list(dict.fromkeys(p for _, state in sorted_by_time(self.control) for p in state.problems))
+        """Return all problems in the order in which they were flagged, but for routine ones."""
+        found = dict.fromkeys(p for _, state in sorted_by_time(self.control) for p in state.problems)
+        return [problem for problem in found if self.problem_spans(problem)]
 
     def holder_of(self, shot: Shot) -> str | None:
         """Return the holder when a scan began; if that was not seen, when it ended."""
@@ -122,8 +128,11 @@ class NightRecord:
         return self._spans(lambda state: state.holder == holder, holder)
 
     def problem_spans(self, problem: int) -> list[Span]:
-        """Return the spans in which a problem was flagged."""
-        return self._spans(lambda state: problem in state.problems)
+        """Return the spans in which a problem was flagged, but for routine ones."""
+        spans = self._spans(lambda state: problem in state.problems)
+        if problem != Problem.THERMAL_DRIFT:
+            return spans
+        return [span for span in spans if all(abs(span.start_ns - ns) > SOON_NS for ns in self.routine)]
 
     def manual_spans(self) -> list[Span]:
         """Return the spans of manual mode."""

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from afspm.clock import NS_PER_S
-from afspm.drift.record import drift_at
+from afspm.drift.record import drift_at, drift_knowledge
 from afspm.model import (
     ControlEvent,
     ControlMode,
@@ -26,18 +26,22 @@ from afspm.model import (
     LogLines,
     Note,
     ProbePosition,
+    Problem,
     ProblemNames,
     ProcessCondition,
     ProcessState,
     ProcessStates,
     Progress,
     Region,
+    RegistrationOutcome,
+    RescanKind,
     Scan,
     ScanLines,
     ScanParameters,
     ScopeState,
     ScopeStatus,
     Spectrum,
+    registration_summary,
 )
 from afspm.model.events import PERSON
 from afspm.model.geometry import XY
@@ -46,6 +50,7 @@ from afspm.record.timeline import Span, Timeline
 from afspm.units import convert, same_kind
 
 __all__ = [
+    "ROUTINE",
     "DriftPoint",
     "FoundPlace",
     "Overview",
@@ -67,6 +72,8 @@ OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
 """Of a process of which nothing more is to be heard."""
 COMPARED = 5  # scans before, by which it is told how long one takes
 NOBODY = None
+ROUTINE = "normal at the start: the first scan is taken in both directions, which gives the velocity of the drift"
+"""Why a problem that is flagged in the normal course of a run is none."""
 K = TypeVar("K")
 V = TypeVar("V")
 
@@ -138,6 +145,11 @@ class DriftPoint:
         matched: whether the scan was registered; else this is a prediction.
         lost: it is not known any more where the sample is.
         correcting: whether components were given sample coordinates.
+        reason: why it was not registered, or only coarsely.
+        outcome: how the position of the scan is known.
+        sd_m: standard deviation of the position along the axis where it is largest; None: not known.
+        failures: the number of errors of the estimator over the scan.
+        filename: of the scan.
     """
 
     time_ns: int
@@ -147,6 +159,10 @@ class DriftPoint:
     lost: bool = False
     correcting: bool = False
     reason: str = ""
+    outcome: RegistrationOutcome = RegistrationOutcome.REGISTERED
+    sd_m: float | None = None
+    failures: int = 0
+    filename: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,6 +220,7 @@ class Overview:
         self._scans: dict[tuple[object, ...], ScanSummary] = {}
         self._spectra: dict[tuple[object, ...], SpectrumSummary] = {}
         self._drift: dict[int, DriftPoint] = {}
+        self._opposite_ns: deque[int] = deque(maxlen=20)
         self._taken_ns: dict[str, int] = {}
 
     @property
@@ -220,6 +237,31 @@ class Overview:
     def drift(self) -> Sequence[DriftPoint]:
         """In the order in which they came."""
         return tuple(self._drift.values())
+
+    @property
+    def registration(self) -> str:
+        """Return how many scans were registered, for people; empty where drift is not followed."""
+        return registration_summary(point.outcome for point in self._drift.values()) if self._drift else ""
+
+    def is_routine(self, span: Span | None) -> bool:
+        """Return whether a problem is flagged in the normal course of a run.
+
+        That is thermal-drift until the first scan of a run with drift correction was taken in both directions.
+        """
+        if span is None or span.label != self.problems.name(Problem.THERMAL_DRIFT):
+            return False
+        return any(abs(span.start_ns - asked_ns) <= SOON_NS for asked_ns in self._opposite_ns)
+
+    @property
+    def problem_spans(self) -> list[Span]:
+        """The spans of all problems in the order of time, without those that are routine."""
+        spans = (span for lane in self.problem_timelines.values() for span in lane.spans)
+        return sorted((span for span in spans if not self.is_routine(span)), key=lambda span: span.start_ns)
+
+    @property
+    def routine_spans(self) -> list[Span]:
+        """The spans of problems that are routine; see `is_routine`."""
+        return [s for lane in self.problem_timelines.values() for s in lane.spans if self.is_routine(s)]
 
     @property
     def in_control(self) -> str:
@@ -431,9 +473,13 @@ class Overview:
         at_ns = message.timestamp.ToNanoseconds()
         point = DriftPoint(
             at_ns, (float(drift_x), float(drift_y)), rate, message.matched, message.lost, message.correcting,
-            message.reason,
+            message.reason, *drift_knowledge(message), message.failures, message.filename,
         )  # fmt: skip
         _keep(self._drift, at_ns, point)
+
+    def _take_rescan(self, message: Any, time_ns: int) -> None:
+        if message.kind == RescanKind.OPPOSITE:
+            self._opposite_ns.append(message.timestamp.ToNanoseconds())
 
     def _take_points(self, message: Any, time_ns: int) -> None:
         found = ((one.spatial.point, one.spatial.units or "m", one) for one in message.spatials[-MOST_TARGETS:])
@@ -504,4 +550,5 @@ _TAKERS: dict[str, Callable[[Overview, Any, int], None]] = {
     "Note": Overview._take_note,
     "SpatialPointWithScoreList": Overview._take_points,
     "DriftMapping": Overview._take_mapping,
+    "DriftRescan": Overview._take_rescan,
 }

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from afspm import wire
+from afspm.drift.record import drift_knowledge
 from afspm.errors import WireError
 from afspm.model import ControlState, Feedback, ProblemNames, ScopeState, ScopeStatus
 from afspm.plain_data import Plain
@@ -73,6 +74,7 @@ def drift(journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filen
     mapping = None if row is None else _decoded("DriftMapping", row[0])
     if mapping is None or (mapping.filename and any(filenames) and mapping.filename not in filenames):
         return None
+    outcome, sd_m = drift_knowledge(mapping)
     return {
         "time_ns": mapping.timestamp.ToNanoseconds(),
         "matrix": list(mapping.matrix),
@@ -82,6 +84,8 @@ def drift(journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filen
         "lost": mapping.lost,
         "correcting": mapping.correcting,
         "reason": mapping.reason,
+        "registration": outcome.label,
+        "sd_m": sd_m,
     }
 
 

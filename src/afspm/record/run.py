@@ -177,14 +177,15 @@ class Run:
 
     @property
     def problems(self) -> Table[ProblemRow]:
-        """Return each time that a problem was flagged."""
-        lanes = self.overview().problem_timelines
+        """Return each time that a problem was flagged, but for thermal-drift while the first scan of a run with drift
+        correction is taken in both directions, which belongs to every run."""
+        overview = self.overview()
+        numbers = overview.problems
         rows = [
-            ProblemRow(span.label, number, span.start_ns, span.end_ns, span.by)
-            for number, lane in lanes.items()
-            for span in lane.spans
+            ProblemRow(span.label, numbers.get(span.label, 0), span.start_ns, span.end_ns, span.by)
+            for span in overview.problem_spans
         ]
-        return Table(sorted(rows, key=lambda row: row.flagged_ns), ProblemRow)
+        return Table(rows, ProblemRow)
 
     @property
     def processes(self) -> Table[ProcessRow]:

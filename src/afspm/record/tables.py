@@ -8,7 +8,7 @@ from enum import Enum
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
 from afspm.errors import FileError
-from afspm.model import ControlState, Frame, ProcessCondition, Region
+from afspm.model import ControlState, Frame, ProcessCondition, Region, RegistrationOutcome
 from afspm.model.geometry import XY
 
 if TYPE_CHECKING:
@@ -32,6 +32,8 @@ class ScanRow:
         holder, mode, problems: who was in control when it began, and how things stood; None: not known.
         filename: of the controller; file: of the record, from the run folder, empty if there is none.
         key: under which it was asked for, `scope.scan(…, key="tile-1")`; empty if it had none.
+        registration: how its position on the sample is known, where drift is corrected; None: it is not.
+        position_sd_m: standard deviation of that position, along the axis where it is largest; None: not known.
     """
 
     number: int
@@ -47,6 +49,8 @@ class ScanRow:
     filename: str
     file: str
     key: str = ""
+    registration: RegistrationOutcome | None = None
+    position_sd_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

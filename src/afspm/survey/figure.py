@@ -153,6 +153,10 @@ class _Picture:
         said = _SAYS.get(self._record.outcome(visit), "")
         axes.text(0.04, 0.95, f"{visit.number}", transform=axes.transAxes, size=9, weight="bold", va="top",
                   color="white", path_effects=_OUTLINE)  # fmt: skip
+        if visit.registration is not None and not visit.registration.is_registered:
+            sd = "" if visit.position_sd_m is None else f" ± {typeset_length(float(f'{visit.position_sd_m:.2g}'))}"
+            axes.text(0.96, 0.95, f"dead reckoning{sd}", transform=axes.transAxes, size=6.5, ha="right", va="top",
+                      color="white", path_effects=_OUTLINE)  # fmt: skip
         if said:
             axes.text(0.5, 0.5, said, transform=axes.transAxes, size=_TEXT, ha="center", va="center",
                       bbox={"facecolor": "white", "alpha": 0.8, "pad": 2.0, "edgecolor": "none"})  # fmt: skip

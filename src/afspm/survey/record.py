@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 
-from afspm.model import Scan, Spectrum
+from afspm.model import RegistrationOutcome, Scan, Spectrum
 from afspm.model.geometry import XY
 from afspm.storage.atomic import write_atomic
 from afspm.survey.targets import Target
@@ -36,6 +36,8 @@ class Visit:
         zoom: None: it was not taken, or not yet.
         curves: by their names.
         refusals: why something was refused.
+        registration: how the position of the zoom on the sample is known, where drift is corrected; None: it is not.
+        position_sd_m: standard deviation of that position; None: not known.
     """
 
     number: int
@@ -44,6 +46,8 @@ class Visit:
     zoom: Scan | None = None
     curves: dict[str, Spectrum] = field(default_factory=dict)
     refusals: list[str] = field(default_factory=list)
+    registration: RegistrationOutcome | None = None
+    position_sd_m: float | None = None
 
 
 class SurveyRecord:
@@ -74,6 +78,9 @@ class SurveyRecord:
     def write(self, path: str | Path) -> None:
         """Write the table: a row for each target, with the controller's files of its zoom and curves.
 
+        `registration` and `position_sd` say how its position is known, where drift is corrected: registered, coarse, or
+        by dead reckoning (refused, failed, new).
+
         Files in the folder of the table, or below it, are named from there.
 
         Raises:
@@ -95,13 +102,18 @@ class SurveyRecord:
         draw(self, Path(path), title=title, simulated=simulated)
 
     def _rows(self, folder: Path) -> Iterator[list[str]]:
-        yield ["number", "x", "y", "length_units", "height", "height_units", "outcome", "reason", "zoom", *self.curves]
+        yield [
+            "number", "x", "y", "position_sd", "length_units", "registration", "height", "height_units", "outcome",
+            "reason", "zoom", *self.curves,
+        ]  # fmt: skip
         for visit in self.visits:
             height = visit.target.height
             yield [
                 str(visit.number),
                 *(f"{value:.9g}" for value in visit.center_m),
+                "" if visit.position_sd_m is None else f"{visit.position_sd_m:.3g}",
                 "m",
+                visit.registration.label if visit.registration else "",
                 *(("", "") if height is None else (f"{height:.6g}", self.survey.unit)),
                 self.outcome(visit).value,
                 "; ".join(visit.refusals),

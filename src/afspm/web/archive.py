@@ -21,7 +21,7 @@ from afspm.web.frames import ChannelFrame, FrameKey
 KEPT = 6
 PAST = (
     "ProcessStates", "JournalEntries", "ControlState", "ScopeStateMsg", "ScanParameters2d", "Scan2d", "Spec1d",
-    "ZCtrlParameters", "DriftMapping", "Note",
+    "ZCtrlParameters", "DriftMapping", "DriftRescan", "Note",
 )  # fmt: skip
 """Messages with which an `Overview` has the time line, the map, drift and refusals. Of others the scheduler has kept
 enough for a late joiner."""

@@ -127,12 +127,14 @@ def test_zooms_outside_the_limits_are_told_as_refused_and_an_early_end_leaves_ta
     afspm_run: Run, tmp_path: Path
 ) -> None:
     narrow = '[limits]\nregion = { x = ["-2.5 um", "2.5 um"], y = ["-2.5 um", "2.5 um"] }\n'
-    one = afspm_run(str(SAMPLE), overlay(tmp_path, FEWER + SLOWER + narrow), "--runs", str(tmp_path / "runs"))
-    one.wait_for("WARNING target 3 of 4 .*refused: zoom: .*lies outside the region allowed")
+    more = FEWER.replace("count = 4", "count = 10")  # enough are left when the end is asked for
+    one = afspm_run(str(SAMPLE), overlay(tmp_path, more + SLOWER + narrow), "--runs", str(tmp_path / "runs"))
+    one.wait_for("WARNING target 2 of 10 .*refused: zoom: .*lies outside the region allowed")
     with afspm.connect(one.folder, name="person") as scope:
         scope.end_experiment()
     assert one.end() == 0, one.output
-    assert outcomes(one.folder) == ["measured", "refused", "refused", "not-reached"]
+    assert outcomes(one.folder)[:2] == ["measured", "refused"]
+    assert outcomes(one.folder)[-1] == "not-reached"
     assert (one.folder / "targets.png").stat().st_size > 50_000
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from afspm.components.drift_table import COLUMNS, DriftTable, drift_row
 from afspm.drift.record import DriftRecord
+from afspm.model import RegistrationOutcome
 from afspm.wire.generated.drift_pb2 import DriftMapping
 
 
@@ -23,6 +24,8 @@ def mapping(number: int, *, matched: bool = True) -> DriftMapping:
         filename=f"{number}.nc",
         center=[1e-6, 2e-6],
         correcting=True,
+        outcome=int(RegistrationOutcome.REGISTERED if matched else RegistrationOutcome.FAILED),  # type: ignore[arg-type]
+        failures=0 if matched else 2,
     )
     message.timestamp.FromNanoseconds(1_750_000_000_000_000_000 + number * 10**9)
     return message
@@ -56,3 +59,14 @@ def test_a_table_is_written_once_over_restarts_and_can_be_read(tmp_path: Path) -
     np.testing.assert_allclose(record.drift_m, [[3e-9, -2e-9]] * 3)
     assert record.matched.tolist() == [True, False, True]
     assert record.reasons[1] == "nothing, is alike"
+    assert [outcome.label for outcome in record.outcomes] == ["registered", "failed", "registered"]
+    assert record.failures == (0, 2, 0)
+    assert record.summary() == "registered 2 of 3 scans, 1 failed"
+
+
+def test_a_scan_before_anything_was_known_has_a_row_without_variances() -> None:
+    message = mapping(1, matched=False)
+    del message.covariance[:]
+    del message.rate[:]
+    row = dict(zip(COLUMNS, drift_row(message), strict=True))
+    assert (row["outcome"], row["var_x_m2"], row["rate_x"]) == ("failed", "nan", "nan")

@@ -15,7 +15,7 @@ from afspm import wire
 from afspm.components.night_picture import NightPicture
 from afspm.components.tip_verdict import BAD, MESSAGE, verdict_message
 from afspm.exit_codes import ExitCode
-from afspm.model import ControlMode, ControlState, Problem, Region, Scan, ScopeState, ScopeStatus
+from afspm.model import ControlMode, ControlState, Problem, Region, RescanKind, Scan, ScopeState, ScopeStatus
 from afspm.record.night_record import (
     THUMBNAIL_PX,
     NightRecord,
@@ -52,6 +52,23 @@ def night(scans: int = 12) -> NightRecord:
     record.add(control_entry(ControlState(), middle + 5 * MINUTE_NS))
     record.add(control_entry(ControlState(holder="series"), middle + 6 * MINUTE_NS))
     return record
+
+
+def test_thermal_drift_until_the_first_scan_was_taken_both_ways_is_left_out_of_the_picture(tmp_path: Path) -> None:
+    drift = int(Problem.THERMAL_DRIFT)
+    asked = wire.message_type("DriftRescan")(kind=int(RescanKind.OPPOSITE))
+    lab = Lab()
+    asked.timestamp.FromNanoseconds(lab.clock.now_ns())
+    lab.publish(ControlState(holder="rescanner", problems=(drift,)))
+    lab.publish(asked)
+    lab.at(60.0, lambda: lab.publish(ControlState(holder="series")))
+    lab.at(120.0, lambda: lab.publish(ControlState(problems=(drift,))))
+    lab.at(180.0, lab.kill)
+    picture = NightPicture()
+    assert run(picture, lab, tmp_path / "state", run_dir=str(tmp_path)) == ExitCode.ENDED
+    (span,) = picture.record.problem_spans(drift)
+    assert span.start_ns == lab.clock.now_ns() - 60 * 10**9
+    assert picture.record.problems == [drift]
 
 
 def test_spans_of_control_and_problems_are_read_from_the_states() -> None:

@@ -118,7 +118,7 @@ def test_direction_and_region_are_set_back_when_somebody_else_says_that_there_is
 
 
 def test_a_search_gets_wider_until_the_sample_is_found_and_the_region_is_set_back() -> None:
-    lab = asked(RescanKind.SEARCH, ["lost", "lost", "unmatched"])
+    lab = asked(RescanKind.SEARCH, ["lost", "unmatched", "well"])
     assert [region.size_m[0] for region in lab.finished] == pytest.approx([2e-6, 4e-6, 8e-6])
     assert {region.center_m for region in lab.finished} == {REGION.center_m}
     assert lab.problems == ()

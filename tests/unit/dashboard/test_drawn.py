@@ -30,6 +30,7 @@ from afspm.model import (
     ProcessState,
     ProcessStates,
     Region,
+    RegistrationOutcome,
     ScopeState,
     ScopeStatus,
     Spectrum,
@@ -346,6 +347,17 @@ def test_what_was_only_predicted_is_drawn_as_dots() -> None:
     assert options is not None
     (dots,) = [one for one in options["series"] if one["type"] == "scatter"]
     assert len(dots["data"]) == 4
+
+
+def test_the_page_says_how_many_scans_were_registered_and_that_the_last_is_dead_reckoning() -> None:
+    points = [DriftPoint(i * S, (1e-9, 2e-9), (0.0, 0.0)) for i in range(3)]
+    assert "Registered 3 of 3 scans." in drift_chart(points).words
+    failed = DriftPoint(
+        4 * S, (1e-9, 2e-9), (0.0, 0.0), matched=False, reason="<oh>", outcome=RegistrationOutcome.FAILED, sd_m=30e-9
+    )
+    words = drift_chart([*points, failed]).words
+    assert "The last scan is predicted (standard deviation 30 nm): &lt;oh&gt;" in words
+    assert "Registered 3 of 4 scans, 1 failed." in words
 
 
 def test_no_drift_is_said() -> None:

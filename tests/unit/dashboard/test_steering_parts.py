@@ -6,11 +6,21 @@ import math
 
 import pytest
 
+from afspm import wire
 from afspm.dashboard.actions import unclear
 from afspm.dashboard.flags import flags
 from afspm.dashboard.scan_dialog import ScanChoice
 from afspm.errors import InvalidValue, UnitError
-from afspm.model import ControlEvent, ControlMode, ControlState, JournalEntries, JournalEntry, Problem, Region
+from afspm.model import (
+    ControlEvent,
+    ControlMode,
+    ControlState,
+    JournalEntries,
+    JournalEntry,
+    Problem,
+    Region,
+    RescanKind,
+)
 from afspm.record.overview import Overview
 
 S = 1_000_000_000
@@ -88,3 +98,15 @@ def test_a_problem_says_what_to_do_and_whether_a_component_does_it() -> None:
     overview.take("ControlState", ControlState(ControlMode.MANUAL, None, (1,)), 3 * S)
     (tip,) = flags(overview)
     assert tip.advice == "Condition or change the tip, then clear the problem."
+
+
+def test_the_first_thermal_drift_is_shown_as_normal() -> None:
+    overview = Overview()
+    overview.take("ControlState", ControlState(ControlMode.AUTOMATED, None, (int(Problem.THERMAL_DRIFT),)), S)
+    asked = wire.message_type("DriftRescan")(kind=int(RescanKind.OPPOSITE))
+    asked.timestamp.FromNanoseconds(S)
+    (before,) = flags(overview)
+    overview.take("DriftRescan", asked, S + 1)
+    (drift,) = flags(overview)
+    assert "Take over" in before.advice
+    assert drift.advice.startswith("normal at the start")

@@ -7,7 +7,7 @@ from benchmarks.drift.pairs import pair
 from benchmarks.drift.surfaces import SURFACES
 from benchmarks.drift.trials import Cell, Trial
 
-from afspm.drift.estimators import DEFAULT, estimator
+from afspm.drift.estimators import DEFAULT, unguarded
 
 # Four pairs of an estimator at the target of 1.25 times the bound come this high with a probability below 1e-3 (chi
 # square of eight degrees of freedom); few edges in view have heavier tails.
@@ -28,7 +28,7 @@ def test_errors_are_near_the_bound_and_what_is_right_is_accepted(surface: str, c
 
 @pytest.mark.parametrize("surface", SURFACES)
 def test_scans_with_nothing_in_common_are_refused(surface: str) -> None:
-    register = estimator(DEFAULT).register
+    register = unguarded().register
     for seed in range(2):
         made = pair(surface, "null", seed, prior_sd_px=1.0)
         assert not register(made.reference, made.scan, made.prior).accepted

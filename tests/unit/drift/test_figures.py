@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from test_record import record
 
-from afspm.drift.record import DriftRecord
 from afspm.drift.registration import DriftScan, Matches
 from afspm.errors import InvalidValue
 from afspm.model import Region
@@ -134,7 +134,5 @@ def test_the_package_of_figures_loads_without_matplotlib() -> None:
 
 def test_a_record_of_nothing_refused_has_no_such_mark() -> None:
     run = record()
-    all_good = DriftRecord(
-        run.keys, run.time_s, run.center_m, run.drift_m, run.covariance_m2, run.rate_m_s, np.ones(20, bool), run.reasons
-    )
+    all_good = replace(run, matched=np.ones(20, bool))
     assert "refused" not in draw_estimates(all_good).axes[0].get_legend_handles_labels()[1]

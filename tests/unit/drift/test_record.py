@@ -10,6 +10,7 @@ import pytest
 
 from afspm.drift.record import DriftRecord, drift_at
 from afspm.errors import FileError
+from afspm.model import RegistrationOutcome
 
 
 def record(n: int = 20, seed: int = 1) -> DriftRecord:
@@ -26,6 +27,8 @@ def record(n: int = 20, seed: int = 1) -> DriftRecord:
         rate_m_s=np.gradient(drift, 900.0, axis=0),
         matched=np.arange(n) % 7 != 3,
         reasons=tuple("nothing in common" if k % 7 == 3 else "" for k in range(n)),
+        outcomes=tuple(RegistrationOutcome.REFUSED if k % 7 == 3 else RegistrationOutcome.REGISTERED for k in range(n)),
+        failures=tuple(k % 2 for k in range(n)),
     )
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from afspm.experiment import Experiment, Finding
+
 from .conftest import FRAME, Write, errors, only_error
 
 SIMULATED = FRAME[: FRAME.index("[microscope]")] + '[microscope]\ncomponent = true\nclass = "Simulator"\n'
@@ -54,3 +56,34 @@ def test_all_that_ready_made_components_need_the_simulator_has(write: Write, com
     assert errors(experiment) == []
     declared = [one.declared for one in experiment.resolved.processes.values() if one.declared.needs_actions]
     assert len(declared) == 1
+
+
+SURVEY = '[survey]\ncomponent = true\nclass = "Survey"\nsize = "5 um"\nzoom = "500 nm"\n'
+DRIFTING = (
+    '[scheduler]\ncomponent = true\nclass = "DriftCompensatedScheduler"\n[rescanner]\ncomponent = true\n'
+    'class = "Rescanner"\n[microscope]\ncomponent = true\nclass = "Simulator"\n'
+)
+
+
+def warnings(experiment: Experiment) -> list[Finding]:
+    found = experiment.check()
+    assert not any(finding.is_error for finding in found), found
+    return [finding for finding in found if "pixels of the survey" in finding.what]
+
+
+def test_a_survey_too_coarse_for_its_zooms_is_warned_of_where_drift_is_corrected(write: Write) -> None:
+    coarse = SURVEY + "pixels = [128, 128]\n"
+    (warning,) = warnings(write(coarse, frame=DRIFTING))
+    assert "[survey] a zoom is 12.7 pixels of the survey wide" in warning.what
+    assert warning.hint == "20 pixels are enough: pixels = [208, 208]"
+    assert warning.place.line == 6
+    assert not warnings(write(coarse.replace("128, 128", "208, 208"), frame=DRIFTING)), "its own cure"
+    assert not warnings(write(coarse, frame=SIMULATED))
+
+
+def test_by_default_a_survey_is_as_fine_as_its_zooms_need_up_to_a_limit(write: Write) -> None:
+    assert not warnings(write(SURVEY, frame=DRIFTING))
+    (warning,) = warnings(write(SURVEY.replace("500 nm", "100 nm"), frame=DRIFTING))
+    assert warning.hint == '20 pixels are enough: zoom = "196 nm"'
+    assert warning.place.line == 5
+    assert not warnings(write(SURVEY.replace("500 nm", "196 nm"), frame=DRIFTING)), "its own cure"

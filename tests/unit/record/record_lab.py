@@ -13,6 +13,7 @@ from afspm.model import (
     Feedback,
     Packet,
     Region,
+    RegistrationOutcome,
     Scan,
     ScanLines,
     ScopeState,
@@ -79,6 +80,16 @@ class Night:
         """From its beginning to its end."""
         scanning = self.state(ScopeState.SCANNING)
         return [scanning, *self.scans(number), self.state(ScopeState.FREE)]
+
+    def registered_scan(self, number: int, outcome: RegistrationOutcome, sd_m: float) -> list[Given]:
+        """As a Drift Compensated Scheduler publishes it: the mapping comes just before."""
+        scanning = self.state(ScopeState.SCANNING)
+        message = wire.message_type("DriftMapping")(
+            matrix=[1, 0, 0, 0, 1, 0], center=[0, 0], covariance=[sd_m**2, 0, 0, sd_m**2], outcome=int(outcome),
+            matched=outcome.is_registered, reason="oh", filename=f"scan-{number:04d}.nc",
+        )  # fmt: skip
+        message.timestamp.FromNanoseconds(self.now_ns)
+        return [scanning, self.packet(message), *self.scans(number), self.state(ScopeState.FREE)]
 
 
 def same(recorded: list[Packet], given: list[Given]) -> bool:

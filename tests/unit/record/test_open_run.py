@@ -16,8 +16,9 @@ import pytest
 from record_lab import ABOUT, Night
 
 import afspm
+from afspm import wire
 from afspm.errors import FileError
-from afspm.model import ScopeState, Spectrum
+from afspm.model import Problem, RegistrationOutcome, RescanKind, ScopeState, Spectrum
 from afspm.record.journal import JOURNAL_FILE, open_to_write, read_only
 from afspm.record.run import Run
 from afspm.record.store import RecordStore
@@ -274,6 +275,33 @@ def test_the_overview_comes_without_reading_files(night: Night, store: RecordSto
     assert [(one.kind, one.position_m, one.names) for one in overview.spectra] == [("IV", (1e-9, 2e-9), curve.names)]
     assert [(scan.channel, scan.shape) for scan in overview.scans] == [("Height", (6, 8)), ("Height Retrace", (6, 8))]
     assert [row.name for row in run.problems] == ["thermal-drift"]
+
+
+def test_scans_say_how_their_position_is_known_and_how_well(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    store.take(night.whole_scan(1))
+    store.take(night.registered_scan(2, RegistrationOutcome.REGISTERED, 1e-9))
+    store.take(night.registered_scan(3, RegistrationOutcome.FAILED, 30e-9))
+    store.take(night.whole_scan(4))
+    run = afspm.open_run(tmp_path)
+    assert [(row.registration, row.position_sd_m) for row in run.scans] == [
+        (None, None),
+        (RegistrationOutcome.REGISTERED, pytest.approx(1e-9)),
+        (RegistrationOutcome.FAILED, pytest.approx(30e-9)),
+        (None, None),
+    ]
+    columns = run.scans.columns()
+    assert columns["registration"] == [None, "registered", "failed", None]
+    assert run.about(run.scans[2])["drift"]["registration"] == "failed"
+    assert run.about(run.scans[2])["drift"]["sd_m"] == pytest.approx(30e-9)
+    assert run.drift.columns()["outcome"] == ["registered", "failed"]
+
+
+def test_the_first_thermal_drift_is_not_among_the_problems(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    flagged = night.control("rescanner", (int(Problem.THERMAL_DRIFT),))
+    asked = wire.message_type("DriftRescan")(kind=int(RescanKind.OPPOSITE))
+    asked.timestamp.FromNanoseconds(night.now_ns)
+    store.take([flagged, night.packet(asked), *night.whole_scan(1), night.control("series")])
+    assert not afspm.open_run(tmp_path).problems
 
 
 def test_file_of_a_scan_outside_the_folder_of_the_run_is_refused(

@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 from afspm import model, wire
-from afspm.model import ControlEvent, ControlMode, ControlRequest, ControlState, ProcessCondition, ScopeState
+from afspm.model import (
+    ControlEvent,
+    ControlMode,
+    ControlRequest,
+    ControlState,
+    ProcessCondition,
+    RegistrationOutcome,
+    RescanKind,
+    ScopeState,
+)
 from afspm.record.overview import MOST_LINES, Overview
 
 S = 1_000_000_000
@@ -209,6 +218,47 @@ def test_drift_is_the_displacement_of_the_sample() -> None:
     assert point.time_ns == 5 * S
     assert point.translation_m == pytest.approx((2e-9, -3e-9))
     assert point.rate_m_s == (1e-12, 0.0)
+
+
+def mapping(at_s: int, outcome: RegistrationOutcome, failures: int = 0) -> Any:
+    message = wire.message_type("DriftMapping")(
+        matrix=[1, 0, 0, 0, 1, 0], center=[0, 0], covariance=[9e-18, 0, 0, 25e-18], matched=outcome.is_registered,
+        outcome=int(outcome), failures=failures, reason="oh", filename=f"{at_s}.nc",
+    )  # fmt: skip
+    message.timestamp.FromNanoseconds(at_s * S)
+    return message
+
+
+def test_the_position_of_each_scan_is_known_with_its_uncertainty_and_how() -> None:
+    night = Overview()
+    outcomes = (RegistrationOutcome.REGISTERED, RegistrationOutcome.COARSE, RegistrationOutcome.FAILED)
+    for number, outcome in enumerate(outcomes):
+        night.take("DriftMapping", mapping(number, outcome, failures=number), (number + 1) * S)
+    assert [point.outcome for point in night.drift] == list(outcomes)
+    assert [(point.sd_m, point.failures, point.filename) for point in night.drift][2] == (
+        pytest.approx(5e-9), 2, "2.nc",
+    )  # fmt: skip
+    assert night.registration == "registered 2 of 3 scans, 1 of them coarsely, 1 failed"
+
+
+def opposite(at_s: int, kind: RescanKind = RescanKind.OPPOSITE) -> Any:
+    message = wire.message_type("DriftRescan")(kind=int(kind))
+    message.timestamp.FromNanoseconds(at_s * S)
+    return message
+
+
+def test_thermal_drift_until_the_first_scan_was_taken_both_ways_is_no_problem() -> None:
+    drift = int(model.Problem.THERMAL_DRIFT)
+    night = seen(
+        ("ControlState", control("series"), 1),
+        ("ControlState", control("rescanner", drift), 10),
+        ("DriftRescan", opposite(10), 11),
+        ("ControlState", control("series"), 20),
+        ("ControlState", control("rescanner", drift), 50),
+        ("DriftRescan", opposite(50, RescanKind.SEARCH), 51),
+    )
+    assert [(span.start_ns, span.end_ns) for span in night.routine_spans] == [(10 * S, 20 * S)]
+    assert [span.start_ns for span in night.problem_spans] == [50 * S]
 
 
 def test_a_spectrum_is_told_with_its_place() -> None:

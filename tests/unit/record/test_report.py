@@ -16,7 +16,7 @@ import pytest
 
 from afspm import model, wire
 from afspm.errors import FileError
-from afspm.model import ControlMode, ControlState, ProcessCondition, ScopeState
+from afspm.model import ControlMode, ControlState, ProcessCondition, RegistrationOutcome, ScopeState
 from afspm.record.bad_scans import BAD, VERDICT_MESSAGE
 from afspm.record.report import REPORT_FILE, page, pictures, story, write
 from afspm.record.run import open_run
@@ -436,3 +436,60 @@ def test_pictures_lie_on_the_map_where_they_were_taken_the_newest_on_top(tmp_pat
 def test_a_figure_that_is_none_is_left_out(run: Path) -> None:
     (run / "half.png").write_bytes(b"\x89PNG but no more")
     assert "half.png" not in write(run).read_text(encoding="utf-8")
+
+
+def test_scans_that_are_not_registered_well_are_listed_with_their_uncertainty(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path, RecordSettings({"experiment": "survey", "frame": "sample"}))
+    outcomes = (RegistrationOutcome.REGISTERED, RegistrationOutcome.FAILED, RegistrationOutcome.REGISTERED)
+    for number, outcome in enumerate(outcomes):
+        message = wire.message_type("DriftMapping")(
+            matrix=[1, 0, 0, 0, 1, 0], center=[0, 0], covariance=[9e-16, 0, 0, 4e-16], outcome=int(outcome),
+            failures=2 * (not outcome.is_registered), matched=outcome.is_registered, reason="<oh>",
+        )  # fmt: skip
+        began_s = 100 * number
+        message.timestamp.FromNanoseconds(START + (began_s + 40) * S)
+        things = [
+            (began_s, model.ScopeStatus(ScopeState.SCANNING)),
+            (began_s + 80, message),
+            (began_s + 81, scan(began_s + 80)),
+            (began_s + 82, model.ScopeStatus(ScopeState.FREE)),
+        ]
+        store.take([(model.Packet(*wire.encode(thing), START + at_s * S), "") for at_s, thing in things])
+    store.flush()
+    store.close()
+    assert story.sentence(told(tmp_path)) == "3 scans, registered 2 of 3 scans, 1 failed"
+    text = write(tmp_path).read_text(encoding="utf-8")
+    Page(text)
+    assert "Registered 2 of 3 scans, 1 failed. The estimator failed over 2 pairs" in text
+    (row,) = re.findall(r"<tr>(?:(?!</tr>).)*#scan-2(?:(?!</tr>).)*</tr>", text)
+    assert "failed" in row
+    assert "30 nm" in row
+    assert "&lt;oh&gt;" in row
+    assert "± 30 nm, failed, by dead reckoning: &lt;oh&gt;" in text
+    assert "± 30 nm, registered" in text
+
+
+def test_the_first_thermal_drift_is_no_problem_and_shown_as_normal(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path, RecordSettings({"experiment": "survey"}))
+    asked = wire.message_type("DriftRescan")(kind=int(model.RescanKind.OPPOSITE))
+    asked.timestamp.FromNanoseconds(START + 10 * S)
+    things = [
+        (1, ControlState(ControlMode.AUTOMATED, "series")),
+        (10, ControlState(ControlMode.AUTOMATED, "rescanner", (int(model.Problem.THERMAL_DRIFT),))),
+        (11, asked),
+        (12, model.ScopeStatus(ScopeState.SCANNING)),
+        (80, scan(80)),
+        (82, model.ScopeStatus(ScopeState.FREE)),
+        (90, ControlState(ControlMode.AUTOMATED, "series")),
+    ]
+    store.take([(model.Packet(*wire.encode(thing), START + at_s * S), "") for at_s, thing in things])
+    store.flush()
+    store.close()
+    found = told(tmp_path)
+    assert not found.problems
+    assert [row.problems for row in found.scans] == [()], "its picture is not framed"
+    with open_run(tmp_path) as opened:
+        assert pictures.night_of(opened, found, pictures.of_scans(opened, found.scans)).problems == []
+    text = write(tmp_path).read_text(encoding="utf-8")
+    assert "is normal at the start" in text
+    assert "thermal-drift flagged" not in text

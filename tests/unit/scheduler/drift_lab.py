@@ -39,6 +39,7 @@ from afspm.model import (
     PositionChange,
     ProbePosition,
     Region,
+    RegistrationOutcome,
     Request,
     Response,
     Scan,
@@ -96,8 +97,17 @@ def forecast(
     ).to_dict()
 
 
-def registered(job: ScanJob, plain: dict[str, Any], *, lost: bool = False, rescan: str = "") -> Registered:
-    """What a worker says that knows this forecast."""
+def registered(
+    job: ScanJob,
+    plain: dict[str, Any],
+    *,
+    lost: bool = False,
+    rescan: str = "",
+    outcome: RegistrationOutcome | None = None,
+    failures: tuple[str, ...] = (),
+) -> Registered:
+    """The answer of a worker that knows this forecast."""
+    outcome = outcome or (RegistrationOutcome.REFUSED if lost else RegistrationOutcome.REGISTERED)
     middle_s = (job.start_s + job.end_s) / 2
     there = forecast_from_dict(plain).at(middle_s)
     zero = [[0.0, 0.0], [0.0, 0.0]]
@@ -108,13 +118,14 @@ def registered(job: ScanJob, plain: dict[str, Any], *, lost: bool = False, resca
         covariance_m2=zero,
         rate_m_s=there.rate_m_s.tolist(),
         rate_covariance=zero,
-        matched=not lost,
+        outcome=outcome,
         lost=lost,
-        reason="nothing is alike" if lost else "",
+        reason="" if outcome.is_registered else "nothing is alike",
         residual_m=[0.0, 0.0],
         references=[],
         rescan=rescan,
         forecast=plain,
+        failures=list(failures),
     )
 
 

@@ -17,7 +17,9 @@ from afspm.model import (
     Packet,
     Parameter,
     Problem,
+    RegistrationOutcome,
     Request,
+    RescanKind,
     Scan,
     ScopeState,
     ScopeStatus,
@@ -604,3 +606,94 @@ def test_what_is_corrected_later_needs_no_scan_down() -> None:
         lab.now_s += 1000.0
     assert not lab.published("DriftRescan")
     assert not problems(lab)
+
+
+# --- how the position of each scan is known ---
+
+SEEN, BADLY = RegistrationOutcome.REGISTERED, RegistrationOutcome.REFUSED
+
+
+def taken(lab: Lab, outcome: RegistrationOutcome, *failures: str) -> None:
+    """A scan, registered with this outcome."""
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[-1], forecast(DRIFT), outcome=outcome, failures=failures))
+
+
+def test_a_scan_that_could_not_be_registered_has_a_mapping_too(lab: Lab) -> None:
+    """Else no table, and no count, would show it."""
+    lab.knows(forecast(DRIFT, rate_sd_m_s=1e-12))
+    lab.scan()
+    (job,) = lab.worker.jobs
+    lab.says(NotRegistered(job.key, "ZeroDivisionError: oh"))
+    assert [e.split("_")[0] for e in lab.envelopes()][-3:] == ["DriftMapping", "Scan2d", "ScopeStateMsg"]
+    (told,) = lab.published("DriftMapping")
+    assert (told.outcome, told.matched, told.reason) == (RegistrationOutcome.FAILED, False, "ZeroDivisionError: oh")
+    assert (told.filename, tuple(told.center)) == (job.scan.filename, HERE.center_m)
+    assert told.covariance[0] > 0.0, "the uncertainty of a prediction"
+    assert "registered 0 of 1 scan, 1 failed" in logged(lab, "ERROR")[0]
+
+
+def test_of_a_scan_before_anything_is_known_no_uncertainty_is_published(lab: Lab) -> None:
+    lab.scan()
+    lab.says(NotRegistered(lab.worker.jobs[0].key, "oh"))
+    (told,) = lab.published("DriftMapping")
+    assert list(told.covariance) == []
+    assert "(unknown)" in logged(lab, "ERROR")[0]
+
+
+def test_each_error_of_the_estimator_is_logged_with_its_pair_and_counted(lab: Lab) -> None:
+    taken(lab, RegistrationOutcome.COARSE, "numbers failed to register b.nc with a.nc: oh")
+    assert logged(lab, "ERROR") == ["numbers failed to register b.nc with a.nc: oh"]
+    (told,) = lab.published("DriftMapping")
+    assert (told.outcome, told.failures, told.matched) == (RegistrationOutcome.COARSE, 1, True)
+    assert "is registered coarsely" in logged(lab, "WARNING")[0]
+
+
+def test_the_count_outlives_a_restart_and_is_logged_at_the_end(lab: Lab) -> None:
+    for outcome in (SEEN, BADLY, RegistrationOutcome.NEW):
+        taken(lab, outcome)
+    assert "registered 1 of 2 scans, 1 not recognised" in logged(lab, "WARNING")[0]
+    again = Lab(state=lab.saved(), now_s=lab.now_s + 100.0)
+    again.in_force()
+    taken(again, SEEN)
+    again.ask(ControlRequest.END_EXPERIMENT)
+    assert "drift: registered 2 of 4 scans, 1 not recognised, 1 of a new place" in logged(again, "INFO")
+    kinds = [type(effect).__name__ for effect in again.effects]
+    assert kinds.index("Log") < kinds.index("Kill")
+
+
+@pytest.mark.parametrize(("share", "flagged_after"), [(0.5, 6), (0.2, 3), (1.0, None)])
+def test_too_many_unregistered_scans_flag_thermal_drift(share: float, flagged_after: int | None) -> None:
+    lab = Lab(DriftCompensationSettings(at_start="nothing", most_unregistered=share))
+    lab.in_force()
+    taken(lab, SEEN)
+    flagged = []
+    for _ in range(11):
+        taken(lab, BADLY)
+        flagged.append(bool(problems(lab)))
+        if flagged[-1]:
+            break
+        taken(lab, RegistrationOutcome.NEW)  # says nothing about drift
+    assert (len(flagged) if any(flagged) else None) == flagged_after
+    if flagged_after is not None:
+        ((kind, reason),) = rescans(lab)
+        assert kind == RescanKind.SEARCH
+        assert f"more than {share:.0%} of the last 10 scans were not registered: registered 1 of" in reason
+        taken(lab, BADLY)
+        assert problems(lab) == (Problem.THERMAL_DRIFT,), "an unregistered scan removes no flag"
+        taken(lab, SEEN)
+        assert not problems(lab)
+
+
+def test_some_unregistered_scans_between_others_flag_nothing(lab: Lab) -> None:
+    for outcome in (SEEN, BADLY) * 10:
+        taken(lab, outcome)
+    assert not problems(lab)
+
+
+def test_the_first_flag_of_a_run_is_logged_as_normal() -> None:
+    lab = Lab(DriftCompensationSettings())
+    lab.in_force()
+    set_direction(lab, "up")
+    taken(lab, SEEN)
+    assert any("thermal-drift is flagged" in text and "normal at the start" in text for text in logged(lab, "INFO"))

@@ -37,12 +37,14 @@ def job(number: int, x: int, y: int, asked: Region | None = None) -> ScanJob:
     return ScanJob(f"{number}.nc 0", scan, number * 100.0, number * 100.0 + 50.0, None, asked)
 
 
-def drift_scan(number: int, x: int, y: int) -> DriftScan:
-    return DriftScan(picture(x, y), HERE, number * 100.0, number * 100.0 + 50.0, None, f"{number}.nc 0")
+def drift_scan(number: int, x: int, y: int) -> tuple[str, DriftScan]:
+    """The key and the scan, for `Estimation.register`."""
+    end_s = number * 100.0 + 50.0
+    return f"{number}.nc 0", DriftScan(picture(x, y), HERE, number * 100.0, end_s, None, f"{number}.nc")
 
 
 def estimation(store: WorkerStateFile, rule: RescanRule | None = None) -> Estimation:
-    made = Estimation(tracker("paper", Brightest()), rule or RescanRule(), store.save)
+    made = Estimation(tracker("paper", Brightest()), rule or RescanRule(), store.save, [])
     if (state := store.load()) is not None:
         made.restore(state)
     return made
@@ -54,16 +56,16 @@ def estimation(store: WorkerStateFile, rule: RescanRule | None = None) -> Estima
 def test_a_scan_is_answered_again_and_not_taken_twice(tmp_path: Path) -> None:
     store = WorkerStateFile(tmp_path / "drift.npz")
     first = estimation(store)
-    first.register(drift_scan(0, 30, 30))
-    answer = first.register(drift_scan(1, 33, 28))
+    first.register(*drift_scan(0, 30, 30))
+    answer = first.register(*drift_scan(1, 33, 28))
     np.testing.assert_allclose(np.array(answer.matrix)[:2, 2], [-3e-9, 2e-9], atol=1e-18)
     assert answer.residual_m == pytest.approx([3e-9, -2e-9])
-    assert answer.references == ["0.nc 0"]
+    assert answer.references == ["0.nc"]
     second = estimation(store)  # after a kill
-    assert second.register(drift_scan(1, 33, 28)) == answer
+    assert second.register(*drift_scan(1, 33, 28)) == answer
     assert second.forecast == answer.forecast
     third = estimation(store)
-    assert third.register(drift_scan(2, 36, 26)) == second.register(drift_scan(2, 36, 26))
+    assert third.register(*drift_scan(2, 36, 26)) == second.register(*drift_scan(2, 36, 26))
 
 
 def test_before_the_first_scan_nothing_is_known(tmp_path: Path) -> None:
@@ -84,9 +86,9 @@ def test_before_the_first_scan_nothing_is_known(tmp_path: Path) -> None:
 def test_a_scan_too_far_from_where_it_was_asked_for_is_wanted_again(rule: RescanRule, again: bool) -> None:
     asked = Region((0.0, 0.0), HERE.size_m, frame=Frame.SAMPLE)
     made = estimation(WorkerStateFile(None), rule)
-    assert not made.register(drift_scan(0, 20, 20), asked).rescan  # nothing was known before
-    assert bool(made.register(drift_scan(1, 35, 28), asked).rescan) is again
-    assert not made.register(drift_scan(2, 60, 60), None).rescan  # nobody asked for it
+    assert not made.register(*drift_scan(0, 20, 20), asked).rescan  # nothing was known before
+    assert bool(made.register(*drift_scan(1, 35, 28), asked).rescan) is again
+    assert not made.register(*drift_scan(2, 60, 60), None).rescan  # nobody asked for it
 
 
 def test_a_tracker_that_can_not_follow_a_compensation_says_so() -> None:
@@ -247,7 +249,7 @@ def test_a_scan_out_of_its_turn_is_refused_and_the_next_is_not(work: Callable[..
     assert refused.key == "2.nc 0"
     answer = heard.next(Registered, 2)
     assert isinstance(answer, Registered)
-    assert answer.references == ["5.nc 0"]
+    assert answer.references == ["5.nc"]
 
 
 def test_a_worker_ends_with_the_scheduler(work: Callable[..., Heard], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from afspm.drift.estimators.guarded import Guarded
+from afspm.drift.estimators.guarded import Guarded, PairFailure, Report, log_failure
 from afspm.drift.naming import named
 from afspm.drift.registration import Estimator
 from afspm.errors import ConfigError
 from afspm.plain_data import PlainMapping
 
-__all__ = ["DEFAULT", "READY_MADE", "Guarded", "estimator"]
+__all__ = ["DEFAULT", "READY_MADE", "Guarded", "PairFailure", "estimator", "unguarded"]
 
 DEFAULT = "least-squares"
 
@@ -28,27 +28,39 @@ READY_MADE: Mapping[str, str] = {
 }
 
 
-def estimator(spec: str | PlainMapping | Estimator = DEFAULT) -> Estimator:
-    """The estimator that is meant, guarded: it refuses where it would have raised or told nonsense.
+def estimator(spec: str | PlainMapping | Estimator = DEFAULT, report: Report = log_failure) -> Estimator:
+    """Return the estimator that is meant, guarded: its errors are reported, and bridged by a coarse estimate.
 
     Args:
         spec: a name of `READY_MADE` or "module.Name"; a table with that as its `class` and the settings of it (only
             `class` names code); or an estimator.
+        report: called with each error over a pair; by default it is logged.
 
     Raises:
         ConfigError: no such name, class or setting, a setting without a meaning, or a library that is missing.
     """
     if isinstance(spec, Guarded):
         return spec
-    if not isinstance(spec, str | Mapping):
-        return _guarded(spec, type(spec).__name__)
-    return _guarded(*named("estimator", spec, READY_MADE, DEFAULT))
+    return Guarded(*_made(spec), report)
 
 
-def _guarded(made: object, name: str) -> Estimator:
+def unguarded(spec: str | PlainMapping | Estimator = DEFAULT) -> Estimator:
+    """Return the estimator that is meant as it is, for tests and benchmarks, where an error has to show.
+
+    Raises:
+        ConfigError: as `estimator`.
+    """
+    return _made(spec)[0]
+
+
+def _made(spec: str | PlainMapping | Estimator) -> tuple[Estimator, str]:
+    made: object = spec
+    name = type(spec).__name__
+    if isinstance(spec, str | Mapping):
+        made, name = named("estimator", spec, READY_MADE, DEFAULT)
     if not callable(getattr(made, "register", None)):
         raise ConfigError(
             f"{name} is not an estimator",
             hint="give it a method register(reference, scan, prior), see afspm.drift.registration",
         )
-    return Guarded(made, name)  # type: ignore[arg-type]
+    return made, name  # type: ignore[return-value]

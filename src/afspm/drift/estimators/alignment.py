@@ -22,6 +22,7 @@ COARSE: Index = np.array([*range(LINEAR.stop), GAIN, BEND], dtype=np.intp)
 ALL: Index = np.arange(COUNT, dtype=np.intp)
 ROUNDS = 4
 SETTLED_PX = 1e-3
+DIGITS = 1e-6  # of products of columns of 32 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +100,7 @@ def _round(pair: WarpedPair, theta: Array, believed: Believed, seen_through: Fin
     curvature = products(columns_q, pair.columns(*gradient, mean, residual)[:, :-1])
     through_q = seen(pair.slopes(*noise_through), weight, metric)
     curvature[:, :SLOPES, :SLOPES] -= scale * products(through_q, pair.slopes(*noise))
-    curvature = _no_less(curvature, spread)
+    curvature = _no_less(curvature, spread, believed.precision)
     slope = products(columns_q, residual[:, None].astype(columns_q.dtype))[:, :, 0]
     after, _ = _stepped(theta, curvature.sum(axis=0), slope.sum(axis=0), believed, ALL)
     return Fit(after, curvature, spread, slope + curvature @ (after - theta))
@@ -117,18 +118,31 @@ def _signal(gradient: Both, noise: Array, known: NDArray[np.bool_]) -> tuple[Bot
     return (x, y), (through_x, through_y), (nx, ny)
 
 
-def _no_less(curvature: Array, spread: Array) -> Array:
+def _no_less(curvature: Array, spread: Array, precision: Array) -> Array:
     """H'QJ, but in no direction less than H'QH. They are about the same; where a direction is hardly seen, nothing but
-    noise may be left of the difference that the curvature is."""
-    from scipy.linalg import eigh
+    noise may be left of the difference that the curvature is.
 
-    total, whole = curvature.sum(axis=0), spread.sum(axis=0)
+    The precision of the prior is on both sides: in an overlap of some 10 px the nuisances act through one gradient and
+    are nearly dependent, and products of columns of 32 bits are not definite any more. Scaled to a diagonal of 1, what
+    is smaller than their digits is nothing.
+    """
+    total, whole = (_symmetric(each.sum(axis=0)) for each in (curvature, spread))
     if not (np.isfinite(total).all() and np.isfinite(whole).all()):
         return curvature
-    values, vectors = eigh((total + total.T) / 2, whole + 1e-12 * (1.0 + np.trace(whole)) * np.eye(len(whole)))
+    least = whole + precision
+    size = 1.0 / np.sqrt(np.diag(least))
+    powers, axes = np.linalg.eigh(size[:, None] * least * size)
+    white = size[:, None] * axes / np.sqrt(np.maximum(powers, DIGITS))
+    values, turned = np.linalg.eigh(white.T @ (total + precision) @ white)
+    vectors = white @ turned
     missing = np.maximum(1.0 - values, 0.0)
-    raised: Array = curvature + spread @ (vectors * missing) @ vectors.T @ whole
+    raised: Array = curvature + (spread + precision / len(spread)) @ (vectors * missing) @ vectors.T @ least
     return raised
+
+
+def _symmetric(matrix: Array) -> Array:
+    both: Array = (matrix + matrix.T) / 2
+    return both
 
 
 def _stepped(theta: Array, curvature: Array, slope: Array, believed: Believed, free: Index) -> tuple[Array, float]:

@@ -1,27 +1,78 @@
-"""Around any estimator: whatever goes wrong in it is a refusal with the reason."""
+"""Around any estimator: an error of the estimator is told apart from a refusal, reported, and bridged.
+
+A refusal says that two scans can't be registered. An error says nothing about the scans: it is reported with the pair,
+and a plain correlation takes the place of the estimate where it is known where to look, and that is sure of its peak.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import logging
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from afspm.drift.estimators.correlation import Correlation
 from afspm.drift.mapping import unlike_drift
 from afspm.drift.overlap import overlap_ratio
 from afspm.drift.registration import DriftScan, Estimator, LinearSeen, Prior, Registration
 
+COARSE_SD_PX = 0.5
+"""Added to the uncertainty of the coarse estimate, in the larger pixel of both scans: 95 % ellipses then hold 98 % and
+more of the accepted pairs of the families, and of zooms in their survey."""
 
-class Guarded:
-    """Runs an estimator so that nobody else needs to be careful.
+_log = logging.getLogger("afspm.drift")
 
-    An exception, a result that is none, of wrong shapes, or accepted with values that can't be, comes out as refused;
-    so does a displacement with which the scans would share nothing, and a sample that is mirrored or much stretched.
-    The estimator gets copies: what it does to them can't reach those who compare the same scans later.
+
+@dataclass(frozen=True)
+class PairFailure:
+    """An error of an estimator over a pair of scans.
+
+    Attributes:
+        estimator: its name.
+        reference, scan: the keys of both scans.
+        reason: the exception, or what is wrong with the result.
     """
 
-    def __init__(self, inner: Estimator, name: str) -> None:
+    estimator: str
+    reference: str
+    scan: str
+    reason: str
+
+    def __str__(self) -> str:
+        pair = f"{_file(self.scan)} with {_file(self.reference)}"
+        return f"{self.estimator} failed to register {pair}: {self.reason}: an error of the estimator, not of the scans"
+
+
+def _file(key: str) -> str:
+    """Return the name of a file without its folder, for keys that are files."""
+    return re.split(r"[\\/]", key)[-1] or "a scan"
+
+
+Report = Callable[[PairFailure], None]
+
+
+def log_failure(failure: PairFailure) -> None:
+    """Log a failure as an error."""
+    _log.error("%s", failure)
+
+
+class Guarded:
+    """Runs an estimator so that no caller needs to be careful.
+
+    An exception, and a result that is none, of wrong shapes, or accepted with values that can't be, are failures: see
+    `Registration.failure`. A displacement with which the scans would share nothing, and a sample that is mirrored or
+    much stretched, are refused. The estimator gets copies, so that changes to them do not reach later comparisons.
+
+    Args:
+        report: called with each failure.
+    """
+
+    def __init__(self, inner: Estimator, name: str, report: Report = log_failure) -> None:
         self.inner = inner
         self.name = name
+        self._report = report
 
     def __repr__(self) -> str:
         return f"<estimator {self.name}: {self.inner!r}>"
@@ -30,17 +81,35 @@ class Guarded:
         """See `Estimator`."""
         try:
             found = self.inner.register(_copied(reference), _copied(scan), prior)
-        except Exception as error:  # anybody's code may stumble in any way
-            return Registration.refused(f"{self.name} failed: {type(error).__name__}: {error}")
-        wrong = _wrong(found) or _impossible(found, reference, scan)
-        return Registration.refused(f"{self.name} failed: {wrong}") if wrong else found
+            failure = _malformed(found)
+        except Exception as error:  # any code, of a user's own estimator too, may stumble in any way
+            failure = f"{type(error).__name__}: {error}"
+        if failure:
+            self._report(PairFailure(self.name, reference.key, scan.key, failure))
+            return self._coarse(reference, scan, prior, f"{self.name} failed: {failure}")
+        impossible = _impossible(found, reference, scan)
+        return Registration.refused(f"{self.name}: {impossible}") if impossible else found
+
+    def _coarse(self, reference: DriftScan, scan: DriftScan, prior: Prior | None, failure: str) -> Registration:
+        # without an expectation one particle is as good as the next: a plain correlation is then sure of wrong ones
+        if prior is None or isinstance(self.inner, Correlation):
+            return Registration.failed(failure)
+        try:
+            found = Correlation().register(reference, scan, prior)
+        except Exception as error:  # what made the estimator stumble may make this one stumble
+            self._report(PairFailure("correlation", reference.key, scan.key, f"{type(error).__name__}: {error}"))
+            return Registration.failed(failure)
+        if not found.accepted or _malformed(found) or _impossible(found, reference, scan):
+            return Registration.failed(failure)
+        wide_m = COARSE_SD_PX * max(*reference.pixel_m, *scan.pixel_m)
+        return replace(found, covariance_m2=found.covariance_m2 + wide_m**2 * np.eye(2), failure=failure)
 
 
 def _copied(scan: DriftScan) -> DriftScan:
     return replace(scan, values=np.array(scan.values, dtype=np.float64))
 
 
-def _wrong(found: object) -> str:
+def _malformed(found: object) -> str:
     """Return what makes a result unusable; empty for nothing."""
     if not isinstance(found, Registration):
         return f"its result is a {type(found).__name__} instead of a Registration"
@@ -61,10 +130,10 @@ def _wrong(found: object) -> str:
     largest = np.abs(covariance).max()
     if np.abs(covariance - covariance.T).max() > 1e-6 * largest or np.linalg.eigvalsh(covariance)[0] <= 0.0:
         return f"accepted with an invalid covariance: {covariance.tolist()}"
-    return _wrong_linear(found.linear_seen)
+    return _malformed_linear(found.linear_seen)
 
 
-def _wrong_linear(seen: object) -> str:
+def _malformed_linear(seen: object) -> str:
     """Return what makes a linear part with its covariance unusable; empty for nothing, and for None."""
     if seen is None:
         return ""
@@ -77,14 +146,15 @@ def _wrong_linear(seen: object) -> str:
         return "linear_seen has no finite matrices of shapes (2, 2) and (4, 4)"
     if np.linalg.eigvalsh((covariance + covariance.T) / 2)[0] < 0.0:
         return f"linear_seen has an invalid covariance: {covariance.tolist()}"
-    return unlike_drift(np.eye(2) + linear)
+    return ""
 
 
 def _impossible(found: Registration, reference: DriftScan, scan: DriftScan) -> str:
     """Why an accepted result of the right form can't be true of any sample; empty if it can."""
     if not found.accepted:
         return ""
-    if unlike := unlike_drift(np.eye(2) + found.linear):
+    seen = found.linear if found.linear_seen is None else np.asarray(found.linear_seen.linear)
+    if unlike := unlike_drift(np.eye(2) + found.linear) or unlike_drift(np.eye(2) + seen):
         return f"accepted with a sample {unlike}"
     if overlap_ratio(reference.region, scan.region, found.displacement_m) == 0.0:
         far_m = float(np.hypot(*found.displacement_m))

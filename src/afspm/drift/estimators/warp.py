@@ -130,6 +130,7 @@ class OverlapBox:
         return np.array([self.x.mean(), self.y.mean()])
 
 
+LEAST_SEARCHED_PX = 32  # of a side of the smaller image: what is left of fewer may be too little to be compared
 CREEP_PX = (4.0, 9.0)  # within which what a line starts with is gone to 1/e
 LINEAR = slice(2, 6)  # the linear map among the parameters theta of a pair
 CREEP = slice(6, 6 + 2 * len(CREEP_PX))  # from the left and from the right, for each length
@@ -287,8 +288,10 @@ class Scene:
     def smaller(self) -> tuple[Scene, int, Array]:
         """For the search: with `factor` times larger pixels where the images are large, that factor, and by how much,
         px, the centres have been moved apart (only whole blocks of pixels are kept)."""
-        largest = max(*self.first.values.shape, *self.second.values.shape)
-        factor = 1 if largest <= 160 else 2 if largest <= 640 else 4
+        sides = *self.first.values.shape, *self.second.values.shape
+        factor = 1 if max(sides) <= 160 else 2 if max(sides) <= 640 else 4
+        while factor > 1 and min(sides) < LEAST_SEARCHED_PX * factor:  # a zoom in its overview
+            factor //= 2
         if factor == 1:
             return self, 1, np.zeros(2)
         cut = [np.array(image.values.shape[::-1]) % factor / 2 for image in (self.first, self.second)]

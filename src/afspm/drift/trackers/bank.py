@@ -122,10 +122,7 @@ class BankTracker:
         found = self._compared(newest, tried)
         used = self._believed(newest, found, anywhere=anywhere)
         placed = used is not None and any(self._proves(one.link.number) for one in used.measured)
-        # that a zoom is not recognised in an overview does not mean that the sample is gone
-        state.unmatched = (
-            0 if placed else state.unmatched + any(self._references.is_alike(number, scan) for number in tried)
-        )
+        state.unmatched = 0 if placed else state.unmatched + self._should_have_matched(scan, tried)
         self._learn(newest, used, tried, placed=placed)
         after = self._known(state.filters)
         # a scan that could be compared with none begins a row of its own, which is as far from the others as it is
@@ -137,7 +134,7 @@ class BankTracker:
             before=before,
             after=after,
             matched=placed,
-            reason="" if placed else _why_not(tried, found, adrift=used is not None),
+            reason=_coarsely(tried) if placed else _why_not(tried, found, adrift=used is not None),
             lost=state.lost,
             registrations=registrations,
             forecast=self.forecast,
@@ -206,6 +203,13 @@ class BankTracker:
         velocity = found.by_shear_m_s + self._state.compensation.velocity_m_s(found.time_s)
         return filters.with_velocity(found.time_s, velocity, found.by_shear_covariance, rarest=self._settings.rarest)
 
+    def _should_have_matched(self, scan: DriftScan, tried: Table[int, Registration]) -> bool:
+        """True if an unmatched scan means that the sample may be gone.
+
+        A zoom that is not recognised in an overview does not, and neither does an error of the estimator.
+        """
+        return any(self._references.is_alike(number, scan) for number, one in tried.items() if not one.failure)
+
     def _is_blind(self, newest: NewestScan) -> bool:
         """True if it is too uncertain where to look, against each of the scans that it can be compared with."""
         kept = self._references.kept
@@ -228,19 +232,23 @@ class BankTracker:
             # not where it was expected, or not to be recognised: somewhere else?
             elsewhere = [number for number in firm if self._references.is_alike(number, newest.scan)]
             for number in elsewhere[: self._settings.second_looks]:
-                tried[number] = self._estimator.register(kept[number].scan, newest.scan)
+                again = self._estimator.register(kept[number].scan, newest.scan)
+                if again.accepted or not tried[number].failure:  # an error is not outweighed by a refusal
+                    tried[number] = again
         return tried
 
     def _compared(self, newest: NewestScan, tried: Table[int, Registration]) -> Comparison | None:
-        """Return what was found, by the references that agree; those adrift count only where there is no other."""
+        """Return what was found, by the references that agree; those adrift count only where there is no other, and
+        coarse results only where there is no exact one."""
         kept, inflation = self._references.kept, self._settings.inflation
         measured = [
             PairMeasurement.of(newest, number, kept[number], found, inflation)
             for number, found in tried.items()
             if found.accepted
         ]
-        firm = [one for one in measured if self._proves(one.link.number)]
-        return Comparison(agreeing(firm or measured, newest.filters), newest.filters) if measured else None
+        firm = [one for one in measured if self._proves(one.link.number)] or measured
+        exact = [one for one in firm if not one.found.failure] or firm
+        return Comparison(agreeing(exact, newest.filters), newest.filters) if measured else None
 
     def _believed(self, newest: NewestScan, found: Comparison | None, *, anywhere: bool) -> Comparison | None:
         """Return what is believed of that: a surprise only where everything is possible, or after another like it."""
@@ -278,7 +286,8 @@ class BankTracker:
             if not state.proven:
                 references.known(numbers)
             state.proven = True
-            references.judged({number: number in numbers for number in tried}, state.scans)
+            judged = [number for number, one in tried.items() if number in numbers or not one.failure]
+            references.judged({number: number in numbers for number in judged}, state.scans)
             self._vouch(newest, {number: tried[number] for number in tried if tried[number].accepted})
         if state.similarity is not None:
             state.similarity = self._straightened(state.similarity, scan, used if placed else None)
@@ -371,5 +380,12 @@ def _why_not(tried: Table[int, Registration], found: Comparison | None, *, adrif
         far = f"found {found.surprise**0.5:.1f} standard deviations from where it was expected"
         return f"{far}; believed if the next one is too"
     if tried:
-        return next(iter(tried.values())).reason
+        failed = (one.failure for one in tried.values() if one.failure)
+        return next(failed, next(iter(tried.values())).reason)
     return "no earlier scan of this part of the sample is stored"
+
+
+def _coarsely(tried: Table[int, Registration]) -> str:
+    """Return the error for which a matched scan is known only coarsely; empty if it is known well."""
+    failures = [one.failure for one in tried.values() if one.accepted]
+    return failures[0] if failures and all(failures) else ""

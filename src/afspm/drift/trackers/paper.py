@@ -200,7 +200,8 @@ class PaperTracker:
         placed, tried, reason = (None, {}, "") if first else self._match(scan, before.mapping)
         matched = first or placed is not None
         mapping = before.mapping if placed is None else self._averaged(before.mapping, placed)
-        state.unmatched = 0 if matched else state.unmatched + bool(tried)  # elsewhere there is nothing to be found
+        # elsewhere there is nothing to be found, and an error of the estimator says nothing about the sample
+        state.unmatched = 0 if matched else state.unmatched + any(not one.failure for one in tried.values())
         self._step(scan, before, mapping, [one for one in tried.values() if one.accepted])
         state.queue.append(PlacedScan(scan, mapping))
         while len(state.queue) > self._length:
@@ -229,9 +230,10 @@ class PaperTracker:
             found = self._estimator.register(old.scan, scan)
             tried[old.scan.key] = found
             if found.accepted:
-                return old.mapping @ transform_between(found, self._transform).inverse, tried, ""
+                return old.mapping @ transform_between(found, self._transform).inverse, tried, found.failure
         if tried:
-            return None, tried, next(reversed(tried.values())).reason
+            failed = (one.failure for one in tried.values() if one.failure)
+            return None, tried, next(failed, next(reversed(tried.values())).reason)
         return None, tried, "no scan of the queue overlaps enough with it"
 
     def _averaged(self, predicted: Mapping, estimated: Mapping) -> Mapping:

@@ -9,9 +9,10 @@ from html import escape
 from afspm.clock import NS_PER_S
 from afspm.drawing import timeline
 from afspm.drawing.image_html import data_url
-from afspm.formatting import day, duration_text
+from afspm.formatting import counted, day, duration_text, quantity
 from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.model import component_of
+from afspm.record.overview import ROUTINE
 from afspm.record.report import curves, markup, sample
 from afspm.record.report.curves import SpectrumGroup
 from afspm.record.report.markup import PageTimes, section, table
@@ -37,6 +38,7 @@ def html(
         section("", _cards(story)),
         section("Time line", f'<div class="scroll">{_timeline(story)}</div>{_zones(clock)}'),
         section("Problems and repairs", _problems(story, clock)),
+        section("Drift", _drift(story, clock)),
         section("Notes", _notes(story, clock)),
         section("On the sample", sample.sample_map(shown, places, story.frame)),
         section("Scans", sample.sheet(story, shown, clock)),
@@ -103,6 +105,7 @@ def _cards(story: RunStory) -> str:
         ("scans", len(story.scans) - story.interrupted, interrupted),
         ("spectra", story.spectra, ""),
         ("problems flagged", flags, f"{unsolved} still flagged at the end" if unsolved else ""),
+        *_registered(story),
         ("refusals", sum(one.count for one in story.refusals), ""),
         ("restarts", len(story.restarts), f"given up: {', '.join(story.given_up)}" if story.given_up else ""),
     ]
@@ -111,6 +114,39 @@ def _cards(story: RunStory) -> str:
         for what, number, note in cards
     ]
     return f'<p class="lead">{escape(sentence(story))}</p><div class="cards">{"".join(made)}</div>'
+
+
+def _registered(story: RunStory) -> list[tuple[str, int, str]]:
+    drift = story.overview.drift
+    if not drift:
+        return []
+    registered = sum(point.outcome.is_registered for point in drift)
+    return [("scans registered", registered, "" if registered == len(drift) else f"of {len(drift)}: see Drift")]
+
+
+def _drift(story: RunStory, clock: PageTimes) -> str:
+    """The scans whose position is not known well, with its uncertainty and the reason."""
+    if not story.overview.drift:
+        return ""
+    rows = [
+        [
+            f'<a href="#{sample.name_of(scan)}">{scan.number}</a>',
+            escape(scan.key),
+            clock.both(scan.time_ns),
+            scan.registration.label if scan.registration else "",
+            "not known" if scan.position_sd_m is None else quantity(scan.position_sd_m, "m", 2),
+            escape(story.why_unregistered(scan)),
+        ]
+        for scan in story.unregistered[:MOST_ROWS]
+    ]
+    errors = sum(point.failures for point in story.overview.drift)
+    failed = (
+        f" The estimator failed over {counted(errors, 'pair')}: an error of its own; see the log." if errors else ""
+    )
+    told = f"<p>{escape(story.overview.registration.capitalize())}.{failed}</p>"
+    left_out = len(story.unregistered) - len(rows)
+    more = f'<p class="note">{left_out} more are in the record.</p>' if left_out else ""
+    return told + table(["scan", "key", "finished", "registration", "standard deviation", "why"], rows) + more
 
 
 def _shares(story: RunStory) -> str:
@@ -154,10 +190,14 @@ def _problems(story: RunStory, clock: PageTimes) -> str:
     for entry in story.seen_late:
         name = escape(story.problem_name(entry))
         rows.append([name, clock.both(entry.time_ns), escape(entry.who), "", "", "", "<b>seen after the end</b>"])
+    routine = "".join(
+        f'<p class="note">{escape(span.label)} at {clock.both(span.start_ns)} is {escape(ROUTINE)}.</p>'
+        for span in story.overview.routine_spans
+    )
     return (
         table(["problem", "flagged", "by", "in control meanwhile", "done to the tip", "for", "cleared"], rows)
         or "<p>None.</p>"
-    )
+    ) + routine
 
 
 def _notes(story: RunStory, clock: PageTimes) -> str:

@@ -141,6 +141,7 @@ def night_of(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -
     record.control = [(row.time_ns, row.state) for row in run.control] or [
         (story.start_ns, ControlState(ControlMode.UNDEFINED))
     ]
+    record.routine = [span.start_ns for span in story.overview.routine_spans]
     record.interruptions = [row.time_ns for row in story.scans if row.interrupted]
     record.marks = [NightMark(of_ns, "", "verdict", score, of_ns) for of_ns, score in run.verdicts()]
     record.marks += [
@@ -153,7 +154,7 @@ def night_of(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -
 
 def drift_of(run: Run) -> Any:
     """A `drift.record.DriftRecord` of what the scheduler told."""
-    from afspm.drift.record import DriftRecord, drift_at
+    from afspm.drift.record import DriftRecord, drift_at, drift_knowledge
 
     told = [wire.decode("DriftMapping", packet.payload) for packet in run.packets(messages=("DriftMapping",))]
     told = [message for message in told if len(message.matrix) == 6 and len(message.center) == 2]
@@ -170,6 +171,8 @@ def drift_of(run: Run) -> Any:
         rate_m_s=np.array([tuple(m.rate) if len(m.rate) == 2 else (0.0, 0.0) for m in told]).reshape(-1, 2),
         matched=np.array([message.matched for message in told], dtype=bool),
         reasons=tuple(message.reason for message in told),
+        outcomes=tuple(drift_knowledge(message)[0] for message in told),
+        failures=tuple(message.failures for message in told),
     )
 
 

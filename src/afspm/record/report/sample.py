@@ -13,7 +13,7 @@ from afspm.clock import NS_PER_S
 from afspm.drawing.curves import round_ticks
 from afspm.drawing.image_html import data_url, scale_bar
 from afspm.formatting import duration_text, quantity, scale, typeset_area, typeset_position
-from afspm.model import Frame
+from afspm.model import Frame, RegistrationOutcome
 from afspm.model.geometry import XY
 from afspm.record.report import markup
 from afspm.record.report.markup import PageTimes
@@ -23,7 +23,8 @@ from afspm.record.tables import ScanRow
 
 _LEGEND = (
     "Click a picture to enlarge it. The bar below it has the colour of who was in control; framed: "
-    "bad or interrupted. Topography, rows brought to one height, without its plane."
+    "bad or interrupted; refused, failed, new: its place on the sample is dead reckoning. Topography, rows brought to "
+    "one height, without its plane."
 )
 _MARGIN = 0.04
 _HIDDEN_BEHIND = 40  # places of a run that are drawn at most where one lies over the other
@@ -34,7 +35,7 @@ def sheet(story: RunStory, shown: Sequence[TopographyPicture], clock: PageTimes)
     if not shown:
         return "" if story.spectra else "<p>None.</p>"
     styles = colours(story)
-    names = ["", *(_name(one.row) for one in shown), ""]
+    names = ["", *(name_of(one.row) for one in shown), ""]
     figures = [_figure(one, story, styles, clock, (names[index], names[index + 2])) for index, one in enumerate(shown)]
     left_out = len(story.scans) - len(shown)
     note = f'<p class="note">{left_out} more are not shown.</p>' if left_out else ""
@@ -93,7 +94,7 @@ class _View:
         turned = f";transform:rotate({-math.degrees(region.angle_rad):.3f}deg)" if region.angle_rad else ""
         bad = "bad" if one.is_bad else ""
         return (
-            f'<a class="{bad}" href="#{_name(one.row)}" title="scan {one.row.number}, {typeset_area(region.size_m)}" '
+            f'<a class="{bad}" href="#{name_of(one.row)}" title="scan {one.row.number}, {typeset_area(region.size_m)}" '
             f'style="{place}{turned}"><img src="{data_url(one.image.image)}" alt=""></a>'
         )
 
@@ -128,6 +129,8 @@ def _figure(
             f"{scale_bar((width, height))}"
         )
     mark = " <b>interrupted</b>" if row.interrupted else ""
+    if row.registration is not None and row.registration is not RegistrationOutcome.REGISTERED:
+        mark += f" <b>{row.registration.label}</b>"
     noted = " ✎" if any(note.scan == row.number for note in story.notes) else ""
     size = f"<br>{typeset_area(region.size_m)}" if region else ""
     caption = (
@@ -136,7 +139,7 @@ def _figure(
     )
     facts = dict(_facts(one, story, clock))
     return markup.figure(
-        _name(row), shown, caption, facts, beside=beside, style="scan bad" if one.is_bad else "scan",
+        name_of(row), shown, caption, facts, beside=beside, style="scan bad" if one.is_bad else "scan",
         ratio=width / height,
     )  # fmt: skip
 
@@ -151,6 +154,13 @@ def _facts(one: TopographyPicture, story: RunStory, clock: PageTimes) -> Iterato
         turned = f", turned by {math.degrees(region.angle_rad):.4g}°" if region.angle_rad else ""
         yield "size", f"{typeset_area(region.size_m)}{turned}"
         yield "centre", typeset_position(region.center_m)
+    if row.registration is not None:
+        sd = "unknown" if row.position_sd_m is None else f"± {quantity(row.position_sd_m, 'm', 2)}"
+        how = "" if row.registration.is_registered else ", by dead reckoning"
+        yield (
+            "position",
+            escape(f"{sd}, {row.registration.label}{how}: {story.why_unregistered(row)}".removesuffix(": ")),
+        )
     if row.shape is not None:
         yield "pixels", f"{row.shape[1]} × {row.shape[0]}"
     if one.image is not None:
@@ -164,5 +174,6 @@ def _facts(one: TopographyPicture, story: RunStory, clock: PageTimes) -> Iterato
     yield "file", escape(row.file)
 
 
-def _name(row: ScanRow) -> str:
+def name_of(row: ScanRow) -> str:
+    """Return the anchor of a scan in the page."""
     return f"scan-{row.number}"

@@ -5,11 +5,20 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from afspm.drawing.timeline import TimelineRow
 from afspm.formatting import counted
-from afspm.model import ControlEvent, ControlRequest, Frame, JournalEntry, ProcessCondition, ScopeState, names
+from afspm.model import (
+    ControlEvent,
+    ControlRequest,
+    Frame,
+    JournalEntry,
+    ProcessCondition,
+    RegistrationOutcome,
+    ScopeState,
+    names,
+)
 from afspm.record.overview import Overview, ProcessRestart
 from afspm.record.run import Run
 from afspm.record.run_json import REAL_S
@@ -44,7 +53,7 @@ class RunStory:
         real_s: how long it took in real time; None: that is not known.
         ended: how it ended, in words; that it goes on, or was cut off.
         frame: of all places.
-        problems: spans of all problems in the order of time.
+        problems: spans of all problems in the order of time, but for routine ones.
         actions: what was done to the tip, e.g. pulses.
         seen_late: the first request to flag each problem that was only noticed after the end.
     """
@@ -102,8 +111,19 @@ class RunStory:
 
     @property
     def problems(self) -> list[Span]:
-        spans = [span for lane in self.overview.problem_timelines.values() for span in lane.spans]
-        return sorted(spans, key=lambda span: span.start_ns)
+        return self.overview.problem_spans
+
+    @property
+    def unregistered(self) -> list[ScanRow]:
+        """Return the scans whose position is not known well: dead reckoning, or a coarse estimate."""
+        well = (None, RegistrationOutcome.REGISTERED)
+        return [scan for scan in self.scans if scan.registration not in well]
+
+    def why_unregistered(self, scan: ScanRow) -> str:
+        """Return why the position of a scan is not known well."""
+        began_ns = scan.time_ns if scan.began_ns is None else scan.began_ns
+        points = (point for point in self.overview.drift if began_ns <= point.time_ns <= scan.time_ns)
+        return next((point.reason for point in points), "")
 
     def shares(self, lane: Timeline) -> list[tuple[str, int]]:
         """For how long altogether, in ns, each thing of a lane was so: the longest first."""
@@ -144,13 +164,20 @@ def read(run: Run) -> RunStory:
         ended=describe_state(run.folder),
         frame=run.frame,
         overview=overview,
-        scans=list(scans),
+        scans=[_without_routine(scan, overview) for scan in scans],
         spectra=len(run.spectra),
         refusals=gathered([entry for entry in run.refusals if entry not in late]),
         actions=[entry for entry in run.journal if entry.what in names.EXTENSION_ACTIONS and entry.response == 0],
         notes=list(run.notes),
         seen_late=list({entry.problem: entry for entry in reversed(late)}.values()),
     )
+
+
+def _without_routine(scan: ScanRow, overview: Overview) -> ScanRow:
+    """Leave out the problem of a scan that is taken in the normal course of a run; see `Overview.is_routine`."""
+    began_ns = scan.time_ns if scan.began_ns is None else scan.began_ns
+    routine = {s.label for s in overview.routine_spans if s.start_ns <= began_ns <= (s.end_ns or began_ns)}
+    return replace(scan, problems=tuple(name for name in scan.problems if name not in routine))
 
 
 def _late_flags(journal: Iterable[JournalEntry]) -> list[JournalEntry]:
@@ -174,6 +201,8 @@ def sentence(story: RunStory) -> str:
         parts.append(f"{story.interrupted} interrupted")
     if story.spectra:
         parts.append(counted(story.spectra, "spectrum", "spectra"))
+    if story.overview.registration:
+        parts.append(story.overview.registration)
     flagged = Counter(span.label for span in story.problems)
     parts += [f"{name} flagged {_times(count)}" for name, count in flagged.items()]
     parts += [f"{story.problem_name(entry)} seen after the end" for entry in story.seen_late]
@@ -219,9 +248,10 @@ def timeline_rows(story: RunStory) -> Iterator[TimelineRow]:
     manual = [span for span in seen.modes.spans if span.label == "manual"]
     if manual:
         yield _row("MANUAL", "manual", manual)
-    for lane in seen.problem_timelines.values():
-        if lane.spans:
-            yield _row(lane.spans[0].label, "problem", lane.spans)
+    for name, spans in itertools.groupby(sorted(story.problems, key=lambda s: s.label), lambda span: span.label):
+        yield _row(name, "problem", spans)
+    if seen.routine_spans:
+        yield _row("first scan both ways", "marked", seen.routine_spans)
     for label in dict.fromkeys(span.label for span in seen.states.spans):
         if label not in ("free", "undefined"):
             style = "problem" if label == "interrupted" else "state"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from afspm.clock import NS_PER_S
-from afspm.scheduler.drift.messages import Matrix, Registered, RescanWanted, ScanJob
+from afspm.model.geometry import XY
+from afspm.scheduler.drift.messages import Matrix, Registered, RescanWanted
 from afspm.scheduler.wire_codec import WireCodec
 from afspm.wire.mapping import timestamp
 from afspm.wire.messages import DriftMapping, DriftRescan, ScanParameters2d
@@ -12,7 +13,7 @@ from afspm.wire.messages import DriftMapping, DriftRescan, ScanParameters2d
 class DriftWireCodec(WireCodec):
     """See `scheduler.drift.told.DriftCodec`."""
 
-    def encode_mapping(self, registered: Registered, scan: ScanJob, *, correcting: bool) -> bytes:
+    def encode_mapping(self, registered: Registered, filename: str, center_m: XY, *, correcting: bool) -> bytes:
         return DriftMapping(
             timestamp=timestamp(round(registered.time_s * NS_PER_S)),
             matrix=_flat(registered.matrix[:2]),
@@ -23,11 +24,13 @@ class DriftWireCodec(WireCodec):
             lost=registered.lost,
             reason=registered.reason,
             residual=registered.residual_m,
-            references=[key.rpartition(" ")[0] for key in registered.references],
-            filename=scan.scan.filename,
-            center=scan.scan.region.center_m,
+            references=registered.references,
+            filename=filename,
+            center=center_m,
             correcting=correcting,
             rescan=registered.rescan,
+            outcome=int(registered.outcome),  # type: ignore[arg-type]
+            failures=len(registered.failures),
         ).SerializeToString()
 
     def encode_rescan(self, wanted: RescanWanted) -> bytes:

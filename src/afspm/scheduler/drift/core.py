@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from afspm.drift.mapping import Mapping
 from afspm.errors import AfspmError
+from afspm.formatting import lengths_text
 from afspm.logic.events import (
     Announced,
     Effect,
@@ -31,6 +33,7 @@ from afspm.model import (
     PacketHeader,
     Parameter,
     Region,
+    RegistrationOutcome,
     Request,
     Scan,
     ScanParameters,
@@ -38,6 +41,7 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
+from afspm.model.geometry import XY
 from afspm.plain_data import Plain
 from afspm.scheduler.drift.forecast import CurrentForecast
 from afspm.scheduler.drift.frame import DriftFrame
@@ -55,9 +59,22 @@ from afspm.scheduler.drift.response import DriftResponse, Step
 from afspm.scheduler.drift.scan_gate import DriftChannel, HeldScan, Matrix, ScanGate
 from afspm.scheduler.drift.scan_timing import ScanStartTracker
 from afspm.scheduler.drift.settings import DriftCompensationSettings
+from afspm.scheduler.drift.tally import RegistrationTally
 
 MAPPING = "DriftMapping"
 Following = Callable[[Step, int], list[Effect]]
+_HOW = {
+    RegistrationOutcome.COARSE: "is registered coarsely",
+    RegistrationOutcome.REFUSED: "is not recognised, and published at the predicted position",
+    RegistrationOutcome.FAILED: "could not be registered, and is published at the predicted position",
+    RegistrationOutcome.NEW: "shows a new place, and is published at the predicted position",
+}
+_LEVELS = {
+    RegistrationOutcome.COARSE: "WARNING",
+    RegistrationOutcome.REFUSED: "WARNING",
+    RegistrationOutcome.FAILED: "ERROR",
+    RegistrationOutcome.NEW: "INFO",
+}
 _MOST_TRIES = 2
 """So often a scan is registered, if the worker ends over it."""
 _MOST_ENDS = 4
@@ -89,7 +106,8 @@ class DriftCore(SchedulerCore):
         self._settings = drift
         self._codec = codec
         self._worker = worker
-        self._consequences = DriftResponse(drift, self, codec, self.frame, self.knowledge, worker, name)
+        self._tally = RegistrationTally()
+        self._consequences = DriftResponse(drift, self, codec, self.frame, self.knowledge, self._tally, worker, name)
         self._gate = ScanGate()
         self._jobs: dict[str, ScanJob] = {}
         self._beginning = ScanStartTracker()
@@ -108,6 +126,13 @@ class DriftCore(SchedulerCore):
         return super().start(now_s, now_ns)
 
     def step(self, event: Input, now_s: float, now_ns: int) -> list[Effect]:
+        had_ended = self.control.ended
+        effects = self._stepped(event, now_s, now_ns)
+        if self.control.ended and not had_ended and self._tally.scans:
+            effects.insert(0, Log("INFO", f"drift: {self._tally.summary()}"))
+        return effects
+
+    def _stepped(self, event: Input, now_s: float, now_ns: int) -> list[Effect]:
         if isinstance(event, PacketIn):
             return self._on_packet(event, now_s, now_ns)
         if isinstance(event, Tick) and self._following:
@@ -117,7 +142,8 @@ class DriftCore(SchedulerCore):
             self._gate.keep(event)  # there is more to come, which waits as well
             return []
         if held is not None and isinstance(event, RequestIn) and event.request.kind == ControlRequest.END_EXPERIMENT:
-            effects = self._publish_as_predicted(held, now_s, now_ns)  # what was measured, before the end
+            # what was measured, before the end
+            effects = self._publish_as_predicted(held, "the experiment ended before", now_s, now_ns, "WARNING")
         effects += super().step(event, now_s, now_ns)
         if self._waits_for_a_person and not self._consequences.is_given_up:
             self._waits_for_a_person, self._ends = False, 0
@@ -134,10 +160,7 @@ class DriftCore(SchedulerCore):
             return self._registered(event, now_s, now_ns)
         if isinstance(event, NotRegistered):
             self._ends = 0
-            told = Log(
-                "ERROR", f"a scan could not be registered, and is published at the predicted position: {event.reason}"
-            )
-            return [told, *self._give_up(event.key, event.reason, now_s, now_ns)]
+            return self._give_up(event.key, event.reason, now_s, now_ns)
         if isinstance(event, WorkerGone):
             return self._gone(event, now_s, now_ns)
         return self._learn(event.forecast)
@@ -158,6 +181,7 @@ class DriftCore(SchedulerCore):
             self.knowledge.restore(kept["knowledge"])
             self._consequences.restore(kept["consequences"])
             self._gate.restore(kept["scans"])
+            self._tally.restore(kept["tally"])
             self._channel.name = self._settings.channel or kept["channel"]
 
     def restore_cache(self, packets: Iterable[LoggedPacket]) -> None:
@@ -172,6 +196,7 @@ class DriftCore(SchedulerCore):
             "knowledge": self.knowledge.to_dict(),
             "consequences": self._consequences.to_dict(),
             "scans": self._gate.to_list(),
+            "tally": self._tally.to_dict(),
             "channel": self._channel.name,
         }
 
@@ -194,7 +219,8 @@ class DriftCore(SchedulerCore):
             return super().step(_relocated(event, scan, self._gate.mapping_of(key), self._codec), now_s, now_ns)
         self._beginning.scan_came()
         until_s = now_s + self._settings.longest_registration
-        self._gate.hold(HeldScan(key, self._middle_s(scan, event, now_ns), until_s))
+        middle_s = self._middle_s(scan, event, now_ns)
+        self._gate.hold(HeldScan(key, middle_s, until_s, scan.filename, scan.region.center_m))
         self.put_off(until_s)
         self._gate.keep(event)
         return self._look_at(event, now_s, now_ns)
@@ -206,7 +232,8 @@ class DriftCore(SchedulerCore):
         if held.asked:
             return []
         if self._ends >= _MOST_ENDS:
-            return self._publish_as_predicted(held, now_s, now_ns)  # a person was told, or decided that it goes on
+            # a person was called, or decided that it goes on
+            return self._publish_as_predicted(held, "drift is no longer followed", now_s, now_ns, "WARNING")
         message = event.header.message
         if message == "ScopeStateMsg":
             status = self._codec.decode_packet(message, event.packet.payload)
@@ -221,9 +248,7 @@ class DriftCore(SchedulerCore):
         return []
 
     def _without_channel(self, key: str, now_s: float, now_ns: int) -> list[Effect]:
-        why, is_new = self._channel.missing()
-        effects: list[Effect] = [Log("WARNING", why)] if is_new else []
-        return effects + self._give_up(key, why, now_s, now_ns)
+        return self._give_up(key, self._channel.missing(), now_s, now_ns, "WARNING")
 
     def _register(self, held: HeldScan, scan: Scan, event: PacketIn, now_ns: int) -> None:
         end_s = _end_s(scan, event, now_ns)
@@ -268,14 +293,36 @@ class DriftCore(SchedulerCore):
             effects += self._slow(held, now_s)
         if job is None:
             return effects  # long told: a worker that was restarted says it again
-        correcting = self.knowledge.corrects(now_ns * 1e-9)
-        payload = self._codec.encode_mapping(said, job, correcting=correcting)
+        self.knowledge.lost = said.lost
         before_ns = self._gate.next_ns() if is_awaited else None
-        effects += super().step(Announced(MAPPING, payload, before_ns), now_s, now_ns)
+        effects += self._announce(said, job.scan.filename, job.scan.region.center_m, before_ns, now_s, now_ns)
+        effects += self._told(said, job.scan.filename)
         if is_awaited:
             effects += self._release(now_s, now_ns)
         self._following.append((now_s, lambda step, now_ns: self._consequences.of(said, job, step, now_ns)))
         return effects + self._consequences.hand_over(now_s, now_ns)
+
+    def _announce(
+        self, said: Registered, filename: str, center_m: XY, before_ns: int | None, now_s: float, now_ns: int
+    ) -> list[Effect]:
+        """Count a scan, and publish how its position is known."""
+        self._tally.add(said.outcome)
+        payload = self._codec.encode_mapping(
+            said, filename, center_m, correcting=self.knowledge.corrects(now_ns * 1e-9)
+        )
+        return super().step(Announced(MAPPING, payload, before_ns), now_s, now_ns)
+
+    def _told(self, said: Registered, filename: str, level: str = "") -> list[Effect]:
+        """Log the errors of an estimator, and a scan that is not registered well."""
+        effects: list[Effect] = [Log("ERROR", failure) for failure in said.failures]
+        if said.outcome is not RegistrationOutcome.REGISTERED:
+            how = _HOW[said.outcome]
+            sd = "unknown" if math.isnan(said.sd_m) else f"± {lengths_text([float(f'{said.sd_m:.2g}')])}"
+            name = filename.replace("\\", "/").rpartition("/")[2] or said.key
+            why = "" if said.failures else f": {said.reason}"  # an error is logged already
+            text = f"scan {name} {how} ({sd}){why}; {self._tally.summary()}"
+            effects.append(Log(level or _LEVELS[said.outcome], text))
+        return effects
 
     def _follow(self, now_s: float, now_ns: int) -> list[Effect]:
         """Do what follows from a published scan: a step of its own, since it may change who is in control."""
@@ -302,17 +349,44 @@ class DriftCore(SchedulerCore):
         text = f"registering a scan took {took_s:.1f} s, and is given up after longest_registration = {limit_s:g} s"
         return [Log("WARNING", f"{text}: use fewer pixels, or raise it")]
 
-    def _give_up(self, key: str, why: str, now_s: float, now_ns: int) -> list[Effect]:
+    def _give_up(self, key: str, why: str, now_s: float, now_ns: int, level: str = "") -> list[Effect]:
         """A scan goes out with the prediction; too many of them, and the prediction is not to be relied on."""
         held = self._gate.held
         if held is None or held.key != key:
             return []
         self._following.append((now_s, lambda step, now_ns: self._consequences.unregistered(why, step, now_ns)))
-        return self._publish_as_predicted(held, now_s, now_ns)
+        return self._publish_as_predicted(held, why, now_s, now_ns, level)
 
-    def _publish_as_predicted(self, held: HeldScan, now_s: float, now_ns: int) -> list[Effect]:
+    def _publish_as_predicted(
+        self, held: HeldScan, why: str, now_s: float, now_ns: int, level: str = ""
+    ) -> list[Effect]:
         self._gate.settle(held.key, self.knowledge.matrix_at(held.middle_s))
-        return [SaveState(self.snapshot()), *self._release(now_s, now_ns)]
+        said = self._predicted(held, why)
+        effects = self._announce(said, held.filename, held.center_m, self._gate.next_ns(), now_s, now_ns)
+        effects += self._told(said, held.filename, level)
+        return [*effects, SaveState(self.snapshot()), *self._release(now_s, now_ns)]
+
+    def _predicted(self, held: HeldScan, why: str) -> Registered:
+        """Return what is known of a scan that could not be registered."""
+        there = self.knowledge.predicted(held.middle_s)
+        known = None if there is None else (there.covariance_m2, there.rate_m_s, there.rate_covariance)
+        covariance_m2, rate_m_s, rate_covariance = ([], [], []) if known is None else (one.tolist() for one in known)
+        return Registered(
+            key=held.key,
+            time_s=held.middle_s,
+            matrix=(Mapping.identity() if there is None else there.mapping).matrix.tolist(),
+            covariance_m2=covariance_m2,
+            rate_m_s=rate_m_s,
+            rate_covariance=rate_covariance,
+            outcome=RegistrationOutcome.FAILED,
+            lost=self.knowledge.lost,
+            reason=why,
+            residual_m=[],
+            references=[],
+            rescan="",
+            forecast=None,
+            failures=[],
+        )
 
     def _release(self, now_s: float, now_ns: int) -> list[Effect]:
         effects: list[Effect] = []
@@ -325,13 +399,11 @@ class DriftCore(SchedulerCore):
         if held is None or now_s < held.until_s:
             return []
         limit_s = self._settings.longest_registration
-        why = f"a scan was not registered within {limit_s:g} s"
-        effects: list[Effect] = []
+        why = f"it was not registered within {limit_s:g} s"
         if held.asked:
-            effects.append(Log("ERROR", f"{why}, and is published at the predicted position"))
             self._jobs.clear()
             self._worker.start()
-        return effects + self._give_up(held.key, why, now_s, now_ns)
+        return self._give_up(held.key, why, now_s, now_ns)
 
     def _gone(self, event: WorkerGone, now_s: float, now_ns: int) -> list[Effect]:
         self._ends += 1
@@ -339,7 +411,7 @@ class DriftCore(SchedulerCore):
         if self._ends >= _MOST_ENDS:
             effects: list[Effect] = [Log("CRITICAL", f"drift is no longer followed: {event.reason}")]
             self._following.append((now_s, self._wait_for_a_person))
-            return effects if held is None else effects + self._publish_as_predicted(held, now_s, now_ns)
+            return effects if held is None else effects + self._publish_as_predicted(held, event.reason, now_s, now_ns)
         effects = [Log("ERROR", f"the process that registers scans ended and is restarted: {event.reason}")]
         self._worker.start()
         if held is None or not held.asked:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from afspm.drift.estimators import PairFailure
 from afspm.drift.overlap import too_far_off, too_little_shared
 from afspm.drift.registration import DriftScan
 from afspm.drift.tracking import Tracker, Update
@@ -29,13 +30,17 @@ class Estimation:
     """A tracker with its memory.
 
     Args:
-        save: keeps the state on disk, before anybody is told what is in it.
+        save: keeps the state on disk, before it is published.
+        failures: to which the tracker's estimator adds its errors; they are taken from it scan by scan.
     """
 
-    def __init__(self, tracker: Tracker, rule: RescanRule, save: Callable[[Plain], None]) -> None:
+    def __init__(
+        self, tracker: Tracker, rule: RescanRule, save: Callable[[Plain], None], failures: list[PairFailure]
+    ) -> None:
         self._tracker = tracker
         self._rule = rule
         self._save = save
+        self._failures = failures
         self._answers: OrderedDict[str, Registered] = OrderedDict()
 
     @property
@@ -48,20 +53,22 @@ class Estimation:
         self._tracker.restore(state["tracker"])
         self._answers = OrderedDict((one["key"], Registered(**one)) for one in state["answers"])
 
-    def register(self, scan: DriftScan, asked: Region | None = None) -> Registered:
+    def register(self, key: str, scan: DriftScan, asked: Region | None = None) -> Registered:
         """Register a scan.
 
         Args:
+            key: of the scan; its name for people is `scan.key`.
             asked: the region that was meant, in sample coordinates.
 
         Raises:
             AfspmError: the tracker does not take it.
         """
-        known = self._answers.get(scan.key)
+        known = self._answers.get(key)
         if known is not None:
             return known
-        answer = self._answer(scan, asked, self._tracker.add(scan))
-        self._answers[scan.key] = answer
+        self._failures.clear()
+        answer = self._answer(key, scan, asked, self._tracker.add(scan))
+        self._answers[key] = answer
         if len(self._answers) > _ANSWERS:
             self._answers.popitem(last=False)
         self._keep()
@@ -82,25 +89,26 @@ class Estimation:
     def _keep(self) -> None:
         self._save({"tracker": self._tracker.state(), "answers": [asdict(one) for one in self._answers.values()]})
 
-    def _answer(self, scan: DriftScan, asked: Region | None, update: Update) -> Registered:
+    def _answer(self, key: str, scan: DriftScan, asked: Region | None, update: Update) -> Registered:
         after, before = update.after, update.before
         center_m = np.asarray(scan.region.center_m)
         residual_m = before.mapping.apply(center_m) - after.mapping.apply(center_m)
         used = [key for key, one in update.registrations.items() if one.accepted]
         return Registered(
-            key=scan.key,
+            key=key,
             time_s=scan.mid_s,
             matrix=after.mapping.matrix.tolist(),
             covariance_m2=_plain(after.covariance_m2),
             rate_m_s=_plain(after.rate_m_s),
             rate_covariance=_plain(after.rate_covariance),
-            matched=update.matched,
+            outcome=update.outcome,
             lost=update.lost,
             reason=update.reason,
             residual_m=_plain(residual_m),
             references=used,
             rescan=_why_again(self._rule, scan, asked, update),
             forecast=update.forecast.to_dict(),
+            failures=list(dict.fromkeys(map(str, self._failures))),  # a pair may be tried in several ways
         )
 
 

@@ -16,10 +16,12 @@ class CurrentForecast:
 
     Attributes:
         start_s: experiment time at which the experiment began.
+        lost: whether the place of the sample is not known any more, as of the newest registered scan.
     """
 
     def __init__(self, settings: DriftCompensationSettings) -> None:
         self.start_s: float | None = None
+        self.lost = False
         self._settings = settings
         self._forecast: Forecast | None = None
         self._plain: Plain | None = None
@@ -52,11 +54,11 @@ class CurrentForecast:
 
     def to_dict(self) -> Plain:
         """As plain JSON."""
-        return {"start_s": self.start_s, "forecast": self._plain}
+        return {"start_s": self.start_s, "lost": self.lost, "forecast": self._plain}
 
     def restore(self, plain: Plain) -> None:
         """Take up what `to_dict` wrote. Raises ValueError if it can't be."""
-        self.start_s = plain["start_s"]
+        self.start_s, self.lost = plain["start_s"], bool(plain["lost"])
         try:
             self.learn(plain["forecast"])
         except AfspmError as error:

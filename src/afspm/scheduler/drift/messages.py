@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
 from afspm.drift.mapping import Mapping
-from afspm.model import Region, RescanKind, Scan
+from afspm.model import Region, RegistrationOutcome, RescanKind, Scan
+from afspm.model.geometry import XY
 from afspm.plain_data import Plain
 from afspm.scheduler.drift.positions import PlaceCodec
 
@@ -21,12 +23,13 @@ class Registered:
         key: of the scan.
         time_s: its middle, experiment time.
         matrix: 3 x 3, of the mapping then.
-        covariance_m2, rate_m_s, rate_covariance: see `drift.tracking.Prediction`.
-        matched, lost, reason: see `drift.tracking.Update`.
+        covariance_m2, rate_m_s, rate_covariance: see `drift.tracking.Prediction`; empty where nothing is known.
+        outcome, lost, reason: see `drift.tracking.Update`.
         residual_m: (x, y) by which the sample was found elsewhere than predicted.
-        references: keys of the scans that it was compared with.
+        references: names of the scans that it was compared with.
         rescan: why it should be taken again; empty if not.
-        forecast: of what is known now, for `forecast_from_dict`.
+        forecast: of what is known now, for `forecast_from_dict`; None: unchanged.
+        failures: the errors of the estimator over this scan, each with its pair.
     """
 
     key: str
@@ -35,13 +38,29 @@ class Registered:
     covariance_m2: Matrix
     rate_m_s: list[float]
     rate_covariance: Matrix
-    matched: bool
+    outcome: RegistrationOutcome
     lost: bool
     reason: str
     residual_m: list[float]
     references: list[str]
     rescan: str
-    forecast: Plain
+    forecast: Plain | None
+    failures: list[str]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "outcome", RegistrationOutcome(self.outcome))  # from JSON it comes as a number
+
+    @property
+    def matched(self) -> bool:
+        return self.outcome.is_registered
+
+    @property
+    def sd_m(self) -> float:
+        """Standard deviation of the position along the axis where it is largest; NaN: not known."""
+        if not self.covariance_m2:
+            return math.nan
+        (xx, xy), (_, yy) = self.covariance_m2
+        return math.sqrt(max((xx + yy) / 2 + math.hypot((xx - yy) / 2, xy), 0.0))
 
     @property
     def mapping(self) -> Mapping:
@@ -125,8 +144,8 @@ class RescanWanted:
 class DriftCodec(PlaceCodec, Protocol):
     """The wire as far as drift compensation needs it."""
 
-    def encode_mapping(self, registered: Registered, scan: ScanJob, *, correcting: bool) -> bytes:
-        """A DriftMapping as the payload of a packet."""
+    def encode_mapping(self, registered: Registered, filename: str, center_m: XY, *, correcting: bool) -> bytes:
+        """Return a DriftMapping as the payload of a packet, for a scan with this file and centre at the tip."""
 
     def encode_rescan(self, wanted: RescanWanted) -> bytes:
         """A DriftRescan as the payload of a packet."""

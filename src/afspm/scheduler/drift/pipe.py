@@ -47,6 +47,7 @@ def job_to_head(job: ScanJob) -> Plain:
     return {
         "do": "register",
         "key": job.key,
+        "name": job.scan.filename or job.key,
         "start_s": job.start_s,
         "end_s": job.end_s,
         "upwards": job.upwards,
@@ -56,12 +57,12 @@ def job_to_head(job: ScanJob) -> Plain:
     }
 
 
-def job_from_head(head: Plain, data: bytes) -> tuple[DriftScan, Region | None]:
-    """The scan, and the region that was meant in sample coordinates."""
+def job_from_head(head: Plain, data: bytes) -> tuple[str, DriftScan, Region | None]:
+    """Return the key, the scan with its name, and the region that was meant in sample coordinates."""
     values = np.frombuffer(data, "<f8").reshape(head["shape"])
     region = _region(head["region"], Frame.TIP)
-    scan = DriftScan(values, region, head["start_s"], head["end_s"], head["upwards"], head["key"])
-    return scan, None if head["asked"] is None else _region(head["asked"], Frame.SAMPLE)
+    scan = DriftScan(values, region, head["start_s"], head["end_s"], head["upwards"], head["name"])
+    return head["key"], scan, None if head["asked"] is None else _region(head["asked"], Frame.SAMPLE)
 
 
 def _to_list(region: Region) -> list[float]:

@@ -24,12 +24,13 @@ from afspm.scheduler.drift.forecast import CurrentForecast
 from afspm.scheduler.drift.frame import DriftFrame
 from afspm.scheduler.drift.messages import DriftCodec, Registered, RescanWanted, ScanJob, Worker
 from afspm.scheduler.drift.settings import DriftCompensationSettings
+from afspm.scheduler.drift.tally import LATELY, RegistrationTally
 
 RESCAN = "DriftRescan"
 _DRIFT, _MALFUNCTION = int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFUNCTION)
 _MOST_UNREGISTERED = 3
 """So many scans in a row that nobody could register are as good as a sample that is lost: that of the trackers."""
-_AT_START = "the drift is unknown until a scan in the other direction gives its velocity"
+_AT_START = "a scan in the other direction gives the velocity of the drift"
 
 Step = Callable[[Input], list[Effect]]
 
@@ -48,6 +49,7 @@ class DriftResponse:
         codec: DriftCodec,
         frame: DriftFrame,
         knowledge: CurrentForecast,
+        tally: RegistrationTally,
         worker: Worker,
         name: str,
     ) -> None:
@@ -56,6 +58,7 @@ class DriftResponse:
         self._codec = codec
         self._frame = frame
         self._knowledge = knowledge
+        self._tally = tally
         self._worker = worker
         self._name = name
         self._started = settings.at_start == "nothing"
@@ -69,12 +72,14 @@ class DriftResponse:
             self._started = True  # until it is corrected there is time enough to learn the velocity
             return []
         if self._core.control.mode is ControlMode.MANUAL:
-            return [] if registered.lost else self._found(step)
+            return self._found(step) if registered.matched and not registered.lost else []
         if registered.lost:
             return self._lost(f"the sample is lost: {registered.reason}", step, now_ns)
         if not self._started:
             return self._begin(job.upwards, step, now_ns)
-        effects = self._found(step)
+        if self._tally.exceeds(self._settings.most_unregistered):
+            return self._too_few(step, now_ns)
+        effects = self._found(step) if registered.matched else []
         if registered.rescan:
             effects += self._want(RescanKind.AGAIN, registered.rescan, step, now_ns)
         return effects
@@ -85,8 +90,10 @@ class DriftResponse:
             return []
         self._unregistered += 1
         if self._unregistered < _MOST_UNREGISTERED:
-            return []
+            exceeds = self._tally.exceeds(self._settings.most_unregistered)
+            return self._too_few(step, now_ns) if exceeds else []
         self._unregistered = 0  # who goes on in spite of it is told again after as many
+        self._tally.judge_anew()
         return self._lost(f"{_MOST_UNREGISTERED} scans in a row could not be registered: {why}", step, now_ns)
 
     def give_up(self, step: Step) -> list[Effect]:
@@ -97,6 +104,12 @@ class DriftResponse:
     def is_given_up(self) -> bool:
         """True while that problem is flagged."""
         return _MALFUNCTION in self._core.control.problems
+
+    def _too_few(self, step: Step, now_ns: int) -> list[Effect]:
+        """Too many of the last scans lie where they were predicted: the prediction is not to be relied on."""
+        self._tally.judge_anew()  # the share counts again from here, should it go on in spite of it
+        share = f"more than {self._settings.most_unregistered:.0%} of the last {LATELY} scans were not registered"
+        return self._lost(f"{share}: {self._tally.summary()}", step, now_ns)
 
     def _lost(self, why: str, step: Step, now_ns: int) -> list[Effect]:
         """Nobody scans on, but for whoever searches."""
@@ -111,7 +124,8 @@ class DriftResponse:
         if upwards is None:
             why = f"the microscope does not report {names.SCAN_DIRECTION}"
             return [Log("INFO", f"{why}: the first scan is not taken in both directions")]
-        effects = step(ProblemSeen(_DRIFT, flagged=True, name=self._name))
+        told = "thermal-drift is flagged until the first scan was taken in both directions: normal at the start"
+        effects = [Log("INFO", told), *step(ProblemSeen(_DRIFT, flagged=True, name=self._name))]
         return effects + self._want(RescanKind.OPPOSITE, _AT_START, step, now_ns, upwards=not upwards)
 
     def _found(self, step: Step) -> list[Effect]:

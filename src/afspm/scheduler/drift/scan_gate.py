@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from afspm.logic.events import PacketIn, TranslatorCaughtUp
 from afspm.model import Scan
+from afspm.model.geometry import XY
 from afspm.units import same_kind
 
 Matrix = list[list[float]]
@@ -25,6 +26,7 @@ class HeldScan:
     Attributes:
         middle_s: experiment time that its position stands for.
         until_s: real time until which it is waited for.
+        filename, center_m: of its first channel, in tip coordinates.
         asked: it is being registered.
         tries: how often that was begun.
     """
@@ -32,6 +34,8 @@ class HeldScan:
     key: str
     middle_s: float
     until_s: float
+    filename: str
+    center_m: XY
     asked: bool = False
     tries: int = 0
 
@@ -89,7 +93,6 @@ class DriftChannel:
 
     def __init__(self, name: str | None) -> None:
         self.name = name
-        self._told = False
 
     def is_of(self, scan: Scan) -> bool:
         """Return whether a scan is of this channel."""
@@ -97,7 +100,6 @@ class DriftChannel:
             self.name = scan.channel
         return scan.channel == self.name
 
-    def missing(self) -> tuple[str, bool]:
-        """Return why a scan without it is not registered, and whether that is said for the first time."""
-        is_new, self._told = not self._told, True
-        return f"a scan without the channel {self.name or 'in a unit of length'}: it can't be used for drift", is_new
+    def missing(self) -> str:
+        """Return why a scan without it is not registered."""
+        return f"without the channel {self.name or 'in a unit of length'} it can't be used for drift"

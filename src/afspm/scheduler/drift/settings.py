@@ -58,6 +58,8 @@ class DriftCompensationSettings:
         correct: whether components are given sample coordinates; else drift is followed and told, and nothing changed.
         correct_after: since the start of the experiment; until then as if `correct` were false.
         rescan: when a scan is taken again.
+        most_unregistered: share of the last ten scans that may lie where they were predicted, since they were not
+            recognised or could not be registered; above it thermal-drift is flagged. 1: never.
         at_start: "up-down": the first scan is followed by one in the other direction, which tells the velocity, where
             a component solves thermal-drift and the microscope reports its direction; "nothing": it is not.
         compensate: hands the velocity over to a controller that compensates by itself.
@@ -70,6 +72,7 @@ class DriftCompensationSettings:
     correct: bool = True
     correct_after: Duration = 0.0
     rescan: RescanRule = field(default_factory=RescanRule)
+    most_unregistered: float = 0.5
     at_start: Literal["up-down", "nothing"] = "up-down"
     compensate: Compensate | None = None
     longest_registration: Duration = 30.0
@@ -81,6 +84,10 @@ class DriftCompensationSettings:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise InvalidValue(f"{name} = {value} s is not zero or more", where="drift")
+
+        if not 0.0 <= self.most_unregistered <= 1.0:
+            said = f"most_unregistered = {self.most_unregistered} is not a share"
+            raise InvalidValue(said, where="drift", hint="0 to 1")
 
     def beside(self, solved: Collection[str]) -> DriftCompensationSettings:
         """Return these settings for a run whose components solve these problems: without a component that scans again,

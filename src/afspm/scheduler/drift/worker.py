@@ -81,12 +81,13 @@ class _Worker:
 
     def _begin(self) -> None:
         """As it was when a scan was registered last."""
-        from afspm.drift.estimators import estimator
+        from afspm.drift.estimators import PairFailure, estimator
         from afspm.drift.trackers import tracker
         from afspm.scheduler.drift.estimation import Estimation
 
-        made = tracker(self._drift.tracker, estimator(self._drift.estimator))
-        self._estimation = Estimation(made, self._drift.rescan, self._save)
+        failures: list[PairFailure] = []
+        made = tracker(self._drift.tracker, estimator(self._drift.estimator, failures.append))
+        self._estimation = Estimation(made, self._drift.rescan, self._save, failures)
         if (state := self._store.load()) is None:
             return
         try:
