@@ -64,6 +64,10 @@ class _Derived:
                 self.problems.pop(entry.problem, None)
 
 
+_ANSWERED_S = 15.0
+"""After so long (real) at the latest a start has its answer, or is known to have none, and its entry is published."""
+
+
 class Written:
     """Every answer is written down once, soon, in order, and what was published of it outlives a kill.
 
@@ -92,7 +96,7 @@ class Written:
         self._derived = _Derived()
         self.entries = 0
         self.is_certain = True
-        self._started: dict[str, set[str]] = {}
+        self._started: dict[str, dict[str, float]] = {}
         self._starts: dict[str, set[int]] = {}
 
     def carried_out(self, host: SchedulerHost, effect: Effect) -> None:
@@ -107,13 +111,16 @@ class Written:
     def executed(self, request: Request) -> None:
         """The microscope carries out a command."""
         if request.id and request.kind == ControlRequest.ACTION and request.subject in _STARTS:
-            self._started.setdefault(request.id.partition("/")[0], set()).add(request.id)
+            begun = self._started.setdefault(request.id.partition("/")[0], {})
+            begun.setdefault(request.id, self._timeline.monotonic_s())
 
     def has_all_starts(self) -> None:
         """Each measurement that was begun has the entry of its start, also where a process was killed in between."""
-        for who, begun in self._started.items():
+        answered_s = self._timeline.monotonic_s() - _ANSWERED_S
+        for who, times_s in self._started.items():
+            begun = sum(begun_s <= answered_s for begun_s in times_s.values())
             written = len(self._starts.get(who, ()))
-            self._must(written >= len(begun) or not self.is_certain, f"{who}: {len(begun)} begun, {written} written")
+            self._must(written >= begun or not self.is_certain, f"{who}: {begun} begun, {written} written")
 
     def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:
         """After each step."""
