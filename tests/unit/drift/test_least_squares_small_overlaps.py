@@ -49,3 +49,13 @@ def test_a_zoom_of_any_size_and_resolution_never_raises(zoom_px: int, longest_px
             for expected in (None, prior):
                 found = LeastSquares().register(one, two, expected)
                 assert found.reason or np.linalg.eigvalsh(found.covariance_m2)[0] > 0.0
+
+
+def test_a_doubtful_match_is_accepted_only_where_it_was_expected() -> None:
+    zoom = Region((0.0, 0.0), (20 * PIXEL_M, 20 * PIXEL_M))
+    reference, scan = scanned(OVERVIEW, 64, 40.0, 0.05, 1, 0.0), scanned(zoom, 64, 40.0, 0.05, 1, 900.0)
+    prior = Prior(DRIFT_M, (1.5 * PIXEL_M) ** 2 * np.eye(2))
+    wrong = LeastSquares().register(reference, scan, prior).quality["wrong"]
+    assert LeastSquares(wrong_at_most=min(0.6 * wrong, 0.9)).register(reference, scan, prior).accepted
+    blind = LeastSquares().register(reference, scan).quality["wrong"]
+    assert not LeastSquares(wrong_at_most=0.6 * blind).register(reference, scan).accepted

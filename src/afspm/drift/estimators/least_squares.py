@@ -38,6 +38,9 @@ BORDER_PX = 1  # where a filter and a spline have to guess what lies beyond
 FARTHEST_PX = 8.0  # from where the search has found it
 TURNED = 0.03  # radians by which the lines of two scans cross
 ELSEWHERE_PX = 32  # the farthest shift that a match is compared with
+EXPECTED = 2.0
+"""By which more doubt is allowed where a displacement is expected: nearly all wrong matches are of scans with nothing
+in common and no prior, and most right ones that are doubtful are zooms with one."""
 DISTRUST = 4.0
 """By which the variance of the noise is taken for larger than its model says, where the images are weighed against what
 else displaces them. The factor of the ellipses, which grows with doubt, would let the images tell too little there."""
@@ -55,7 +58,8 @@ class LeastSquares:
     5. `acceptance`: is it a match at all?
 
     Args:
-        wrong_at_most: the largest probability that a match which is accepted is wrong by more than a pixel.
+        wrong_at_most: the largest probability that a match which is accepted is wrong by more than a pixel; twice as
+            large where a displacement is expected.
 
     Raises:
         ConfigError: it is not between 0 and 1.
@@ -97,7 +101,8 @@ class LeastSquares:
     def _registration(
         self, theta: Array, total: Array, box: OverlapBox, grid: CommonGrid, found: MatchEvidence
     ) -> Registration:
-        reason = found.refusal(self._wrong_at_most)
+        expected = found.searched < 1.0
+        reason = found.refusal(min(self._wrong_at_most * (EXPECTED if expected else 1.0), 0.99))
         return Registration(
             accepted=not reason,
             reason=reason,
