@@ -24,6 +24,7 @@ class Condition:
         row_tilt: rise over each row by itself.
         one_over_f: noise of the whole scan as a time series, power as 1 / frequency^exponent.
         scars: share of the rows with a stretch where something disturbs the tip.
+        scar_rows: the most rows that one of them takes.
         spikes: share of the pixels that are off by some rms heights.
         lost: share of the rows of which nothing was kept.
         tilt: up to this much rise over the image.
@@ -51,6 +52,7 @@ class Condition:
     one_over_f: float = 0.0
     exponent: float = 1.0
     scars: float = 0.0
+    scar_rows: int = 1
     spikes: float = 0.0
     lost: float = 0.0
     tilt: float = 0.0
@@ -110,7 +112,8 @@ def measured(image: Array, condition: Condition, random: np.random.Generator, ga
         seen += condition.one_over_f * series.reshape(ny, 2 * nx)[:, :nx]
     for row in np.flatnonzero(np.less(random.random(ny), condition.scars)):
         start, length = random.integers(nx), 1 + int(random.exponential(0.4 * nx))
-        seen[row, start : start + length] += random.choice((-1.0, 1.0)) * abs(random.normal(1.0, 0.4))
+        thick = int(random.integers(1, condition.scar_rows + 1)) if condition.scar_rows > 1 else 1
+        seen[row : row + thick, start : start + length] += random.choice((-1.0, 1.0)) * abs(random.normal(1.0, 0.4))
     if condition.spikes:
         seen += 3.0 * random.standard_normal(image.shape) * (random.random(image.shape) < condition.spikes)
     x, y = np.linspace(-0.5, 0.5, nx), np.linspace(-0.5, 0.5, ny)[:, None]

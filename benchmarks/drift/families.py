@@ -71,6 +71,7 @@ def drawn_condition(name: str, random: Random) -> Condition:
         one_over_f=usual.one_over_f * log(0.3, 2.0),
         exponent=u(0.8, 1.4),
         scars=usual.scars * u(0.0, 2.0),
+        scar_rows=3,
         spikes=likely(0.3) * log(1e-4, 3e-3),
         lost=likely(0.2) * u(0.0, 0.03),
         tilt=u(0.0, 3.0),

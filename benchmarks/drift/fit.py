@@ -34,7 +34,7 @@ from benchmarks.drift.unseen import trials
 from benchmarks.drift.workers import done
 
 HARD = ("hard", "hard+prior")
-CELLS = ("real", *HARD, "null", "null+prior")
+CELLS = ("real", *HARD, "null", "null+prior", "zoom+prior", "null-zoom+prior")
 AT_ONCE = 200  # jobs, before their outcomes are kept
 SEED = 20_000
 MORE_SEEDS = (30_000, 40_000)  # of stampers alone: how well they are known is the hardest to tell
@@ -45,6 +45,8 @@ THRESHOLDS = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15)
 WRONG_SHARE = 0.0035  # of accepted ones, at most: on others it is half as many again, and 0.5 % is wanted
 DOUBTS = ("varied", "shared", "unclear", "leverage")
 COVERED = 0.96  # of right matches, by the ellipses of 95 %: on others it will be less
+DOMAIN = 0.99  # of accepted right matches are within the largest spread
+TURNS = 3  # who is accepted depends on the spread, and that is fitted to those who are
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -117,20 +119,24 @@ def evidence(outcome: Outcome) -> MatchEvidence | None:
 def fitted(outcomes: Sequence[Outcome]) -> str:
     """The module of coefficients: a logistic regression with a ridge, by features of unit variance; the most that a
     match may be wrong by; and the spread of the ellipses, with which the former have been found."""
-    spread = _spread(outcomes)
-    pairs = [(_with_spread(found, one, spread), one.failed) for one in outcomes if (found := evidence(one)) is not None]
-    features = [found.features() for found, _ in pairs]
-    x = np.array([list(one.values()) for one in features])
-    wrong = np.array([failed for _, failed in pairs], dtype=np.float64)
-    right = np.median(x[wrong == 0.0], axis=0)
-    scale = np.maximum(x.std(axis=0), 1e-9)  # what none of the pairs tells apart weighs nothing
-    weights = _logistic((x - right) / scale, wrong)
-    odds = weights[0] + (x - right) / scale @ weights[1:]
+    found = [(one, each) for one in outcomes if (each := evidence(one)) is not None]
+    wrong = np.array([one.failed for one, _ in found], dtype=np.float64)
+    accepted = np.array([one.accepted for one, _ in found])
+    for _ in range(TURNS):
+        spread = _spread([one for (one, _), sure in zip(found, accepted, strict=True) if sure and not one.failed])
+        features = [_with_spread(each, one, spread).features() for one, each in found]
+        x = np.array([list(one.values()) for one in features])
+        right = np.median(x[wrong == 0.0], axis=0)
+        scale = np.maximum(x.std(axis=0), 1e-9)  # what none of the pairs tells apart weighs nothing
+        weights = _logistic((x - right) / scale, wrong)
+        probability = 1.0 / (1.0 + np.exp(-weights[0] - (x - right) / scale @ weights[1:]))
+        most = _threshold(probability, wrong)
+        accepted = probability <= most
     names = list(features[0])
     return "\n".join([
         '"""Coefficients of the default estimator. Written by `python -m benchmarks.drift.fit`.',
         "",
-        f"Fitted to {len(pairs)} pairs of the fitted half of the families, from seed {min(o.seed for o in outcomes)};",
+        f"Fitted to {len(found)} pairs of the fitted half of the families, from seed {min(o.seed for o in outcomes)};",
         f"{wrong.sum():.0f} of them were wrong.",
         '"""',
         "",
@@ -142,7 +148,7 @@ def fitted(outcomes: Sequence[Outcome]) -> str:
         *_table("RIGHT", names, right),
         '"""The median of right matches."""',
         "",
-        f"WRONG_AT_MOST = {_threshold(1.0 / (1.0 + np.exp(-odds)), wrong)}",
+        f"WRONG_AT_MOST = {most}",
         f'"""The largest probability with which at most {WRONG_SHARE:.2%} of those accepted were wrong."""',
         "",
         *_table("SPREAD", list(spread), list(spread.values())),
@@ -162,7 +168,8 @@ def _with_spread(found: MatchEvidence, outcome: Outcome, spread: Mapping[str, fl
 
 
 def _log_spread(outcome: Outcome, spread: Mapping[str, float]) -> float:
-    return math.log(spread["all"]) + sum(spread[name] * outcome.quality[name] for name in DOUBTS)
+    found = math.log(spread["all"]) + sum(spread[name] * outcome.quality[name] for name in DOUBTS)
+    return min(found, math.log(spread["most"]))
 
 
 def _threshold(probability: Array, wrong: Array) -> float:
@@ -170,10 +177,9 @@ def _threshold(probability: Array, wrong: Array) -> float:
     return max(fitting, default=min(THRESHOLDS))
 
 
-def _spread(outcomes: Sequence[Outcome]) -> dict[str, float]:
+def _spread(right: Sequence[Outcome]) -> dict[str, float]:
     """By how much errors of accepted right matches exceed their model, so that ellipses of 95 % hold `COVERED` of them
     whatever the doubt: linear quantile regression (Koenker and Bassett, Econometrica 46, 33, 1978)."""
-    right = [one for one in outcomes if one.accepted and not one.failed]
     log_chi2 = np.log([max(one.chi2 * one.quality["spread"], 1e-6) / ELLIPSE_95 for one in right])
     columns = np.array([[1.0, *(one.quality[name] for name in DOUBTS)] for one in right])
     count, free = columns.shape
@@ -183,7 +189,8 @@ def _spread(outcomes: Sequence[Outcome]) -> dict[str, float]:
     found = linprog(cost, A_eq=equal, b_eq=log_chi2, bounds=(0.0, None)).x
     assert found is not None, "there is always a solution"
     best = found[:free] - found[free : 2 * free]
-    return {"all": math.exp(best[0]), **dict(zip(DOUBTS, best[1:].tolist(), strict=True))}
+    most = math.exp(np.quantile(columns @ best, DOMAIN))
+    return {"all": math.exp(best[0]), **dict(zip(DOUBTS, best[1:].tolist(), strict=True)), "most": most}
 
 
 def _logistic(x: Array, wrong: Array) -> Array:

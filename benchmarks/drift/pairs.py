@@ -218,7 +218,9 @@ def framed(first: Sampling, second: Sampling, how: Condition, random: np.random.
     frames: list[Frame] = []
     for sampling, origin, angle in zip((first, second), (-middle, shift - middle), angles, strict=True):
         # The sample moves by `drift` while the rows are scanned: a row at q_y sees what lies drift q_y / height before.
-        drift = how.drift_px * random.standard_normal(2) * (-1.0 if frames and how.turned_round else 1.0)
+        # A zoom is scanned in less time, or more slowly when the sample has come to rest.
+        drift_px = how.drift_px * min(1.0, (sampling.shape[0] - 1) * sampling.step_px[1] / widths[0][1])
+        drift = drift_px * random.standard_normal(2) * (-1.0 if frames and how.turned_round else 1.0)
         shear = np.eye(2) - np.outer(drift, (0.0, 1.0 / ((sampling.shape[0] - 1) * sampling.step_px[1])))
         turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
         if frames and how.calibration:

@@ -8,14 +8,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from rich.table import Table
 
 from benchmarks.drift import cuts
-from benchmarks.drift.families import HALVES, Half
+from benchmarks.drift.families import HALVES, Half, source
+from benchmarks.drift.pairs import Sampling
 from benchmarks.drift.parts import Plan, Report
 from benchmarks.drift.surfaces import SURFACES
 from benchmarks.drift.trials import Cell, Outcome, Trial, geometric_mean
 from benchmarks.rows import Row
 
 # Pairs of each surface in each half. The prior of pairs that have nothing in common is that of a tracker gone wrong.
-PAIRS = {"white30": 24, "real": 96, "real+prior": 48, "hard": 48, "hard+prior": 48, "null": 48, "null+prior": 48}
+PAIRS = {
+    "white30": 24, "real": 96, "real+prior": 48, "hard": 48, "hard+prior": 48, "null": 48, "null+prior": 48,
+    "zoom+prior": 48, "null-zoom+prior": 48,
+}  # fmt: skip
+ZOOMS = {"zoom": "real", "null-zoom": "null"}  # by the conditions under which they are taken
+ZOOM_PX = (10.0, 30.0)  # of the overview
 PRIOR_SD_PX = 1.5
 GAP = 1.25  # of the unseen half over the fitted one, beyond which something was learnt by heart
 
@@ -29,14 +35,22 @@ def trials(half: Half, seeds: Mapping[str, Sequence[int]], estimators: tuple[str
     """The pairs of one half, by cell."""
     found = []
     for cell, numbers in seeds.items():
-        condition, _, prior = cell.partition("+")
-        sd_px = PRIOR_SD_PX if prior else None
-        found += [
-            Trial(cell, surface, condition, seed, estimators, prior_sd_px=sd_px, half=half)
-            for surface in surfaces()
-            for seed in numbers
-        ]
+        name, _, prior = cell.partition("+")
+        condition, sd_px = ZOOMS.get(name, name), PRIOR_SD_PX if prior else None
+        for surface in surfaces() if name == condition else SURFACES:
+            for seed in numbers:
+                samplings = None if name == condition else _zoom(half, seed)
+                found.append(
+                    Trial(cell, surface, condition, seed, estimators, samplings=samplings, prior_sd_px=sd_px, half=half)
+                )
     return found
+
+
+def _zoom(half: Half, seed: int) -> tuple[Sampling, Sampling]:
+    """An overview, and a zoom with pixels of its own."""
+    random = source(half, seed, 31)
+    pixels = int(random.choice((64, 96, 128)))
+    return Sampling.square(128), Sampling.square(pixels, random.uniform(*ZOOM_PX) / (pixels - 1))
 
 
 def jobs(plan: Plan) -> list[Trial]:
@@ -64,6 +78,8 @@ def _table(cells: Cells) -> Table:
         table.add_column(head, justify="left" if head in ("", "surface") else "right", no_wrap=True)
     for cell in PAIRS:
         for surface in surfaces():
+            if cell.partition("+")[0] in ZOOMS and surface not in SURFACES:
+                continue
             both = [cells[half, cell, surface] for half in HALVES]
             table.add_row(
                 cell, surface, str(both[1].count), _both(both, "rms_px", ".4f"), _both(both, "ratio", ".2f"),
@@ -98,13 +114,12 @@ def _rows(cells: Cells) -> Iterator[Row]:
         mean = 100 * sum(c.right_accepted for c in every) / len(every)
         yield Row(f"unseen {cell}: right ones accepted", "%", mean, None, target, "high")
         yield Row(f"unseen {cell}: right ones accepted, worst surface", "%", least, None, target, "high")
-    wrong = [c for cell in PAIRS for c in of(cell).values()]
+    wrong = [c for cell in PAIRS for c in of(cell).values() if c.count]
     share = sum(c.wrong * c.count for c in wrong) / sum(c.accepted * c.count for c in wrong)
     yield Row("unseen: wrong among accepted", "%", 100 * share, None, 0.5)
-    for cell in ("null", "null+prior"):
-        yield Row(
-            f"unseen {cell}: accepted, worst surface", "%", 100 * max(c.wrong for c in of(cell).values()), None, 2
-        )
+    for cell in ("null", "null+prior", "null-zoom+prior"):
+        most = 100 * max(c.wrong for c in of(cell).values() if c.count)
+        yield Row(f"unseen {cell}: accepted, worst surface", "%", most, None, 2)
     for cell in ("real", "real+prior", "hard", "hard+prior"):
         covered = [100 * c.covered for c in of(cell).values() if not math.isnan(c.covered)]
         yield Row(f"unseen {cell}: 95 % ellipse covers, lowest", "%", min(covered), None, 90, "high")

@@ -17,7 +17,8 @@ from afspm.drift.estimators.coefficients import INTERCEPT, RIGHT, WEIGHTS
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-PARTS = 8  # of the overlap in each direction
+PARTS = 8  # of the overlap in each direction, at most
+PART_PX = 4  # smaller ones hold too little to correlate
 APART_PX = 4  # nearer than this a repetition is the match itself
 FEW = 10  # with fewer repetitions a surface doesn't repeat itself
 MOST_REPEATS = 30.0  # standard deviations: a place of its own
@@ -97,7 +98,7 @@ _REASONS = {
 
 
 def agreement(one: Array, two: Array, known: Mask) -> float:
-    """Return, of those of the 8 x 8 parts of two aligned images that have features (twice the power of what a typical
+    """Return, of those of up to 8 x 8 parts of two aligned images that have features (twice the power of what a typical
     part has left), the share that correlates by more than 0.5."""
     n = np.maximum(_sums(known.astype(np.float64)), 1.0)
     a, b = _sums(one * known) / n, _sums(two * known) / n
@@ -112,7 +113,8 @@ def agreement(one: Array, two: Array, known: Mask) -> float:
 def _sums(values: Array) -> Array:
     """Over each part."""
     for axis in (0, 1):
-        values = np.add.reduceat(values, np.arange(PARTS) * values.shape[axis] // PARTS, axis=axis)
+        parts = min(max(values.shape[axis] // PART_PX, 2), PARTS)
+        values = np.add.reduceat(values, np.arange(parts) * values.shape[axis] // parts, axis=axis)
     return values
 
 

@@ -10,7 +10,16 @@ from numpy.typing import NDArray
 
 from afspm.drift.estimators.coefficients import SPREAD
 from afspm.drift.estimators.images import Unusable, flatten_rows
-from afspm.drift.estimators.noise import LEAST_NOISE, FineFilter, denoised, noise_metric, products, seen, without_lines
+from afspm.drift.estimators.noise import (
+    LEAST_NOISE,
+    CrossingLines,
+    FineFilter,
+    denoised,
+    noise_metric,
+    products,
+    seen,
+    without_lines,
+)
 from afspm.drift.estimators.warp import BEND, COUNT, GAIN, LINEAR, SLOPES, WarpedPair, derivative
 
 Array = NDArray[np.float64]
@@ -86,19 +95,19 @@ def _round(pair: WarpedPair, theta: Array, believed: Believed, seen_through: Fin
     """
     one, two, known = pair.warped(theta)
     mean, residual = (one + two) / 2, two - one
-    left = without_lines(residual, known)
+    left = without_lines(residual, known, pair.crossing)
     gradient = derivative(mean, 1), derivative(mean, 0)
-    signal, noise_through, noise = _signal(gradient, left / 2, known)
+    signal, noise_through, noise = _signal(gradient, left / 2, known, pair.crossing)
     weight = known * _row_weights(left, known)[:, None]
     metric = noise_metric(left, known, seen_through)
     columns = pair.columns(*signal, mean, residual)
-    columns_q = seen(columns, weight, metric)
+    columns_q = seen(columns, weight, metric, pair.crossing)
     left_over = float(np.vdot(columns_q[:, -1], residual))
     scale = max(weight.sum(), 1.0) / max(left_over, LEAST_NOISE * weight.sum(), LEAST_NOISE)
     columns_q, columns = scale * columns_q[:, :-1], columns[:, :-1]
     spread = products(columns_q, columns)
     curvature = products(columns_q, pair.columns(*gradient, mean, residual)[:, :-1])
-    through_q = seen(pair.slopes(*noise_through), weight, metric)
+    through_q = seen(pair.slopes(*noise_through), weight, metric, pair.crossing)
     curvature[:, :SLOPES, :SLOPES] -= scale * products(through_q, pair.slopes(*noise))
     curvature = _no_less(curvature, spread, believed.precision)
     slope = products(columns_q, residual[:, None].astype(columns_q.dtype))[:, :, 0]
@@ -106,15 +115,20 @@ def _round(pair: WarpedPair, theta: Array, believed: Believed, seen_through: Fin
     return Fit(after, curvature, spread, slope + curvature @ (after - theta))
 
 
-def _signal(gradient: Both, noise: Array, known: NDArray[np.bool_]) -> tuple[Both, Both, Both]:
+def _signal(
+    gradient: Both, noise: Array, known: NDArray[np.bool_], crossing: CrossingLines | None
+) -> tuple[Both, Both, Both]:
     """Return the signal of a gradient, what of noise would come through with it, and that noise.
 
     Rows are flattened first: the step from one row to the next holds the offsets of both, and a patch can't tell them
     from a feature.
     """
-    nx, ny = (without_lines(derivative(noise, axis), known) for axis in (1, 0))
-    x, through_x = denoised(flatten_rows(gradient[0], known), nx)
-    y, through_y = denoised(flatten_rows(gradient[1], known), ny)
+    nx, ny = (without_lines(derivative(noise, axis), known, crossing) for axis in (1, 0))
+    flat = [
+        flatten_rows(each, known) if crossing is None else without_lines(each, known, crossing) for each in gradient
+    ]
+    x, through_x = denoised(flat[0], nx)
+    y, through_y = denoised(flat[1], ny)
     return (x, y), (through_x, through_y), (nx, ny)
 
 
@@ -200,8 +214,10 @@ class Doubt:
 
     @property
     def spread(self) -> float:
-        """The factor by which the covariance is larger, fitted by `python -m benchmarks.drift.fit`."""
-        return SPREAD["all"] * math.exp(sum(SPREAD[name] * value for name, value in self.features().items()))
+        """The factor by which the covariance is larger, fitted by `python -m benchmarks.drift.fit`. It is never more
+        than for nearly all of the pairs of that fit: what grows as a power means nothing beyond them."""
+        factor = SPREAD["all"] * math.exp(sum(SPREAD[name] * value for name, value in self.features().items()))
+        return min(factor, SPREAD["most"])
 
 
 def covariance(fit: Fit, believed: Believed) -> tuple[Array, Doubt]:
@@ -212,15 +228,14 @@ def covariance(fit: Fit, believed: Believed) -> tuple[Array, Doubt]:
     J. Appl. Econom. 38, 671, 2023), which allows for noise that is correlated within a block. As few blocks hold most
     of the features it scatters widely, so it is one sign among others.
     """
+    if not np.isfinite(fit.theta).all():
+        raise Unusable("without a displacement that fits")
     used = np.abs(fit.curvature).max(axis=(1, 2)) > 0.0
-    n = int(used.sum())
+    n = max(int(used.sum()), 1)
     whole = fit.curvature.sum(axis=0) + believed.precision
     inverse = np.linalg.inv(whole)
     model = inverse @ (fit.spread.sum(axis=0) + believed.precision) @ inverse.T
-    try:
-        change = np.linalg.solve(whole - fit.curvature[used], fit.slope[used][:, :, None])[:, :, 0]
-    except np.linalg.LinAlgError:
-        raise Unusable("too small to estimate the uncertainty of a displacement") from None
+    change = np.linalg.solve(whole - fit.curvature[used], fit.slope[used][:, :, None])[:, :, 0]
     varied = change.T @ change * (n - 1) / n + inverse @ believed.precision @ inverse.T
     model = (model + model.T) / 2
     shift, alone = model[:2, :2], whole[:2, :2]
@@ -228,14 +243,8 @@ def covariance(fit: Fit, believed: Believed) -> tuple[Array, Doubt]:
         varied=float(np.trace(np.linalg.solve(shift, varied[:2, :2]))) / 2,
         shared=abs(float(np.linalg.det(shift) * np.linalg.det(alone))) ** 0.25,
         sd_px=math.sqrt(float(np.linalg.eigvalsh(shift)[-1])),
-        leverage=_leverage(fit.curvature[:, :2, :2]),
+        leverage=float(np.linalg.eigvals(np.linalg.solve(alone, fit.curvature[:, :2, :2])).real.max()),
     )
     total: Array = doubt.spread * model
     total[:2, :2] += FLOOR_PX**2 * np.eye(2)
     return total, doubt
-
-
-def _leverage(curvature: Array) -> float:
-    """The largest eigenvalue of what a block, (2, 2), is of the sum of all (n, 2, 2)."""
-    shares = np.linalg.solve(curvature.sum(axis=0), curvature)
-    return float(np.linalg.eigvals(shares).real.max())

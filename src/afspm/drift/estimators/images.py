@@ -29,10 +29,13 @@ class Image:
     Attributes:
         values: [y, x], finite everywhere: what was not measured is filled from the nearest row.
         known: [y, x], where something was measured, or a single row is missing between two that were.
+        made_up: [y, x], where rows beside stand in for what was measured, which says nothing of a displacement; None:
+            nowhere.
     """
 
     values: Array
     known: Mask
+    made_up: Mask | None = None
 
 
 def prepare(values: Array) -> Image:
@@ -88,33 +91,75 @@ def _less_lines(values: Array, weight: Array) -> Array:
 
 
 SCAR_PX = 15
+SCAR_ROWS = 2
 SCAR_SD = 2.5  # beyond the rows on both sides of it, in standard deviations of a pixel from their mean
 
 
 def without_scars(values: Array) -> Array:
-    """Return an image with the mean of the rows beside them in place of scars.
+    """Replace scars by what the rows above and below them show.
 
-    A scar is where most of `SCAR_PX` pixels of a row are above both of its neighbours, or below both. Nothing on a
-    surface is as thin as a row and much longer.
+    A scar is up to `SCAR_ROWS` rows thick: most of `SCAR_PX` pixels of each of its rows are above both of the rows
+    beside it, or below both. Nothing on a surface is as thin and much longer.
+    """
+    level = levelled(values)
+    scar = np.zeros(values.shape, dtype=bool)
+    for thick in range(1, min(SCAR_ROWS, len(values) - 2) + 1):
+        up, down, apart = standing_out(level, thick)
+        least = SCAR_SD * spread_of(apart)
+        scar |= scarred(up > least, down > least, thick)
+    return mended_rows(values, level, scar)
+
+
+def levelled(values: Array) -> Array:
+    """An image less the offsets of its rows, by the medians of the steps between them."""
+    steps = np.median(np.diff(values, axis=0), axis=1)
+    level: Array = values - np.concatenate([[0.0], np.cumsum(steps)])[:, None]
+    return level
+
+
+def standing_out(level: Array, thick: int) -> tuple[Array, Array, Array]:
+    """Return how far so many rows are all above both of the rows beside them, how far all below, and how far their
+    middle is from the mean of both. Each is an image without the first row and the last ones."""
+    count = len(level) - thick - 1
+    above, below = level[:count], level[thick + 1 :]
+    inside = [level[1 + k : 1 + k + count] for k in range(thick)]
+    up = np.minimum.reduce(inside) - np.maximum(above, below)
+    down = np.minimum(above, below) - np.maximum.reduce(inside)
+    return up, down, inside[thick // 2] - (above + below) / 2
+
+
+def spread_of(values: Array) -> float:
+    """Standard deviation of a normal distribution, by the median."""
+    return 1.4826 * float(np.median(abs(values - np.median(values))))
+
+
+def scarred(up: Mask, down: Mask, thick: int) -> Mask:
+    """Where there are scars of so many rows, of where they stand out."""
+    there = _mostly(up) | _mostly(down)
+    scar = np.zeros((there.shape[0] + thick + 1, there.shape[1]), dtype=bool)
+    for k in range(thick):
+        scar[1 + k : 1 + k + len(there)] |= there
+    return scar
+
+
+def mended_rows(values: Array, level: Array, scar: Mask) -> Array:
+    """An image with what lies between the rows beside a scar in its place.
+
+    Args:
+        level: the image without the offsets of its rows.
     """
     from scipy.ndimage import binary_dilation
 
-    step = np.diff(values, axis=0)
-    step -= np.median(step, axis=1, keepdims=True)
-    up, down = step[:-1], -step[1:]
-    beyond = np.where(up * down > 0.0, np.copysign(np.minimum(abs(up), abs(down)), up), 0.0)
-    apart = (up + down) / 2
-    least = SCAR_SD * 1.4826 * float(np.median(abs(apart - np.median(apart))))
-    scar = np.zeros(values.shape, dtype=bool)
-    scar[1:-1] = _mostly(beyond > least) | _mostly(beyond < -least)
     if not scar.any():
         return values
     scar = binary_dilation(scar, np.ones((1, 9), dtype=bool))
     rows, columns = np.arange(len(values))[:, None], np.arange(values.shape[1])
     before = np.maximum.accumulate(np.where(scar, 0, rows), axis=0)
     after = np.minimum.accumulate(np.where(scar, len(values) - 1, rows)[::-1], axis=0)[::-1]
+    above, below = before[:-2], after[2:]
+    share = (rows[1:-1] - above) / (below - above)
     beside = values.copy()
-    beside[1:-1] = (values[before[:-2], columns] + values[after[2:], columns]) / 2
+    beside[1:-1] = (1.0 - share) * level[above, columns] + share * level[below, columns]
     for row in np.flatnonzero(scar.any(axis=1) & ~scar.all(axis=1)):
         beside[row] += np.median((values[row] - beside[row])[~scar[row]])
     return np.where(scar, beside, values)
@@ -174,10 +219,12 @@ class CommonGrid:
 
     Attributes:
         to_m: (2, 2) from pixels to metres in tip coordinates.
+        to_own: (2, 2) from pixels to those of the scan, along its own axes.
         reference_m, scan_m: (2,) the centres in tip coordinates.
     """
 
     to_m: Array
+    to_own: Array
     reference_m: Array
     scan_m: Array
 
@@ -216,10 +263,11 @@ def onto_common_grid(
     turned = np.array([[cos, -sin], [sin, cos]]) * scan.pixel_m  # the steps of the scan's columns and rows
     pixel: Array = np.maximum(own, np.hypot(*turned.T))
     image1 = _resampled(image1, np.diag(pixel / own))
-    image2 = _resampled(image2, np.linalg.inv(turned) * pixel)
+    to_own = np.linalg.inv(turned) * pixel
+    image2 = _resampled(image2, to_own)
     c, s = math.cos(angle), math.sin(angle)
     to_m = np.array([[c, -s], [s, c]]) @ np.diag(pixel)
-    return CommonGrid(to_m, np.array(reference.region.center_m), np.array(scan.region.center_m)), image1, image2
+    return CommonGrid(to_m, to_own, np.array(reference.region.center_m), np.array(scan.region.center_m)), image1, image2
 
 
 def _resampled(image: Image, step: Array) -> Image:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+import math
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +21,10 @@ from afspm.drift.estimators.alignment import (
 )
 from afspm.drift.estimators.coefficients import WRONG_AT_MOST
 from afspm.drift.estimators.images import CommonGrid, Unusable, onto_common_grid, prepare
-from afspm.drift.estimators.noise import FineFilter, without_lines
+from afspm.drift.estimators.noise import CrossingLines, FineFilter, without_lines
 from afspm.drift.estimators.nuisances import CREEP_SD_PX, Shear, averaged
 from afspm.drift.estimators.search import ExpectedShift, MaskedCorrelation, Scorer, candidates, shear_by_drift
-from afspm.drift.estimators.spikes import without_spikes
+from afspm.drift.estimators.spikes import without_scars_of_one, without_spikes
 from afspm.drift.estimators.warp import COUNT, CREEP, LINEAR, SLOPES, OverlapBox, Scene, WarpedPair
 from afspm.drift.registration import DriftScan, LinearSeen, Prior, Registration
 from afspm.errors import ConfigError
@@ -35,7 +36,11 @@ GAIN_SD = 1.0  # of the logarithm
 BEND_SD = 0.15
 BORDER_PX = 1  # where a filter and a spline have to guess what lies beyond
 FARTHEST_PX = 8.0  # from where the search has found it
+TURNED = 0.03  # radians by which the lines of two scans cross
 ELSEWHERE_PX = 32  # the farthest shift that a match is compared with
+EXPECTED = 2.0
+"""By which more doubt is allowed where a displacement is expected: nearly all wrong matches are of scans with nothing
+in common and no prior, and most right ones that are doubtful are zooms with one."""
 DISTRUST = 4.0
 """By which the variance of the noise is taken for larger than its model says, where the images are weighed against what
 else displaces them. The factor of the ellipses, which grows with doubt, would let the images tell too little there."""
@@ -53,7 +58,8 @@ class LeastSquares:
     5. `acceptance`: is it a match at all?
 
     Args:
-        wrong_at_most: the largest probability that a match which is accepted is wrong by more than a pixel.
+        wrong_at_most: the largest probability that a match which is accepted is wrong by more than a pixel; twice as
+            large where a displacement is expected.
 
     Raises:
         ConfigError: it is not between 0 and 1.
@@ -80,7 +86,8 @@ class LeastSquares:
             return Registration.refused("the scans overlap too little")
         try:
             shear = _expected_shear(prior, reference, scan, grid)
-            theta, total, seen, doubt = _fine(scene, box, start[0], expected, shear)
+            lines = _Lines.of(reference, scan, grid)
+            theta, total, seen, doubt = _fine(scene, box, start[0], lines, expected, shear)
         except Unusable as reason:
             rows, columns = box.shape
             return Registration.refused(f"the overlap of {columns} x {rows} pixels is {reason}")
@@ -94,7 +101,8 @@ class LeastSquares:
     def _registration(
         self, theta: Array, total: Array, box: OverlapBox, grid: CommonGrid, found: MatchEvidence
     ) -> Registration:
-        reason = found.refusal(self._wrong_at_most)
+        expected = found.searched < 1.0
+        reason = found.refusal(min(self._wrong_at_most * (EXPECTED if expected else 1.0), 0.99))
         return Registration(
             accepted=not reason,
             reason=reason,
@@ -124,14 +132,20 @@ def _coarse(scene: Scene, expected: ExpectedShift | None) -> tuple[Array, float,
 
 
 def _fine(
-    scene: Scene, box: OverlapBox, theta: Array, expected: ExpectedShift | None, shear: Shear
+    scene: Scene,
+    box: OverlapBox,
+    theta: Array,
+    lines: _Lines,
+    expected: ExpectedShift | None,
+    shear: Shear,
 ) -> tuple[Array, Array, LinearSeen, Doubt]:
     """theta and its covariance, its linear map as the images alone tell it, and doubts."""
-    scene = without_spikes(scene, theta)
+    scene = without_spikes(without_scars_of_one(scene, theta), theta)
     fine = FineFilter.of(scene.first.values, scene.second.values)
     values = fine.applied(scene.first.values), fine.applied(scene.second.values)
-    pair = WarpedPair(*scene.splines(values, order=5), box.without_border(BORDER_PX), theta[:2])
-    believed = _believed(expected)
+    inner = box.without_border(BORDER_PX)
+    pair = WarpedPair(*scene.splines(values), inner, theta[:2], lines.own_px, lines.crossing(inner, theta[:2]))
+    believed = _believed(expected or ExpectedShift(theta[:2], FARTHEST_PX**2 * np.eye(2)))
     fit = generalised_least_squares(pair, theta, believed, fine)
     spread, doubt = covariance(fit, believed)
     seen = LinearSeen(fit.theta[LINEAR].reshape(2, 2), spread[LINEAR, LINEAR])
@@ -166,6 +180,26 @@ def _believed(expected: ExpectedShift | None) -> Believed:
     if expected is not None:
         mean[:2], precision[:2, :2] = expected.mean, np.linalg.inv(expected.covariance)
     return Believed(mean, precision)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lines:
+    """How the lines of two scans lie on their common grid; see `WarpedPair`."""
+
+    own_px: tuple[float, float]
+    to_own: Array
+
+    @classmethod
+    def of(cls, reference: DriftScan, scan: DriftScan, grid: CommonGrid) -> _Lines:
+        width_m = float(np.linalg.norm(grid.to_m[:, 0]))
+        turned = abs(math.sin(scan.region.angle_rad - reference.region.angle_rad)) > TURNED
+        return cls((reference.pixel_m[0] / width_m, 0.0 if turned else scan.pixel_m[0] / width_m), grid.to_own)
+
+    def crossing(self, box: OverlapBox, shift_px: Array) -> CrossingLines | None:
+        if self.own_px[1]:
+            return None
+        x, y = np.meshgrid(box.x + shift_px[0] / 2, box.y + shift_px[1] / 2)
+        return CrossingLines.of(*np.tensordot(self.to_own, np.stack([x, y]), 1))
 
 
 def _expected_shear(prior: Prior | None, reference: DriftScan, scan: DriftScan, grid: CommonGrid) -> Shear:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,13 +91,67 @@ def independent_values(first: Array, second: Array) -> float:
 
 
 BLOCK_ROWS = 8
+BLOCKS = 8  # at least, where rows are few, of two rows or more
 CACHED = 1 << 15  # numbers
 LEAST_NOISE = 1e-8
 """Variance, where that of the scan is 1: digits end somewhere, and two scans that agree beyond are not known better."""
 HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it the filter leaves little of them
 
 
-def seen(columns: NDArray[Real], weight: Array, metric: Array | None) -> NDArray[Real]:
+@dataclass(frozen=True, eq=False)
+class CrossingLines:
+    """The lines of a scan that is turned against the grid: of each of them a parabola is unknown as well.
+
+    Attributes:
+        number: [y, x], the line that each pixel of the grid is nearest to, from 0 on.
+        along: [y, x], where on that line it lies, about -1 to 1.
+    """
+
+    number: NDArray[np.intp]
+    along: Array
+
+    @classmethod
+    def of(cls, x: Array, y: Array) -> CrossingLines:
+        """Of own pixel coordinates [y, x] of the pixels of a grid. Lines are told apart by halves: what lies between
+        two lines shows some of both."""
+        half = np.rint(2.0 * y).astype(np.intp)
+        return cls(half - half.min(), 2.0 * (x - x.min()) / max(float(np.ptp(x)), 1.0) - 1.0)
+
+    def seen(self, columns: NDArray[Real], weight: Array) -> NDArray[Real]:
+        """Like `seen` with white noise, and free of the crossing lines as well: by projections in turn (von Neumann,
+        Functional Operators II, 1950)."""
+        root = np.sqrt(weight)
+        left = (columns * root[:, None, :]).astype(columns.dtype)
+        basis, inverse = self._basis(root)
+        shape = left.transpose(0, 2, 1).shape
+        for _ in range(PROJECTIONS):
+            left = _less_lines(left, root.astype(columns.dtype)[:, None, :])
+            pixels = left.transpose(0, 2, 1).reshape(-1, columns.shape[1])
+            sums = (basis.T @ pixels).reshape(len(inverse), 3, -1)
+            pixels = pixels - basis @ (inverse @ sums).reshape(3 * len(inverse), -1)
+            left = pixels.reshape(shape).transpose(0, 2, 1).astype(columns.dtype)
+        return np.asarray(left * root[:, None, :], dtype=columns.dtype)
+
+    def _basis(self, root: Array) -> tuple[Any, Array]:
+        """1, x, x² of each line, (pixel, 3 lines), sparse; and the inverse of their products, (line, 3, 3)."""
+        from scipy.sparse import csr_array
+
+        number, count = self.number.ravel(), int(self.number.max()) + 1
+        powers = root.ravel()[:, None] * self.along.ravel()[:, None] ** np.arange(3)
+        places = 3 * number[:, None] + np.arange(3)
+        basis = csr_array((powers.ravel(), places.ravel(), np.arange(0, powers.size + 1, 3)), (number.size, 3 * count))
+        gram = np.stack([
+            [np.bincount(number, powers[:, k] * powers[:, m], count) for m in range(3)] for k in range(3)
+        ])  # fmt: skip
+        return basis, np.asarray(np.linalg.inv(gram.transpose(2, 0, 1) + 1e-5 * np.eye(3)), dtype=np.float64)
+
+
+PROJECTIONS = 4
+
+
+def seen(
+    columns: NDArray[Real], weight: Array, metric: Array | None, crossing: CrossingLines | None = None
+) -> NDArray[Real]:
     """Return Q f less what parabolas explain of it: the product with another image g is f'Qg free of both of theirs.
 
     Generalised least squares row by row: each row has a parabola of its own, and noise with a memory. A row is scanned
@@ -111,10 +165,13 @@ def seen(columns: NDArray[Real], weight: Array, metric: Array | None) -> NDArray
         columns: [y, column, x].
         weight: [y, x] of each pixel; 0 where nothing is known. f and g are multiplied with its root.
         metric: Q, (x, x); None: white noise.
+        crossing: lines of the other scan, if they lie across the rows; then the noise is taken for white.
 
     Returns:
         Like `columns`; the root of the weight of g is in it.
     """
+    if crossing is not None:
+        return crossing.seen(columns, weight)
     if metric is None and weight.min() == 1.0 == weight.max():
         parabolas: NDArray[Real] = _parabolas(columns.shape[2]).astype(columns.dtype)
         return np.asarray(columns - (columns @ parabolas) @ parabolas.T, dtype=columns.dtype)
@@ -153,15 +210,25 @@ def _along_rows(columns: NDArray[Real], metric: NDArray[Real]) -> NDArray[Real]:
     return (columns.reshape(-1, metric.shape[0]) @ metric).reshape(columns.shape)
 
 
-def without_lines(values: Array, known: NDArray[np.bool_]) -> Array:
-    """Each row, [y, x], less the parabola fitted to it; 0 where nothing is known."""
-    return seen(values[:, None], known.astype(np.float64), None)[:, 0]
+def _less_lines(rows: NDArray[Real], root: NDArray[Real]) -> NDArray[Real]:
+    """Rows less their parabolas, both times the root of the weight."""
+    x = np.linspace(-1.0, 1.0, rows.shape[2], dtype=rows.dtype)
+    lines = np.concatenate([root, root * x, root * x**2], axis=1)
+    gram = lines @ lines.transpose(0, 2, 1) + 1e-5 * np.eye(3, dtype=rows.dtype)
+    fitted = np.linalg.solve(gram, lines @ rows.transpose(0, 2, 1)).transpose(0, 2, 1)
+    return np.asarray(rows - fitted @ lines, dtype=rows.dtype)
 
 
-def products(one: NDArray[Real], two: NDArray[Real], block_rows: int = BLOCK_ROWS) -> Array:
+def without_lines(values: Array, known: NDArray[np.bool_], crossing: CrossingLines | None = None) -> Array:
+    """Each row, [y, x], less the parabola fitted to it, and the crossing lines less theirs; 0 where nothing is
+    known."""
+    return seen(values[:, None], known.astype(np.float64), None, crossing)[:, 0]
+
+
+def products(one: NDArray[Real], two: NDArray[Real]) -> Array:
     """Sums of the products of columns, [y, column, x] each, over blocks of rows: (block, columns of one, columns
     of two). Where `one` is `seen` of something the lines of `two` cancel, but in whole rows only."""
-    starts = np.arange(0, one.shape[0], block_rows)
+    starts = np.arange(0, one.shape[0], min(max(one.shape[0] // BLOCKS, 2), BLOCK_ROWS))
     sums: Array = np.add.reduceat(one @ two.transpose(0, 2, 1), starts, axis=0, dtype=np.float64)
     return sums
 

@@ -5,39 +5,38 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.estimators.images import Image
+from afspm.drift.estimators.noise import CrossingLines
 
 Array = NDArray[np.float64]
 Columns = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-Order = Literal[3, 5]
 
 
 @dataclass(frozen=True, eq=False)
 class Spline:
-    """An image as splines, evaluated at pixel coordinates (x, y) from its centre.
+    """An image as cubic splines, evaluated at pixel coordinates (x, y) from its centre.
 
     Attributes:
-        order: 3; or 5, which is nearer to the truth at what is only some pixels long, and takes twice as long.
-        known: where it is more than two pixels from what is not known; None: everywhere.
+        known: where it is more than two pixels from what is not known, and not made up; None: everywhere.
     """
 
     coefficients: Array
     known: Mask | None
-    order: Order = 3
 
     @classmethod
-    def of(cls, values: Array, known: Mask, order: Order = 3) -> Spline:
+    def of(cls, values: Array, known: Mask, made_up: Mask | None = None) -> Spline:
         """Its values are met exactly at the pixels."""
         from scipy.ndimage import binary_erosion, spline_filter
 
         inner = None if known.all() else binary_erosion(known, iterations=2, border_value=1)
-        return cls(spline_filter(values, order, mode="mirror"), inner, order)
+        if made_up is not None:
+            inner = ~made_up if inner is None else inner & ~made_up
+        return cls(spline_filter(values, mode="mirror"), inner)
 
     def at(self, x: Array, y: Array) -> tuple[Array, Mask]:
         """The values, and where they are known, at points."""
@@ -45,7 +44,7 @@ class Spline:
 
         ny, nx = self.coefficients.shape
         at = np.stack([y + (ny - 1) / 2, x + (nx - 1) / 2])
-        values = map_coordinates(self.coefficients, at, order=self.order, mode="mirror", prefilter=False)
+        values = map_coordinates(self.coefficients, at, mode="mirror", prefilter=False)
         known = (np.abs(x) <= (nx - 1) / 2 + 1e-6) & (np.abs(y) <= (ny - 1) / 2 + 1e-6)
         if self.known is not None:
             rows, columns = np.rint(at).astype(int)
@@ -53,10 +52,7 @@ class Spline:
         return values, known
 
     def on_grid(self, x: Array, y: Array) -> tuple[Array, Mask]:
-        """The same on a grid of one pixel, x and y its axes: row by row and column by column it is much faster.
-
-        Of cubic splines.
-        """
+        """The same on a grid of one pixel, x and y its axes: row by row and column by column it is much faster."""
         values, known = self.coefficients, np.ones((y.size, x.size), dtype=bool)
         picked = []
         for axis, at in enumerate((y, x)):
@@ -143,18 +139,23 @@ class WarpedPair:
     """Two images on a box.
 
     Parameters are theta = (ux, uy, axx, axy, ayx, ayy, c.., g, h): shift u px and linear map A about the centre of the
-    box, d(q) = u + A (q - centre); how far lines creep at their start, px, the same in both scans; logarithm g of the
-    gain of the second over the first, and h, by how much more the second is bent (heights z appear as z + h z² / 2:
-    feedback and tip do that to edges).
+    box, d(q) = u + A (q - centre); how far lines creep at their start, in pixels of their own scan, the same in both;
+    logarithm g of the gain of the second over the first, and h, by how much more the second is bent (heights z appear
+    as z + h z² / 2: feedback and tip do that to edges).
 
     Attributes:
         shift_px: (2,) about u: by which the lines of both start at different places of the box.
+        own_px: width of a pixel of each scan, in pixels of the grid: lines creep for some of their own pixels, which in
+            a zoom is next to nothing. 0: its lines don't lie along the rows of the grid, so there is no model.
+        crossing: the lines of the second scan, where they don't.
     """
 
     first: Spline
     second: Spline
     box: OverlapBox
     shift_px: Array = field(default_factory=lambda: np.zeros(2))
+    own_px: tuple[float, float] = (1.0, 1.0)
+    crossing: CrossingLines | None = None
 
     def warped(self, theta: Array) -> tuple[Array, Array, Mask]:
         """I1(q - d/2) and I2(q + d/2), each with half of the other's contrast, and where both are known.
@@ -162,7 +163,7 @@ class WarpedPair:
         Both are moved by half: so both carry equal interpolation noise, the gradient of their mean is not correlated
         with the noise of their difference, and the shift is not pulled towards whole pixels.
         """
-        if theta[2:SLOPES].any() or self.first.order != 3:
+        if theta[2:SLOPES].any():
             (one, known1), (two, known2) = self._both(theta)
         else:
             x, y, (dx, dy) = self.box.x, self.box.y, theta[:2]
@@ -190,7 +191,11 @@ class WarpedPair:
                 for spline, sign in ((self.first, -1.0), (self.second, 1.0))
             )
             for length in CREEP_PX:
-                row = np.exp(-np.maximum(start1, 0.0) / length) - np.exp(-np.maximum(start2, 0.0) / length)
+                row = sum(
+                    (sign * own * np.exp(-np.maximum(start, 0.0) / (length * own))
+                     for start, own, sign in ((start1, self.own_px[0], 1.0), (start2, self.own_px[1], -1.0)) if own),
+                    np.zeros(at.size),
+                )  # fmt: skip
                 found.append(row[:-1] - row[-1])
         return np.array(found)
 
@@ -266,9 +271,13 @@ class Scene:
     def band_splines(self) -> tuple[Spline, Spline]:
         return self.splines(self.band)
 
-    def splines(self, values: Both, order: Order = 3) -> tuple[Spline, Spline]:
+    def splines(self, values: Both) -> tuple[Spline, Spline]:
         """Of values that are known where the images are."""
-        return Spline.of(values[0], self.first.known, order), Spline.of(values[1], self.second.known, order)
+        one, two = (
+            Spline.of(each, image.known, image.made_up)
+            for each, image in zip(values, (self.first, self.second), strict=True)
+        )
+        return one, two
 
     def box(self, shift_px: Array) -> OverlapBox | None:
         """Where they overlap; see `OverlapBox.of_overlap`."""
