@@ -70,7 +70,7 @@ class TipSafety:
             self._changed(before, after, _who(event, effects))
             self._before = after
         for effect in effects:
-            if isinstance(effect, Forward) and effect.request.subject == names.RETRACT:
+            if isinstance(effect, Forward) and _is_retract(effect.request):
                 self._has_asked = True
             elif isinstance(effect, Log):
                 if effect.level == "CRITICAL" or (effect.level == "WARNING" and after is not before):
@@ -165,6 +165,10 @@ class TipSafety:
         value = float(parameter.value)
         within = (limit.low is None or value >= limit.low) and (limit.high is None or value <= limit.high)
         self._must(within, f"{parameter.name} was set to {value:g}, outside of its limits")
+
+
+def _is_retract(request: Request) -> bool:
+    return request.kind == ControlRequest.ACTION and request.subject == names.RETRACT
 
 
 def _who(event: Input | None, effects: Sequence[Effect]) -> str:
