@@ -9,7 +9,6 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from afspm import wire
-from afspm.drift.record import drift_knowledge
 from afspm.errors import NoSuchItem, WireError
 from afspm.model import Frame, Region, RegistrationOutcome, Spectrum, names
 from afspm.record.tables import ScanRow, SpectrumRow, Table
@@ -170,6 +169,8 @@ def _positions(query: Query) -> dict[int, tuple[RegistrationOutcome, float | Non
     if not mappings:
         return {}
     found, after_ns = {}, -1
+    from afspm.drift.record import drift_knowledge  # it loads numpy, which the supervisor does without
+
     for number, published_ns in sorted(query(_PUBLISHED["scans"]), key=itemgetter(1)):
         payload = None
         while mappings and mappings[-1][0] <= published_ns:

@@ -152,7 +152,7 @@ def test_a_secret_of_others_is_not_in_its_environment(
 
 
 KILLED_SUPERVISOR = """
-import sys, threading
+import os, sys, threading
 from afspm.launch import Launch
 from afspm.supervisor.process import ChildProcess
 from afspm.supervisor.reaper import Reaper
@@ -167,6 +167,7 @@ reaper.begin()
 code = child + (holds_lock if sys.argv[2] == "holds" else "sys.stdin.read()")
 child = ChildProcess(Task(Launch("child"), (sys.executable, "-c", code, call)), print)
 reaper.watch(child.pid, has_tip=False)
+os.write(1, b"watched")
 threading.Event().wait()
 """
 
@@ -177,11 +178,15 @@ def test_nothing_outlives_a_supervisor_that_was_killed(what: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(DEADLINE_S)
         port = str(server.getsockname()[1])
-        supervisor = subprocess.Popen([sys.executable, "-c", KILLED_SUPERVISOR, port, what])
+        command = [sys.executable, "-c", KILLED_SUPERVISOR, port, what]
+        supervisor = subprocess.Popen(command, stdout=subprocess.PIPE, bufsize=0)
         connections = [server.accept()[0] for _ in range(2)]
         for connection in connections:
             connection.settimeout(DEADLINE_S)
             assert connection.recv(1) == b"x"
+        assert supervisor.stdout is not None
+        with supervisor.stdout as output:
+            assert output.read(7) == b"watched"  # the children may be there before
         supervisor.kill()
         supervisor.wait()
         for connection in connections:

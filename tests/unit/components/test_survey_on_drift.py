@@ -16,6 +16,8 @@ from afspm.drift.registration import DriftScan, Prior, Registration
 from afspm.exit_codes import ExitCode
 from afspm.model import RegistrationOutcome
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("skimage")
 PIXEL_M = 5e-6 / 207
 """Of the survey."""

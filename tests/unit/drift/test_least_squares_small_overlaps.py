@@ -10,6 +10,8 @@ from afspm.drift.estimators.least_squares import LeastSquares
 from afspm.drift.registration import DriftScan, Prior
 from afspm.model import Region
 
+pytestmark = pytest.mark.slow
+
 PIXEL_M = 40e-9
 OVERVIEW = Region((0.0, 0.0), (63 * PIXEL_M, 63 * PIXEL_M))
 DRIFT_M = np.array([0.7, -0.4]) * PIXEL_M

@@ -22,6 +22,8 @@ from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Frame, Region
 from afspm.scheduler.drift.worker_state import WorkerStateFile
 
+pytestmark = pytest.mark.slow
+
 Array = NDArray[np.float64]
 
 NM = 1e-9

@@ -13,6 +13,8 @@ from vendor_bench import FLAT, SOON, TURNED, left_in_danger, moved, ready, scann
 
 from afspm.model import ControlResponse, Region, Scan, ScopeState, Spectrum, names
 
+pytestmark = pytest.mark.slow
+
 Make = Callable[..., Bench]
 Settings = dict[str, Any]
 FREE, UNDEFINED = ScopeState.FREE, ScopeState.UNDEFINED

@@ -220,6 +220,7 @@ class GxsmFunctions:
         program = self._program
         doing, scan = program.rig.doing(now_s), program.rig.scan
         scanning = doing == "scan" and scan is not None and now_s >= scan.start_s + program.shows_s
+        scanning = scanning or (program.is_between_repeats and not doing)
         paused, probing = scanning and scan is not None and scan.paused, doing == "spectrum"
         feedback = bool(program.rig.setup.feedback.on)
         if program.card == "RPSPMC":

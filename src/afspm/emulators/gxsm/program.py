@@ -179,6 +179,12 @@ class GxsmProgram:
             self.start_scan()
         return min(next_s or math.inf, self.saving.done_s) if self._next else next_s
 
+    @property
+    def is_between_repeats(self) -> bool:
+        """True after the end of a scan that the next one follows at once: GXSM does not tell of an end then."""
+        is_whole = self.last is not None and self.last.stopped_s is None
+        return self.repeats and is_whole and (self._scanning or self._next)
+
     def stop_scan(self) -> None:
         """Break off the scan that runs, or is to begin."""
         self._next = False
