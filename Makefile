@@ -7,7 +7,7 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 SETUP := .venv/.made
 
-.PHONY: demo demo-drift test test-all mutants test-samples coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
+.PHONY: demo demo-drift test test-all test-apart mutants test-samples coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
 .PHONY: test-nexus test-tiled check bench bench-drift soak chaos simulate power-cut docs clean
 .DEFAULT_GOAL := demo
 
@@ -46,12 +46,17 @@ QUICK := tests/unit tests/simulation tests/vendors tests/docs $(addprefix tests/
 test: $(COLLECTED)
 	@$(PYTEST) -n $(TESTS_AT_A_TIME) --dist worksteal -m "not slow" $(QUICK)
 
-## the rest: whole experiments, samples, snippets of the docs, the page, the gateway, faults of controllers, mutants. What
-## needs more (root, compilers, an hour) has a target of its own, below
+## the rest: whole experiments, samples, snippets of the docs, faults of controllers, mutants. What is APART, or needs more
+## (root, compilers, an hour), has a target of its own, below
 # A power cut is tried alone: the scheduler publishes what a disk has not taken within 0.2 s, which may be lost
 test-all: $(COLLECTED)
-	@$(PYTEST) -n $(TESTS_AT_A_TIME) --dist worksteal -m slow --ignore tests/system/hosts --ignore $(POWER_CUT)
+	@$(PYTEST) -n $(TESTS_AT_A_TIME) --dist worksteal -m slow $(addprefix --ignore ,$(APART) tests/system/hosts $(POWER_CUT))
 	@$(PYTEST) $(POWER_CUT)
+
+## the page, the gateway, clients in other languages, the installed wheel, and each row of the benchmark once
+APART := tests/ui $(addprefix tests/system/,gateway clients install benchmarks)
+test-apart: $(COLLECTED)
+	@$(PYTEST) -n $(TESTS_AT_A_TIME) --dist worksteal $(APART)
 
 # asserts are rewritten once, not by each of the processes that run tests; what can't be collected fails there
 $(COLLECTED): $(TEST) $(shell find tests -name '*.py')
@@ -59,7 +64,7 @@ $(COLLECTED): $(TEST) $(shell find tests -name '*.py')
 
 ## decisions broken on purpose, each of which the simulated nights have to find; prints how many they found
 mutants: $(TEST)
-	@$(PYTEST) -n 2 tests/simulation/test_mutants.py
+	@AFSPM_CASES=all $(PYTEST) -n 2 tests/simulation/test_mutants.py
 
 ## every sample in experiments/, shortened, to its end
 test-samples: $(TEST)

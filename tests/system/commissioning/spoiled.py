@@ -15,7 +15,7 @@ from afspm.microscopes.park import Park
 from afspm.model import Scan, ScopeState, ScopeStatus, Spectrum, names
 from afspm.translator import Driver
 
-LATE_S = 60.0
+LATE_S = 120.0
 """Experiment seconds."""
 
 
@@ -45,7 +45,7 @@ class OtherWay(Driver):
 
 
 class LateEnd(Driver):
-    """Notices the end of a scan a minute late."""
+    """Notices the end of a scan two minutes late."""
 
     until_s = 0.0
     before = ScopeState.FREE

@@ -10,6 +10,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
+from rotation import rotated
 from systems import PATIENCE
 
 from afspm.record.run_json import run_json_or_empty
@@ -77,7 +78,10 @@ def run(folder: Path, command: str, *files: Path) -> tuple[subprocess.CompletedP
     return done, runs[-1]
 
 
-@pytest.fixture(scope="module", params=["nanonis", "asylum", "gxsm", "gxsm-shm", "nanosurf", "park"])
+VENDORS = ("nanonis", "asylum", "gxsm", "gxsm-shm", "nanosurf", "park")
+
+
+@pytest.fixture(scope="module", params=rotated(VENDORS, 3))
 def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path, Path]:
     """The vendor, a trace, and the file of an experiment that plays it back."""
     vendor, _, transport = str(request.param).partition("-")
