@@ -54,9 +54,11 @@ test-all: $(COLLECTED)
 	@$(PYTEST) $(POWER_CUT)
 
 ## the page, the gateway, clients in other languages, the installed wheel, and each row of the benchmark once
+SPEED := tests/ui/test_full_speed.py
 APART := tests/ui $(addprefix tests/system/,gateway clients install benchmarks)
 test-apart: $(COLLECTED)
-	@$(PYTEST) -n $(TESTS_AT_A_TIME) --dist worksteal $(APART)
+	@$(PYTEST) -n 4 --dist worksteal --ignore $(SPEED) $(APART)
+	@$(PYTEST) $(SPEED)
 
 # asserts are rewritten once, not by each of the processes that run tests; what can't be collected fails there
 $(COLLECTED): $(TEST) $(shell find tests -name '*.py')
