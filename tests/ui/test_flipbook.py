@@ -63,7 +63,7 @@ def url(browser: Any, drifted: Path) -> Iterator[str]:
     command = (*AFSPM, "dashboard", str(drifted), "--port", "0")
     with subprocess.Popen(command, stdout=subprocess.PIPE, encoding="utf-8") as process:
         assert process.stdout is not None
-        found = next(filter(None, (re.search(r"stays at (\S+);", line) for line in process.stdout)), None)
+        found = next(filter(None, (re.search(r"the dashboard is at (\S+);", line) for line in process.stdout)), None)
         assert found
         yield found[1]
         process.terminate()
