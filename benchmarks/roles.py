@@ -82,24 +82,25 @@ def emulator(vendor: str, folder: str) -> None:
     made.run(ExperimentClock.real(), Path(folder), logging.getLogger(vendor), ready)
 
 
-def bare_packet_proxy(publisher: str, queue: int) -> None:
+def proxy_sockets(publisher: str, queue: int) -> tuple[Any, Any]:
+    """Return the sockets of a proxy, towards the publisher and towards its subscribers, whose address is printed."""
     context: zmq.Context[Any] = zmq.Context()
     front, back = context.socket(zmq.XSUB), context.socket(zmq.XPUB)
     for socket in (front, back):
         socket.set_hwm(queue)
     front.connect(publisher)
     ready(bound(back))
+    return front, back
+
+
+def bare_packet_proxy(publisher: str, queue: int) -> None:
+    front, back = proxy_sockets(publisher, queue)
     zmq.proxy(front, back)
 
 
 def bare_logging_proxy(publisher: str, queue: int) -> None:
     """Append each packet to a file, which is written over now and then, before passing the packet on."""
-    context: zmq.Context[Any] = zmq.Context()
-    front, back = context.socket(zmq.XSUB), context.socket(zmq.XPUB)
-    for socket in (front, back):
-        socket.set_hwm(queue)
-    front.connect(publisher)
-    ready(bound(back))
+    front, back = proxy_sockets(publisher, queue)
     poller = zmq.Poller()
     poller.register(front, zmq.POLLIN)
     poller.register(back, zmq.POLLIN)
