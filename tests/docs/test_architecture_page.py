@@ -15,6 +15,6 @@ def test_the_layers_are_those_of_the_contract() -> None:
     ]
     (layers,) = [contract["layers"] for contract in contracts if contract["type"] == "layers"]
     page = (ROOT / "docs/explanation/architecture.md").read_text(encoding="utf-8")
-    shown = re.search(r"```text\n(cli\n.*?)\n```", page, re.DOTALL)
+    shown = re.search(r"```text\n(plugins\n.*?)\n```", page, re.DOTALL)
     assert shown is not None
     assert shown[1].splitlines() == layers

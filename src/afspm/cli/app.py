@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from afspm import plugins
+from afspm import entry_points
 from afspm.cli import (
     clients,
     commission,
@@ -89,9 +89,9 @@ app.command("emulate", rich_help_panel=MICROSCOPES)(drivers.emulate)
 
 def _add_plugins() -> None:
     """Add the commands of installed packages: one that can't be loaded says so when it is called."""
-    for name in plugins.names(plugins.COMMANDS):
+    for name in entry_points.names(entry_points.COMMANDS):
         try:
-            command = plugins.load(plugins.COMMANDS, name)
+            command = entry_points.load(entry_points.COMMANDS, name)
         except ConfigError as error:
             command = _unloadable(error)
         if isinstance(command, typer.Typer):

@@ -7,7 +7,7 @@ import importlib
 import inspect
 from collections.abc import Iterable, Mapping
 
-from afspm import plugins
+from afspm import entry_points
 from afspm.errors import AfspmError, ConfigError
 from afspm.plain_data import PlainMapping
 from afspm.requirements import require
@@ -59,7 +59,7 @@ def _imported(what: str, name: str) -> type[object]:
 
 def _ready_made(what: str, name: str, ready_made: Mapping[str, str]) -> type[object]:
     if name not in ready_made:
-        if isinstance(plugin := plugins.load(f"afspm.{what}s", name), type):
+        if isinstance(plugin := entry_points.load(f"afspm.{what}s", name), type):
             return plugin
         known = ", ".join(ready_made)
         hint = _near(name.casefold(), ready_made) or f"known: {known}; name one of your own as module.Name"

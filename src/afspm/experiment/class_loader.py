@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from afspm import plugins
+from afspm import entry_points
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.parts import DECLARED_KEYS
 from afspm.experiment.published import GUIDE
@@ -128,10 +128,10 @@ def full_path(name: str) -> str:
             found = _attribute(module, name)
             return f"{found.__module__}.{found.__qualname__}"
         known += [n for n in offered if n[:1].isupper()]
-    for group in (plugins.COMPONENTS, plugins.DRIVERS):
-        if (path := plugins.class_path(group, name)) is not None:
+    for group in (entry_points.COMPONENTS, entry_points.DRIVERS):
+        if (path := entry_points.class_path(group, name)) is not None:
             return path
-        known += plugins.names(group)
+        known += entry_points.names(group)
     raise Unloadable(f"there is no ready-made class {name!r}", nearest(name, known) or 'write it as "module.Name"')
 
 

@@ -8,7 +8,7 @@ from datetime import tzinfo
 from importlib import import_module
 from pathlib import Path
 
-from afspm import plugins
+from afspm import entry_points
 from afspm.errors import FileError
 from afspm.files.content import FileContent
 
@@ -52,7 +52,7 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
         raise FileError(
             f"afspm has no reader for {path.suffix or 'a file without a suffix'}",
             where=str(path),
-            hint=f"read: {' '.join((*FORMATS, *(f'.{name}' for name in plugins.names(plugins.READERS))))}",
+            hint=f"read: {' '.join((*FORMATS, *(f'.{name}' for name in entry_points.names(entry_points.READERS))))}",
         )
     try:
         return _told_apart(reader(path, zone))
@@ -72,7 +72,7 @@ def _reader(suffix: str) -> Reader | None:
         module, _, function = FORMATS[suffix].partition(":")
         reader = getattr(import_module(f"afspm.files.{module}"), function)
     else:
-        reader = plugins.load(plugins.READERS, suffix.removeprefix("."))
+        reader = entry_points.load(entry_points.READERS, suffix.removeprefix("."))
     return reader
 
 

@@ -13,7 +13,7 @@ import pytest
 from site_folder import EXAMPLE_PLUGIN, install
 from systems import PATIENCE
 
-from afspm import plugins
+from afspm import entry_points
 from afspm.drift.estimators import estimator
 from afspm.drift.registration import DriftScan
 from afspm.errors import ConfigError, FileError
@@ -114,8 +114,8 @@ def test_a_command_of_a_plug_in_is_run_and_a_broken_one_spoils_nothing(site: Pat
 
 
 def test_a_name_that_nobody_offers_is_none() -> None:
-    assert plugins.find(plugins.READERS, "example") is None
-    assert plugins.load(plugins.READERS, "example") is None
+    assert entry_points.find(entry_points.READERS, "example") is None
+    assert entry_points.load(entry_points.READERS, "example") is None
 
 
 def test_a_name_that_two_packages_offer_is_refused(site: Path) -> None:
@@ -124,4 +124,4 @@ def test_a_name_that_two_packages_offer_is_refused(site: Path) -> None:
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other-plugin\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[afspm.readers]\nexample = other_plugin:read\n")
     with pytest.raises(ConfigError, match="several packages: example-plugin, other-plugin"):
-        plugins.load(plugins.READERS, "example")
+        entry_points.load(entry_points.READERS, "example")
