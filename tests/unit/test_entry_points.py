@@ -52,7 +52,9 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder.mkdir()
     install(EXAMPLE_PLUGIN, folder)
     monkeypatch.syspath_prepend(folder)
+    entry_points.forget()
     yield folder
+    entry_points.forget()
     for name in [name for name in sys.modules if name.partition(".")[0] == "example_plugin"]:
         del sys.modules[name]
 
@@ -114,7 +116,7 @@ def test_a_command_of_a_plug_in_is_run_and_a_broken_one_spoils_nothing(site: Pat
 
 
 def test_a_name_that_nobody_offers_is_none() -> None:
-    assert entry_points.find(entry_points.READERS, "example") is None
+    assert entry_points.find("example", entry_points.READERS) is None
     assert entry_points.load(entry_points.READERS, "example") is None
 
 
@@ -123,5 +125,6 @@ def test_a_name_that_two_packages_offer_is_refused(site: Path) -> None:
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other-plugin\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[afspm.readers]\nexample = other_plugin:read\n")
+    entry_points.forget()
     with pytest.raises(ConfigError, match="several packages: example-plugin, other-plugin"):
         entry_points.load(entry_points.READERS, "example")
