@@ -89,10 +89,15 @@ def class_path(name: str) -> str | None:
     return None if point is None else f"{point.module}.{point.attr}"
 
 
+def modules(*groups: str) -> tuple[str, ...]:
+    """Return the modules that the names of some groups are in, sorted."""
+    return tuple(sorted({point.module for point in _points(groups)}))
+
+
 def is_declared(class_: type) -> bool:
-    """Return whether a class, or a class that it is derived from, is in a module that declares classes."""
-    modules = {point.module for point in _points(CLASSES)}
-    return any(base.__module__ in modules for base in class_.__mro__)
+    """Return whether a class, or a class that it is derived from, is in a module of declared classes."""
+    declared = modules(*CLASSES)
+    return any(base.__module__ in declared for base in class_.__mro__)
 
 
 def load(group: str, name: str) -> Any:
