@@ -13,7 +13,7 @@ of any other package, and are found in the same way. A package declares a line f
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
@@ -117,15 +117,24 @@ def folder(group: str, name: str) -> Path | None:
     return None if spec is None or spec.origin is None else Path(spec.origin).parent
 
 
-def inventory() -> tuple[DeclaredName, ...]:
-    """Load everything that is declared, and return it by group and name, each with why it can't be used."""
+def inventory(taken_commands: Collection[str] = ()) -> tuple[DeclaredName, ...]:
+    """Load everything that is declared, and return it by group and name, each with why it can't be used.
+
+    Args:
+        taken_commands: the commands of the core, which no package replaces.
+    """
     found = []
-    for group in GROUPS:
-        for point in sorted(_points([group]), key=lambda point: (point.name, _package(point))):
+    for group, points in sorted(_installed().items(), key=lambda item: (item[0] not in GROUPS, item[0])):
+        for point in sorted(points, key=lambda point: (_package(point), point.name)):
             problem = ""
             try:
-                find(point.name, *(CLASSES if group in CLASSES else (group,)))
-                _loaded(point)
+                if group not in GROUPS:
+                    problem = f"there is no such group, but {', '.join(GROUPS)}"
+                elif group == COMMANDS and point.name in taken_commands:
+                    problem = "afspm has a command of this name"
+                else:
+                    find(point.name, *(CLASSES if group in CLASSES else (group,)))
+                    _loaded(point)
             except ConfigError as error:
                 problem = error.what
             found.append(DeclaredName(group, point.name, _package(point, with_version=True), problem))
@@ -136,7 +145,8 @@ def inventory() -> tuple[DeclaredName, ...]:
 def _installed() -> Mapping[str, tuple[EntryPoint, ...]]:
     # metadata.entry_points() reads the files of all packages at each call
     points = metadata.entry_points()
-    return {group: tuple(points.select(group=group)) for group in GROUPS}
+    groups = sorted(group for group in points.groups if group.startswith("afspm."))
+    return {group: tuple(points.select(group=group)) for group in groups}
 
 
 def forget() -> None:
@@ -145,7 +155,7 @@ def forget() -> None:
 
 
 def _points(groups: Iterable[str]) -> Iterable[EntryPoint]:
-    return (point for group in groups for point in _installed()[group])
+    return (point for group in groups for point in _installed().get(group, ()))
 
 
 def _loaded(point: EntryPoint) -> Any:

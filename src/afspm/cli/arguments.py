@@ -15,9 +15,7 @@ MICROSCOPES, PLUGINS = "Microscopes", "Plug-ins"
 """The panels of `afspm --help`."""
 
 Files = Annotated[list[Path], typer.Argument(metavar="FILE [OVERLAY…]", help=_FILES, show_default=False)]
-FilesUnlessResumed = Annotated[
-    list[Path] | None, typer.Argument(metavar="FILE [OVERLAY…]", help=_FILES, show_default=False)
-]
+OptionalFiles = Annotated[list[Path] | None, typer.Argument(metavar="FILE [OVERLAY…]", help=_FILES, show_default=False)]
 Where = Annotated[Path, typer.Argument(metavar="RUN|FILE", help=_WHERE)]
 RecordedRun = Annotated[
     Path, typer.Argument(metavar="RUN", help="The folder of a run, or of all runs: its newest is meant.")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Protocol
 import typer
 
 from afspm import entry_points
-from afspm.cli.arguments import RUNS, FilesUnlessResumed, Runs, Speed, names_in, opt
+from afspm.cli.arguments import RUNS, OptionalFiles, Runs, Speed, names_in, opt
 from afspm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ class Page(Protocol):
 
 
 def run(
-    files: FilesUnlessResumed = None,
+    files: OptionalFiles = None,
     only: Annotated[
         list[str] | None, opt("Start these processes here, and no others.", "--only", metavar="NAME[,NAME…]")
     ] = None,

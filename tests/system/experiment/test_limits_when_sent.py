@@ -96,7 +96,7 @@ sys.stdin.read()
 '''
 
 
-@pytest.mark.parametrize("microscope", ["simulator", *sorted(MAKERS.keys() - {"gxsm"})])
+@pytest.mark.parametrize("microscope", ["simulator", *sorted(MAKERS)])
 def test_burst_of_requests_stays_in_the_region(microscope: str, tmp_path: Path) -> None:
     overlay, script = tmp_path / "overlay.toml", tmp_path / "burst.py"
     overlay.write_text(LIMITED.replace("SCRIPT", script.as_posix()), encoding="utf-8")
