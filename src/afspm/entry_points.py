@@ -32,14 +32,13 @@ READERS = "afspm.readers"  # by the suffix of a file, without its dot: (path, zo
 EXPORTERS = "afspm.exporters"  # afspm export --to NAME: a module, see afspm.record.export
 ESTIMATORS = "afspm.estimators"  # of drift, by name
 TRACKERS = "afspm.trackers"  # of drift, by name
+FIGURES = "afspm.figures"  # of the report: (run, title), draws into the folder of the run
 COMMANDS = "afspm.commands"  # afspm NAME: a function, or a typer.Typer
-PAGES = (
-    "afspm.pages"  # what `afspm run --dashboard` shows a run with: a module with the functions of afspm.cli.run.Page
-)
+PAGES = "afspm.pages"  # `afspm run --dashboard`: a module with the functions of afspm.cli.run.Page
 
 CLASSES = (COMPONENTS, SCHEDULERS, DRIVERS, EMULATORS)
 """The groups of the classes that an experiment file names without a module."""
-GROUPS = (*CLASSES, READERS, EXPORTERS, ESTIMATORS, TRACKERS, COMMANDS, PAGES)
+GROUPS = (*CLASSES, READERS, EXPORTERS, ESTIMATORS, TRACKERS, FIGURES, COMMANDS, PAGES)
 
 
 @dataclass(frozen=True)
