@@ -34,7 +34,7 @@ ESTIMATORS = "afspm.estimators"  # of drift, by name
 TRACKERS = "afspm.trackers"  # of drift, by name
 FIGURES = "afspm.figures"  # of the report: (run, title), draws into the folder of the run
 COMMANDS = "afspm.commands"  # afspm NAME: a function, or a typer.Typer
-PAGES = "afspm.pages"  # `afspm run --dashboard`: a module with the functions of afspm.cli.run.Page
+PAGES = "afspm.pages"  # `afspm run --dashboard`: a module with the functions of afspm.cli.run.RunPage
 
 CLASSES = (COMPONENTS, SCHEDULERS, DRIVERS, EMULATORS)
 """The groups of the classes that an experiment file names without a module."""

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 class DeclaredCommands(TyperGroup):
-    """The core's own commands, and those that packages declare: loaded for the help, and where they are called."""
+    """The commands of the core, and the commands of packages, which are loaded for the help and where they are called."""
 
     def list_commands(self, ctx: object) -> list[str]:
         declared = entry_points.names(entry_points.COMMANDS)
@@ -99,10 +99,9 @@ app.command("emulate", rich_help_panel=MICROSCOPES)(drivers.emulate)
 
 
 def _declared(name: str) -> Command | None:
-    """Return the command that a package declares: one that can't be loaded says why when it is called."""
     try:
         found = entry_points.load(entry_points.COMMANDS, name)
-    except ConfigError as error:
+    except ConfigError as error:  # raised again where the command is called: the help of all others has to show
         found = _unloadable(error)
     if found is None:
         return None

@@ -29,7 +29,7 @@ def doctor(
 
     Looks at names, ports, keys, clocks, versions, disk and memory, and at what the scheduler publishes. It works before
     the experiment runs, while it runs, and when a part of it does not. Lists the drivers, components, readers … of all
-    installed packages, and those that can't be loaded. Without a file it looks at this computer alone. Ends with 1 if
+    installed packages, with the reason where one can't be loaded. Without a file it looks at this computer alone. Ends with 1 if
     something keeps the experiment from working.
     """
     from afspm.experiment import load
@@ -45,7 +45,6 @@ def doctor(
 
 
 def _commands(context: typer.Context) -> Collection[str]:
-    """Return the commands of the core."""
     root = context.find_root().command
     return root.commands.keys() if isinstance(root, TyperGroup) else ()
 

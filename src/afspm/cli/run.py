@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from afspm.supervisor.run import FinishedRun
 
 
-class Page(Protocol):
+class RunPage(Protocol):
     """The functions of a module that shows runs in the browser."""
 
     def with_page(self, files: list[Path]) -> Experiment:
@@ -136,8 +136,8 @@ def _stay(experiment: Experiment, ended: FinishedRun, wanted: bool | None) -> No
         page.stay(ended.folder, *found)
 
 
-def _page() -> Page:
-    page: Page | None = entry_points.load(entry_points.PAGES, "dashboard")
+def _page() -> RunPage:
+    page: RunPage | None = entry_points.load(entry_points.PAGES, "dashboard")
     if page is None:
         raise ConfigError("no installed package shows a run in the browser", where=entry_points.PAGES)
     return page

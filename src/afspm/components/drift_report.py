@@ -1,4 +1,4 @@
-"""Drift against time, for the report of a run of which no component has drawn it."""
+"""Drift against time, for the report of a run without a component that draws it."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ def draw(run: Run, title: str) -> None:
 
 def drift_of(run: Run) -> DriftRecord:
     """Return the drift that the scheduler published."""
-    told = [wire.decode("DriftMapping", packet.payload) for packet in run.packets(messages=("DriftMapping",))]
-    told = [message for message in told if len(message.matrix) == 6 and len(message.center) == 2]
+    published = [wire.decode("DriftMapping", packet.payload) for packet in run.packets(messages=("DriftMapping",))]
+    published = [message for message in published if len(message.matrix) == 6 and len(message.center) == 2]
 
     def square(values: Any) -> NDArray[np.float64]:
         return np.array(values if len(values) == 4 else [np.nan] * 4, dtype=np.float64).reshape(2, 2)
 
     return DriftRecord(
-        keys=tuple(message.filename for message in told),
-        time_s=np.array([message.timestamp.ToNanoseconds() * 1e-9 for message in told]),
-        center_m=np.array([tuple(message.center) for message in told]).reshape(-1, 2),
-        drift_m=np.array([drift_at(np.array(m.matrix).reshape(2, 3), m.center) for m in told]).reshape(-1, 2),
-        covariance_m2=np.array([square(message.covariance) for message in told]).reshape(-1, 2, 2),
-        rate_m_s=np.array([tuple(m.rate) if len(m.rate) == 2 else (0.0, 0.0) for m in told]).reshape(-1, 2),
-        matched=np.array([message.matched for message in told], dtype=bool),
-        reasons=tuple(message.reason for message in told),
-        outcomes=tuple(drift_knowledge(message)[0] for message in told),
-        failures=tuple(message.failures for message in told),
+        keys=tuple(message.filename for message in published),
+        time_s=np.array([message.timestamp.ToNanoseconds() * 1e-9 for message in published]),
+        center_m=np.array([tuple(message.center) for message in published]).reshape(-1, 2),
+        drift_m=np.array([drift_at(np.array(m.matrix).reshape(2, 3), m.center) for m in published]).reshape(-1, 2),
+        covariance_m2=np.array([square(message.covariance) for message in published]).reshape(-1, 2, 2),
+        rate_m_s=np.array([tuple(m.rate) if len(m.rate) == 2 else (0.0, 0.0) for m in published]).reshape(-1, 2),
+        matched=np.array([message.matched for message in published], dtype=bool),
+        reasons=tuple(message.reason for message in published),
+        outcomes=tuple(drift_knowledge(message)[0] for message in published),
+        failures=tuple(message.failures for message in published),
     )
