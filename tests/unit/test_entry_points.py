@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib import metadata
 from pathlib import Path
 
@@ -174,14 +174,14 @@ def test_command_of_afspm_is_not_replaced_and_doctor_says_so(site: Path) -> None
 
 def test_metadata_of_the_installed_packages_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     read_times = 0
-    read = metadata.entry_points
+    read = metadata.distributions
 
-    def counted() -> metadata.EntryPoints:
+    def counted() -> Iterable[metadata.Distribution]:
         nonlocal read_times
         read_times += 1
         return read()
 
-    monkeypatch.setattr(metadata, "entry_points", counted)
+    monkeypatch.setattr(metadata, "distributions", counted)
     entry_points.forget()
     for name in ("Simulator", "Scheduler", "Nanonis"):
         assert entry_points.class_path(name) is not None
@@ -207,3 +207,16 @@ def declare(site: Path, lines: str) -> None:
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other-plugin\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(lines)
     entry_points.forget()
+
+
+def test_of_two_versions_of_a_package_the_first_in_the_path_is_used(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    declare(site, "[afspm.readers]\nold = other_plugin:read\n")
+    newer = tmp_path / "newer"
+    newer.mkdir()
+    declare(newer, "[afspm.readers]\nnew = other_plugin:read\n")
+    monkeypatch.syspath_prepend(newer)
+    entry_points.forget()
+    assert entry_points.find("new", entry_points.READERS) is not None
+    assert entry_points.find("old", entry_points.READERS) is None

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 class DeclaredCommands(TyperGroup):
-    """The commands of the core, and the commands of packages, which are loaded for the help and where they are called."""
+    """The commands of the core and of packages, which are loaded for the help and where they are called."""
 
     def list_commands(self, ctx: object) -> list[str]:
         declared = entry_points.names(entry_points.COMMANDS)

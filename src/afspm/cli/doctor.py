@@ -29,8 +29,8 @@ def doctor(
 
     Looks at names, ports, keys, clocks, versions, disk and memory, and at what the scheduler publishes. It works before
     the experiment runs, while it runs, and when a part of it does not. Lists the drivers, components, readers … of all
-    installed packages, with the reason where one can't be loaded. Without a file it looks at this computer alone. Ends with 1 if
-    something keeps the experiment from working.
+    installed packages, with the reason where one can't be loaded. Without a file it looks at this computer alone. Ends
+    with 1 if something keeps the experiment from working.
     """
     from afspm.experiment import load
     from afspm.supervisor.doctor import examine
