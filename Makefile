@@ -88,10 +88,10 @@ test-gateway: $(TEST)
 	@AFSPM_SCHEMATHESIS_S=240 $(BIN)/pytest tests/system/gateway
 
 ## each base operation of every translator: the simulated microscope's, the image's, and those of emulated controllers
-TRANSLATORS ?= simulator image emulated_nanonis emulated_asylum emulated_gxsm emulated_nanosurf emulated_park
+TRANSLATORS ?= $(wildcard experiments/every_microscope/[is]*.toml src/afspm/microscopes/*/emulated.toml)
 test-translators: $(TEST)
-	@printf '%s\n' $(TRANSLATORS) | xargs -P 4 -I NAME $(BIN)/afspm test-translator experiments/every_microscope/NAME.toml \
-	  --frame "500 nm" --runs build/translators --report build/translators/NAME.json
+	@printf '%s\n' $(TRANSLATORS) | xargs -P 4 -I FILE $(BIN)/afspm test-translator FILE \
+	  --frame "500 nm" --runs build/translators
 
 ## build the clients in other languages, and judge each by `afspm test-client`; what is not installed is skipped: CLIENTS=rust
 CLIENTS ?=

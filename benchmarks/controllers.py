@@ -15,15 +15,9 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
-from afspm import wire
-from afspm.microscopes.asylum import Asylum
-from afspm.microscopes.gxsm import Gxsm
-from afspm.microscopes.nanonis import Nanonis
-from afspm.microscopes.nanosurf import Nanosurf
-from afspm.microscopes.park import Park
+from afspm import entry_points, wire
 from afspm.model import ControlRequest, Parameter, Region, Request, ScanParameters, ScopeState, names
 from afspm.process.memory import Memory
-from afspm.translator.driver import Driver
 from afspm.translator.tcp import Receiver
 from afspm.translator.translator import Translator
 from afspm.translator.zmq_connection import ZmqConnection
@@ -34,15 +28,14 @@ from benchmarks.rows import Row, measurement
 
 REQUESTS = effort(200, 2)
 AT_MOST_MS = 1.0
-TCP, ZEROMQ = (Receiver, "some"), (ZmqConnection, "_await_reply")
-VENDORS: dict[str, tuple[type[Driver], tuple[type, str]]] = {
-    "asylum": (Asylum, ZEROMQ),
-    "nanonis": (Nanonis, TCP),
-    "nanosurf": (Nanosurf, TCP),
-    "gxsm": (Gxsm, TCP),
-    "park": (Park, ZEROMQ),
+WAITS = ((Receiver, "some"), (ZmqConnection, "_await_reply"))
+"""The classes and their methods that wait for the answer of a controller, over TCP and over ZeroMQ."""
+VENDORS = {
+    name.lower(): name
+    for name in entry_points.names(entry_points.DRIVERS)
+    if f"{name}Emulator" in entry_points.names(entry_points.EMULATORS)
 }
-"""The driver, and the class and its method that waits for the answer of the controller."""
+"""The drivers of the emulated controllers, by the names of the emulators."""
 FRAME = ScanParameters(Region((1e-7, -5e-8), (4e-7, 3e-7), 0.1), (48, 64), "m")
 
 
@@ -100,7 +93,7 @@ class Answers:
 def translator(vendor: str, processes: Roles, folder: Path, port: Answers) -> Translator:
     """A translator in this process, connected to an emulated controller in another."""
     address = processes.start("emulator", vendor=vendor, folder=str(folder / "files"))
-    microscope: Any = VENDORS[vendor][0]
+    microscope = entry_points.load(entry_points.DRIVERS, VENDORS[vendor])
     memory = Memory(folder / "state.json", synced=False)
     made = Translator(microscope(address=address), port, memory, folder, logging.getLogger("benchmark"))
     made.look()
@@ -126,7 +119,8 @@ def controller(vendor: str) -> Iterator[Row]:
         folder = Path(stack.enter_context(TemporaryDirectory()))
         made = translator(vendor, stack.enter_context(roles()), folder, port)
         stack.callback(made.driver.close)
-        stack.enter_context(waiting.counted(*VENDORS[vendor][1]))
+        for wait in WAITS:
+            stack.enter_context(waiting.counted(*wait))
         asked = [Parameter(names.SCAN_SPEED, None, None)]
         set_ = bias if names.TIP_BIAS_VOLTAGE in made.driver.table else speed
         for what, kind, subjects in (

@@ -10,14 +10,15 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 VENV = ROOT / ".venv"
 TOOLS = ROOT / "build" / "tools"
 UV_VERSION = "uv>=0.5,<1"
-EXTRAS = ("bluesky", "dashboard", "features", "gateway", "messages", "nanosurf", "park", "study", "testing", "xarray")
-"""What the tests use; Jupyter they install where they need it."""
+NOT_TESTED = {"all", "notebook"}
+"""The extras that are not installed for the tests: these install Jupyter where they need it."""
 
 
 def main(wanted: str) -> None:
@@ -30,7 +31,12 @@ def main(wanted: str) -> None:
     if wanted != "demo":
         groups = ["test", *(["browser"] if _has_browser() else []), *(["check"] if wanted == "all" else [])]
         groups += [wanted] if wanted in ("coverage", "gateway") else []
-        _sync(*(f"--group={group}" for group in ["pip", *groups]), *(f"--extra={extra}" for extra in EXTRAS))
+        _sync(*(f"--group={group}" for group in ["pip", *groups]), *(f"--extra={extra}" for extra in _extras()))
+
+
+def _extras() -> list[str]:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return sorted(project["optional-dependencies"].keys() - NOT_TESTED)
 
 
 def _sync(*options: str) -> None:

@@ -1,4 +1,4 @@
-"""Writes the reports of the emulated controllers, for the matrix: `python tools/commission_emulators.py [NAME…]`.
+"""Writes the reports of the emulated controllers, for the matrix: `python tools/commission_emulators.py [DRIVER…]`.
 
 It goes through `afspm commission` with each, at the speed that the command has by itself.
 """
@@ -10,13 +10,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from afspm import entry_points
 from afspm.testing.commissioning.procedure import commission
 from afspm.testing.commissioning.report import InstrumentReport
 from afspm.testing.translators import CheckOptions
 
 ROOT = Path(__file__).resolve().parents[1]
-REPORTS = ROOT / "docs/reference/instruments"
-EXPERIMENTS = ROOT / "experiments/every_microscope"
 
 
 class NoPanel:
@@ -36,9 +35,12 @@ class NoPanel:
 
 
 def main(names: Sequence[str]) -> None:
-    for name in names or sorted(file.stem.removeprefix("emulated_") for file in EXPERIMENTS.glob("emulated_*.toml")):
-        file = REPORTS / f"emulated_{name}.toml"
-        options = CheckOptions([EXPERIMENTS / f"emulated_{name}.toml"], runs=ROOT / "build/commissioning")
+    for name in names or entry_points.names(entry_points.DRIVERS):
+        folder = entry_points.folder(entry_points.DRIVERS, name)
+        if folder is None or not (folder / "emulated.toml").exists():
+            continue
+        file = folder / "reports/emulator.toml"
+        options = CheckOptions([folder / "emulated.toml"], runs=ROOT / "build/commissioning")
         result = commission(options, NoPanel(), file, "emulator")
         sys.stdout.write(f"{name}: {'passed' if result.passed else 'NOT AS IT SHOULD BE'} {result.lost}\n")
         report = InstrumentReport.read(file)

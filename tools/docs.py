@@ -16,9 +16,7 @@ from typing import Any
 
 import python_api
 
-from afspm import components
-from afspm.dashboard import Dashboard
-from afspm.gateway import Gateway
+from afspm import Component, entry_points
 from afspm.logic import arbitration, diagram
 from afspm.microscopes.simulator import Simulator
 from afspm.microscopes.simulator.faults import Fault
@@ -51,7 +49,9 @@ def transition_table() -> str:
 
 def instruments() -> str:
     """The matrix: how far each operation of each maker's controller has been tried, from the reports."""
-    reports = [InstrumentReport.read(file) for file in sorted((ROOT / "docs/reference/instruments").glob("*.toml"))]
+    reports = [
+        InstrumentReport.read(file) for folder in _makers().values() for file in sorted(folder.glob("reports/*.toml"))
+    ]
     rows = sorted({(report.maker, report.release) for report in reports})
     lines = ["| maker | release | " + " | ".join(OPERATIONS) + " |", "| --- " * (len(OPERATIONS) + 2) + "|"]
     for row in rows:
@@ -60,6 +60,25 @@ def instruments() -> str:
         lines.append("| " + " | ".join([*row, *cells]) + " |")
     told = [f"- {one.maker}, {one.release}, *{one.tried_on}*: {one.evidence}. {one.note}".rstrip() for one in reports]
     return "\n".join([*lines, "", *told]) + "\n"
+
+
+def controllers() -> str:
+    """The table of drivers: the maker, its program, the class, and how the controller is set up and emulated."""
+    lines = ["| maker | program | class | set it up | emulated |", "| --- | --- | --- | --- | --- |"]
+    for driver, folder in _makers().items():
+        class_, emulated = entry_points.load(entry_points.DRIVERS, driver), f"{driver}Emulator"
+        readme = f"[README](../../{(folder / 'README.md').relative_to(ROOT).as_posix()})"
+        is_emulated = emulated in entry_points.names(entry_points.EMULATORS)
+        shown = f"`{emulated}`, [emulated.toml](../../{(folder / 'emulated.toml').relative_to(ROOT).as_posix()})"
+        lines.append(f"| {class_.maker} | {class_.software} | `{driver}` | {readme} | {shown if is_emulated else ''} |")
+    return "\n".join(lines) + "\n"
+
+
+def _makers() -> dict[str, Path]:
+    """The folders of the drivers with a README, by the name of the driver."""
+    names = entry_points.names(entry_points.DRIVERS)
+    folders = ((name, entry_points.folder(entry_points.DRIVERS, name)) for name in names)
+    return {name: folder for name, folder in folders if folder is not None and (folder / "README.md").exists()}
 
 
 def _tried(reports: list[InstrumentReport], operation: str) -> str:
@@ -85,11 +104,10 @@ def _done(do: arbitration.ControlChange) -> str:
 
 def component_pages() -> str:
     """Each ready-made component: what it does, and its settings."""
-    found = {name: getattr(components, name) for name in components.__all__} | {
-        "Dashboard": Dashboard,
-        "Gateway": Gateway,
+    found = {
+        name: entry_points.load(entry_points.COMPONENTS, name) for name in entry_points.names(entry_points.COMPONENTS)
     }
-    return "\n".join(_class_page(name, found[name]) for name in sorted(found))
+    return "\n".join(_class_page(name, class_) for name, class_ in found.items() if issubclass(class_, Component))
 
 
 def simulator_page() -> str:
@@ -223,6 +241,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "state-diagram": state_diagram,
     "transition-table": transition_table,
     "instruments": instruments,
+    "controllers": controllers,
     "components": component_pages,
     "simulator": simulator_page,
     "python-api": python_api.python_api,

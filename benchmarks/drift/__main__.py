@@ -22,7 +22,8 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 from rich.console import Console
 from rich.table import Table
 
-from afspm.drift.estimators import DEFAULT, READY_MADE
+from afspm import entry_points
+from afspm.drift.estimators import DEFAULT
 from afspm.drift.estimators import estimator as estimator_named
 from afspm.errors import ConfigError
 from benchmarks.drift import sizes
@@ -32,6 +33,7 @@ from benchmarks.rows import Row
 
 PARTS = ("tracks", "sizes", "accuracy", "false_acceptance", "unseen", "independent")  # the longest jobs first
 RESULT = Path("build/bench-drift.json")
+NAMES = entry_points.names(entry_points.ESTIMATORS)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -63,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=secrets.randbelow(10**6) * 1000, help="default: a fresh one")
     parser.add_argument("--quick", action="store_true", help="an eighth of the pairs")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--estimators", nargs="+", default=[DEFAULT, *(n for n in READY_MADE if n != DEFAULT)],
+    parser.add_argument("--estimators", nargs="+", default=[DEFAULT, *(n for n in NAMES if n != DEFAULT)],
                         help="names; the first is held against the targets")  # fmt: skip
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     return parser

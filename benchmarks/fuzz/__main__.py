@@ -7,30 +7,21 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from afspm.emulators.asylum import AsylumEmulator
+from afspm.emulators import registry
 from afspm.emulators.emulator import Emulator
-from afspm.emulators.gxsm import GxsmEmulator
-from afspm.emulators.nanonis import NanonisEmulator
-from afspm.emulators.nanosurf import NanosurfEmulator
-from benchmarks.fuzz.asylum import AsylumFuzzer
 from benchmarks.fuzz.frame import Fuzzer, fuzz
-from benchmarks.fuzz.gxsm import GxsmFuzzer
-from benchmarks.fuzz.nanonis import NanonisFuzzer
-from benchmarks.fuzz.nanosurf import NanosurfFuzzer
 
 
 def emulators() -> Iterator[tuple[type[Fuzzer[Any]], Emulator]]:
-    """Each emulator, with what calls it."""
-    yield NanonisFuzzer, NanonisEmulator()
-    yield AsylumFuzzer, AsylumEmulator()
-    yield NanosurfFuzzer, NanosurfEmulator()
-    yield GxsmFuzzer, GxsmEmulator(version=3)
-    yield GxsmFuzzer, GxsmEmulator(version=4, card="RPSPMC")
-    if sys.platform.startswith("linux"):
-        yield GxsmFuzzer, GxsmEmulator(version=4, transport="shm")
+    """Yield each emulator, with what calls it: from the modules of this folder that have the name of an emulator."""
+    for name in registry.names():
+        if find_spec(f"benchmarks.fuzz.{name}") is not None:
+            yield from import_module(f"benchmarks.fuzz.{name}").cases()
 
 
 def main(count: int = 50_000, seed: int = 1) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from typing import Any, Final
 
 import zmq
@@ -101,3 +102,8 @@ class AsylumFuzzer(Fuzzer[AsylumEmulator]):
         connection.close()
         if reply is None or reply["errorCode"]["value"] != 0 or reply.get("messageID") != "check":
             raise Unfit(f"it answers {reply} to GV")
+
+
+def cases() -> Iterator[tuple[type[AsylumFuzzer], AsylumEmulator]]:
+    """Yield the emulators to be called."""
+    yield AsylumFuzzer, AsylumEmulator()

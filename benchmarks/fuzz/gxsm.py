@@ -12,7 +12,9 @@ import pickle
 import signal
 import socket
 import struct
+import sys
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -233,3 +235,11 @@ class _Memory:
             return self._chance.randbytes(self._chance.randrange(60))
         content = pickle.dumps(tuple(arguments), self._chance.randrange(5))
         return content[: self._chance.randrange(len(content))] if kind < 0.7 else content
+
+
+def cases() -> Iterator[tuple[type[GxsmFuzzer], GxsmEmulator]]:
+    """Yield the emulators to be called."""
+    yield GxsmFuzzer, GxsmEmulator(version=3)
+    yield GxsmFuzzer, GxsmEmulator(version=4, card="RPSPMC")
+    if sys.platform.startswith("linux"):
+        yield GxsmFuzzer, GxsmEmulator(version=4, transport="shm")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import socket
 import struct
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any, Final
 
@@ -146,3 +147,8 @@ def _packed(code: str, value: Any) -> bytes:
         count = struct.pack(">i", len(value)) if code[0] == "[" else b""
         return count + b"".join(_packed(code[1], one) for one in value)
     return struct.pack(f">{code.replace('n', 'i')}", value)
+
+
+def cases() -> Iterator[tuple[type[NanonisFuzzer], NanonisEmulator]]:
+    """Yield the emulators to be called."""
+    yield NanonisFuzzer, NanonisEmulator()

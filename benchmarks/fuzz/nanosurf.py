@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import struct
+from collections.abc import Iterator
 from typing import Final
 
 from afspm.emulators.nanosurf import NanosurfEmulator
@@ -104,3 +105,8 @@ def _exactly(connection: socket.socket, size: int) -> bytes:
             raise ConnectionError("the connection was closed")
         received += part
     return received
+
+
+def cases() -> Iterator[tuple[type[NanosurfFuzzer], NanosurfEmulator]]:
+    """Yield the emulators to be called."""
+    yield NanosurfFuzzer, NanosurfEmulator()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import inspect
 import re
 import tomllib
@@ -12,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from afspm.drift import estimators, trackers
+from afspm import entry_points
 from afspm.drift.trackers.references import Choice
 from afspm.drift.trackers.settings import BankSettings
 
@@ -28,9 +27,8 @@ ROWS = [
 def defaults(owner: str) -> dict[str, Any]:
     if owner == "bank":
         return {field.name: field.default for one in (BankSettings, Choice) for field in dataclasses.fields(one)}
-    path = ({**estimators.READY_MADE, **trackers.READY_MADE})[owner]
-    module, _, name = path.rpartition(".")
-    parameters = inspect.signature(getattr(importlib.import_module(module), name)).parameters
+    group = entry_points.TRACKERS if owner == "paper" else entry_points.ESTIMATORS
+    parameters = inspect.signature(entry_points.load(group, owner)).parameters
     return {name: one.default for name, one in parameters.items()}
 
 

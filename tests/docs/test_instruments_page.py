@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from afspm import entry_points
 from afspm.errors import FileError
 from afspm.testing.commissioning.progress import StepOutcome
 from afspm.testing.commissioning.report import InstrumentReport
@@ -13,14 +14,15 @@ from afspm.testing.commissioning.steps import OPERATIONS
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "reference" / "instruments.md"
-REPORTS = sorted((ROOT / "docs" / "reference" / "instruments").glob("*.toml"))
+FOLDERS = [entry_points.folder(entry_points.DRIVERS, name) for name in entry_points.names(entry_points.DRIVERS)]
+REPORTS = [file for folder in FOLDERS if folder is not None for file in sorted(folder.glob("reports/*.toml"))]
 
 
 def test_there_are_reports() -> None:
     assert len(REPORTS) >= 4
 
 
-@pytest.mark.parametrize("file", REPORTS, ids=lambda file: str(file.stem))
+@pytest.mark.parametrize("file", REPORTS, ids=lambda file: f"{file.parents[1].name}-{file.stem}")
 def test_a_report_tells_known_outcomes_of_known_operations(file: Path) -> None:
     report = InstrumentReport.read(file)
     assert set(report.operations) <= set(OPERATIONS)

@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 EXAMPLE_PLUGIN = Path(__file__).parent / "example_plugin"
+EXAMPLE_MAKER = Path(__file__).parent / "example_maker"
 
 
 def install(project: Path, site: Path) -> None:

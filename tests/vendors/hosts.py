@@ -12,8 +12,10 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import IO, Any, Protocol
 
+from afspm import entry_points
+
 HOST = "afspm.process.host"
-IMPORTED = [HOST, "numpy", "afspm.microscopes.asylum", "afspm.microscopes.gxsm", "afspm.microscopes.nanonis"]
+IMPORTED = [HOST, "numpy", *entry_points.modules(entry_points.DRIVERS)]
 
 
 class Host(Protocol):

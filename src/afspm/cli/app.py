@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from afspm import entry_points
 from afspm.cli import (
     clients,
     commission,
-    dashboard,
     demo,
     doctor,
-    drift,
     drivers,
     experiment_file,
     new,
@@ -26,10 +25,27 @@ from afspm.cli import (
     steer,
     trace,
 )
+from afspm.cli.arguments import AFTERWARDS, BEFORE, MEANWHILE, MICROSCOPES, PLUGINS
 from afspm.errors import ConfigError
+
+if TYPE_CHECKING:
+    from typer._click.core import Command
+
+
+class DeclaredCommands(TyperGroup):
+    """The commands of the core and of packages, which are loaded for the help and where they are called."""
+
+    def list_commands(self, ctx: object) -> list[str]:
+        declared = entry_points.names(entry_points.COMMANDS)
+        return [*self.commands, *(name for name in declared if name not in self.commands)]
+
+    def get_command(self, ctx: object, cmd_name: str) -> Command | None:
+        return self.commands.get(cmd_name) or _declared(cmd_name)
+
 
 app = typer.Typer(
     name="afspm",
+    cls=DeclaredCommands,
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode="markdown",  # paragraphs are filled; [security] is text
@@ -55,9 +71,6 @@ def _afspm(
     """Automate scanning probe microscopes: run experiments of several components that share one microscope."""
 
 
-BEFORE, MEANWHILE, AFTERWARDS = "Before", "While it runs", "Afterwards"
-MICROSCOPES, PLUGINS = "Microscopes", "Plug-ins"
-
 app.command("demo")(demo.demo)
 app.command("run")(run.run)
 app.add_typer(new.app, name="new", rich_help_panel=BEFORE)
@@ -66,7 +79,6 @@ app.command("doctor", rich_help_panel=BEFORE)(doctor.doctor)
 app.command("graph", rich_help_panel=BEFORE)(experiment_file.graph)
 app.command("keys", rich_help_panel=BEFORE)(experiment_file.keys)
 app.command("notify", rich_help_panel=BEFORE)(notify.notify)
-app.command("dashboard", rich_help_panel=MEANWHILE)(dashboard.dashboard)
 app.command("status", rich_help_panel=MEANWHILE)(status.status)
 app.command("watch", rich_help_panel=MEANWHILE)(status.watch)
 app.command("pause", rich_help_panel=MEANWHILE)(steer.pause)
@@ -79,7 +91,6 @@ app.command("runs", rich_help_panel=AFTERWARDS)(runs.runs)
 app.command("report", rich_help_panel=AFTERWARDS)(recorded.report)
 app.command("export", rich_help_panel=AFTERWARDS)(recorded.export)
 app.command("replay", rich_help_panel=AFTERWARDS)(recorded.replay)
-app.add_typer(drift.app, name="drift", rich_help_panel=AFTERWARDS)
 app.command("test-client", rich_help_panel=MICROSCOPES)(clients.check_client)
 app.command("test-translator", rich_help_panel=MICROSCOPES)(drivers.check_translator)
 app.command("commission", rich_help_panel=MICROSCOPES)(commission.commission)
@@ -87,17 +98,21 @@ app.command("trace", rich_help_panel=MICROSCOPES)(trace.trace)
 app.command("emulate", rich_help_panel=MICROSCOPES)(drivers.emulate)
 
 
-def _add_plugins() -> None:
-    """Add the commands of installed packages: one that can't be loaded says so when it is called."""
-    for name in entry_points.names(entry_points.COMMANDS):
-        try:
-            command = entry_points.load(entry_points.COMMANDS, name)
-        except ConfigError as error:
-            command = _unloadable(error)
-        if isinstance(command, typer.Typer):
-            app.add_typer(command, name=name, rich_help_panel=PLUGINS)
-        else:
-            app.command(name, rich_help_panel=PLUGINS)(command)
+def _declared(name: str) -> Command | None:
+    try:
+        found = entry_points.load(entry_points.COMMANDS, name)
+    except ConfigError as error:  # raised again where the command is called: the help of all others has to show
+        found = _unloadable(error)
+    if found is None:
+        return None
+    if not isinstance(found, typer.Typer):
+        function, found = found, typer.Typer(add_completion=False, rich_markup_mode="markdown")
+        found.command()(function)
+    command = typer.main.get_command(found)
+    command.name = name
+    if isinstance(command, TyperCommand | TyperGroup):  # typer leaves the panel to add_typer
+        command.rich_help_panel = found.rich_help_panel if isinstance(found.rich_help_panel, str) else PLUGINS
+    return command
 
 
 def _unloadable(error: ConfigError) -> Callable[[], None]:
@@ -106,6 +121,3 @@ def _unloadable(error: ConfigError) -> Callable[[], None]:
         raise error
 
     return command
-
-
-_add_plugins()

@@ -10,11 +10,12 @@ import typer
 _FILES = "The experiment file; each further file overrides those before it, and needs to hold only what differs."
 _WHERE = "The folder of a run, a folder of runs (its newest is meant), or the experiment file."
 RUNS = Path("runs")
+BEFORE, MEANWHILE, AFTERWARDS = "Before", "While it runs", "Afterwards"
+MICROSCOPES, PLUGINS = "Microscopes", "Plug-ins"
+"""The panels of `afspm --help`."""
 
 Files = Annotated[list[Path], typer.Argument(metavar="FILE [OVERLAY…]", help=_FILES, show_default=False)]
-FilesUnlessResumed = Annotated[
-    list[Path] | None, typer.Argument(metavar="FILE [OVERLAY…]", help=_FILES, show_default=False)
-]
+OptionalFiles = Annotated[list[Path] | None, typer.Argument(metavar="FILE [OVERLAY…]", help=_FILES, show_default=False)]
 Where = Annotated[Path, typer.Argument(metavar="RUN|FILE", help=_WHERE)]
 RecordedRun = Annotated[
     Path, typer.Argument(metavar="RUN", help="The folder of a run, or of all runs: its newest is meant.")

@@ -1,4 +1,4 @@
-"""`afspm dashboard`: the page of an experiment that runs already, here or on another computer."""
+"""`afspm dashboard`: the page of an experiment that runs already, here or on another computer; and of `afspm run`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from afspm.cli.arguments import RUNS, Where, opt
+from afspm.cli.arguments import MEANWHILE, RUNS, Where, opt
 from afspm.plain_data import Plain, PlainMapping
 
 if TYPE_CHECKING:
@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 NAME_OF_CLASS = "Dashboard"
 
+app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=MEANWHILE)
 
+
+@app.command()
 def dashboard(
     where: Where = RUNS,
     host: Annotated[
@@ -80,7 +83,7 @@ def stay(folder: Path, name: str, settings: PlainMapping) -> None:
         # leaving closes its standard input, which ends the page if Ctrl-C has not
 
 
-def dashboard_of(experiment: Experiment, started: Sequence[str]) -> tuple[str, PlainMapping] | None:
+def page_of(experiment: Experiment, started: Sequence[str]) -> tuple[str, PlainMapping] | None:
     """Return name and settings of a dashboard among the processes that were started here; None: there is none."""
     for process in experiment.resolved.processes.values():
         if process.class_path.rpartition(".")[2] == NAME_OF_CLASS and process.name in started:
@@ -88,7 +91,7 @@ def dashboard_of(experiment: Experiment, started: Sequence[str]) -> tuple[str, P
     return None
 
 
-def with_dashboard(files: list[Path]) -> Experiment:
+def with_page(files: list[Path]) -> Experiment:
     """Return the experiment, with a dashboard if its file has none."""
     from afspm.experiment import load
 
@@ -96,7 +99,7 @@ def with_dashboard(files: list[Path]) -> Experiment:
     return experiment if _has_dashboard(experiment) else load(*files, _overlay())
 
 
-def resumed_with_dashboard(found: ResumableRun) -> ResumableRun:
+def resumed_with_page(found: ResumableRun) -> ResumableRun:
     """Return the run that is to go on, with a dashboard if it has none."""
     return found if _has_dashboard(found.experiment) else found.with_overlay(_overlay())
 
@@ -203,7 +206,7 @@ def _start_part(file: Path) -> int:
     from afspm.errors import ConfigError
     from afspm.supervisor import run as running
 
-    experiment = with_dashboard([file])
+    experiment = with_page([file])
     names = [one.name for one in experiment.resolved.processes.values() if one.class_path.endswith(f".{NAME_OF_CLASS}")]
     try:
         running.dry_run(experiment, running.RunOptions(only=tuple(names)))

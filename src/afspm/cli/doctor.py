@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer.core import TyperGroup
 
-from afspm.cli.arguments import RUNS, Files, Runs, opt
+from afspm.cli.arguments import RUNS, OptionalFiles, Runs, opt
 
 if TYPE_CHECKING:
     from afspm.supervisor.doctor import Examination
@@ -17,7 +19,8 @@ _COLOURS = {"fine": "green", "warning": "yellow", "error": "bold red"}
 
 
 def doctor(
-    files: Files,
+    context: typer.Context,
+    files: OptionalFiles = None,
     runs: Runs = RUNS,
     listen: Annotated[float, opt("For how long (s) to listen to what is published.", "--listen", min=0.1)] = 3.0,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
@@ -25,18 +28,25 @@ def doctor(
     """Say what is wrong with an experiment, seen from this computer, and what to do about it.
 
     Looks at names, ports, keys, clocks, versions, disk and memory, and at what the scheduler publishes. It works before
-    the experiment runs, while it runs, and when a part of it does not. Ends with 1 if something keeps it from working.
+    the experiment runs, while it runs, and when a part of it does not. Lists the drivers, components, readers … of all
+    installed packages, with the reason where one can't be loaded. Without a file it looks at this computer alone. Ends
+    with 1 if something keeps the experiment from working.
     """
     from afspm.experiment import load
     from afspm.supervisor.doctor import examine
 
-    examined = examine(load(*files), runs, listen)
+    examined = examine(load(*files) if files else None, runs, listen, _commands(context))
     if as_json:
         typer.echo(json.dumps(_as_json(examined), indent=2, ensure_ascii=False))
     else:
         _show(examined)
     if not examined.is_well:
         raise typer.Exit(1)
+
+
+def _commands(context: typer.Context) -> Collection[str]:
+    root = context.find_root().command
+    return root.commands.keys() if isinstance(root, TyperGroup) else ()
 
 
 def _as_json(examined: Examination) -> dict[str, object]:

@@ -9,6 +9,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from afspm.cli.arguments import AFTERWARDS
+
 _FILES = "files"
 
 
@@ -25,6 +27,7 @@ app = typer.Typer(
     cls=FilesUnlessNamed,
     no_args_is_help=True,
     rich_markup_mode="markdown",
+    rich_help_panel=AFTERWARDS,
     help="Follow drift in recorded scans (afspm drift FILE…; its options: afspm drift files --help), or study settings "
     "in simulated nights (afspm drift study).",
 )

@@ -24,7 +24,7 @@ from afspm.drift.record import DriftRecord
 from afspm.drift.registration import DriftScan, Registration
 from afspm.drift.trackers import tracker
 from afspm.errors import AfspmError, FileError, InvalidValue
-from afspm.files import FORMATS, FileContent, read
+from afspm.files import FileContent, read, suffixes
 from afspm.formatting import counted, day_and_time
 from afspm.model import RegistrationOutcome
 from afspm.record.journal import JOURNAL_FILE
@@ -97,7 +97,7 @@ def _files(paths: Sequence[Path]) -> Iterator[Path]:
             yield path
             continue
         folder = path / _SCANS_OF_A_RUN if (path / _SCANS_OF_A_RUN).is_dir() else path
-        found = sorted(file for file in folder.rglob("*") if file.is_file() and file.suffix.lower() in FORMATS)
+        found = sorted(file for file in folder.rglob("*") if file.is_file() and file.suffix.lower() in suffixes())
         of_the_controller = [file for file in found if file.suffix != RECORDED]
         # the record has the same scans once more, where drift was compensated in sample coordinates
         yield from of_the_controller if (path / JOURNAL_FILE).exists() and of_the_controller else found

@@ -26,7 +26,10 @@ def export(
     run: RecordedRun = RUNS,
     to: Annotated[
         str,
-        typer.Option(metavar="gwy|h5|nc|png|csv|documents", help="Gwyddion, NeXus, netCDF, pictures, tables, Bluesky."),
+        typer.Option(
+            metavar="FORMAT",
+            help="gwy, h5 (NeXus), nc, png, csv, documents (Bluesky), or another that `afspm doctor` lists.",
+        ),
     ] = "gwy",
     out: Annotated[Path | None, opt("Where to write. Default: export in the folder of the run.", metavar="DIR")] = None,
     scans: Annotated[str | None, opt("Only these scans, by their numbers; 7-: from 7 on.", metavar="1-5,8")] = None,

@@ -2,20 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Protocol
 
 import typer
 
-from afspm.cli.arguments import RUNS, FilesUnlessResumed, Runs, Speed, names_in, opt
+from afspm import entry_points
+from afspm.cli.arguments import RUNS, OptionalFiles, Runs, Speed, names_in, opt
+from afspm.errors import ConfigError
 
 if TYPE_CHECKING:
     from afspm.experiment import Experiment, ProcessStart
+    from afspm.plain_data import PlainMapping
+    from afspm.supervisor.resume import ResumableRun
     from afspm.supervisor.run import FinishedRun
 
 
+class RunPage(Protocol):
+    """The functions of a module that shows runs in the browser."""
+
+    def with_page(self, files: list[Path]) -> Experiment:
+        """Return the experiment of these files, with a page if the files have none."""
+
+    def resumed_with_page(self, found: ResumableRun) -> ResumableRun:
+        """Return the run that is to go on, with a page if it has none."""
+
+    def page_of(self, experiment: Experiment, started: Sequence[str]) -> tuple[str, PlainMapping] | None:
+        """Return name and settings of a page among the processes that were started here; None: there is none."""
+
+    def stay(self, folder: Path, name: str, settings: PlainMapping) -> None:
+        """Show a run that has ended until Ctrl-C, on the page of this name and these settings."""
+
+
 def run(
-    files: FilesUnlessResumed = None,
+    files: OptionalFiles = None,
     only: Annotated[
         list[str] | None, opt("Start these processes here, and no others.", "--only", metavar="NAME[,NAME…]")
     ] = None,
@@ -57,7 +78,6 @@ def run(
     from dataclasses import replace
 
     from afspm.cli import metadata_questions
-    from afspm.cli.dashboard import resumed_with_dashboard, with_dashboard
     from afspm.cli.experiment_file import require_no_errors
     from afspm.experiment import load
     from afspm.supervisor import resume as resuming
@@ -77,7 +97,7 @@ def run(
             raise typer.BadParameter(said, param_hint="--resume")
         found = resuming.find(resume)
         if dashboard:
-            found = resumed_with_dashboard(found)
+            found = _page().resumed_with_page(found)
         as_begun = found.options(options)
         require_no_errors(found.experiment, as_begun.only, as_begun.without)
         ended = resuming.resume(found, options, terminal=sys.stdout)
@@ -85,7 +105,7 @@ def run(
         raise typer.Exit(ended.outcome.exit_code)
     if not files:
         raise typer.BadParameter("name an experiment file, or a run with --resume", param_hint="FILE")
-    experiment = with_dashboard(files) if dashboard else load(*files)
+    experiment = _page().with_page(files) if dashboard else load(*files)
     require_no_errors(experiment, options.only, options.without)
     if dry_run:
         for start in running.dry_run(experiment, options):
@@ -102,14 +122,25 @@ def _stay(experiment: Experiment, ended: FinishedRun, wanted: bool | None) -> No
     """Keep the page of a dashboard that was started here, unless a person has stopped the run."""
     import sys
 
-    from afspm.cli.dashboard import dashboard_of, stay
     from afspm.logic.supervision.run_end import EndReason
 
     started = [report.name for report in ended.outcome.reports if report.starts]
     if ended.outcome.why is EndReason.STOPPED or not (sys.stdout.isatty() if wanted is None else wanted):
         return
-    if (found := dashboard_of(experiment, started)) is not None:
-        stay(ended.folder, *found)
+    try:
+        page = _page()
+    except ConfigError as error:  # the run has ended well: its exit code stays
+        typer.echo(f"the page does not stay: {error}", err=True)
+        return
+    if (found := page.page_of(experiment, started)) is not None:
+        page.stay(ended.folder, *found)
+
+
+def _page() -> RunPage:
+    page: RunPage | None = entry_points.load(entry_points.PAGES, "dashboard")
+    if page is None:
+        raise ConfigError("no installed package shows a run in the browser", where=entry_points.PAGES)
+    return page
 
 
 def _told(start: ProcessStart) -> str:

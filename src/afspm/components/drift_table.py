@@ -13,8 +13,8 @@ from afspm.client.component import Component
 from afspm.clock import iso_utc
 from afspm.components.line_file import LineFile, csv_line
 from afspm.drift.record import COLUMNS as RECORD
-from afspm.drift.record import drift_at
 from afspm.model import RegistrationOutcome
+from afspm.model.drift_mapping import drift_at
 
 COLUMNS = ("datetime", "filename", "offset_x", "offset_y", "rate_x", "rate_y", "units", *RECORD, "lost", "correcting")
 

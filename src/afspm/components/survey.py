@@ -14,10 +14,10 @@ from afspm.client.keyed_results import check_key
 from afspm.components.planned_scans import FRAME, Pixels, checked_parameters, pair, shape_of
 from afspm.components.scan_plan import XY, ScanPlan
 from afspm.components.target_finder import TargetFinder
-from afspm.drift.record import drift_knowledge
 from afspm.errors import ConfigError, Refused
 from afspm.formatting import area_text, counted, lengths_text, position_text
 from afspm.model import Region, RegistrationOutcome, Scan, ScanSet, names, registration_summary
+from afspm.model.drift_mapping import drift_knowledge
 from afspm.storage.atomic import OutageLog
 from afspm.survey.record import Outcome, SurveyRecord, Visit
 from afspm.survey.targets import Target, lowest_beside

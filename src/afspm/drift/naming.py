@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import inspect
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 from afspm import entry_points
 from afspm.errors import AfspmError, ConfigError
@@ -13,15 +13,13 @@ from afspm.plain_data import PlainMapping
 from afspm.requirements import require
 
 
-def named(
-    what: str, spec: str | PlainMapping, ready_made: Mapping[str, str], default: str, *arguments: object
-) -> tuple[object, str]:
+def named(what: str, spec: str | PlainMapping, default: str, *arguments: object) -> tuple[object, str]:
     """Return the part that a user asks for, and its name.
 
     Args:
-        what: "estimator" or "tracker", for errors.
-        spec: a name of `ready_made` or "module.Name", or a table with that as its `class` and the settings of it (only
-            `class` names code).
+        what: "estimator" or "tracker".
+        spec: a name that a package declares or "module.Name", or a table with that as its `class` and the settings of
+            it (only `class` names code).
         default: where the table has no class.
         arguments: given before the settings.
 
@@ -32,7 +30,7 @@ def named(
     name = settings.pop("class", default)
     if not isinstance(name, str):
         raise ConfigError(f"{_a(what)} must be a text, not {name!r}", where="class")
-    found = _imported(what, name) if "." in name else _ready_made(what, name, ready_made)
+    found = _imported(what, name) if "." in name else _declared(what, name)
     require(found)
     _check_settings(what, name, found, settings, len(arguments))
     try:
@@ -57,14 +55,13 @@ def _imported(what: str, name: str) -> type[object]:
     return found
 
 
-def _ready_made(what: str, name: str, ready_made: Mapping[str, str]) -> type[object]:
-    if name not in ready_made:
-        if isinstance(plugin := entry_points.load(f"afspm.{what}s", name), type):
-            return plugin
-        known = ", ".join(ready_made)
-        hint = _near(name.casefold(), ready_made) or f"known: {known}; name one of your own as module.Name"
+def _declared(what: str, name: str) -> type[object]:
+    found = entry_points.load(f"afspm.{what}s", name)
+    if not isinstance(found, type):
+        known = entry_points.names(f"afspm.{what}s")
+        hint = _near(name.casefold(), known) or f"known: {', '.join(known)}; name one of your own as module.Name"
         raise ConfigError(f"there is no {what} {name!r}", hint=hint)
-    return _imported(what, ready_made[name])
+    return found
 
 
 def _check_settings(what: str, name: str, class_: type[object], settings: PlainMapping, given: int) -> None:

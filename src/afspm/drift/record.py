@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +14,7 @@ from afspm.drift.registration import DriftScan
 from afspm.drift.tracking import Update
 from afspm.errors import FileError
 from afspm.model import RegistrationOutcome, registration_summary
+from afspm.model.drift_mapping import drift_at
 
 Array = NDArray[np.float64]
 
@@ -165,20 +164,3 @@ class DriftRecord:
             )
         except (KeyError, ValueError, TypeError) as error:
             raise FileError(f"is not a table of drift: {error}", where=str(path)) from error
-
-
-def drift_at(matrix: Array, center_m: Sequence[float]) -> Array:
-    """(2,) by how much the sample is displaced where the tip is: x_tip - x_sample."""
-    at = np.asarray(center_m, dtype=np.float64)
-    drift: Array = at - (matrix[:2, :2] @ at + matrix[:2, 2])
-    return drift
-
-
-def drift_knowledge(message: Any) -> tuple[RegistrationOutcome, float | None]:
-    """Return how a DriftMapping knows the position of its scan, and its standard deviation along the axis where it is
-    largest; None: not known."""
-    outcome = RegistrationOutcome.of(message.outcome, matched=message.matched)
-    if len(message.covariance) != 4:
-        return outcome, None
-    largest = float(np.linalg.eigvalsh(np.array(message.covariance).reshape(2, 2))[-1])
-    return outcome, math.sqrt(max(largest, 0.0))

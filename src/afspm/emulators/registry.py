@@ -1,39 +1,41 @@
-"""The emulators that there are, by the names that a command line uses. Each is only imported when it is wanted."""
+"""The emulators by the names that a command line uses: of "NanonisEmulator", `afspm emulate nanonis`."""
 
 from __future__ import annotations
 
 import importlib
-import pkgutil
 from types import ModuleType
 
-from afspm import emulators
+from afspm import entry_points
 from afspm.emulators.emulator import Emulator
 from afspm.errors import ConfigError
 
-CONSTANT = "EMULATOR"
-"""A package of an emulator says by this name which of its classes it is."""
-
 
 def names() -> list[str]:
-    """Return the names of afspm's emulators: the packages beside this module."""
-    return sorted(module.name for module in pkgutil.iter_modules(emulators.__path__) if module.ispkg)
+    """Return the names of the emulators that installed packages declare."""
+    return sorted(map(_spoken, entry_points.names(entry_points.EMULATORS)))
 
 
 def emulator(name: str) -> type[Emulator]:
-    """The emulator of a name, or one of the user's by "module.Class".
+    """Return the emulator of a name, or one of the user's by "module.Class".
 
     Raises:
         ConfigError: there is none, or it can't be imported.
     """
     module_name, _, class_name = name.rpartition(".")
-    if not module_name:
-        if name not in names():
-            raise ConfigError(f"there is no emulator {name!r}", hint=f"there are {', '.join(names()) or 'none'}")
-        module_name, class_name = f"{emulators.__name__}.{name}", CONSTANT
-    found = getattr(_imported(module_name, name), class_name, None)
+    if module_name:
+        found = getattr(_imported(module_name, name), class_name, None)
+    else:
+        declared = {_spoken(one): one for one in entry_points.names(entry_points.EMULATORS)}
+        if name not in declared:
+            raise ConfigError(f"there is no emulator {name!r}", hint=f"there are {', '.join(declared) or 'none'}")
+        found = entry_points.load(entry_points.EMULATORS, declared[name])
     if not (isinstance(found, type) and issubclass(found, Emulator)):
         raise ConfigError(f"{name} is not an emulator", hint="a class derived from afspm.emulators.emulator.Emulator")
     return found
+
+
+def _spoken(class_name: str) -> str:
+    return class_name.removesuffix("Emulator").lower()
 
 
 def _imported(module: str, name: str) -> ModuleType:

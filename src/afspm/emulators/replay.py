@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import selectors
 import socket
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,17 +13,16 @@ from typing import Any, ClassVar
 
 import zmq
 
+from afspm import entry_points
 from afspm.emulators.emulator import LOOPBACK, Emulator
 from afspm.emulators.playback import Deviation, Playback
-from afspm.microscopes.gxsm import bridge
 from afspm.storage.atomic import write_atomic
+from afspm.translator.driver import Driver, Introduction
 from afspm.translator.trace import ZEROMQ, TraceHeader, read_trace
 from afspm.transport.polling import milliseconds
 
 RESULT = "replay.json"
 _AT_ONCE = 1 << 16
-_INTRODUCED = "Gxsm"
-"""The driver whose connections begin with proofs of a secret, which a trace does not hold."""
 
 
 @dataclass
@@ -35,7 +35,7 @@ class ReplayClient:
 
     number: int
     tcp: socket.socket | None = None
-    introduction: bridge.Introduction | None = None
+    introduction: Introduction | None = None
     identity: bytes = b""
     received: bytearray = field(default_factory=bytearray)
 
@@ -67,9 +67,7 @@ class TraceReplay(Emulator):
 
     def open(self) -> str:
         lines = read_trace(self._trace)
-        header = lines[0]
-        is_introduced = isinstance(header, TraceHeader) and header.driver == _INTRODUCED
-        self._secret = bridge.secret() if is_introduced else b""
+        self._introductions = _introductions(lines[0])
         self.playback = Playback(lines)
         self._clients: list[ReplayClient] = []
         if self.playback.transport == ZEROMQ:
@@ -101,7 +99,7 @@ class TraceReplay(Emulator):
             if key.fileobj is self._listener:
                 connected, _ = self._listener.accept()
                 address = "{}:{}".format(*connected.getsockname())
-                introduction = bridge.Introduction(self._secret, address) if self._secret else None
+                introduction = None if self._introductions is None else self._introductions(address)
                 client = ReplayClient(self.playback.connect(), connected, introduction)
                 self._clients.append(client)
                 self._selector.register(connected, selectors.EVENT_READ, client)
@@ -118,7 +116,7 @@ class TraceReplay(Emulator):
         while b"\n" in client.received and client.introduction is not None and not client.introduction.is_over:
             line, _, rest = client.received.partition(b"\n")
             client.received[:] = rest
-            reply = client.introduction.reply(bridge.parsed(bytes(line)))
+            reply = client.introduction.reply_to(bytes(line))
             if not reply:
                 self._drop(client)
                 return
@@ -196,3 +194,9 @@ class TraceReplay(Emulator):
                 client.tcp.close()
         self._listener.close()
         self._selector.close()
+
+
+def _introductions(header: object) -> Callable[[str], Introduction] | None:
+    name = header.driver if isinstance(header, TraceHeader) else ""
+    driver: type[Driver] | None = entry_points.load(entry_points.DRIVERS, name)
+    return None if driver is None else driver.introductions()

@@ -16,32 +16,13 @@ from types import ModuleType
 from typing import Any
 
 from afspm import entry_points
+from afspm.errors import ConfigError
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.parts import DECLARED_KEYS
 from afspm.experiment.published import GUIDE
 from afspm.experiment.toml_lines import Table
 from afspm.model import Role
 
-# Where a class named without a module is looked for, in this order.
-SHORT_NAME_PACKAGES = (
-    "afspm.components",
-    "afspm.scheduler",
-    "afspm.microscopes.simulator",
-    "afspm.microscopes.image",
-    "afspm.microscopes.nanonis",
-    "afspm.microscopes.asylum",
-    "afspm.microscopes.gxsm",
-    "afspm.microscopes.nanosurf",
-    "afspm.microscopes.park",
-    "afspm.emulators.nanonis",
-    "afspm.emulators.asylum",
-    "afspm.emulators.gxsm",
-    "afspm.emulators.nanosurf",
-    "afspm.emulators.park",
-    "afspm.emulators.replay",
-    "afspm.dashboard",
-    "afspm.gateway",
-)
 # By where they come from: a class of the user is recognised by what it is derived from.
 _ROLE_BY_BASE = (
     ("afspm.scheduler", Role.SCHEDULER),
@@ -111,28 +92,21 @@ def _is_from(folder: Path, name: str) -> bool:
 
 
 def full_path(name: str) -> str:
-    """Return a name without a module as the full path of the class, of ours or of a plug-in; other paths as they are.
+    """Return a name without a module as the full path of the class that a package declares; other paths as they are.
 
     Raises:
-        Unloadable: there is no such class.
+        Unloadable: there is no such class, or several packages declare it.
     """
     if "." in name:
         return name
-    known: list[str] = []
-    for package in SHORT_NAME_PACKAGES:
-        module = _import(package)
-        if module is None:
-            continue
-        offered = getattr(module, "__all__", None) or _own_classes(module)
-        if name in offered:
-            found = _attribute(module, name)
-            return f"{found.__module__}.{found.__qualname__}"
-        known += [n for n in offered if n[:1].isupper()]
-    for group in (entry_points.COMPONENTS, entry_points.DRIVERS):
-        if (path := entry_points.class_path(group, name)) is not None:
-            return path
-        known += entry_points.names(group)
-    raise Unloadable(f"there is no ready-made class {name!r}", nearest(name, known) or 'write it as "module.Name"')
+    try:
+        path = entry_points.class_path(name)
+    except ConfigError as error:
+        raise Unloadable(error.what, error.hint) from error
+    if path is None:
+        hint = nearest(name, entry_points.names(*entry_points.CLASSES)) or 'write it as "module.Name"'
+        raise Unloadable(f"there is no ready-made class {name!r}", hint)
+    return path
 
 
 def load(path: str) -> Any:
@@ -194,13 +168,6 @@ def _hidden(module: ModuleType) -> str:
     return ""
 
 
-def _import(package: str) -> ModuleType | None:
-    try:
-        return importlib.import_module(package)
-    except ImportError:
-        return None
-
-
 def _no_module(module: str, error: ModuleNotFoundError) -> Unloadable:
     missing = error.name or module
     if module != missing and not module.startswith(missing + "."):
@@ -242,10 +209,6 @@ def _where(error: BaseException) -> str:
 
 def _public_classes(module: ModuleType) -> list[str]:
     return [n for n, v in vars(module).items() if inspect.isclass(v) and not n.startswith("_")]
-
-
-def _own_classes(module: ModuleType) -> list[str]:
-    return [name for name in _public_classes(module) if getattr(module, name).__module__ == module.__name__]
 
 
 def _names(value: object) -> tuple[str, ...] | None:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
+from afspm import entry_points
 from afspm.client.parameter_values import to_parameter
 from afspm.errors import AfspmError
 from afspm.experiment.toml_lines import Table
@@ -15,14 +16,6 @@ from afspm.logic.limits import ExperimentLimits
 from afspm.model import ControlRequest, Parameter, ProbePosition, Region, Request, ScanParameters, names
 from afspm.model.geometry import XY
 from afspm.units import si
-
-PURE = (
-    "afspm.components",
-    "afspm.emulators",
-    "afspm.scheduler",
-    *(f"afspm.microscopes.{one}" for one in ("asylum", "gxsm", "image", "nanonis", "nanosurf", "park", "simulator")),
-)
-"""Classes from here, and those derived from them, do nothing in `__init__` but to keep and to check their settings."""
 
 
 @dataclass(frozen=True)
@@ -76,10 +69,13 @@ class Refusal:
 def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
     """Return the plan of a component with these settings; None where it has none, or none that can be known.
 
+    Only declared classes, and those derived from them, are made: they do nothing in `__init__` but to keep and to
+    check their settings.
+
     Raises:
         AfspmError: the component refuses its settings.
     """
-    if not any(f"{base.__module__}.".startswith(f"{package}.") for base in component.__mro__ for package in PURE):
+    if not entry_points.is_declared(component):
         return None
     made = component(**settings)
     if callable(check := getattr(made, "check", None)):

@@ -4,12 +4,13 @@
     content = read("scan0001.ibw")
     content.scans[0].values      # [y, x], both ascending
 
-A format is a function from a path and a time zone to a `FileContent`; `FORMATS` has them by the suffix.
+A reader is a function from a path and a time zone to a `FileContent`; packages declare readers by the suffix of their
+files (`afspm.entry_points`).
 """
 
 from __future__ import annotations
 
-from afspm.files.content import FileContent
-from afspm.files.reading import FORMATS, read
+from afspm.files.content import FileContent, OtherFormat
+from afspm.files.reading import read, suffixes
 
-__all__ = ["FORMATS", "FileContent", "read"]
+__all__ = ["FileContent", "OtherFormat", "read", "suffixes"]

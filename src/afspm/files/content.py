@@ -8,10 +8,17 @@ from dataclasses import dataclass, field
 from datetime import datetime, tzinfo
 from typing import Any
 
+from afspm.errors import FileError
 from afspm.model import Scan, Spectrum
 
 _UNIT = re.compile(r"\s*\(((?:[^()]|\([^()]*\))*)\)")  # one pair of parentheses may stand in another: A/sqrt(Hz)
 _TOPOGRAPHY = ("height", "zsensor", "topo", "zs-topo", "z")
+
+
+class OtherFormat(FileError):
+    """A file of another format with the same suffix: the next reader of the suffix is tried."""
+
+    code = "file-format"
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,4 @@
-"""NetCDF (.nc): GXSM's scans, NetCDF-3 of Gxsm3 and NetCDF-4 (which is HDF5) of Gxsm4, one channel a file; and those of
-the simulated microscope, told by their attribute Conventions.
+"""NetCDF (.nc): GXSM's scans, NetCDF-3 of Gxsm3 and NetCDF-4 (which is HDF5) of Gxsm4, one channel a file.
 
 Values are FloatField * dz; rows come from the top; lengths are in ångström whatever their attributes say; rangex goes
 from the first pixel to the last; offsetx is the centre; alpha is clockwise in degrees.
@@ -18,8 +17,8 @@ from numpy.typing import NDArray
 
 from afspm.clock import NS_PER_S
 from afspm.errors import FileError
-from afspm.files import hdf5, netcdf, simulator
-from afspm.files.content import FileContent
+from afspm.files import hdf5, netcdf
+from afspm.files.content import FileContent, OtherFormat
 from afspm.model import Region, Scan
 from afspm.units import convert
 
@@ -52,16 +51,13 @@ def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
     """A scan. Raises FileError, KeyError and ValueError: something else, or broken."""
     if hdf5.is_hdf5(path):
         return _content(_netcdf4(path), path)
-    file = netcdf.read(path)
-    if simulator.is_ours(file):
-        return simulator.content(file, path)
-    return _content(_netcdf3(file), path)
+    return _content(_netcdf3(netcdf.read(path)), path)
 
 
 def _netcdf3(file: netcdf.File) -> _Raw:
     name = "FloatField" if "FloatField" in file.variables else "H"
     if name not in file.variables:
-        raise FileError("a NetCDF file written neither by GXSM nor by the simulated microscope")
+        raise OtherFormat("a NetCDF file written neither by GXSM nor by the simulated microscope")
     field = file.variables[name]
     numbers = {key: float(v.values.flat[0]) for key, v in file.variables.items() if v.values.size == 1}
     return _Raw(field.values, _as_texts(field.attributes), numbers, dict(file.texts), _as_texts(file.attributes))
@@ -74,7 +70,7 @@ def _as_texts(attributes: netcdf.Attributes) -> dict[str, str]:
 def _netcdf4(path: Path) -> _Raw:
     with hdf5.opened(path) as file:
         if "FloatField" not in file:
-            raise FileError("a NetCDF file that GXSM did not write")
+            raise OtherFormat("a NetCDF file that GXSM did not write")
         field = file["FloatField"]
         numbers: dict[str, float] = {}
         texts: dict[str, str] = {}

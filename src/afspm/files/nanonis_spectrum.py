@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from afspm.errors import FileError
-from afspm.files.content import FileContent, local_ns, name_and_unit
+from afspm.files.content import FileContent, OtherFormat, local_ns, name_and_unit
 from afspm.files.nanonis import CONTROLLER
 from afspm.model import Spectrum
 
@@ -29,7 +29,7 @@ def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
     head, found, table = text.partition(f"\n{_TABLE}\n")
     header = {key: rest.strip() for key, _, rest in (line.partition("\t") for line in head.split("\n")) if key}
     if not found or "Experiment" not in header:
-        raise FileError("is not a spectrum of Nanonis, or incomplete: it has no [DATA]")
+        raise OtherFormat("is not a spectrum of Nanonis, or incomplete: it has no [DATA]")
     if not table.endswith("\n"):
         raise FileError("is incomplete: its last line is cut off")
     columns, *lines = [line.split("\t") for line in table.splitlines() if line.strip()]

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.errors import FileError
-from afspm.files import hdf5, nsid
-from afspm.files.content import FileContent
+from afspm.files import hdf5
+from afspm.files.content import FileContent, OtherFormat
 from afspm.model import Frame, Region, Scan, Spectrum
 from afspm.model.spectrum_grid import PointGrid
 from afspm.plain_data import Plain
@@ -36,10 +36,15 @@ VENDOR = "vendor"
 
 
 def read_hdf5(path: Path, zone: tzinfo | None) -> FileContent:
-    """A file of the record; else one of NSID. Raises FileError: it is neither, or broken."""
+    """Return what a file of the record holds.
+
+    Raises:
+        OtherFormat: the record did not write it.
+        FileError: it is broken.
+    """
     with hdf5.opened(path) as file:
         if not _is_ours(file):
-            return nsid.read_nsid(path, zone)
+            raise OtherFormat("afspm did not write it")
         about = about_of(file)
         if about["content"] == GRID:
             return FileContent("", spectra=tuple(_grid(file, about)), header=about)

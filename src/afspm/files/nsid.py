@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from afspm.errors import FileError
 from afspm.files import asylum, hdf5
-from afspm.files.content import FileContent
+from afspm.files.content import FileContent, OtherFormat
 from afspm.model import Region, Scan
 from afspm.units import convert
 
@@ -26,7 +26,7 @@ def read_nsid(path: Path, zone: tzinfo | None) -> FileContent:
         file.visititems(lambda _, node: nodes.append(node))
         images = [node for node in nodes if "quantity" in node.attrs and len(getattr(node, "shape", ())) == 2]
         if not images:
-            raise FileError("holds no images")
+            raise OtherFormat("holds no images")
         note = _note(images[0])
         end = asylum.end_ns(note, zone)
         scans = tuple(_scan(image, note, end, path) for image in images)

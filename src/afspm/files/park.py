@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from afspm.errors import FileError
-from afspm.files.content import FileContent, local_ns
+from afspm.files.content import FileContent, OtherFormat, local_ns
 from afspm.files.park_header import (
     CURVE_KINDS,
     CURVES,
@@ -53,7 +53,7 @@ def read_tiff(path: Path, zone: tzinfo | None) -> FileContent:
     tags = _tags(path)
     version, raw = int(tags.get(VERSION_TAG, 0)), bytes(tags.get(HEADER_TAG, b""))
     if tags.get(MAGIC_TAG) != MAGIC:
-        raise FileError("is not a TIFF of a Park microscope")
+        raise OtherFormat("is not a TIFF of a Park microscope")
     if len(raw) < VERSIONS.get(version, math.inf):
         raise FileError(f"has a header of {len(raw)} bytes in version {version:#x}, which afspm does not know")
     header = np.frombuffer(raw.ljust(HEADER.itemsize, b"\0"), HEADER, 1)[0]

@@ -1,42 +1,36 @@
-"""`read`: any file that a controller wrote."""
+"""`read`: any file that a controller wrote.
+
+A reader is declared by the suffix of its files ("sxm"). Where several controllers write files of one suffix, each
+further reader adds a name of its own ("nc.gxsm"): the readers of a suffix are tried in the order of their names until
+one does not raise `OtherFormat`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import tzinfo
-from importlib import import_module
 from pathlib import Path
 
 from afspm import entry_points
 from afspm.errors import FileError
-from afspm.files.content import FileContent
+from afspm.files.content import FileContent, OtherFormat
 
 Reader = Callable[[Path, tzinfo | None], FileContent]
 
-# By suffix, "module:function" of this package.
-FORMATS = {
-    ".ibw": "asylum:read_igor",
-    ".h5": "nexus:read_hdf5",
-    ".hdf5": "nexus:read_hdf5",
-    ".sxm": "nanonis:read_scan",
-    ".dat": "nanonis_spectrum:read_spectrum",
-    ".nc": "gxsm:read_netcdf",
-    ".vpdata": "gxsm_spectrum:read_spectrum",
-    ".gsf": "gsf:read_field",
-    ".nhf": "nanosurf_hdf5:read_nhf",
-    ".nid": "nanosurf_nid:read_nid",
-    ".tif": "park:read_tiff",
-    ".tiff": "park:read_tiff",
-}
+
+def suffixes() -> tuple[str, ...]:
+    """Return the suffixes of files that can be read, with their dots."""
+    return tuple(dict.fromkeys(f".{name.partition('.')[0]}" for name in entry_points.names(entry_points.READERS)))
 
 
 def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     """The scans and spectra of a file.
 
-    Asylum (.ibw, NSID .h5), Nanonis (.sxm, .dat), GXSM (.nc, .vpdata), Nanosurf (.nhf, .nid), Park (.tiff),
-    Gwyddion's simple fields (.gsf), those of the simulated microscope (.nc), and afspm's own: of the record, and of a
-    grid of spectra that was exported (.h5). Of channels of one name, the second is "name #2".
+    The suffix of the file chooses the reader: of a maker's format, of Gwyddion's simple fields (.gsf), or of afspm's
+    own files: of the record, and of a grid of spectra that was exported (.h5). `afspm doctor` lists the suffixes. Of
+    channels of one name, the second is "name #2".
 
     Args:
         zone: of the clock of the controller, which most write without saying which it was; None: that of this computer.
@@ -47,15 +41,15 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     path = Path(path)
     if not path.is_file():
         raise FileError("no such file", where=str(path))
-    reader = _reader(path.suffix.lower())
-    if reader is None:
+    readers = _readers(path.suffix.lower())
+    if not readers:
         raise FileError(
             f"afspm has no reader for {path.suffix or 'a file without a suffix'}",
             where=str(path),
-            hint=f"read: {' '.join((*FORMATS, *(f'.{name}' for name in entry_points.names(entry_points.READERS))))}",
+            hint=f"read: {' '.join(suffixes())}",
         )
     try:
-        return _told_apart(reader(path, zone))
+        return _told_apart(_first_that_reads(readers, path, zone))
     except FileError as error:
         if error.where:
             raise
@@ -65,15 +59,20 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
         raise FileError(f"is not readable as {path.suffix}: {why}", where=str(path)) from error
 
 
-def _reader(suffix: str) -> Reader | None:
-    """Return the reader of a suffix, of ours or of an installed package; None if there is none."""
-    reader: Reader | None
-    if suffix in FORMATS:
-        module, _, function = FORMATS[suffix].partition(":")
-        reader = getattr(import_module(f"afspm.files.{module}"), function)
-    else:
-        reader = entry_points.load(entry_points.READERS, suffix.removeprefix("."))
-    return reader
+def _readers(suffix: str) -> list[str]:
+    return [name for name in entry_points.names(entry_points.READERS) if f".{name.partition('.')[0]}" == suffix]
+
+
+def _first_that_reads(readers: Sequence[str], path: Path, zone: tzinfo | None) -> FileContent:
+    for name in readers[:-1]:
+        with suppress(OtherFormat):
+            return _read(name, path, zone)
+    return _read(readers[-1], path, zone)
+
+
+def _read(name: str, path: Path, zone: tzinfo | None) -> FileContent:
+    reader: Reader = entry_points.load(entry_points.READERS, name)
+    return reader(path, zone)
 
 
 def _told_apart(content: FileContent) -> FileContent:

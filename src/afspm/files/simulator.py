@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from datetime import tzinfo
 from pathlib import Path
 
 import numpy as np
 
 from afspm.clock import NS_PER_S
 from afspm.errors import FileError
-from afspm.files.content import FileContent
+from afspm.files import hdf5, netcdf
+from afspm.files.content import FileContent, OtherFormat
 from afspm.files.netcdf import File
 from afspm.model import Region, Scan, Spectrum, names
 
@@ -17,12 +19,18 @@ CONVENTIONS = "afspm simulator 1"
 _AXES = ("x", "y")
 
 
-def is_ours(file: File) -> bool:
-    return file.attributes.get("Conventions") == CONVENTIONS
+def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
+    """Return the scan or spectrum of a file.
 
-
-def content(file: File, path: Path) -> FileContent:
-    """A scan or a spectrum. Raises FileError: something of it is missing."""
+    Raises:
+        OtherFormat: another program wrote it.
+        FileError: something of it is missing.
+    """
+    if hdf5.is_hdf5(path):
+        raise OtherFormat("is NetCDF-4, which the simulated microscope does not write")
+    file = netcdf.read(path)
+    if file.attributes.get("Conventions") != CONVENTIONS:
+        raise OtherFormat("the simulated microscope did not write it")
     header: dict[str, object] = dict(file.attributes)
     try:
         end_ns = int(str(file.attributes["time_ns"]))

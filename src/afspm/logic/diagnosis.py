@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 
+from afspm.entry_points import DeclaredName
 from afspm.formatting import duration_text
 
 
@@ -65,6 +66,22 @@ class Versions:
     afspm: str
     python: str
     libzmq: str
+
+
+def of_packages(declared: Iterable[DeclaredName]) -> Iterator[Diagnosis]:
+    """Yield what each package adds to afspm, a line for each group, and what of it can't be used.
+
+    A name that can't be used is a warning: only an experiment that needs the name fails.
+    """
+    usable: dict[tuple[str, str], list[str]] = {}
+    for one in declared:
+        if one.problem:
+            what = f"{one.group} {one.name}: {one.problem}"
+            yield Diagnosis("package", Severity.WARNING, one.package, what, "mend or uninstall the package")
+        else:
+            usable.setdefault((one.package, one.group.removeprefix("afspm.")), []).append(one.name)
+    for (package, group), names in usable.items():
+        yield fine("package", package, f"{group} {', '.join(names)}")
 
 
 def fine(code: str, where: str, what: str) -> Diagnosis:

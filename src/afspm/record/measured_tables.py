@@ -169,7 +169,7 @@ def _positions(query: Query) -> dict[int, tuple[RegistrationOutcome, float | Non
     if not mappings:
         return {}
     found, after_ns = {}, -1
-    from afspm.drift.record import drift_knowledge  # it loads numpy, which the supervisor does without
+    from afspm.model.drift_mapping import drift_knowledge  # it loads numpy, which the supervisor does without
 
     for number, published_ns in sorted(query(_PUBLISHED["scans"]), key=itemgetter(1)):
         payload = None

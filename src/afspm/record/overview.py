@@ -12,7 +12,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from afspm.clock import NS_PER_S
-from afspm.drift.record import drift_at, drift_knowledge
 from afspm.model import (
     ControlEvent,
     ControlMode,
@@ -43,6 +42,7 @@ from afspm.model import (
     Spectrum,
     registration_summary,
 )
+from afspm.model.drift_mapping import drift_at, drift_knowledge
 from afspm.model.events import PERSON
 from afspm.model.geometry import XY
 from afspm.record.running_scan import DoneScan, RunningScan

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from afspm import wire
-from afspm.drift.record import drift_knowledge
 from afspm.errors import WireError
 from afspm.model import ControlState, Feedback, ProblemNames, ScopeState, ScopeStatus
+from afspm.model.drift_mapping import drift_knowledge
 from afspm.plain_data import Plain
 
 _BACK = 20

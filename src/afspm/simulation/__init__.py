@@ -11,8 +11,8 @@ A feature at `x_sample` is found at `x_tip = world.sample.to_tip(x_sample, t)`; 
 from __future__ import annotations
 
 from afspm.simulation.scanning import SimulatedScan
-from afspm.simulation.surfaces.picture import READERS, Heightmap
+from afspm.simulation.surfaces.picture import Heightmap
 from afspm.simulation.tip import TipShape
 from afspm.simulation.world import World, WorldSettings
 
-__all__ = ["READERS", "Heightmap", "SimulatedScan", "TipShape", "World", "WorldSettings"]
+__all__ = ["Heightmap", "SimulatedScan", "TipShape", "World", "WorldSettings"]

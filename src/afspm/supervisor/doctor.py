@@ -6,14 +6,14 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import psutil
 
-from afspm import wire
+from afspm import entry_points, wire
 from afspm.addresses import connectable
 from afspm.client.connect import find_run, guest_of
 from afspm.clock import NS_PER_S, ExperimentClock
@@ -51,10 +51,17 @@ class Examination:
         return diagnosis.is_well(self.found)
 
 
-def examine(experiment: Experiment, runs: Path, listen_s: float) -> Examination:
-    """Look at everything that can be seen from here, and listen to the scheduler for so long."""
-    found = Examination([*_file(experiment)])
-    if diagnosis.is_well(found.found):
+def examine(experiment: Experiment | None, runs: Path, listen_s: float, commands: Collection[str] = ()) -> Examination:
+    """Look at everything that can be seen from here, and listen to the scheduler for so long.
+
+    Without an experiment, look at this computer alone.
+
+    Args:
+        commands: of the core, which no package replaces.
+    """
+    found = Examination([] if experiment is None else [*_file(experiment)])
+    found.found += diagnosis.of_packages(entry_points.inventory(commands))
+    if experiment is not None and diagnosis.is_well(found.found):
         found.found += _keys(experiment)
         _Connections(experiment, found).examine(listen_s)
     found.found += _disk(runs)

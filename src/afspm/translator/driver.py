@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 from afspm.clock import Clock
 from afspm.errors import AfspmError, ConfigError, InvalidValue, Refused
@@ -102,6 +102,19 @@ def action(name: str, *, state: ScopeState | None = None, while_busy: bool | Non
         return method
 
     return marked
+
+
+class Introduction(Protocol):
+    """The first lines of a connection, which a trace does not hold since they prove a secret.
+
+    Attributes:
+        is_over: True once both sides have proven that they know the secret.
+    """
+
+    is_over: bool
+
+    def reply_to(self, line: bytes) -> str:
+        """Return the controller's answer to a line; empty: hang up."""
 
 
 class Driver(ABC):
@@ -227,6 +240,15 @@ class Driver(ABC):
         """
         table = ParameterTable.from_toml(cls.parameters_file)
         return table.extended(changed, where="the experiment file", translated=cls.translated)
+
+    @classmethod
+    def introductions(cls) -> Callable[[str], Introduction] | None:
+        """Return what makes the introduction of a connection to an address, for the replay of a trace; None: no secret.
+
+        Raises:
+            OSError, ValueError: the secret can't be read.
+        """
+        return None
 
     @classmethod
     def technique(cls, settings: Mapping[str, object]) -> str:

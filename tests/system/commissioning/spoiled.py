@@ -6,12 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from afspm import entry_points
 from afspm.emulators.nanonis import NanonisEmulator
-from afspm.microscopes.asylum import Asylum
-from afspm.microscopes.gxsm import Gxsm
-from afspm.microscopes.nanonis import Nanonis
-from afspm.microscopes.nanosurf import Nanosurf
-from afspm.microscopes.park import Park
 from afspm.model import Scan, ScopeState, ScopeStatus, Spectrum, names
 from afspm.translator import Driver
 
@@ -62,7 +58,7 @@ def turned(values: Any) -> dict[str, Any]:
     return {name: -float(value) if name == names.SCAN_ANGLE else value for name, value in values.items()}
 
 
-for vendor in (Nanonis, Asylum, Gxsm, Nanosurf, Park):
+for vendor in (entry_points.load(entry_points.DRIVERS, name) for name in entry_points.names(entry_points.DRIVERS)):
     for fault in (MirroredY, OtherWay, LateEnd):
         name = fault.__name__ + vendor.__name__
         globals()[name] = type(name, (fault, vendor), {"__module__": __name__})

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from makers import MAKERS
 from rotation import rotated
 from systems import PATIENCE, can_interrupt, freeze, interrupt, not_on_wine
 
@@ -24,7 +25,7 @@ from afspm.testing.translators import CheckOptions
 from afspm.translator.trace import FILE, TracedExchange, read_trace
 
 HERE = Path(__file__).parent
-VENDORS = ("Nanonis", "Asylum", "Gxsm", "Nanosurf", "Park")
+VENDORS = tuple(maker.driver for maker in MAKERS.values())
 ONE_VENDOR = rotated(VENDORS, len(VENDORS))
 """Where the same is tried with each: one at each commit."""
 EXPERIMENT = """

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import zmq
+from makers import MAKERS
 from systems import PATIENCE, can_interrupt, interrupt
 
 from afspm.clock import ExperimentClock
@@ -70,7 +71,7 @@ def test_a_crash_on_the_command_line_ends_with_1(tmp_path: Path) -> None:
         assert process.wait(DEADLINE_S) == 1
 
 
-@pytest.mark.parametrize("vendor", ["nanonis", "asylum", "gxsm", "nanosurf", "park"])
+@pytest.mark.parametrize("vendor", sorted(MAKERS))
 def test_a_port_that_is_taken_is_told_in_one_sentence(vendor: str, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])

@@ -10,6 +10,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
+from makers import MAKERS
 from rotation import rotated
 from systems import PATIENCE
 
@@ -32,17 +33,8 @@ files = {files}
 [microscope]
 component = true
 class = "{driver}"
-{where} = {files_here}
+{where}
 """
-
-WHERE = {
-    "nanonis": "session_dir",
-    "asylum": "folders",
-    "gxsm": "scan_dir",
-    "nanosurf": "gallery_dir",
-    "park": "data_dir",
-}
-"""The setting that says where the controller's files are."""
 OTHER = """
 [details]
 regions = [{ center = ["0 nm", "0 nm"], size = ["400 nm", "500 nm"] }]
@@ -78,7 +70,7 @@ def run(folder: Path, command: str, *files: Path) -> tuple[subprocess.CompletedP
     return done, runs[-1]
 
 
-VENDORS = ("nanonis", "asylum", "gxsm", "gxsm-shm", "nanosurf", "park")
+VENDORS = tuple(f"{name}{way}" for name in MAKERS for way in ("", *(f"-{one}" for one in MAKERS[name].transports)))
 
 
 @pytest.fixture(scope="module", params=rotated(VENDORS, 3))
@@ -90,7 +82,7 @@ def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     folder = tmp_path_factory.mktemp("recorded")
     how = folder / "how.toml"
     how.write_text(f'[controller]\ntransport = "{transport}"\n' if transport else "", encoding="utf-8")
-    done, ran = run(folder, "trace", FILES / "experiment.toml", FILES / f"emulated_{vendor}.toml", how)
+    done, ran = run(folder, "trace", FILES / "experiment.toml", MAKERS[vendor].emulated, how)
     assert done.returncode == 0, done.stdout + done.stderr
     assert str(ran / FILE) in done.stdout
     trace = Path(shutil.move(ran / FILE, folder))
@@ -100,11 +92,10 @@ def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     start = (datetime.fromisoformat(header.began) - timedelta(hours=10)).isoformat()
     files = folder / "files"
     here, before = json.dumps(str(files)), str(ran / "controller").replace("/", ":")  # as Igor writes folders
-    where = WHERE[vendor]
-    there = f"{{ {json.dumps(before)} = {here} }}" if vendor == "asylum" else here
+    where = MAKERS[vendor].files.format(here=here, there=json.dumps(before))
     names = {"start": start, "trace": json.dumps(str(trace)), "files": here, "driver": header.driver}
     file = folder / "replay.toml"
-    file.write_text(REPLAY.format(**names, where=where, files_here=there), encoding="utf-8")
+    file.write_text(REPLAY.format(**names, where=where), encoding="utf-8")
     files.mkdir()
     shutil.rmtree(ran)  # nothing of it is left to be found
     return vendor, trace, file

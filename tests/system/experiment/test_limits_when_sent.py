@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from afspm_process import AFSPM
+from makers import MAKERS
 from systems import PATIENCE
 
 from afspm.model import ControlResponse
@@ -95,13 +96,13 @@ sys.stdin.read()
 '''
 
 
-@pytest.mark.parametrize("microscope", ["simulator", "nanonis", "asylum", "nanosurf", "park"])
+@pytest.mark.parametrize("microscope", ["simulator", *sorted(MAKERS)])
 def test_burst_of_requests_stays_in_the_region(microscope: str, tmp_path: Path) -> None:
     overlay, script = tmp_path / "overlay.toml", tmp_path / "burst.py"
     overlay.write_text(LIMITED.replace("SCRIPT", script.as_posix()), encoding="utf-8")
     script.write_text(BURST, encoding="utf-8")
-    second = microscope if microscope == "simulator" else f"emulated_{microscope}"
-    files = [str(FILES / "experiment.toml"), str(FILES / f"{second}.toml"), str(overlay)]
+    second = FILES / "simulator.toml" if microscope == "simulator" else MAKERS[microscope].emulated
+    files = [str(FILES / "experiment.toml"), str(second), str(overlay)]
     done = subprocess.run(
         [*AFSPM, "run", *files, "--runs", str(tmp_path / "runs"), "--no-report"],
         capture_output=True,

@@ -8,9 +8,10 @@ from typing import Any
 
 import pytest
 from experiment_lab import WITNESS, AfspmRun
+from makers import MAKERS
 
 FILES = Path(__file__).parents[3] / "experiments" / "every_microscope"
-ADDRESSES = {"nanonis": "127.0.0.1:{port}", "asylum": "tcp://127.0.0.1:{port}", "gxsm": "127.0.0.1:{port}"}
+TIMED = sorted(name for name, maker in MAKERS.items() if maker.takes("reply_timeout_s"))
 SCANS = 3
 OVERLAY = """
 [clock]
@@ -36,15 +37,15 @@ history = {{ Scan2d = 20 }}
 """
 
 
-@pytest.fixture(params=sorted(ADDRESSES))
+@pytest.fixture(params=TIMED)
 def run(request: pytest.FixtureRequest, tmp_path: Path, stranger: Any) -> Iterator[AfspmRun]:
     """The file names a controller that is not this run's emulator, and that must not hear of it."""
     (tmp_path / "witness.py").write_text(WITNESS, encoding="utf-8")
-    address = ADDRESSES[request.param].format(port=stranger.port)
+    address = MAKERS[request.param].address.format(port=stranger.port)
     (tmp_path / "overlay.toml").write_text(OVERLAY.format(address=address), encoding="utf-8")
     files = (
         str(FILES / "experiment.toml"),
-        str(FILES / f"emulated_{request.param}.toml"),
+        str(MAKERS[request.param].emulated),
         str(tmp_path / "overlay.toml"),
     )
     options = ("--runs", str(tmp_path / "runs"), "--verbose", "--no-report", "--without", "metadata")

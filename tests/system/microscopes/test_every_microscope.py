@@ -10,27 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from afspm_process import AFSPM
+from makers import MAKERS
 from numpy.typing import NDArray
 from systems import PATIENCE
 
 ROOT = Path(__file__).parents[3]
 FILES = ROOT / "experiments" / "every_microscope"
 DEADLINE_S = 90.0 * PATIENCE
-HEIGHTS = {
-    "simulator": "Height",
-    "nanonis": "Z Forward",
-    "asylum": "HeightTrace",
-    "gxsm": "ZS-Topo",
-    "nanosurf": "Height Forward",
-    "park": "Height Forward",
-}
-ADDRESSES = {
-    "nanonis": "127.0.0.1:{port}",
-    "asylum": "tcp://127.0.0.1:{port}",
-    "gxsm": "127.0.0.1:{port}",
-    "nanosurf": "127.0.0.1:{port}",
-    "park": "tcp://127.0.0.1:{port}",
-}
 NOISE_M = 0.8e-9
 """The rms between two scans of the same place whose lines are not taken at the same moments."""
 OVERLAY = """
@@ -52,8 +38,9 @@ def scans_on(microscope: str, folder: Path, more: str = "") -> Kept:
     overlay = folder / "overlay.toml"
     overlay.write_text(OVERLAY + more, encoding="utf-8")
     (folder / "keeper.py").write_text(Path(__file__).with_name("keeper.py").read_text(encoding="utf-8"))
-    second = f"emulated_{microscope}" if microscope in ADDRESSES else microscope
-    files = [str(FILES / "experiment.toml"), str(FILES / f"{second}.toml"), str(overlay)]
+    maker = MAKERS.get(microscope)
+    second, height = (FILES / "simulator.toml", "Height") if maker is None else (maker.emulated, maker.heights)
+    files = [str(FILES / "experiment.toml"), str(second), str(overlay)]
     done = subprocess.run(
         [*AFSPM, "run", *files, "--runs", str(folder / "runs"), "--no-report", "--without", "metadata,recorder"],
         capture_output=True,
@@ -68,7 +55,7 @@ def scans_on(microscope: str, folder: Path, more: str = "") -> Kept:
     for file in sorted((folder / "runs").glob("*-*/kept-*.npz")):
         with np.load(file) as found:
             channel, unit, *place = json.loads(str(found["facts"]))
-            if channel == HEIGHTS[microscope]:
+            if channel == height:
                 assert unit == "m"
                 kept.append((place, found["values"]))
     return kept
@@ -88,10 +75,10 @@ def apart_m(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 @pytest.mark.xdist_group("every_microscope")
-@pytest.mark.parametrize("microscope", sorted(ADDRESSES))
+@pytest.mark.parametrize("microscope", sorted(MAKERS))
 def test_the_same_scans_of_the_same_sample(microscope: str, simulated: Kept, tmp_path: Path, stranger: Any) -> None:
     """And none of it is asked of the controller that the file names, which is not this run's emulator."""
-    address = ADDRESSES[microscope].format(port=stranger.port)
+    address = MAKERS[microscope].address.format(port=stranger.port)
     found = scans_on(microscope, tmp_path, ELSEWHERE.format(address=address))
     assert len(found) == len(simulated) == 3
     for (place, heights), (wanted_place, wanted) in zip(found, simulated, strict=True):

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from systems import PATIENCE
 
-from afspm.cli.dashboard import resumed_with_dashboard
+from afspm.cli.dashboard import resumed_with_page
 from afspm.clock import NS_PER_S
 from afspm.errors import ConfigError, FileError
 from afspm.record.run_json import STATE_DIR
@@ -136,7 +136,7 @@ def test_a_run_that_has_a_dashboard_is_resumed_with_that_one(tmp_path: Path) -> 
     (tmp_path / "run.json").write_text("{}", encoding="utf-8")
     (tmp_path / "state").mkdir()
     found = resume.find(tmp_path)
-    assert resumed_with_dashboard(found) == found
+    assert resumed_with_page(found) == found
     assert found.added == ()
 
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 from afspm_process import AFSPM
+from makers import MAKERS
 
 from afspm.emulators import registry
 
-FILES = Path(__file__).parents[3] / "experiments" / "every_microscope"
 DEADLINE_S = 90.0
 
 
@@ -41,13 +41,13 @@ def checked(folder: Path, *files: Path) -> dict[str, Any]:
     return found
 
 
-@pytest.mark.parametrize("vendor", registry.names())
+@pytest.mark.parametrize("vendor", sorted(MAKERS))
 def test_no_byte_reaches_who_has_the_vendors_usual_port(
     vendor: str, tmp_path: Path, strangers: Callable[..., AbstractContextManager[Any]]
 ) -> None:
     usual = registry.emulator(vendor).usual
     with strangers(*range(usual["port"], usual["port"] + usual.get("ports", 1))):
-        assert checked(tmp_path, FILES / f"emulated_{vendor}.toml")["simulated"] is True
+        assert checked(tmp_path, MAKERS[vendor].emulated)["simulated"] is True
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Gxsm4's shared memory is there on Linux alone")
@@ -69,7 +69,7 @@ def test_no_call_reaches_the_shared_memory_of_a_gxsm_that_is_not_the_emulated_on
     )
     try:
         before = Path("/dev/shm", name).read_bytes()
-        assert checked(tmp_path, FILES / "emulated_gxsm.toml", overlay)["simulated"] is True
+        assert checked(tmp_path, MAKERS["gxsm"].emulated, overlay)["simulated"] is True
         assert Path("/dev/shm", name).read_bytes() == before
         assert calls == []
     finally:

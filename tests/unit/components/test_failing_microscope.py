@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from client_lab import OTHER_REGION, Lab, run
 
-from afspm.components import ScanSeries
+from afspm.components.planned_scans import ScanSeries
 from afspm.errors import MeasurementFailed
 from afspm.exit_codes import ExitCode
 from afspm.model import Problem, Region, Scan

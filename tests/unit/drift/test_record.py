@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from afspm.drift.record import DriftRecord, drift_at
+from afspm.drift.record import DriftRecord
 from afspm.errors import FileError
 from afspm.model import RegistrationOutcome
+from afspm.model.drift_mapping import drift_at
 
 
 def record(n: int = 20, seed: int = 1) -> DriftRecord:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from afspm.scheduler import DriftCompensatedScheduler
+from afspm.scheduler.drift.scheduler import DriftCompensatedScheduler
 
 from .conftest import Write, errors, only_error
 

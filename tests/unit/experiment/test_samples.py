@@ -6,6 +6,7 @@ import itertools
 from pathlib import Path
 
 import pytest
+from makers import MAKERS
 
 from afspm.experiment import Experiment, load
 from afspm.experiment.graph import draw
@@ -14,6 +15,7 @@ from afspm.transport.keys import generate
 EXPERIMENTS = Path(__file__).parents[3] / "experiments"
 WITHOUT_A_MICROSCOPE = "every_microscope"  # its second file has it
 SECOND_FILES = sorted(p.name for p in (EXPERIMENTS / WITHOUT_A_MICROSCOPE).glob("*.toml") if p.stem != "experiment")
+SECOND_FILES += [str(maker.emulated) for maker in MAKERS.values()]
 NAMES = sorted(folder.name for folder in EXPERIMENTS.iterdir() if (folder / "experiment.toml").exists())
 SAMPLES = [(name,) for name in NAMES if name != WITHOUT_A_MICROSCOPE]
 SAMPLES += [("best_points", "drift.toml")]

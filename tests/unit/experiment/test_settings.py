@@ -170,7 +170,7 @@ def test_findings_are_in_the_order_of_the_lines(write: Write) -> None:
         ("needing.X", "needs 'not_there_at_all'", "install"),
         ("time.X", "time has no 'X'", "give time.py another name"),
         ("leaving.X", "SystemExit: 3 (leaving.py:2)", ""),
-        ("afspm.components.ScanSerie", "has no 'ScanSerie'", "ScanSeries"),
+        ("afspm.components.planned_scans.ScanSerie", "has no 'ScanSerie'", "ScanSeries"),
     ],
 )
 def test_a_class_that_can_t_be_had_is_an_error(write: Write, tmp_path: Path, name: str, said: str, hint: str) -> None:

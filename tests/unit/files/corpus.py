@@ -14,9 +14,9 @@ from samples import DATA, WHOLE
 from systems import not_on_wine
 
 import afspm
-from afspm.files import FORMATS, FileContent
+from afspm.files import FileContent, suffixes
 
-_FILES = sorted(path.relative_to(DATA).as_posix() for path in DATA.rglob("*") if path.suffix in FORMATS)
+_FILES = sorted(path.relative_to(DATA).as_posix() for path in DATA.rglob("*") if path.suffix in suffixes())
 REAL = sorted({re.sub(r"\w+\.h5$|\d+", "", name): name for name in reversed(_FILES)}.values())
 """One of each series, and one .h5, all of which one program made: the others are built the same."""
 

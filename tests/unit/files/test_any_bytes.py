@@ -22,7 +22,7 @@ from samples import DATA, WHOLE
 
 import afspm
 from afspm.errors import FileError
-from afspm.files import FORMATS, FileContent
+from afspm.files import FileContent, suffixes
 
 pytest.importorskip("h5py")
 pytest.importorskip("scipy")
@@ -82,7 +82,7 @@ ODD = st.one_of(
 
 
 @settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow])
-@given(st.lists(st.one_of(PIECES, PIECES, ODD), max_size=6), st.sampled_from(sorted(FORMATS)))
+@given(st.lists(st.one_of(PIECES, PIECES, ODD), max_size=6), st.sampled_from(sorted(suffixes())))
 def test_pieces_of_files_are_refused_or_make_sense(pieces: list[bytes], suffix: str) -> None:
     require_sense(b"".join(pieces), f"file{suffix}")
 

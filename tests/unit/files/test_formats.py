@@ -14,7 +14,7 @@ from samples import END_NS, HEIGHT_M, OTHER, REGION, WHOLE, gxsm3, gxsm4, sxm
 
 import afspm
 from afspm.errors import FileError
-from afspm.files import FORMATS, FileContent
+from afspm.files import FileContent, suffixes
 from afspm.model import Region
 
 pytest.importorskip("h5py")
@@ -217,7 +217,7 @@ def test_what_is_not_there_is_not_told_to_have_the_wrong_suffix(name: str, tmp_p
         afspm.read(tmp_path / name)
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("suffix", suffixes())
 def test_what_is_not_there_or_something_else_is_refused_by_its_name(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"a{suffix}"
     with pytest.raises(FileError, match="no such file"):

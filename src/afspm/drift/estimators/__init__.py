@@ -15,25 +15,17 @@ from afspm.drift.registration import Estimator
 from afspm.errors import ConfigError
 from afspm.plain_data import PlainMapping
 
-__all__ = ["DEFAULT", "READY_MADE", "Guarded", "PairFailure", "estimator", "unguarded"]
+__all__ = ["DEFAULT", "Guarded", "PairFailure", "estimator", "unguarded"]
 
 DEFAULT = "least-squares"
-
-READY_MADE: Mapping[str, str] = {
-    DEFAULT: "afspm.drift.estimators.least_squares.LeastSquares",
-    "brief": "afspm.drift.estimators.features.Brief",
-    "orb": "afspm.drift.estimators.features.Orb",
-    "sift": "afspm.drift.estimators.features.Sift",
-    "correlation": "afspm.drift.estimators.correlation.Correlation",
-}
 
 
 def estimator(spec: str | PlainMapping | Estimator = DEFAULT, report: Report = log_failure) -> Estimator:
     """Return the estimator that is meant, guarded: its errors are reported, and bridged by a coarse estimate.
 
     Args:
-        spec: a name of `READY_MADE` or "module.Name"; a table with that as its `class` and the settings of it (only
-            `class` names code); or an estimator.
+        spec: a name that a package declares or "module.Name"; a table with that as its `class` and the settings of it
+            (only `class` names code); or an estimator.
         report: called with each error over a pair; by default it is logged.
 
     Raises:
@@ -57,7 +49,7 @@ def _made(spec: str | PlainMapping | Estimator) -> tuple[Estimator, str]:
     made: object = spec
     name = type(spec).__name__
     if isinstance(spec, str | Mapping):
-        made, name = named("estimator", spec, READY_MADE, DEFAULT)
+        made, name = named("estimator", spec, DEFAULT)
     if not callable(getattr(made, "register", None)):
         raise ConfigError(
             f"{name} is not an estimator",

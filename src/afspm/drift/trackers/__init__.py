@@ -20,14 +20,10 @@ from afspm.errors import ConfigError, InvalidValue
 from afspm.model.snapshot import restored
 from afspm.plain_data import PlainMapping
 
-__all__ = ["DEFAULT", "READY_MADE", "BankTracker", "PaperTracker", "forecast_from_dict", "tracker"]
+__all__ = ["DEFAULT", "BankTracker", "PaperTracker", "forecast_from_dict", "tracker"]
 
 DEFAULT = "bank"
 
-READY_MADE: Table[str, str] = {
-    DEFAULT: "afspm.drift.trackers.bank.BankTracker",
-    "paper": "afspm.drift.trackers.paper.PaperTracker",
-}
 _FORECASTS: Table[str, type[BankForecast] | type[PaperForecast]] = {
     kind.KIND: kind for kind in (BankForecast, PaperForecast)
 }
@@ -37,13 +33,13 @@ def tracker(spec: str | PlainMapping = DEFAULT, estimator: Estimator | None = No
     """The tracker that is meant.
 
     Args:
-        spec: a name of `READY_MADE` or "module.Name", or a table with that as its `class` and its settings.
+        spec: a name that a package declares or "module.Name", or a table with that as its `class` and its settings.
         estimator: that it registers scans with, its first argument; the default one if there is none.
 
     Raises:
         ConfigError: no such name, class or setting, a setting without a meaning, or a library that is missing.
     """
-    made, name = named("tracker", spec, READY_MADE, DEFAULT, default_estimator() if estimator is None else estimator)
+    made, name = named("tracker", spec, DEFAULT, default_estimator() if estimator is None else estimator)
     if not all(callable(getattr(made, method, None)) for method in ("add", "state", "restore")):
         raise ConfigError(
             f"{name} is not a tracker", hint="give it the methods add, state and restore, see afspm.drift.tracking"

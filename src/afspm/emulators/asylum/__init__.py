@@ -233,6 +233,3 @@ class AsylumEmulator(Emulator):
             self._server.send(queued.client, payload, b"")
             return
         self._server.send(queued.client, payload)
-
-
-EMULATOR = AsylumEmulator

@@ -183,6 +183,3 @@ class GxsmEmulator(Emulator):
                 self.log.exception("%s failed", call.method)
                 found = SystemError(str(error))
             call.answered(found)
-
-
-EMULATOR = GxsmEmulator

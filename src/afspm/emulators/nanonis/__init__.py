@@ -312,6 +312,3 @@ def _release(given: str | int) -> int:
     if text.isdigit() and int(text) > 3000:
         return int(text)
     raise ConfigError(f"there is no release {text!r}", where="release", hint=f"{', '.join(RELEASES)}, or its number")
-
-
-EMULATOR = NanonisEmulator

@@ -80,6 +80,3 @@ class NanosurfEmulator(ScriptedEmulator):
 
     def _select(self, level: int | None) -> None:
         self._levels[self._client] = level
-
-
-EMULATOR = NanosurfEmulator

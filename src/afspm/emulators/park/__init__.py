@@ -173,6 +173,3 @@ def _parsed(request: bytes) -> Plain | None:
 
 def _no_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is not JSON")
-
-
-EMULATOR = ParkEmulator

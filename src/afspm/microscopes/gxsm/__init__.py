@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.errors import ConfigError, Refused
+from afspm.microscopes.gxsm import bridge
 from afspm.microscopes.gxsm.activity import SHOWS_S, Activity, Saving
 from afspm.microscopes.gxsm.hardware import (
     ABORT,
@@ -35,7 +36,7 @@ from afspm.microscopes.gxsm.settings import (
     user_unit_m,
 )
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
-from afspm.translator.driver import ControllerLost, Driver, action
+from afspm.translator.driver import ControllerLost, Driver, Introduction, action
 from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
 from afspm.units import Duration
@@ -97,6 +98,10 @@ class Gxsm(Driver):
         self._whole_table = self.table
         self._asking: Asking | None = None
         self._kept = KeptSettings(_AT_FIRST)
+
+    @classmethod
+    def introductions(cls) -> Callable[[str], Introduction]:
+        return partial(bridge.Introduction, bridge.secret())
 
     @classmethod
     def excused(cls, controller: str) -> Mapping[str, str]:

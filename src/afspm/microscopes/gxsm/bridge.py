@@ -81,6 +81,10 @@ class Introduction:
         self._known, self._address, self._expected = known, address, ""
         self.is_over = False
 
+    def reply_to(self, line: bytes) -> str:
+        """Return the answer to a line; empty: hang up."""
+        return self.reply(parsed(line))
+
     def reply(self, call) -> str:  # type: ignore[no-untyped-def]
         """Return the answer to a line (`parsed`); empty: hang up."""
         step, *arguments = call or [""]

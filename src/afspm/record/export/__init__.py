@@ -1,27 +1,26 @@
-"""A recorded run in the formats of others: `afspm export`."""
+"""A recorded run in the formats of others: `afspm export`.
+
+An exporter is a module that a package declares by its format. `write(run, row)` yields the ends of the names and the
+contents of the files of a scan or spectrum. Two more functions where the format has such files: `tables(run, scans,
+spectra)` yields names and contents of files about all that was measured, and `grid_file(stack, metadata)` returns the
+spectra of a grid as one file.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from importlib import import_module
 from pathlib import Path
 
+from afspm import entry_points
 from afspm.errors import FileError, InvalidValue
 from afspm.record.export.grids import grids
 from afspm.record.measured_files import write_synced
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 
-__all__ = ["FORMATS", "chosen", "export"]
+__all__ = ["chosen", "export"]
 
-FORMATS = {"h5": "nexus", "gwy": "gwyddion", "nc": "netcdf", "png": "png", "csv": "tables", "documents": "documents"}
-"""By suffix, the module of this package; its `write(run, row)` yields the ends of names and contents of files."""
-
-TABLES = ("csv", "documents")
-"""The formats with files about all that was measured; its `tables(run, scans, spectra)` makes them."""
-GRIDS = ("h5", "gwy")
-"""The formats in which the spectra of a grid are one file, too; its `grid_file(stack, metadata)` makes it."""
 
 Writer = Callable[[Run, ScanRow | SpectrumRow], Iterator[tuple[str, bytes]]]
 
@@ -32,7 +31,7 @@ def export(
     """Write a run in another format, and yield each file as it is there.
 
     Args:
-        to: one of `FORMATS`.
+        to: a format that a package declares an exporter for.
         folder: made if it is not there.
         scans: numbers of scans, as for `chosen`; None: all scans and spectra.
         tell: is told what is left out, and why; None: a file of the record that is damaged is an error.
@@ -41,21 +40,22 @@ def export(
         InvalidValue: there is no such format, or no such scan.
         FileError: a file can't be read or written.
     """
-    if to not in FORMATS:
-        raise InvalidValue(f"there is no format {to!r}", hint=f"one of {', '.join(FORMATS)}")
+    module = entry_points.load(entry_points.EXPORTERS, to)
+    if module is None:
+        hint = f"one of {', '.join(entry_points.names(entry_points.EXPORTERS))}"
+        raise InvalidValue(f"there is no format {to!r}", hint=hint)
     wanted = list(run.scans) if scans is None else chosen(list(run.scans), scans)
     for row in wanted:
         if not row.file and tell is not None:
             tell(f"scan {row.number} was interrupted before anything of it was seen")
     spectra = list(run.spectra) if scans is None else []
     wanted = [row for row in wanted if row.file]
-    module = import_module(f"afspm.record.export.{FORMATS[to]}")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, content in module.tables(run, wanted, spectra) if to in TABLES else ():
+        for name, content in module.tables(run, wanted, spectra) if hasattr(module, "tables") else ():
             yield _written(folder / name, content)
         yield from _one_by_one(module.write, run, [*wanted, *spectra], folder, tell)
-        for name, stack in grids(run, spectra) if to in GRIDS else ():
+        for name, stack in grids(run, spectra) if hasattr(module, "grid_file") else ():
             yield _written(folder / f"{name}.{to}", module.grid_file(stack, run.metadata))
     except OSError as error:
         raise FileError(f"can't be written: {error}", where=str(folder)) from error

@@ -7,12 +7,11 @@ import logging
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import wire
+from afspm import entry_points
 from afspm.drawing.image_html import Shown, shown
 from afspm.drawing.levelling import Levelling, levelled
 from afspm.errors import AfspmError
@@ -109,23 +108,23 @@ def topography(scans: ScanSet) -> str:
 
 
 def draw(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -> None:
-    """Draw the night and drift against time, where no component has."""
-    if _is_ours(run.folder, OWN_NIGHT, NIGHT) and any(one.grey is not None for one in pictures):
+    """Draw the night where no component has, and the figures that packages declare."""
+    if is_ours(run.folder, OWN_NIGHT, NIGHT) and any(one.grey is not None for one in pictures):
         from afspm.record import night_figure
 
         record = night_of(run, story, pictures)
         numbers = {number: story.overview.problems.name(number) for number in record.problems}
         night_figure.draw(record, run.folder / OWN_NIGHT, numbers, title=story.name, simulated=story.simulated)
-    if _is_ours(run.folder, OWN_OFFSET, OFFSET) and len(story.overview.drift) > 1:
-        from afspm.drift.figures import style
-        from afspm.drift.figures.drawings import draw_offsets
+    title = f"{story.name} (simulated)" if story.simulated else story.name
+    for name in entry_points.names(entry_points.FIGURES):
+        try:
+            entry_points.load(entry_points.FIGURES, name)(run, title)
+        except Exception as error:  # of a package: the report goes without its figure
+            _log.warning("the figure %s is not drawn: %s: %s", name, type(error).__name__, error)
 
-        title = f"{story.name} (simulated)" if story.simulated else story.name
-        style.save(draw_offsets(drift_of(run), title=title), run.folder / OWN_OFFSET)
 
-
-def _is_ours(folder: Path, own: str, components: str) -> bool:
-    """Return whether a figure is ours to draw; remove ours if a component has drawn it since."""
+def is_ours(folder: Path, own: str, components: str) -> bool:
+    """Return whether the report draws a figure; remove the report's figure if a component has drawn it since."""
     if (folder / components).exists():
         (folder / own).unlink(missing_ok=True)
         return False
@@ -150,30 +149,6 @@ def night_of(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -
         if entry.what in (names.PULSE, names.CRASH) and entry.response == 0
     ]
     return record
-
-
-def drift_of(run: Run) -> Any:
-    """A `drift.record.DriftRecord` of what the scheduler told."""
-    from afspm.drift.record import DriftRecord, drift_at, drift_knowledge
-
-    told = [wire.decode("DriftMapping", packet.payload) for packet in run.packets(messages=("DriftMapping",))]
-    told = [message for message in told if len(message.matrix) == 6 and len(message.center) == 2]
-
-    def square(values: Any) -> NDArray[np.float64]:
-        return np.array(values if len(values) == 4 else [np.nan] * 4, dtype=np.float64).reshape(2, 2)
-
-    return DriftRecord(
-        keys=tuple(message.filename for message in told),
-        time_s=np.array([message.timestamp.ToNanoseconds() * 1e-9 for message in told]),
-        center_m=np.array([tuple(message.center) for message in told]).reshape(-1, 2),
-        drift_m=np.array([drift_at(np.array(m.matrix).reshape(2, 3), m.center) for m in told]).reshape(-1, 2),
-        covariance_m2=np.array([square(message.covariance) for message in told]).reshape(-1, 2, 2),
-        rate_m_s=np.array([tuple(m.rate) if len(m.rate) == 2 else (0.0, 0.0) for m in told]).reshape(-1, 2),
-        matched=np.array([message.matched for message in told], dtype=bool),
-        reasons=tuple(message.reason for message in told),
-        outcomes=tuple(drift_knowledge(message)[0] for message in told),
-        failures=tuple(message.failures for message in told),
-    )
 
 
 def of_figures(folder: Path) -> list[FigurePicture]:

@@ -40,7 +40,7 @@ def read(path: Path) -> Heightmap:
     """
     if not path.is_file():
         raise FileError("no such file", where=str(path))
-    reader = READERS.get(path.suffix.lower(), read_picture)
+    reader = _reader(path.suffix.lower())
     try:
         found = reader(path)
     except FileError:
@@ -77,7 +77,10 @@ def read_scan(path: Path) -> Heightmap:
     return Heightmap(scan.values, scan.region.size_m)
 
 
-READERS: dict[str, Reader] = {".npy": read_array, **dict.fromkeys(files.FORMATS, read_scan)}
+def _reader(suffix: str) -> Reader:
+    if suffix == ".npy":
+        return read_array
+    return read_scan if suffix in files.suffixes() else read_picture
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,38 @@
+"""Displacement of the sample and its uncertainty, as a `DriftMapping` message says them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.model.registration_outcome import RegistrationOutcome
+
+Array = NDArray[np.float64]
+
+
+class OutcomeFields(Protocol):
+    """The fields of the message that say how the position of its scan is known."""
+
+    outcome: int
+    matched: bool
+    covariance: Sequence[float]
+
+
+def drift_at(matrix: Array, center_m: Sequence[float]) -> Array:
+    """Return x_tip - x_sample, (2,): the displacement of the sample where the tip is."""
+    at = np.asarray(center_m, dtype=np.float64)
+    drift: Array = at - (matrix[:2, :2] @ at + matrix[:2, 2])
+    return drift
+
+
+def drift_knowledge(message: OutcomeFields) -> tuple[RegistrationOutcome, float | None]:
+    """Return how the position of a scan is known, and its largest standard deviation (m); None: not known."""
+    outcome = RegistrationOutcome.of(message.outcome, matched=message.matched)
+    if len(message.covariance) != 4:
+        return outcome, None
+    largest = float(np.linalg.eigvalsh(np.array(message.covariance).reshape(2, 2))[-1])
+    return outcome, math.sqrt(max(largest, 0.0))
