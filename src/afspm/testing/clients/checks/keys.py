@@ -5,9 +5,9 @@ from __future__ import annotations
 from afspm.testing.clients.bench import ClientBench
 from afspm.testing.clients.checks.measure import require_scans, scan_step
 from afspm.testing.clients.checks.requests import begin_note, published
+from afspm.testing.clients.client_suite import client_check
 from afspm.testing.clients.experiment import JUDGE, Security
-from afspm.testing.clients.registry import client_check
-from afspm.testing.verdicts import expect
+from afspm.testing.conformance import expect
 from afspm.transport.keys import pair
 
 _LISTENED_S = 2.0

@@ -8,12 +8,12 @@ from dataclasses import replace
 from afspm.model import RELAY_REQUEST, ControlRequest, ControlResponse, Note, Parameter, RelayedMessage
 from afspm.testing.clients.bench import ClientBench
 from afspm.testing.clients.checks.wire import ask, in_base64
+from afspm.testing.clients.client_suite import client_check
 from afspm.testing.clients.experiment import CLIENT, JUDGE, SCHEDULER, JudgedExperiment
 from afspm.testing.clients.program import Answer, ClientProgram
 from afspm.testing.clients.proxy import CuttingProxy
-from afspm.testing.clients.registry import client_check
 from afspm.testing.clients.scripted import ScriptedRequest, success
-from afspm.testing.verdicts import expect
+from afspm.testing.conformance import expect
 from afspm.wire import decode, encode, encode_subject
 
 REQUESTS = 1000
