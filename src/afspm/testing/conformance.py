@@ -1,8 +1,8 @@
 """The conformance kernel: checks of a translator, a client or a controller, done one after the other.
 
 Theory of operation. A `Suite` collects the checks of one kind of program, in order. A `Check` contains a function of
-the suite's fixture, which raises a `Verdict` unless the program passes. `attempt` makes a `CheckResult` of a check, and
-`SuiteReport.run` of several. The surroundings of a check differ from suite to suite (a question to a person, a new
+the suite's fixture, which raises a `CheckEnded` unless the program passes. `attempt` makes a `CheckResult` of a check,
+and `SuiteReport.run` of several. The surroundings of a check differ from suite to suite (a question to a person, a new
 experiment after a failure): they are in the fixture's `perform` and `explain`. Each wait within a check has a time
 limit of its own, so that a check ends even if the program does not answer.
 
@@ -50,13 +50,13 @@ class CheckOutcome(Enum):
     BLOCKED = "blocked"
 
 
-class Verdict(Exception):
+class CheckEnded(Exception):
     """A check ends without having passed; the text is the line of its result."""
 
     outcome: ClassVar[CheckOutcome]
 
 
-class Failed(Verdict, AssertionError):
+class Failed(CheckEnded, AssertionError):
     """The program under test does not do what it should.
 
     Args:
@@ -69,19 +69,19 @@ class Failed(Verdict, AssertionError):
         super().__init__(f"expected {expected}; came {came}")
 
 
-class Skipped(Verdict):
+class Skipped(CheckEnded):
     """It can't be checked here; the text says why."""
 
     outcome = CheckOutcome.SKIPPED
 
 
-class Unsupported(Verdict):
+class Unsupported(CheckEnded):
     """The program does not have what the check needs; the text names it."""
 
     outcome = CheckOutcome.UNSUPPORTED
 
 
-class Declined(Verdict):
+class Declined(CheckEnded):
     """The person did not confirm; nothing was done."""
 
     outcome = CheckOutcome.DECLINED
@@ -127,7 +127,7 @@ class Check:
     Attributes:
         name: "scan/cancel": the subject, and the requirement.
         title: a sentence that is true of a program that passes.
-        do: takes the suite's fixture; raises a Verdict, or returns a line worth knowing though all is well.
+        do: takes the suite's fixture; raises a CheckEnded, or returns a line worth knowing though all is well.
         needs: actions and parameters without which there is nothing to check.
         remedy: what to do if it fails.
     """
@@ -190,7 +190,7 @@ class Fixture(Protocol[K_contra]):
         """The clock by which a check's duration is measured."""
 
     def perform(self, check: K_contra) -> str | None:
-        """Do a check, unless something prevents it. Raises Verdict, Lost."""
+        """Do a check, unless something prevents it. Raises CheckEnded, Lost."""
 
     def explain(self, check: K_contra, failure: Failed) -> tuple[str, ...]:
         """Return the evidence of a failure, and get ready for the next check.
@@ -216,7 +216,7 @@ def attempt(check: K, fixture: Fixture[K]) -> CheckResult:
         except Failed as failure:
             complaints = fixture.explain(check, failure)
             outcome, line = failure.outcome, str(failure)
-    except Verdict as verdict:
+    except CheckEnded as verdict:
         outcome, line = verdict.outcome, str(verdict)
     return CheckResult(check.name, check.title, outcome, line, fixture.clock.monotonic_s() - began_s, complaints)
 

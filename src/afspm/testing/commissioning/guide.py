@@ -58,7 +58,7 @@ class Guide:
         return self.kit.clock
 
     def perform(self, step: CommissioningStep) -> str:
-        """Explain a step, have it confirmed if it moves anything, and do it. Raises a Verdict."""
+        """Explain a step, have it confirmed if it moves anything, and do it. Raises a CheckEnded."""
         if missing := self.kit.support.missing(step.needs):
             raise Unsupported(", ".join(missing))
         self.prompts.show(f"\n{step.title}\n{step.explained}")

@@ -191,7 +191,7 @@ class CheckMeasurements:
         return self.client.clock
 
     def perform(self, check: Check) -> None:
-        """Do a check. Raises a Verdict: Skipped if the microscope does not have what it needs."""
+        """Do a check. Raises a CheckEnded: Skipped if the microscope does not have what it needs."""
         self._heeded = len(self._complaints)
         if missing := self.support.missing(check.needs):
             raise Skipped(f"not supported: {', '.join(missing)}")
