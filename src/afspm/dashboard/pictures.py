@@ -10,7 +10,7 @@ from functools import lru_cache
 from afspm.dashboard.scan_facts import Facts
 from afspm.drawing.levelling import Array, Levelling, levelled
 from afspm.drawing.palette import PALETTES
-from afspm.drawing.raster import Contrast, ValueRange, indices, png, value_range
+from afspm.drawing.raster import Contrast, ValueRange, indices, png, shared_range
 from afspm.web.frames import ChannelFrame
 
 KEPT = 8
@@ -81,13 +81,14 @@ class PictureCache:
         self._lock = threading.Lock()
         self._drawn = lru_cache(KEPT)(_draw)
 
-    def draw(self, frame: ChannelFrame, look: Look) -> RenderedFrame:
-        """Return the picture of a frame."""
+    def draw(self, frame: ChannelFrame, look: Look, beside: ChannelFrame | None = None) -> RenderedFrame:
+        """Return the picture of a frame; with the same range of values as that of a frame beside it."""
         with self._lock:  # two that want the same wait for one; two that want others share a core anyway
-            return self._drawn(frame, look)
+            return self._drawn(frame, look, beside)
 
 
-def _draw(frame: ChannelFrame, look: Look) -> RenderedFrame:
+def _draw(frame: ChannelFrame, look: Look, beside: ChannelFrame | None) -> RenderedFrame:
     values = levelled(frame.values, look.levelling)
-    span = value_range(values, look.contrast)
+    compared = [] if beside is None or beside.unit != frame.unit else [levelled(beside.values, look.levelling)]
+    span = shared_range([values, *compared], look.contrast)
     return RenderedFrame(frame, look, values, span, png(indices(values, span), look.palette))

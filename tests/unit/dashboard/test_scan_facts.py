@@ -106,6 +106,6 @@ def test_a_thumbnail_is_small_and_of_what_is_not_kept_there_is_none() -> None:
     thumbnails = Thumbnails(lambda time_ns, channel: frame if (time_ns, channel) == (S, "Height") else None)
     png = thumbnails.png(S, "Height")
     assert png is not None
-    assert int.from_bytes(png[16:20]) == int.from_bytes(png[20:24]) == SIDE_PX
+    assert 100 <= min(int.from_bytes(png[16:20]), int.from_bytes(png[20:24])) <= SIDE_PX
     assert len(png) > 500, "a particle is on it"
     assert thumbnails.png(2 * S, "Height") is None
