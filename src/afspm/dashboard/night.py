@@ -15,7 +15,7 @@ from afspm.errors import FileError
 from afspm.model import Note, Scan
 from afspm.model.geometry import XY
 from afspm.record.overview import Overview
-from afspm.record.packets import Playback
+from afspm.record.packets import RecordPlayback
 from afspm.record.run import Run, open_run
 from afspm.web.frames import FrameStore
 from afspm.web.watch import SpectrumStore, Watch
@@ -110,7 +110,7 @@ class NightWatch(Watch):
         super().__init__(self.moment, night.problems)
         self._night = night
         self._events: Sequence[NightEvent] = ()
-        self._playback: Playback[NightEvent] = Playback(())
+        self._playback: RecordPlayback[NightEvent] = RecordPlayback(())
         self.go(night.end_ns)
 
     @property
@@ -147,7 +147,7 @@ class NightWatch(Watch):
     def _go(self, time_ns: int) -> None:
         if time_ns < self.moment.time_ns or not self.is_current:
             self._events = self._night.events
-            self._playback = Playback(self._events)
+            self._playback = RecordPlayback(self._events)
             self.overview, self.frames = Overview(self.problems), ChannelNames()
             self.tip_to_sample = None
         self.moment.time_ns = time_ns

@@ -40,7 +40,7 @@ class Timed(Protocol):
 T = TypeVar("T", bound=Timed)
 
 
-class Playback(Generic[T]):
+class RecordPlayback(Generic[T]):
     """Recorded things, oldest first, each given once its time has come: to a page or to components.
 
     Where the time comes from, a clock that runs or the moment that a viewer has chosen, is the caller's affair.

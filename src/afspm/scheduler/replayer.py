@@ -11,7 +11,7 @@ from afspm import wire
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import TransportError, WireError
 from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlResponse, Packet, Response
-from afspm.record.packets import Playback
+from afspm.record.packets import RecordPlayback
 from afspm.transport.late_joiners import PublishedHistory
 from afspm.transport.network import Network
 from afspm.transport.polling import Poller, WakeUp, milliseconds
@@ -37,7 +37,7 @@ class Replayer:
 
     def __init__(
         self,
-        recorded: Playback[Packet],
+        recorded: RecordPlayback[Packet],
         clock: ExperimentClock,
         log: RateLimitedLog,
         *,

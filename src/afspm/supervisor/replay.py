@@ -18,7 +18,7 @@ from afspm.errors import ConfigError, FileError
 from afspm.launch import Launch, Sockets
 from afspm.model import Frame
 from afspm.process import signals
-from afspm.record.packets import Playback
+from afspm.record.packets import RecordPlayback
 from afspm.record.run import Run, open_run
 from afspm.record.run_json import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR
 from afspm.record.run_lock import lock_run
@@ -70,7 +70,7 @@ def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> 
                 tell(f"left out: {why}")
             left_out.add(why)
 
-        recorded = Playback(run.packets(messages=tuple(options.only) or None, tell=leave_out))
+        recorded = RecordPlayback(run.packets(messages=tuple(options.only) or None, tell=leave_out))
         if recorded.next_ns is None:
             raise ConfigError("there is nothing to replay", where=str(run.folder))
         clock = _clock(run, options.speed, recorded.next_ns)

@@ -1,11 +1,11 @@
-"""Playback of what was recorded: each thing in its time, and none twice or never."""
+"""RecordPlayback of what was recorded: each thing in its time, and none twice or never."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import islice
 
-from afspm.record.packets import Playback
+from afspm.record.packets import RecordPlayback
 
 
 @dataclass
@@ -18,7 +18,7 @@ def times(things: object) -> list[int | None]:
 
 
 def test_each_is_given_once_its_time_has_come() -> None:
-    playback = Playback([Recorded(10), Recorded(20), Recorded(20), Recorded(30)])
+    playback = RecordPlayback([Recorded(10), Recorded(20), Recorded(20), Recorded(30)])
     assert (playback.next_ns, times(playback.due(9))) == (10, [])
     assert times(playback.due(20)) == [10, 20, 20]
     assert playback.next_ns == 30
@@ -27,10 +27,10 @@ def test_each_is_given_once_its_time_has_come() -> None:
 
 
 def test_caller_that_stops_early_loses_none_and_gets_none_twice() -> None:
-    playback = Playback([Recorded(None), *map(Recorded, range(1, 10))])
+    playback = RecordPlayback([Recorded(None), *map(Recorded, range(1, 10))])
     assert times(islice(playback.due(100), 4)) == [None, 1, 2, 3]
     assert times(playback.due(100)) == [4, 5, 6, 7, 8, 9]
 
 
 def test_nothing_recorded_has_no_next_time() -> None:
-    assert Playback[Recorded](()).next_ns is None
+    assert RecordPlayback[Recorded](()).next_ns is None

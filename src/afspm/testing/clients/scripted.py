@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import zmq
 
@@ -63,7 +64,7 @@ class ScriptedScheduler:
     """
 
     def __init__(self, clock: Clock, control: str, publish: str, keys: Keys | None) -> None:
-        self._clock, self._addresses, self._keys = clock, (control, publish), keys
+        self._clock, self._bound = clock, (control, publish, keys)
         self._woken: WakeUp[None] = WakeUp()
         self.requests: list[ScriptedRequest] = []
         self.greetings: list[ScriptedRequest] = []
@@ -77,11 +78,11 @@ class ScriptedScheduler:
 
     def open(self) -> None:
         """Bind the sockets, the first time or again."""
-        control, publish = self._addresses
-        self._network = Network(self._keys)
+        control, publish, keys = self._bound
+        self._network = Network(keys)
         self._router = self._network.socket(zmq.ROUTER)
         self._router.setsockopt(zmq.ROUTER_HANDOVER, 1)
-        self._monitor = Monitor(self._network, self._router, ACCEPTED)
+        monitor = Monitor(self._network, self._router, ACCEPTED)
         self._network.bind(self._router, control, requests=True)
         self._publisher = self._network.socket(zmq.XPUB, max_bytes=LONGEST + 1)
         self._publisher.setsockopt(zmq.XPUB_MANUAL, 1)
@@ -89,7 +90,7 @@ class ScriptedScheduler:
         self._network.bind(self._publisher, publish)
         self._poller: Poller[Callable[[], None]] = Poller(self._woken)
         self._poller.register(self._router, self._take_request)
-        self._poller.register(self._monitor.socket, self._count_connections)
+        self._poller.register(monitor.socket, partial(self._count_connections, monitor))
         self._poller.register(self._publisher, self._take_subscription)
 
     def shut(self) -> None:
@@ -131,8 +132,8 @@ class ScriptedScheduler:
         """Send a response to a client."""
         self._router.send_multipart([peer, b"", *frames])
 
-    def _count_connections(self) -> None:
-        self.connections += len(self._monitor.drain())
+    def _count_connections(self, monitor: Monitor) -> None:
+        self.connections += len(monitor.drain())
 
     def _take_request(self) -> None:
         peer, *frames = [frame.bytes for frame in receive_frames(self._router)]
