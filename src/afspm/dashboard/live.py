@@ -15,11 +15,10 @@ from fastapi import Depends, FastAPI, Response
 from fastapi.responses import PlainTextResponse
 
 from afspm.dashboard.conditions import Conditions
-from afspm.dashboard.pictures import Look, PictureCache, RenderedFrame
+from afspm.dashboard.pictures import Look, PictureCache, RenderedFrame, Thumbnails
 from afspm.dashboard.scan_facts import Facts, began_ns, scan_facts
-from afspm.dashboard.thumbnails import Thumbnails
+from afspm.drawing.curves import profile
 from afspm.drawing.palette import DIVERGING, LEVELS, PALETTES
-from afspm.drawing.profile import profile
 from afspm.drawing.raster import png
 from afspm.web.archive import Archive
 from afspm.web.frames import ChannelFrame, number_or_none

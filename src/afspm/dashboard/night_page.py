@@ -8,12 +8,14 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import math
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from datetime import datetime
 from html import escape
 from typing import ClassVar
 
+import numpy as np
 from fastapi import FastAPI, Response
 from fastapi.responses import FileResponse, PlainTextResponse
 from nicegui import events, ui
@@ -21,16 +23,18 @@ from nicegui import events, ui
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.dashboard.access import Access, Visitor
 from afspm.dashboard.actions import Action, ActionResult, Actions, Steering, not_signed_in
-from afspm.dashboard.comparison import difference
 from afspm.dashboard.content import Content, Contents
 from afspm.dashboard.night import Night, NightWatch
 from afspm.dashboard.page import ASSETS, TABS, Page, Services, section
 from afspm.dashboard.pictures import Look, RenderedFrame
-from afspm.drawing.levelling import Levelling
+from afspm.drawing.levelling import Array, Levelling, levelled
 from afspm.drawing.palette import DIVERGING
 from afspm.drawing.raster import ValueRange, indices, png, value_range
+from afspm.drift.estimators import estimator
+from afspm.drift.registration import DriftScan
 from afspm.errors import AfspmError, InvalidValue
-from afspm.formatting import time_of_day, typeset_area
+from afspm.formatting import time_of_day, typeset_area, typeset_position
+from afspm.model import Region
 from afspm.model.events import PERSON
 from afspm.plain_data import Plain
 from afspm.record.notes import append_note
@@ -38,7 +42,9 @@ from afspm.record.report import REPORT_FILE, write
 from afspm.record.run_lock import describe_state
 from afspm.record.tables import ScanRow
 from afspm.web.archive import Archive, allowed_region
+from afspm.web.frames import ChannelFrame
 
+_ALIKE = 1e-3
 _HEAD = """<link rel="stylesheet" href="/assets/night.css"><script type="module" src="/assets/night.js"></script>"""
 
 
@@ -198,3 +204,48 @@ class NightSteering(Steering):
             return action(NightActions(self._night, who))
         except AfspmError as error:
             return ActionResult(str(error), ok=False)
+
+
+def difference(first: ChannelFrame, second: ChannelFrame, how: Levelling) -> tuple[ChannelFrame, str]:
+    """Return second minus first as a frame at the place of the first, and in words how they were laid over each other.
+
+    What both have in common is found by registration, where their sizes match; it has NaN where only one was measured.
+
+    Raises:
+        InvalidValue: they have not the same pixels, or other units.
+    """
+    if first.values.shape != second.values.shape:
+        (rows, columns), (others, along) = first.values.shape, second.values.shape
+        raise InvalidValue(f"{columns} × {rows} and {along} × {others} pixels can't be subtracted")
+    if first.unit != second.unit:
+        raise InvalidValue(f"values in {first.unit or '1'} and {second.unit or '1'} can't be subtracted")
+    before, after = levelled(first.values, how), levelled(second.values, how)
+    moved_m, words = _displacement(first.region, second.region, before, after)
+    change = _moved(after, first.region, moved_m) - before
+    if np.isfinite(change).any():
+        change -= np.nanmedian(change)
+    return replace(first, number=first.number ^ second.number, values=change), words
+
+
+def _displacement(first: Region, second: Region, before: Array, after: Array) -> tuple[tuple[float, float], str]:
+    """Return by how much the second picture lies elsewhere than the first, within the frame; and that in words."""
+    unmoved = (0.0, 0.0)
+    if not all(math.isclose(a, b, rel_tol=_ALIKE) for a, b in zip(first.size_m, second.size_m, strict=True)):
+        return unmoved, "not registered, because the sizes differ: compared pixel by pixel"
+    frame = Region((0.0, 0.0), first.size_m)
+    found = estimator("correlation").register(DriftScan(before, frame, 0.0, 1.0), DriftScan(after, frame, 2.0, 3.0))
+    if not found.accepted:
+        return unmoved, f"not registered ({found.reason}): compared pixel by pixel"
+    x, y = map(float, found.displacement_m)
+    return (x, y), f"registered: the second scan was moved by {typeset_position((-x, -y))}"
+
+
+def _moved(values: Array, region: Region, displacement_m: tuple[float, float]) -> Array:
+    """Return values with a displacement taken back; NaN where nothing is known."""
+    from scipy import ndimage
+
+    if displacement_m == (0.0, 0.0):
+        return values
+    pixels_m = (side / max(n - 1, 1) for side, n in zip(region.size_m[::-1], values.shape, strict=True))
+    shift = [-d / pixel for d, pixel in zip(displacement_m[::-1], pixels_m, strict=True)]
+    return np.asarray(ndimage.shift(values, shift, order=1, cval=np.nan))

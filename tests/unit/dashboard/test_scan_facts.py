@@ -11,8 +11,8 @@ import numpy as np
 from afspm.clock import ExperimentClock
 from afspm.dashboard.actions import ActionResult
 from afspm.dashboard.conditions import Conditions
+from afspm.dashboard.pictures import SIDE_PX, Thumbnails
 from afspm.dashboard.scan_facts import scan_facts
-from afspm.dashboard.thumbnails import SIDE_PX, Thumbnails
 from afspm.model import ControlMode, ControlState, Feedback, Region, Scan, ScopeState, ScopeStatus
 from afspm.record.overview import Overview
 from afspm.web.frames import ChannelFrame
