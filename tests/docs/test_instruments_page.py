@@ -8,7 +8,7 @@ import pytest
 
 from afspm import entry_points
 from afspm.errors import FileError
-from afspm.testing.commissioning.progress import StepOutcome
+from afspm.testing.commissioning.progress import outcome_of
 from afspm.testing.commissioning.report import InstrumentReport
 from afspm.testing.commissioning.steps import OPERATIONS
 
@@ -26,7 +26,7 @@ def test_there_are_reports() -> None:
 def test_a_report_tells_known_outcomes_of_known_operations(file: Path) -> None:
     report = InstrumentReport.read(file)
     assert set(report.operations) <= set(OPERATIONS)
-    assert {StepOutcome(outcome) for outcome in report.operations.values()}
+    assert {outcome_of(outcome) for outcome in report.operations.values()}
     assert report.release in PAGE.read_text(encoding="utf-8")
 
 

@@ -308,7 +308,7 @@ def test_both_axes_of_the_picture_have_one_unit(night: Night, opened: Opened, sc
     )
     page.wait_for_selector(f".map polygon[data-time='{far.time_ns}']", state="attached")
     page.evaluate(f"afspm.pin({{ time: '{far.time_ns}', channel: '{far.channel}' }})")
-    page.wait_for_function("window.texts?.includes('y [µm]') && window.texts.includes('x [µm]')")
+    page.wait_for_function("window.texts?.includes('y / µm') && window.texts.includes('x / µm')")
 
 
 def test_whoever_has_not_signed_in_can_steer_nothing(night: Night, opened: Opened) -> None:

@@ -40,6 +40,9 @@ WithinFrame = Annotated[
         metavar="SIZE",
     ),
 ]
+SuiteReportFile = Annotated[
+    Path | None, opt("Write the report here, too; as JUnit's XML if FILE ends with .xml.", "--report", metavar="FILE")
+]
 
 
 def names_in(given: list[str] | None) -> tuple[str, ...]:

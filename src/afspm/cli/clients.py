@@ -18,7 +18,9 @@ def check_client(
     only: Annotated[
         list[str] | None, opt("Only checks with this in their name.", "--only", "-k", metavar="PART")
     ] = None,
-    report: Annotated[Path | None, opt("Write the report here, too.", "--report", metavar="FILE")] = None,
+    report: Annotated[
+        Path | None, opt("Write the report here, too; JUnit's XML if FILE ends with .xml.", "--report", metavar="FILE")
+    ] = None,
     runs: Runs = RUNS,
     listed: Annotated[bool, typer.Option("--list", help="List the checks, and do none.")] = False,
 ) -> None:
@@ -31,14 +33,13 @@ def check_client(
 
     from rich.console import Console
 
-    from afspm.testing.clients import judge
-    from afspm.testing.clients.registry import all_client_checks
-    from afspm.testing.clients.report import show_client_end
-    from afspm.testing.verdicts import show_result
+    from afspm.testing.clients.client_suite import CLIENT_SUITE
+    from afspm.testing.clients.runner import judge, show_client_end
+    from afspm.testing.conformance import show_result
 
     if listed:
-        for check in all_client_checks():
-            typer.echo(f"{check.name:25}{check.title}")
+        for check in CLIENT_SUITE.checks():
+            typer.echo(check.listed)
         return
     if not command:
         raise typer.BadParameter("the client's conformance program is wanted", param_hint="-- COMMAND")
@@ -46,7 +47,6 @@ def check_client(
     result = judge(command, runs, only or (), lambda one: show_result(one, console))
     show_client_end(result, console)
     if report is not None:
-        report.parent.mkdir(parents=True, exist_ok=True)
-        report.write_text(result.to_json(), encoding="utf-8")
+        result.write(report)
     if not result.passed:
         raise typer.Exit(1)

@@ -36,7 +36,9 @@ def check_translator(
         list[str] | None,
         opt("Processes that run already: joined by the addresses in the file.", "--without", metavar="NAME[,NAME…]"),
     ] = None,
-    report: Annotated[Path | None, opt("Write the report here, too.", "--report", metavar="FILE")] = None,
+    report: Annotated[
+        Path | None, opt("Write the report here, too; JUnit's XML if FILE ends with .xml.", "--report", metavar="FILE")
+    ] = None,
     runs: Runs = RUNS,
     speed: CheckSpeed = 20.0,
     frame: WithinFrame = "",
@@ -53,10 +55,12 @@ def check_translator(
     from rich.console import Console
 
     from afspm.testing.translators import CheckOptions
+    from afspm.testing.translators.translator_suite import TRANSLATOR_SUITE
     from afspm.units import si
 
     if listed:
-        _list()
+        for check in TRANSLATOR_SUITE.checks():
+            typer.echo(check.listed)
         return
     if not files:
         raise typer.BadParameter("an experiment file is wanted", param_hint="FILE")
@@ -65,13 +69,6 @@ def check_translator(
     if not yes and not _is_simulated(options):
         typer.confirm(_ASK, abort=True)
     _check(options, console, report)
-
-
-def _list() -> None:
-    from afspm.testing.translators.registry import all_checks
-
-    for check in all_checks():
-        typer.echo(f"{check.name:31}{check.title}")
 
 
 def _is_simulated(options: CheckOptions) -> bool:
@@ -83,9 +80,9 @@ def _is_simulated(options: CheckOptions) -> bool:
 def _check(options: CheckOptions, console: Console, copy: Path | None) -> None:
     import signal
 
+    from afspm.testing.conformance import show_result
     from afspm.testing.translators import CheckReport, run
     from afspm.testing.translators.report import show_beginning, show_end
-    from afspm.testing.verdicts import show_result
 
     begun: list[CheckReport] = []
 
@@ -103,7 +100,7 @@ def _check(options: CheckOptions, console: Console, copy: Path | None) -> None:
         raise
     show_end(report, console)
     if copy is not None:
-        copy.write_text(report.to_json(), encoding="utf-8")
+        report.write(copy)
     if not report.passed:
         raise typer.Exit(1)
 

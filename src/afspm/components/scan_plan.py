@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from afspm.errors import InvalidValue
+from afspm.formatting import lengths_text
 from afspm.model import Region
 
 XY = tuple[float, float]
@@ -116,7 +117,9 @@ def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad
         raise InvalidValue(f"a grid of {columns} x {rows} points has none")
     for count, step_m in zip(counts, spacing_m, strict=True):
         if count > 1 and not step_m > 0.0:
-            raise InvalidValue(f"{count} points of a grid lie {step_m:g} m apart", hint="spacing is above zero")
+            raise InvalidValue(
+                f"{count} points of a grid lie {lengths_text([step_m])} apart", hint="spacing is above zero"
+            )
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
     points = []
     for row in range(rows):

@@ -9,8 +9,9 @@ from html import escape
 
 import numpy as np
 
+from afspm.drawing.chart import Axis, Curve
 from afspm.drawing.curves import Array, thinned
-from afspm.formatting import quantity, scale, time_of_day, typeset_position
+from afspm.formatting import quantity, time_of_day, typeset_position
 from afspm.model import RegistrationOutcome, Spectrum, registration_summary
 from afspm.plain_data import Plain
 from afspm.record.overview import DriftPoint
@@ -42,13 +43,14 @@ def drift_chart(points: Sequence[DriftPoint]) -> Chart:
     lost = np.array([point.lost for point in points])
     guessed = np.array([not point.matched for point in points]) & ~lost
     shown: Array = np.where(lost[:, None], np.nan, xy)
-    factor, unit = scale(float(np.nanmax(np.abs(shown), initial=0.0)), "m")
-    series = [_line(time_ms, shown[:, i] * factor, f"var(--t{i})", name) for i, name in enumerate("xy")]
+    y = Axis.over("drift of the sample", "m", shown)
+    factor, _ = y.scaled
+    series = [_line(Curve(time_ms, shown[:, i], f"var(--t{i})"), 1.0, factor, name) for i, name in enumerate("xy")]
     if guessed.any():
         either = np.concatenate([xy[guessed, 0], xy[guessed, 1]]) * factor
         dots = {"type": "scatter", "name": "predicted only", "symbolSize": 5, "itemStyle": {"color": "var(--bad)"}}
         series.append({**dots, "data": _pairs(np.tile(time_ms[guessed], 2), either)})
-    options = _options(series, {"type": "time"}, f"drift of the sample [{unit}]")
+    options = _options(series, {"type": "time"}, y)
     return Chart(_drift_words(points[-1], registered), {**options, "legend": _LEGEND})
 
 
@@ -79,31 +81,23 @@ def spectrum_chart(spectra: Sequence[tuple[int, Spectrum]], variable: str) -> Ch
         return Chart(f'<p class="nothing">A spectrum at {time_of_day(time_ns)} that has no curve.</p>')
     variable = variable if variable in last.names[1:] else last.names[1]
     before = [s for _, s in spectra[:-1] if s.names == last.names and s.units == last.units][-BEFORE:]
-    across, unit_across = scale(_largest([last], last.names[0]), last.units[0])
-    up, unit_up = scale(_largest([*before, last], variable), last.units[last.names.index(variable)])
-    drawn = [(s, "var(--t0)" if s is last else _QUIET) for s in [*before, last]]
-    series = [_line(s.values[:, 0] * across, s[variable] * up, colour) for s, colour in drawn]
-    for one in series[:-1]:
-        one["lineStyle"]["opacity"] = 0.4
+    unit = last.units[last.names.index(variable)]
+    x = Axis.over(last.names[0], last.units[0], last.values[:, 0])
+    y = Axis.over(variable, unit, np.concatenate([s[variable] for s in (*before, last)]))
+    curves = [Curve(s.values[:, 0], s[variable], _QUIET, 0.4) for s in before]
+    curves.append(Curve(last.values[:, 0], last[variable], "var(--t0)"))
+    series = [_line(curve, x.scaled[0], y.scaled[0]) for curve in curves]
     where = "" if last.position_m is None else f" at {typeset_position(last.position_m)}"
     words = f"<p>{escape(last.kind or 'Spectrum')}{where}, {time_of_day(time_ns)}</p>"
-    axis = {"type": "value", "scale": True, "name": _named(last.names[0], unit_across)}
-    return Chart(words, _options(series, axis, _named(variable, unit_up)))
+    return Chart(words, _options(series, {"type": "value", "scale": True, "name": x.scaled[1]}, y))
 
 
-def _largest(spectra: Sequence[Spectrum], name: str) -> float:
-    return max(float(np.nanmax(np.abs(one[name]), initial=0.0)) for one in spectra)
-
-
-def _named(name: str, unit: str) -> str:
-    return f"{name} [{unit}]" if unit else name
-
-
-def _line(x: Array, y: Array, colour: str, name: str = "") -> Options:
-    style = {"color": colour}
+def _line(curve: Curve, across: float, up: float, name: str = "") -> Options:
+    style = {"color": curve.colour}
     return {
-        "type": "line", "name": name, "data": _pairs(*thinned(x, y)), "showSymbol": False, "itemStyle": style,
-        "lineStyle": {**style, "width": 1.6}, "emphasis": {"disabled": True},
+        "type": "line", "name": name, "data": _pairs(*thinned(curve.x * across, curve.y * up)), "showSymbol": False,
+        "itemStyle": style, "lineStyle": {**style, "width": 1.6, "opacity": curve.opacity},
+        "emphasis": {"disabled": True},
     }  # fmt: skip
 
 
@@ -113,7 +107,7 @@ def _pairs(x: Array, y: Array) -> list[list[float | None]]:
     return [[a if math.isfinite(a) else None, float(f"{b:.6g}") if math.isfinite(a + b) else None] for a, b in points]
 
 
-def _options(series: list[Options], x: Options, y_name: str) -> Options:
+def _options(series: list[Options], x: Options, y: Axis) -> Options:
     axis = {
         "axisLabel": {"color": _QUIET},
         "axisLine": {"onZero": False, "lineStyle": {"color": _LINE}},
@@ -124,6 +118,6 @@ def _options(series: list[Options], x: Options, y_name: str) -> Options:
         "animation": False, "grid": _MARGINS, "series": series,
         "tooltip": {"trigger": "axis", "className": "tip", "borderWidth": 0},
         "xAxis": {**axis, "nameLocation": "middle", "nameTextStyle": {"color": _QUIET}, "nameGap": 26, **x},
-        "yAxis": {**axis, **names, "type": "value", "scale": True, "name": y_name,
+        "yAxis": {**axis, **names, "type": "value", "scale": True, "name": y.scaled[1],
                   "splitLine": {"lineStyle": {"color": _LINE}}},
     }  # fmt: skip

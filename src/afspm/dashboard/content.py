@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -86,12 +87,15 @@ class Contents:
         self._pictures = pictures
         self._lock = threading.Lock()
         self._content = Content()
-        self._made_s = self._drawn_s = -1e9
+        self._made_s = self._drawn_s = -math.inf
+        self._revision = 0
 
     def get(self) -> Content:
         """Return how it is now, or was a moment ago."""
         with self._lock:
-            now_s = self._watch.clock.monotonic_s()
+            now_s, revision = self._watch.clock.monotonic_s(), self._watch.revision
+            if revision != self._revision:
+                self._revision, self._made_s, self._drawn_s = revision, -math.inf, -math.inf
             if now_s - self._made_s >= ANEW_S or self._watch.ended != self._content.ended:
                 self._made_s = now_s
                 self._content = self._make(now_s)

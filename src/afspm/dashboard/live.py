@@ -15,11 +15,10 @@ from fastapi import Depends, FastAPI, Response
 from fastapi.responses import PlainTextResponse
 
 from afspm.dashboard.conditions import Conditions
-from afspm.dashboard.pictures import Look, PictureCache, RenderedFrame
+from afspm.dashboard.pictures import Look, PictureCache, RenderedFrame, Thumbnails
 from afspm.dashboard.scan_facts import Facts, began_ns, scan_facts
-from afspm.dashboard.thumbnails import Thumbnails
+from afspm.drawing.curves import profile
 from afspm.drawing.palette import DIVERGING, LEVELS, PALETTES
-from afspm.drawing.profile import profile
 from afspm.drawing.raster import png
 from afspm.web.archive import Archive
 from afspm.web.frames import ChannelFrame, number_or_none
@@ -32,10 +31,16 @@ FINISHED_S = 0.004  # between two of finished ones, for each who looks on, and t
 
 @dataclass(frozen=True)
 class PictureRequest:
-    """The picture that is meant; `time` in ns of a finished scan, 0: the newest."""
+    """The picture that is meant.
+
+    Attributes:
+        time: in ns, of a finished scan; 0: the newest.
+        beside: that of another scan with which it is compared: both get the same range of values; 0: none.
+    """
 
     channel: str = ""
     time: int = 0
+    beside: int = 0
     levelling: str = ""
     contrast: str = ""
     palette: str = ""
@@ -157,7 +162,8 @@ class Live:
             with self._watch.reading():
                 frame = self._watch.frames.newest(asked.channel or None)
         look = Look.named(asked.levelling, asked.contrast, asked.palette)
-        return None if frame is None else self._cache.draw(frame, look)
+        other = self._finished(asked.beside, asked.channel) if asked.beside else None
+        return None if frame is None else self._cache.draw(frame, look, other)
 
     def _facts(self, frame: ChannelFrame) -> Facts:
         with self._watch.reading() as overview:

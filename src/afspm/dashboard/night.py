@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from afspm.dashboard.content import Content, Contents
 from afspm.drawing.levelling import Array
 from afspm.errors import FileError
-from afspm.model import Note, Region, Scan
+from afspm.model import Note, Scan
 from afspm.model.geometry import XY
 from afspm.record.overview import Overview
+from afspm.record.packets import RecordPlayback
 from afspm.record.run import Run, open_run
 from afspm.web.frames import FrameStore
 from afspm.web.watch import SpectrumStore, Watch
@@ -111,7 +110,7 @@ class NightWatch(Watch):
         super().__init__(self.moment, night.problems)
         self._night = night
         self._events: Sequence[NightEvent] = ()
-        self._taken = 0
+        self._playback: RecordPlayback[NightEvent] = RecordPlayback(())
         self.go(night.end_ns)
 
     @property
@@ -121,6 +120,12 @@ class NightWatch(Watch):
     @property
     def is_over(self) -> bool:
         return self.moment.time_ns >= (self.overview.ended_ns or self._night.end_ns)
+
+    @property
+    def revision(self) -> int:
+        if not self.is_current:
+            self.go(self.moment.time_ns)
+        return self.changes
 
     @property
     def is_current(self) -> bool:
@@ -141,13 +146,13 @@ class NightWatch(Watch):
 
     def _go(self, time_ns: int) -> None:
         if time_ns < self.moment.time_ns or not self.is_current:
-            self._events, self._taken = self._night.events, 0
+            self._events = self._night.events
+            self._playback = RecordPlayback(self._events)
             self.overview, self.frames = Overview(self.problems), ChannelNames()
             self.tip_to_sample = None
         self.moment.time_ns = time_ns
-        for event in takewhile(lambda one: one.time_ns <= time_ns, self._events[self._taken :]):
+        for event in self._playback.due(time_ns):
             self.take(event.message, event.thing, event.time_ns, event.envelope)
-            self._taken += 1
         self.spectra = self._night.spectra_until(time_ns)
         self.connected = True
         self.changes += 1
@@ -166,23 +171,6 @@ class ChannelNames(FrameStore):
 
     def take_scan(self, scan: Scan, time_ns: int) -> None:
         self._names[scan.channel] = None
-
-
-class NightContents(Contents):
-    """Makes the page of one viewer, whenever the moment changes."""
-
-    def __init__(self, watch: NightWatch, limits: Region | None, pictures: str) -> None:
-        super().__init__(watch, limits, pictures=pictures)
-        self._moment = watch
-        self._made_of = -1
-
-    def get(self) -> Content:
-        if not self._moment.is_current:
-            self._moment.go(self._moment.moment.time_ns)
-        if self._made_of != self._moment.changes:
-            self._made_of = self._moment.changes
-            self._made_s = self._drawn_s = -np.inf
-        return super().get()
 
 
 class StoppedClock:

@@ -1,19 +1,22 @@
-"""Frames as pictures for the browser, each made once however many look at it."""
+"""Frames as pictures for the browser, each made once for all viewers; small ones for the map and the time line."""
 
 from __future__ import annotations
 
 import json
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 from afspm.dashboard.scan_facts import Facts
-from afspm.drawing.levelling import Array, Levelling, levelled
+from afspm.drawing.image_html import shown
+from afspm.drawing.levelling import Array, Levelling, flattened, levelled
 from afspm.drawing.palette import PALETTES
-from afspm.drawing.raster import Contrast, ValueRange, indices, png, value_range
+from afspm.drawing.raster import Contrast, ValueRange, indices, png, shared_range
 from afspm.web.frames import ChannelFrame
 
-KEPT = 8
+KEPT, THUMBNAILS_KEPT = 8, 600
+SIDE_PX = 128
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,13 +84,41 @@ class PictureCache:
         self._lock = threading.Lock()
         self._drawn = lru_cache(KEPT)(_draw)
 
-    def draw(self, frame: ChannelFrame, look: Look) -> RenderedFrame:
-        """Return the picture of a frame."""
+    def draw(self, frame: ChannelFrame, look: Look, beside: ChannelFrame | None = None) -> RenderedFrame:
+        """Return the picture of a frame; with the same range of values as that of a frame beside it."""
         with self._lock:  # two that want the same wait for one; two that want others share a core anyway
-            return self._drawn(frame, look)
+            return self._drawn(frame, look, beside)
 
 
-def _draw(frame: ChannelFrame, look: Look) -> RenderedFrame:
+def _draw(frame: ChannelFrame, look: Look, beside: ChannelFrame | None) -> RenderedFrame:
     values = levelled(frame.values, look.levelling)
-    span = value_range(values, look.contrast)
+    compared = [] if beside is None or beside.unit != frame.unit else [levelled(beside.values, look.levelling)]
+    span = shared_range([values, *compared], look.contrast)
     return RenderedFrame(frame, look, values, span, png(indices(values, span), look.palette))
+
+
+class Thumbnails:
+    """Draws, from any thread, and keeps the newest few hundred; a finished scan never changes.
+
+    Args:
+        frame: returns a finished channel by time and name; None if its values are not kept.
+    """
+
+    def __init__(self, frame: Callable[[int, str], ChannelFrame | None]) -> None:
+        self._frame = frame
+        self._lock = threading.Lock()
+        self._kept = lru_cache(THUMBNAILS_KEPT)(self._draw)
+
+    def png(self, time_ns: int, channel: str) -> bytes | None:
+        """Return the picture of a scan, flattened; None if its values are not kept."""
+        with self._lock:
+            try:
+                return self._kept(time_ns, channel)
+            except LookupError:
+                return None
+
+    def _draw(self, time_ns: int, channel: str) -> bytes:
+        frame = self._frame(time_ns, channel)
+        if frame is None:
+            raise LookupError(time_ns)
+        return shown(flattened(frame.values), SIDE_PX).image

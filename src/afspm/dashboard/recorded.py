@@ -57,10 +57,9 @@ def serve(settings: RecordedSettings, tell: Callable[[str], object], stopped: th
     """
     from afspm.dashboard.application import application
     from afspm.dashboard.conditions import Conditions
-    from afspm.dashboard.night import Night, NightContents, NightWatch
-    from afspm.dashboard.night_page import NightPage
-    from afspm.dashboard.night_requests import NightRequests
-    from afspm.dashboard.night_steering import NightSteering
+    from afspm.dashboard.content import Contents
+    from afspm.dashboard.night import Night, NightWatch
+    from afspm.dashboard.night_page import NightPage, NightRequests, NightSteering
     from afspm.dashboard.page import Services
     from afspm.web.watch import Audience
 
@@ -75,7 +74,7 @@ def serve(settings: RecordedSettings, tell: Callable[[str], object], stopped: th
     steering = NightSteering(night, access, settings.name)
     pictures = f"/live/thumbnail/{secrets.token_hex(4)}"
     services = Services(
-        watch, NightContents(watch, allowed_region(night.folder), pictures), steering, Audience(), access,
+        watch, Contents(watch, allowed_region(night.folder), pictures=pictures), steering, Audience(), access,
         night.title, night.simulated, Conditions(watch, partial(steering.do, Visitor())),
     )  # fmt: skip
     encrypted = settings.certificate is not None

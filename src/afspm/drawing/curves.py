@@ -1,4 +1,4 @@
-"""Curves: fewer points without losing a peak, and round ticks."""
+"""Curves: fewer points without losing a peak, round ticks, and the profile of a scan along a line."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 MOST_POINTS = 600
+MOST_PROFILE_POINTS = 1024
+Pixel = tuple[float, float]
 
 
 def thinned(x: Array, y: Array, most: int = MOST_POINTS) -> tuple[Array, Array]:
@@ -45,3 +47,38 @@ def round_ticks(low: float, high: float, about: int = 5) -> list[float]:
 def _multiples(step: float, low: float, high: float) -> list[float]:
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     return [round(i * step, 14 - math.floor(math.log10(abs(i * step) or 1.0))) for i in range(first, last + 1)]
+
+
+def profile(values: Array, size_m: tuple[float, float], begin: Pixel, end: Pixel) -> tuple[Array, Array]:
+    """Return (distances in m, values) along a line in the scan, linear between pixels, about one point a pixel.
+
+    Args:
+        values: [y, x], y ascending; NaN where nothing was measured.
+        size_m: of the scan.
+        begin, end: (column, row), fractions of pixels allowed; what lies outside is moved to the border.
+    """
+    ny, nx = values.shape
+    (x0, y0), (x1, y1) = ((min(max(x, 0.0), nx - 1.0), min(max(y, 0.0), ny - 1.0)) for x, y in (begin, end))
+    count = min(MOST_PROFILE_POINTS, max(2, round(math.hypot(x1 - x0, y1 - y0)) + 1))
+    column_m, row_m = size_m[0] / max(nx - 1, 1), size_m[1] / max(ny - 1, 1)
+    length_m = math.hypot((x1 - x0) * column_m, (y1 - y0) * row_m)
+    found = _interpolated(values, np.linspace(x0, x1, count), np.linspace(y0, y1, count))
+    return np.linspace(0.0, length_m, count), found
+
+
+def _interpolated(values: Array, x: Array, y: Array) -> Array:
+    ny, nx = values.shape
+    left = np.clip(np.floor(x).astype(int), 0, max(nx - 2, 0))
+    low = np.clip(np.floor(y).astype(int), 0, max(ny - 2, 0))
+    right, high = np.minimum(left + 1, nx - 1), np.minimum(low + 1, ny - 1)
+    u, v = x - left, y - low
+    total = np.zeros(x.shape)
+    # a neighbour of no weight must not spoil it with its NaN
+    for rows, columns, weights in (
+        (low, left, (1 - u) * (1 - v)),
+        (low, right, u * (1 - v)),
+        (high, left, (1 - u) * v),
+        (high, right, u * v),
+    ):
+        total += np.where(weights > 0.0, values[rows, columns] * weights, 0.0)
+    return total

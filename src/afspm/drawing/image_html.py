@@ -36,7 +36,7 @@ def shown(values: Array, largest_px: int, palette: str = PALETTES[0], *, small: 
     Args:
         small: a file of few bytes counts for more than exact colours.
     """
-    some = reduced(values, largest_px)
+    some = reduced(values, largest_px, each_side=True)
     span = value_range(some)
     return Shown((webp if small else png)(indices(some, span), palette), span)
 

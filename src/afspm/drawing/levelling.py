@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+_SD_PER_MAD = 1.4826
+_OUTLIERS_SD = 4.0
 
 
 class Levelling(Enum):
@@ -33,6 +35,21 @@ def levelled(values: Array, how: Levelling) -> Array:
     if not finite.any():
         return values
     return values - _BACKGROUNDS[how](values, finite)
+
+
+def flattened(values: Array) -> Array:
+    """Return values with their lines brought to one height and without their plane: as small pictures show them.
+
+    Outliers are masked: neither a scar nor a high particle tilts its neighbours.
+    """
+    flat = levelled(levelled(values, Levelling.DIFFERENCES), Levelling.PLANE)
+    finite = np.isfinite(flat)
+    if not finite.any():
+        return flat
+    from_middle = np.abs(flat - np.median(flat[finite]))
+    near = finite & (from_middle <= _OUTLIERS_SD * _SD_PER_MAD * np.median(from_middle[finite]))
+    # more than half of the values lie within: a plane through them always exists
+    return flat - _plane(flat, near)
 
 
 def _plane(values: Array, finite: NDArray[np.bool_]) -> Array:

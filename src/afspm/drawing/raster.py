@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
@@ -18,13 +19,13 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 _SAMPLED = 65_536  # values that the range is found from, of a larger picture evenly chosen ones
-_OUTLIERS_PERCENT = 0.5
+_OUTLIERS_PERCENT = 1.0
 _FAST = 1  # of zlib: pictures are made by the dozen, and looked at once
 _QUALITY = 80
 
 
 class Contrast(Enum):
-    """The values that the ends of the colour map stand for: all but the outer half percents, or all."""
+    """The values that the ends of the colour map stand for: all but the outer percents, or all."""
 
     ROBUST = "robust"
     FULL = "full"
@@ -60,6 +61,12 @@ def value_range(values: Array, contrast: Contrast = Contrast.ROBUST) -> ValueRan
     return ValueRange(low, high)
 
 
+def shared_range(pictures: Iterable[Array], contrast: Contrast = Contrast.ROBUST) -> ValueRange:
+    """Return the range for pictures that are compared: no smaller than that of any."""
+    spans = [value_range(values, contrast) for values in pictures]
+    return ValueRange(min(span.low for span in spans), max(span.high for span in spans))
+
+
 def indices(values: Array, span: ValueRange) -> NDArray[np.uint8]:
     """Return the index of each value in the colour map; UNMEASURED where it is not finite."""
     with np.errstate(invalid="ignore", over="ignore"):
@@ -89,12 +96,18 @@ def webp(levels: NDArray[np.uint8], palette: str = PALETTES[0]) -> bytes:
     return written.getvalue()
 
 
-def reduced(values: Array, largest_px: int) -> Array:
-    """Return the means of squares of pixels, so that at most `largest_px` a side are left; NaN counts for nothing."""
-    step = max(1, -(-max(values.shape) // largest_px))
-    if step == 1:
+def reduced(values: Array, largest_px: int, *, each_side: bool = False) -> Array:
+    """Return the means of blocks of pixels, so that at most `largest_px` a side are left; NaN counts for nothing.
+
+    Args:
+        each_side: reduce each side by itself, for pictures that are drawn in the proportions of their region; else
+            blocks are squares of pixels.
+    """
+    steps = [max(1, -(-count // largest_px)) for count in values.shape]
+    if max(steps) == 1:
         return values
-    across, along = (min(step, count) for count in values.shape)  # a few long lines are not put together
+    # a few long lines are not put together beyond their number
+    across, along = steps if each_side else (min(max(steps), count) for count in values.shape)
     rows, columns = values.shape[0] // across, values.shape[1] // along
     blocks = values[: rows * across, : columns * along].reshape(rows, across, columns, along)
     measured = np.isfinite(blocks)

@@ -15,6 +15,8 @@ COLUMNS = 720  # stretches narrower than this part of the run are put together
 MOST_PICTURES = 14
 _STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
 _DAY_S = _STEPS_S[-1]
+_EDGES = ((0.0, 3.0, 0), (97.0, 100.0, -100))
+"""Percent of the row in which the text of a tick does not lie about the tick: from, to, and its shift."""
 
 CSS = """
 .lanes{display:grid;gap:3px}
@@ -103,12 +105,14 @@ def timeline_html(
 def _axis(begin_ns: int, end_ns: int, zone: tzinfo | None, name: str) -> str:
     at_s = time_ticks(begin_ns / NS_PER_S, end_ns / NS_PER_S)
     seconds = any(s % 60 for s in at_s)
-    ticks = "".join(
-        f'<span style="left:{100.0 * (s * NS_PER_S - begin_ns) / (end_ns - begin_ns):.2f}%">'
-        f"{time_of_day(round(s * NS_PER_S), zone, seconds=seconds)}</span>"
-        for s in at_s
-    )
-    return f'<div class="lane-axis"><b>{name}</b><div>{ticks}</div></div>'
+    ticks = []
+    for s in at_s:
+        percent = 100.0 * (s * NS_PER_S - begin_ns) / (end_ns - begin_ns)
+        # the page ends where the row does: what reaches beyond is cut off
+        within = next((f";transform:translateX({by}%)" for low, high, by in _EDGES if low <= percent <= high), "")
+        text = time_of_day(round(s * NS_PER_S), zone, seconds=seconds)
+        ticks.append(f'<span style="left:{percent:.2f}%{within}">{text}</span>')
+    return f'<div class="lane-axis"><b>{name}</b><div>{"".join(ticks)}</div></div>'
 
 
 def tint_class(name: str) -> str:

@@ -6,7 +6,7 @@ import json
 import threading
 from bisect import bisect_right
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +20,8 @@ from afspm.model import (
     JournalEntries,
     JournalEntry,
     ProblemNames,
+    ProcessState,
+    ProcessStates,
     Scan,
     ScopeStatus,
     Spectrum,
@@ -80,6 +82,7 @@ class EventHistory:
         self._problems = problems
         self._lock = threading.Lock()
         self._events: list[Event] = []
+        self._processes: dict[str, tuple[ProcessState, ...]] = {}
         self._bytes = 0
         self._complete_since_ns = complete_since_ns
 
@@ -100,6 +103,8 @@ class EventHistory:
         with self._lock:
             if kind is None or (self._events and time_ns <= self._events[-1].time_ns):
                 return
+            if isinstance(thing, ProcessStates) and not self._has_changed(thing):
+                return
             data = {"time": iso_utc(time_ns), "data": _data(thing, time_ns, self._problems)}
             event = Event(time_ns, kind, json.dumps(data, allow_nan=False))
             self._events.append(event)
@@ -115,6 +120,12 @@ class EventHistory:
             missed = self._complete_since_ns if time_ns < self._complete_since_ns else None
         newest_ns = max(time_ns, found[-1].time_ns if found else missed or time_ns)
         return EventBatch(tuple(one for one in found if one.kind in kinds), newest_ns, missed)
+
+    def _has_changed(self, states: ProcessStates) -> bool:
+        # a supervisor publishes all its processes every 2 s: as events they were most of a night's memory
+        now = tuple(replace(one, step_age_s=0.0) for one in states.processes)
+        before, self._processes[states.supervisor] = self._processes.get(states.supervisor), now
+        return now != before
 
     def _drop_oldest(self) -> None:
         count = max(1, len(self._events) // 8)

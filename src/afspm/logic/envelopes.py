@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from afspm.errors import ConfigError
+from afspm.formatting import lengths_text
 from afspm.model import PacketHeader
 
 EnvelopeMapping = Callable[[PacketHeader], str]
@@ -83,7 +84,8 @@ class CacheRule:
                     hint=f"e.g. {self.message or '{message}'}_{self.envelope}",
                 )
         if self.above_m is not None and self.up_to_m is not None and self.above_m >= self.up_to_m:
-            raise ConfigError(f"no width is above {self.above_m:g} m and up to {self.up_to_m:g} m", where="[cache]")
+            above, up_to = (lengths_text([width_m]) for width_m in (self.above_m, self.up_to_m))
+            raise ConfigError(f"no width is above {above} and up to {up_to}", where="[cache]")
 
     def fits(self, header: PacketHeader) -> bool:
         wanted = ((self.message, header.message), (self.channel, header.channel), (self.kind, header.kind))

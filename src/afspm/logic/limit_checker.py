@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from afspm.errors import InvalidValue
+from afspm.formatting import lengths_text, position_text, quantity
 from afspm.logic.frozen import replace
 from afspm.logic.limit_state import LastUse, LimitState, Usage
 from afspm.logic.limits import ExperimentLimits, Limit
@@ -313,12 +314,14 @@ class LimitChecker:
             )
 
     def _check_value(self, name: str, value: float, limit: Limit, now_ns: int) -> None:
-        unit = f" {limit.unit}" if limit.unit else f" {BASE_PARAMETERS.get(name) or ''}".rstrip()
-        said = f"{name} = {value:g}{unit}"
+        def text(amount: float, digits: int = 6) -> str:
+            return quantity(amount, limit.unit or BASE_PARAMETERS.get(name) or "", digits)
+
+        said = f"{name} = {text(value)}"
         if limit.low is not None and value < limit.low - abs(limit.low) * _REACH:
-            raise _param_error(f"{said} is below the lowest allowed, {limit.low:g}{unit} ({limit.source})")
+            raise _param_error(f"{said} is below the lowest allowed, {text(limit.low)} ({limit.source})")
         if limit.high is not None and value > limit.high + abs(limit.high) * _REACH:
-            raise _param_error(f"{said} is above the highest allowed, {limit.high:g}{unit} ({limit.source})")
+            raise _param_error(f"{said} is above the highest allowed, {text(limit.high)} ({limit.source})")
         if not limit.bounds_changes:
             return
         known = self.state.usage.known.get(name)
@@ -329,15 +332,17 @@ class LimitChecker:
         change = abs(value - known.value)
         if limit.step is not None and change > limit.step * (1 + _REACH):
             raise _param_error(
-                f"{said} is a step of {change:g}{unit}, the largest allowed is {limit.step:g}{unit} ({limit.source})"
+                f"{said} is a step of {text(change)}, the largest allowed is {text(limit.step)} ({limit.source})"
             )
-        allowed = None if limit.rate_per_s is None else limit.rate_per_s * (now_ns - known.since_ns) / 1e9
+        if limit.rate_per_s is None:
+            return
+        allowed = limit.rate_per_s * (now_ns - known.since_ns) / 1e9
         moved_since = change + abs(known.value - known.origin)
-        if allowed is not None and moved_since > allowed * (1 + _REACH):
+        if moved_since > allowed * (1 + _REACH):
             ago_s = (now_ns - known.since_ns) / 1e9
             raise _param_error(
-                f"{said} changes by {moved_since:g}{unit} within {ago_s:.3g} s, allowed is at most {allowed:.3g}{unit},"
-                f" at {limit.rate_per_s:g}{unit} per second ({limit.source})"
+                f"{said} changes by {text(moved_since)} within {ago_s:.3g} s, allowed is at most {text(allowed, 3)},"
+                f" at {text(limit.rate_per_s)} per second ({limit.source})"
             )
 
     def _check_scan(self, wanted: ScanParameters, reach: float = _REACH) -> None:
@@ -356,7 +361,7 @@ class LimitChecker:
         for x, y in region.corners_m():
             if not _inside(allowed, (float(x), float(y)), reach):
                 raise _param_error(
-                    f"the scan's corner ({x:.6g}, {y:.6g}) m lies outside the region allowed"
+                    f"the scan's corner {position_text((float(x), float(y)))} lies outside the region allowed"
                     f" ({self.limits.region_source})"
                 )
 
@@ -367,7 +372,7 @@ class LimitChecker:
                 raise _param_error(f"a scan region can't have a {value} in it")
         for size in (change.width_m, change.height_m):
             if size is not None and size <= 0:
-                raise _param_error(f"a scan region of size {size:g} m is empty")
+                raise _param_error(f"a scan region of size {lengths_text([size])} is empty")
         if self.state.position.region is not None:
             return change.onto(self.state.position.region)
         if self.limits.region is not None:
@@ -380,7 +385,7 @@ class LimitChecker:
         allowed = self.limits.region
         if allowed is not None and not _inside(allowed, xy_m, reach):
             raise _param_error(
-                f"the probe position ({xy_m[0]:.6g}, {xy_m[1]:.6g}) m lies outside the region allowed"
+                f"the probe position {position_text(xy_m)} lies outside the region allowed"
                 f" ({self.limits.region_source})"
             )
 

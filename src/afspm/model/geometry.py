@@ -12,6 +12,7 @@ from enum import Enum
 from typing import TYPE_CHECKING
 
 from afspm.errors import InvalidValue, UnitError
+from afspm.formatting import area_text
 from afspm.units import si_or_text
 
 if TYPE_CHECKING:
@@ -70,9 +71,7 @@ class Region:
                 f"a region needs finite numbers, not centre {self.center_m}, size {self.size_m}, angle {self.angle_rad}"
             )
         if values[2] <= 0.0 or values[3] <= 0.0:
-            raise InvalidValue(
-                f"a region of {values[2]:g} m x {values[3]:g} m is empty", hint="both sizes are above zero"
-            )
+            raise InvalidValue(f"a region of {area_text(values[2:4])} is empty", hint="both sizes are above zero")
         object.__setattr__(self, "center_m", values[:2])
         object.__setattr__(self, "size_m", values[2:4])
         object.__setattr__(self, "angle_rad", values[4])

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.clock import NS_PER_S
-from afspm.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM, colour_map
+from afspm.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM, UNMEASURED, colour_map
 from afspm.drawing.timeline import time_ticks
 from afspm.formatting import counted, period_text, time_of_day
 from afspm.model import names
@@ -118,7 +118,7 @@ def _sheet(ax: Axes, record: NightRecord, shots: Sequence[Shot], colours: Mappin
     pitch, tall = THUMB_PX + GAP_PX, THUMB_PX + GAP_PX + BAR_PX
     canvas = np.full((rows * tall, COLUMNS * pitch, 3), PAPER, np.uint8)
     bad_ns = record.bad_ns()
-    palette = np.vstack([colour_map("gold"), colour_map("gold")[-1:]])  # for each of 256 greys
+    palette = np.vstack([colour_map("gold"), [_rgb(NEUTRAL)]])  # the last: not measured
     for i, shot in enumerate(shots):
         y, x = i // COLUMNS * tall, i % COLUMNS * pitch + GAP_PX // 2
         picture = palette[_fitted(shot.picture)[::-1]]  # drawn with y upwards
@@ -266,7 +266,7 @@ def _fitted(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     rows = np.minimum((np.arange(max(1, round(ny * scale))) / scale).astype(int), ny - 1)
     columns = np.minimum((np.arange(max(1, round(nx * scale))) / scale).astype(int), nx - 1)
     small = picture[np.ix_(rows, columns)]
-    canvas = np.zeros((THUMB_PX, THUMB_PX), np.uint8)
+    canvas = np.full((THUMB_PX, THUMB_PX), UNMEASURED, np.uint8)
     y, x = (THUMB_PX - small.shape[0]) // 2, (THUMB_PX - small.shape[1]) // 2
     canvas[y : y + small.shape[0], x : x + small.shape[1]] = small
     return canvas

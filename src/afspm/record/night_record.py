@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.drawing.levelling import flattened
+from afspm.drawing.raster import indices, reduced, value_range
 from afspm.model import ControlMode, ControlState, Problem, Scan
 from afspm.plain_data import Plain
 from afspm.record.bad_scans import bad_scans
@@ -189,15 +191,6 @@ def mark_entry(
 
 
 def thumbnail(values: NDArray[np.float64], largest_px: int = THUMBNAIL_PX) -> NDArray[np.uint8]:
-    """A scan as a small grey picture: lines levelled, contrast from the 1st to the 99th percentile."""
-    step = max(1, -(-max(values.shape) // largest_px))
-    finite = np.where(np.isfinite(values), values, 0.0)
-    across, along = (min(step, n) for n in values.shape)  # a few long lines are a picture of a line each
-    rows, columns = values.shape[0] // across, values.shape[1] // along
-    blocks = finite[: rows * across, : columns * along].reshape(rows, across, columns, along)
-    small = blocks.mean(axis=(1, 3))
-    small = small - np.median(small, axis=1, keepdims=True)
-    low, high = np.percentile(small, (1, 99))
-    grey = np.clip((small - low) / (high - low if high > low else 1.0), 0.0, 1.0)
-    picture: NDArray[np.uint8] = np.round(grey * 255).astype(np.uint8)
-    return picture
+    """Return a scan as a small picture [y, x] of indices into a colour map, flattened as all small pictures are."""
+    small = flattened(reduced(values, largest_px))
+    return indices(small, value_range(small))

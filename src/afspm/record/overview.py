@@ -339,7 +339,7 @@ class Overview:
 
     def _take_status(self, status: ScopeStatus, time_ns: int) -> None:
         before, self.status = self.status, status
-        self.states.change(status.state.name.lower(), time_ns)
+        self.states.change(sys.intern(status.state.name.lower()), time_ns)
         if status.state is ScopeState.SCANNING:
             if before is None or before.state is not ScopeState.SCANNING or self.running is None:
                 holder = self.control.holder if self.control else None
@@ -418,6 +418,9 @@ class Overview:
 
     def _take_entries(self, entries: JournalEntries, time_ns: int) -> None:
         for entry in entries.entries:
+            # thousands of entries are kept, and most have the same words
+            who, what, kind = map(sys.intern, (entry.who, entry.what, entry.kind))
+            entry = replace(entry, who=who, what=what, kind=kind)
             self.entries.append(entry)
             if entry.refused:
                 self.refusals.append(entry)

@@ -1,12 +1,12 @@
-"""Packets read back from the record: whole, or without the values that are in files."""
+"""Packets read back from the record: whole, or without the values that are in files; and played back in time."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from afspm import wire
 from afspm.errors import FileError, WireError
@@ -28,6 +28,38 @@ _AT_ONCE = 500
 _FILES_KEPT = 4
 _LAST = chr(0x10FFFF)  # after every envelope
 _COLUMNS = "time_ns, envelope, message, payload, scan, spectrum, channel, first_row, rows"
+
+
+class Timed(Protocol):
+    """Something recorded, with the time at which it was published."""
+
+    @property
+    def time_ns(self) -> int | None: ...
+
+
+T = TypeVar("T", bound=Timed)
+
+
+class RecordPlayback(Generic[T]):
+    """Recorded things, oldest first, each given once its time has come: to a page or to components.
+
+    Where the time comes from, a clock that runs or the moment that a viewer has chosen, is the caller's affair.
+    """
+
+    def __init__(self, things: Iterable[T]) -> None:
+        self._things = iter(things)
+        self._next = next(self._things, None)
+
+    @property
+    def next_ns(self) -> int | None:
+        """The time of the next one; None after the last."""
+        return None if self._next is None else self._next.time_ns or 0
+
+    def due(self, now_ns: int) -> Iterator[T]:
+        """Yield those whose time has come; a caller that stops early loses none."""
+        while self._next is not None and (self._next.time_ns or 0) <= now_ns:
+            thing, self._next = self._next, next(self._things, None)
+            yield thing
 
 
 def packets(

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from itertools import islice
 
 from afspm import wire
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import TransportError, WireError
 from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlResponse, Packet, Response
+from afspm.record.packets import RecordPlayback
 from afspm.transport.late_joiners import PublishedHistory
 from afspm.transport.network import Network
 from afspm.transport.polling import Poller, WakeUp, milliseconds
@@ -26,7 +28,7 @@ class Replayer:
     """Publishes packets at the times at which they were published.
 
     Args:
-        packets: oldest first.
+        recorded: the packets.
         clock: shows the time of the recorded run.
 
     Raises:
@@ -35,14 +37,14 @@ class Replayer:
 
     def __init__(
         self,
-        packets: Iterator[Packet],
+        recorded: RecordPlayback[Packet],
         clock: ExperimentClock,
         log: RateLimitedLog,
         *,
         publish: str,
         serve: str,
     ) -> None:
-        self._packets = packets
+        self._recorded = recorded
         self._clock = clock
         self._network = Network.from_launch("replay", None)
         self._published = PublishedHistory(clock)
@@ -58,7 +60,6 @@ class Replayer:
             self._poller.register(socket, self._publisher.serve)
         for socket in (self._router.socket, self._router.monitor.socket):
             self._poller.register(socket, self._answer)
-        self._next = next(self._packets, None)
         self._ended = self._stopping = False
         self.count = 0
         """How many packets have been published."""
@@ -69,7 +70,7 @@ class Replayer:
         Args:
             stay: also when all is published.
         """
-        while not self._stopping and (self._next is not None or stay):
+        while not self._stopping and (self._recorded.next_ns is not None or stay):
             self._serve(self._due_in_s())
             self._publish_due()
         self._end()
@@ -98,21 +99,17 @@ class Replayer:
         self._wake_up.close()
 
     def _due_in_s(self) -> float:
-        if self._next is None:
+        next_ns = self._recorded.next_ns
+        if next_ns is None:
             return math.inf
-        left_ns = (self._next.time_ns or 0) - self._clock.now_ns()
-        return max(0.0, self._clock.real_s(left_ns / NS_PER_S))
+        return max(0.0, self._clock.real_s((next_ns - self._clock.now_ns()) / NS_PER_S))
 
     def _publish_due(self) -> None:
-        for _ in range(MOST_AT_ONCE):
-            if self._next is None or (self._next.time_ns or 0) > self._clock.now_ns():
-                return
-            packet = self._next
+        for packet in islice(self._recorded.due(self._clock.now_ns()), MOST_AT_ONCE):
             keep = not packet.envelope.startswith("ScanLines")  # as a scheduler does
             stamped = self._published.stamp(packet.envelope, bytes(packet.payload), packet.time_ns, keep=keep)
             self._publisher.publish(stamped)
             self.count += 1
-            self._next = next(self._packets, None)
 
     def _serve(self, within_s: float) -> None:
         timeout = None if within_s == math.inf else milliseconds(within_s)

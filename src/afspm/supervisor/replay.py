@@ -8,7 +8,6 @@ import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 
 from afspm import wire
@@ -17,8 +16,9 @@ from afspm.client.connect import GUEST
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
 from afspm.launch import Launch, Sockets
-from afspm.model import Frame, Packet
+from afspm.model import Frame
 from afspm.process import signals
+from afspm.record.packets import RecordPlayback
 from afspm.record.run import Run, open_run
 from afspm.record.run_json import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR
 from afspm.record.run_lock import lock_run
@@ -70,14 +70,13 @@ def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> 
                 tell(f"left out: {why}")
             left_out.add(why)
 
-        packets = run.packets(messages=tuple(options.only) or None, tell=leave_out)
-        first = next(packets, None)
-        if first is None:
+        recorded = RecordPlayback(run.packets(messages=tuple(options.only) or None, tell=leave_out))
+        if recorded.next_ns is None:
             raise ConfigError("there is nothing to replay", where=str(run.folder))
-        clock = _clock(run, options.speed, first)
+        clock = _clock(run, options.speed, recorded.next_ns)
         publish, serve = _addresses(run, options)
         complaints = RateLimitedLog(logging.getLogger("afspm.replay"), clock)
-        replayer = Replayer(chain([first], packets), clock, complaints, publish=publish, serve=serve)
+        replayer = Replayer(recorded, clock, complaints, publish=publish, serve=serve)
         try:
             with (
                 signals.caught(lambda _: replayer.stop(), replayer.wakeup_fileno()),
@@ -98,9 +97,9 @@ def _check(only: Sequence[str], run: Run) -> None:
             raise ConfigError(f"there is no message {name!r}", where="--only", hint="e.g. Scan2d,ControlState")
 
 
-def _clock(run: Run, speed: float | None, first: Packet) -> ExperimentClock:
+def _clock(run: Run, speed: float | None, first_ns: int) -> ExperimentClock:
     recorded = run.facts.get("clock", {})
-    start_s = (first.time_ns or 0) / NS_PER_S
+    start_s = first_ns / NS_PER_S
     speed = float(recorded.get("speed", 1.0)) if speed is None else speed
     return ExperimentClock.starting_now(start_s - BEFORE_S * speed, speed)
 

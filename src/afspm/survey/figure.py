@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from afspm.drawing.image_html import round_length_m
 from afspm.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM
+from afspm.drawing.raster import shared_range
 from afspm.formatting import counted, scale, typeset_area, typeset_length
 from afspm.model import Scan, Spectrum
 from afspm.model.geometry import XY
@@ -215,8 +216,8 @@ class _Picture:
         Returns:
             The factor to the unit that it is labelled with, and the colours of its values.
         """
-        known = np.concatenate([image[np.isfinite(image)] for image in images])
-        low, high = (float(value) for value in np.percentile(known, (0.5, 99.9)))
+        span = shared_range(images)
+        low, high = span.low, span.high
         factor, shown = scale(max(abs(low), abs(high)), scan.unit)
         colours = Normalize(low * factor, high * factor)
         width, height = scan.region.size_m

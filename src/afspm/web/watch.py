@@ -84,6 +84,11 @@ class Watch:
         return None
 
     @property
+    def revision(self) -> int:
+        """Differs after a jump to another moment: all that was made of the one before is made again."""
+        return 0
+
+    @property
     def is_over(self) -> bool:
         """Whether nothing of the run is left at the moment that is shown."""
         return self.ended

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from afspm.cli.app import app
 from afspm.testing.clients import judge
-from afspm.testing.verdicts import CheckOutcome
+from afspm.testing.conformance import CheckOutcome
 
 PROGRAM = (sys.executable, str(Path(__file__).with_name("conformance_program.py")))
 

@@ -19,8 +19,8 @@ from rotation import rotated
 from systems import PATIENCE, can_interrupt, freeze, interrupt, not_on_wine
 
 from afspm.testing.commissioning.procedure import CommissioningResult, commission
-from afspm.testing.commissioning.progress import StepOutcome
 from afspm.testing.commissioning.report import InstrumentReport
+from afspm.testing.conformance import CheckOutcome
 from afspm.testing.translators import CheckOptions
 from afspm.translator.trace import FILE, TracedExchange, read_trace
 
@@ -112,14 +112,14 @@ def test_what_is_wrong_with_a_controller_is_found(
     person = Person()
     result = commissioned(tmp_path, vendor, person, f"spoiled.{fault}{vendor}")
     found = result.progress.results[step]
-    assert found.outcome is StepOutcome.MISMATCH, (found, result.lost)
+    assert found.outcome is CheckOutcome.FAILED, (found, result.lost)
     assert said in found.line
     assert any("What to do: " in line for line in person.shown)
     assert not result.passed
     if step == "axes":
         assert any("The tip was withdrawn" in line or "WITHDRAW" in line.upper() for line in person.shown)
     else:  # nothing that needs the step is done
-        assert result.progress.results["axes"].outcome is StepOutcome.BLOCKED
+        assert result.progress.results["axes"].outcome is CheckOutcome.BLOCKED
 
 
 @pytest.mark.parametrize("vendor", sorted({"Nanonis", *ONE_VENDOR}))
@@ -139,7 +139,7 @@ def test_a_panel_that_shows_something_else_is_a_mismatch(
         pytest.skip("what the person sees is the same with each vendor")
     result = commissioned(tmp_path, vendor, Person({words: answer, "Is the tip at the sample": False}))
     found = result.progress.results[step]
-    assert found.outcome is StepOutcome.MISMATCH
+    assert found.outcome is CheckOutcome.FAILED
     assert said in found.line
 
 
@@ -149,7 +149,7 @@ def test_a_panel_that_shows_the_width_of_whole_pixels_is_right(tmp_path: Path, m
     person = Person({"of the frame": "1 um", "pixels in a line": "32", "scanner can't reach it": False})
     result = commissioned(tmp_path, "spoiled.CoarseNanonis", person, "Nanonis")
     panel = result.progress.results["panel"]
-    assert (panel.outcome, panel.line) == (StepOutcome.PASSED, "3 values are those of the panel")
+    assert (panel.outcome, panel.line) == (CheckOutcome.PASSED, "3 values are those of the panel")
     assert any("afspm reads 968.75 nm: the same" in line for line in person.shown)
 
 
@@ -157,7 +157,7 @@ def test_nothing_is_moved_before_it_is_confirmed(tmp_path: Path) -> None:
     result = commissioned(tmp_path, "Nanonis", Person({"scanner can't reach it": False}))
     exchanges = [one for one in read_trace(result.folder / FILE) if isinstance(one, TracedExchange)]
     assert not [one.what for one in exchanges if one.command]
-    assert result.progress.results["frame"].outcome is StepOutcome.BLOCKED
+    assert result.progress.results["frame"].outcome is CheckOutcome.BLOCKED
 
 
 def test_it_goes_on_where_it_was_left_and_asks_for_the_tip_again(tmp_path: Path) -> None:
@@ -174,7 +174,7 @@ def test_it_goes_on_where_it_was_left_and_asks_for_the_tip_again(tmp_path: Path)
     result = commissioned(tmp_path, "Nanonis", person)
     assert any("scanner can't reach it" in line for line in person.shown)
     assert not any("afspm takes one scan" in line for line in person.shown)
-    assert result.progress.results["stop"].outcome is StepOutcome.PASSED
+    assert result.progress.results["stop"].outcome is CheckOutcome.PASSED
 
 
 def test_ctrl_c_in_contact_withdraws_the_tip(tmp_path: Path) -> None:
@@ -218,7 +218,7 @@ def test_a_lost_connection_is_noticed_and_found_again(tmp_path: Path) -> None:
         "Is the tip at the sample": False,
     }
     result = commissioned(tmp_path, "Nanonis", Person(says))
-    assert result.progress.results["connection"].outcome is StepOutcome.PASSED, (result.progress.results, result.lost)
+    assert result.progress.results["connection"].outcome is CheckOutcome.PASSED, (result.progress.results, result.lost)
 
 
 def test_the_command_asks_and_reports(tmp_path: Path) -> None:

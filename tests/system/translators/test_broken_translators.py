@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from afspm.testing.conformance import CheckOutcome, show_result
 from afspm.testing.translators import CheckOptions, CheckReport, client, run
 from afspm.testing.translators.session import SPEED
-from afspm.testing.verdicts import CheckOutcome, show_result
 
 HERE = Path(__file__).parent
 STUCK = ("NeverFreeAgain", "SuccessWithoutChange")

@@ -18,7 +18,7 @@ from afspm.errors import ConfigError
 from afspm.process.memory import Memory
 from afspm.supervisor.ports import FreePorts
 from afspm.testing.translators import CheckOptions, CheckOutcome, CheckReport, client, run
-from afspm.testing.translators.registry import all_checks
+from afspm.testing.translators.translator_suite import TRANSLATOR_SUITE
 
 DEADLINE_S = 60.0
 EXPERIMENT = """
@@ -80,7 +80,7 @@ def values(report: CheckReport) -> dict[str, Any]:
 def test_the_simulator_does_all_that_it_should_and_is_left_as_it_was(file: Path) -> None:
     report = run(CheckOptions([file], runs=file.parent / "runs"))
     assert report.passed, report
-    assert [result.name for result in report.results] == [check.name for check in all_checks()]
+    assert [result.name for result in report.results] == [check.name for check in TRANSLATOR_SUITE.checks()]
     assert {result.outcome for result in report.results} == {CheckOutcome.PASSED}
     after = values(report)
     assert after["tip-bias-voltage"] == pytest.approx(0.2)

@@ -14,6 +14,7 @@ from client_lab import REGION, Lab, context_of, run
 from afspm import wire
 from afspm.components.night_picture import NightPicture
 from afspm.components.tip_verdict import BAD, MESSAGE, verdict_message
+from afspm.drawing.palette import LEVELS, UNMEASURED
 from afspm.exit_codes import ExitCode
 from afspm.model import ControlMode, ControlState, Problem, Region, RescanKind, Scan, ScopeState, ScopeStatus
 from afspm.record.night_record import (
@@ -100,12 +101,15 @@ def test_who_took_a_scan_whose_beginning_was_missed_is_who_was_in_control_at_its
 
 
 def test_a_thumbnail_is_small_and_shows_scans_of_any_shape_and_with_holes() -> None:
-    values = np.arange(1000.0 * 300).reshape(1000, 300)
-    values[10:20] = np.nan
+    values = np.arange(1000.0 * 300).reshape(1000, 300)  # a plane, which is taken off
+    values[500:600, 100:200] += 1e5
+    values[:100] = np.nan
     picture = thumbnail(values)
     assert max(picture.shape) <= THUMBNAIL_PX
     assert picture.dtype == np.uint8
-    assert np.ptp(picture) == 255
+    assert (picture[0] == UNMEASURED).all()
+    assert picture[34, 9] == LEVELS - 1
+    assert np.median(picture[10:]) < 30
     assert thumbnail(np.zeros((5, 5))).shape == (5, 5)
 
 

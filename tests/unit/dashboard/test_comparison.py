@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from afspm.dashboard.comparison import difference
+from afspm.dashboard.night_page import difference
 from afspm.drawing.levelling import Levelling
 from afspm.errors import InvalidValue
 from afspm.model import Region

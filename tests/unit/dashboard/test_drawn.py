@@ -372,8 +372,8 @@ def test_a_spectrum_is_drawn_with_those_before_it_behind() -> None:
     chart = spectrum_chart(spectra, "I")
     assert chart.options is not None
     assert len(lines(chart.options)) == 3
-    assert [one["lineStyle"].get("opacity") for one in chart.options["series"]] == [0.4, 0.4, None]
-    assert chart.options["yAxis"]["name"] == "I [nA]"
+    assert [one["lineStyle"].get("opacity") for one in chart.options["series"]] == [0.4, 0.4, 1.0]
+    assert chart.options["yAxis"]["name"] == "I / nA"
 
 
 def test_a_spectrum_of_one_variable_is_no_error() -> None:

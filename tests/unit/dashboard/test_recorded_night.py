@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from afspm import wire
-from afspm.dashboard.night import Night, NightContents, NightWatch
+from afspm.dashboard.content import Contents
+from afspm.dashboard.night import Night, NightWatch
 from afspm.model import (
     ControlMode,
     ControlState,
@@ -84,7 +85,7 @@ def test_at_each_moment_it_is_as_it_was(night: Night) -> None:
 
 def test_when_the_run_is_over_no_process_is_alive(night: Night) -> None:
     watch = NightWatch(night)
-    contents = NightContents(watch, None, "")
+    contents = Contents(watch, None)
     (process,) = contents.get().processes
     assert (process.condition, process.since_ns) == (ProcessCondition.ENDED, watch.overview.newest_ns)
     watch.go(START + 15 * S)
@@ -93,7 +94,7 @@ def test_when_the_run_is_over_no_process_is_alive(night: Night) -> None:
 
 
 def test_in_manual_mode_the_page_says_that_a_person_is_in_control(night: Night) -> None:
-    contents = NightContents(NightWatch(night), None, "")
+    contents = Contents(NightWatch(night), None)
     assert "a person</b> is in control" in contents.get().status
 
 
@@ -108,7 +109,7 @@ def test_forth_and_back_is_the_same(night: Night) -> None:
 
 def test_the_page_is_made_of_the_moment(night: Night) -> None:
     watch = NightWatch(night)
-    contents = NightContents(watch, None, "")
+    contents = Contents(watch, None)
     assert "MANUAL" in contents.get().status
     assert contents.get().trouble == ""
     watch.go(START + 15 * S)
@@ -119,7 +120,7 @@ def test_the_page_is_made_of_the_moment(night: Night) -> None:
 
 def test_a_note_of_the_morning_stands_at_the_moment_that_it_is_about(night: Night) -> None:
     watch, other = NightWatch(night), NightWatch(night)
-    contents = NightContents(watch, None, "")
+    contents = Contents(watch, None)
     contents.get()
     append_note(night.folder, "terminal:ada", "double tip", 7, scan(10).time_ns)
     append_note(night.folder, "terminal:ada", "<i>really</i>", 8, scan(10).time_ns)

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import itertools
+import re
+from datetime import UTC
 
-from afspm.drawing.timeline import COLUMNS, stretches, time_ticks
+from afspm.drawing.timeline import COLUMNS, TimelineRow, stretches, time_ticks, timeline_html
 from afspm.record.timeline import Span
 
 S = 1_000_000_000
@@ -29,3 +31,11 @@ def test_of_several_in_one_column_the_longest_is_shown() -> None:
 def test_a_time_in_the_far_future_makes_no_millions_of_ticks() -> None:
     assert 3 <= len(time_ticks(0.0, 3600.0)) <= 8
     assert len(time_ticks(0.0, 1e12)) <= 8
+
+
+def test_times_at_the_ends_of_a_row_stay_within_it() -> None:
+    row = TimelineRow("control", (Span("series", 0, 60 * S),), lambda _: "")
+    drawn = timeline_html([row], 0, 60 * S, UTC)
+    ticks = re.findall(r'<span style="left:([\d.]+)%(;transform:translateX\((-?\d+)%\))?">', drawn)
+    assert [(at, shift) for at, _, shift in ticks][:2] == [("0.00", "0"), ("16.67", "")]
+    assert (ticks[-1][0], ticks[-1][2]) == ("100.00", "-100")

@@ -35,7 +35,7 @@ REGION = '[limits]\nregion = { x = ["-2 um", "2 um"], y = ["-2 um", "2 um"] }\n'
         (SERIES + SIZE, 'end_when_done = "yes"', "end_when_done is true or false, not 'yes'", ""),
         (SERIES + SIZE, "keep_control = 1", "keep_control is true or false, not 1", ""),
         (SERIES + SIZE, 'parameters = { scan-speed = "2 um" }', "um can't be converted to m/s", "give it in m/s"),
-        (GRID, 'spacing = ["0 nm", "1 um"]', "[grid] 3 points of a grid lie 0 m apart", "spacing is above zero"),
+        (GRID, 'spacing = ["0 nm", "1 um"]', "[grid] 3 points of a grid lie 0 nm apart", "spacing is above zero"),
         (SURVEY + 'zoom = "1 um"\n', 'min_height = "-1 nm"', "[survey] min_height: -1 nm is below zero", ""),
         (SERIES + SIZE, "pixels = [0, 128]", "[series] pixels: [0, 128] is no number of pixels", "columns and rows"),
         (LIST, "pixels = [128, -1]", "[list] pixels: [128, -1] is no number of pixels", "columns and rows"),

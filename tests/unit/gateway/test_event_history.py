@@ -14,6 +14,9 @@ from afspm.model import (
     LogLine,
     LogLines,
     ProblemNames,
+    ProcessCondition,
+    ProcessState,
+    ProcessStates,
     Region,
     Scan,
     ScopeState,
@@ -73,6 +76,20 @@ def test_long_events_take_no_more_memory_than_many() -> None:
     kept = made.after(-1, ALL, 1000)
     assert kept.missed_until_ns is not None
     assert sum(len(event.text) for event in kept.events) <= MOST_BYTES
+
+
+def test_processes_are_an_event_only_when_more_than_the_age_of_a_step_has_changed() -> None:
+    made = EventHistory(ProblemNames())
+
+    def take(time_ns: int, supervisor: str, condition: ProcessCondition, age_s: float) -> None:
+        state = ProcessState("series", "component", condition, 1, age_s)
+        made.take("ProcessStates", ProcessStates(time_ns, supervisor, (state,)), time_ns)
+
+    for time_ns in range(10, 1000, 2):
+        take(time_ns, "here", ProcessCondition.ALIVE, time_ns / 7)
+        take(time_ns + 1, "there", ProcessCondition.BUSY, time_ns / 7)
+    take(1001, "here", ProcessCondition.ENDED, 0.0)
+    assert times(made, -1) == [10, 11, 1001]
 
 
 def test_times_are_texts_and_values_are_left_out() -> None:

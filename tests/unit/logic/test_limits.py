@@ -68,6 +68,17 @@ def test_a_refusal_names_parameter_value_limit_and_where_it_was_set() -> None:
         assert part in reason
 
 
+def test_refusals_have_readable_units() -> None:
+    near = checker(ExperimentLimits(region=STAGE))
+    corner = ScanParameters(Region((4.5e-6, 0.0), (4e-6, 1e-6)))
+    assert "the scan's corner (6.5, -0.5) µm" in why(near, Request(int(ControlRequest.SET_SCAN_PARAMS), corner))
+    empty = Request(int(ControlRequest.SET_SCAN_PARAMS), ScanParameters(RegionChange(width_m=-2e-9)))
+    assert "size -2 nm" in why(near, empty)
+    steps = guard(tip_bias_voltage=Limit(step=2e-3))
+    steps.in_force(Parameter(BIAS, 0.1, "V"), 0)
+    assert "= 107.5 mV is a step of 7.5 mV, the largest allowed is 2 mV" in why(steps, set_("0.1075", "V"))
+
+
 @pytest.mark.parametrize(
     ("value", "unit", "fits"), [("5", "V", True), ("5000", "mV", True), ("5001", "mV", False), ("-5.1", None, False)]
 )
@@ -213,7 +224,7 @@ def test_a_part_of_a_position_is_checked_with_the_rest_of_it() -> None:
     assert why(limits, half) == ""
     limits.carried_out(half, 0)
     beyond = Request(int(ControlRequest.SET_PROBE_POS), PositionChange(y_m=5.1e-6))
-    assert "(4e-06, 5.1e-06)" in why(limits, beyond)
+    assert "(4, 5.1) µm" in why(limits, beyond)
 
 
 def test_pixels_along_one_axis_are_counted_with_those_along_the_other() -> None:
@@ -263,7 +274,7 @@ def test_nothing_is_done_at_the_probe_outside_the_region_whoever_moved_it(action
     g = checker(ExperimentLimits(region=STAGE, region_source="toml:9"))
     assert "not reported" in here(g, action)
     g.in_force(ProbePosition((9e-6, 0.0)), 0)
-    assert "(9e-06, 0)" in here(g, action)
+    assert "(9, 0) µm" in here(g, action)
     assert "toml:9" in here(g, action)
     g.in_force(ProbePosition((5e-6, 0.0)), 0)
     assert here(g, action) == ""

@@ -124,7 +124,7 @@ def test_value_is_read_again_after_an_unanswered_change() -> None:
     lab.step(Tick())  # overdue, and the next may be sent
     lab.ask("experiment", PARAM, Parameter(BIAS, "-0.1", "V"), "experiment/a/2")
     (reply,) = replies(told(lab, "0.1"))
-    assert "a step of 0.2 V" in reply.response.reason
+    assert "a step of 200 mV" in reply.response.reason
 
 
 def test_reading_request_is_sent_after_the_turn_of_a_command() -> None:
@@ -275,7 +275,7 @@ def test_two_do_not_change_one_value_at_a_time() -> None:
     assert sent(lab.answer(read, payload=lab.codec.encode(Parameter(BIAS, "0", "V")))) == [Parameter(BIAS, "0.1", "V")]
     assert sent(lab.answer(lab.forwarded[-1])) == [Parameter(BIAS)]
     (reply,) = replies(told(lab, "0.1"))
-    assert (reply.name, "a step of 0.2 V" in reply.response.reason) == ("ben", True)
+    assert (reply.name, "a step of 200 mV" in reply.response.reason) == ("ben", True)
 
 
 def test_what_a_person_waits_to_set_is_not_set_when_the_mode_is_automated_again() -> None:

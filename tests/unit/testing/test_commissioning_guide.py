@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from afspm.testing.commissioning.guide import UNSEEN, Guide
-from afspm.testing.verdicts import Failed, Skipped
+from afspm.testing.conformance import Failed, Skipped
 
 
 @dataclass

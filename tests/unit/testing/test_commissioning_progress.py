@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from afspm.testing.commissioning.progress import CommissioningProgress, CommissioningStep, StepOutcome, StepResult
+from afspm.testing.commissioning.progress import CommissioningProgress, CommissioningStep
 from afspm.testing.commissioning.steps import OPERATIONS, all_steps
+from afspm.testing.conformance import CheckOutcome, CheckResult
 
 
 def step(name: str, *after: str, **facts: object) -> CommissioningStep:
-    return CommissioningStep(name, name, "", "", lambda guide: "", after=after, **facts)  # type: ignore[arg-type]
+    return CommissioningStep(name=name, title=name, do=lambda guide: "", explained="", after=after, **facts)  # type: ignore[arg-type]
 
 
 STEPS = (
@@ -20,11 +21,11 @@ STEPS = (
 )
 
 
-def walk(progress: CommissioningProgress, outcomes: dict[str, StepOutcome]) -> list[str]:
+def walk(progress: CommissioningProgress, outcomes: dict[str, CheckOutcome]) -> list[str]:
     done = []
     while (now := progress.next()) is not None:
         done.append(now.name)
-        progress.results[now.name] = StepResult(outcomes.get(now.name, StepOutcome.PASSED))
+        progress.results[now.name] = CheckResult(now.name, now.title, outcomes.get(now.name, CheckOutcome.PASSED))
     return done
 
 
@@ -34,23 +35,23 @@ def test_all_steps_are_done_in_their_order() -> None:
     assert progress.passed
 
 
-@pytest.mark.parametrize("outcome", [StepOutcome.MISMATCH, StepOutcome.DECLINED])
-def test_what_was_not_right_or_not_confirmed_blocks_all_that_needs_it(outcome: StepOutcome) -> None:
+@pytest.mark.parametrize("outcome", [CheckOutcome.FAILED, CheckOutcome.DECLINED])
+def test_what_was_not_right_or_not_confirmed_blocks_all_that_needs_it(outcome: CheckOutcome) -> None:
     progress = CommissioningProgress(STEPS)
     assert walk(progress, {"gate": outcome}) == ["read", "gate"]
-    assert progress.results["late"].outcome is StepOutcome.BLOCKED
+    assert progress.results["late"].outcome is CheckOutcome.BLOCKED
     assert not progress.passed
 
 
 def test_what_is_not_supported_blocks_nothing() -> None:
     progress = CommissioningProgress(STEPS)
-    assert walk(progress, {"read": StepOutcome.SKIPPED})[1:] == ["gate", "scan", "late"]
+    assert walk(progress, {"read": CheckOutcome.SKIPPED})[1:] == ["gate", "scan", "late"]
     assert progress.passed
 
 
 def test_resumed_it_asks_for_the_tip_again_and_leaves_out_what_has_passed() -> None:
     first = CommissioningProgress(STEPS)
-    walk(first, {"late": StepOutcome.MISMATCH})
+    walk(first, {"late": CheckOutcome.FAILED})
     again = CommissioningProgress.resumed(STEPS, first.results)
     assert walk(again, {}) == ["gate", "late"]
     assert walk(CommissioningProgress.resumed(STEPS, again.results), {}) == []
@@ -58,9 +59,9 @@ def test_resumed_it_asks_for_the_tip_again_and_leaves_out_what_has_passed() -> N
 
 def test_the_worst_outcome_of_an_operation_counts_and_nothing_left_out_hides_a_pass() -> None:
     progress = CommissioningProgress(STEPS)
-    walk(progress, {"late": StepOutcome.SKIPPED})
+    walk(progress, {"late": CheckOutcome.SKIPPED})
     assert progress.operations() == {"scan": "passed"}
-    progress.results["late"] = StepResult(StepOutcome.MISMATCH)
+    progress.results["late"] = CheckResult("late", "late", CheckOutcome.FAILED)
     assert progress.operations() == {"scan": "mismatch"}
 
 
@@ -80,7 +81,7 @@ def test_nothing_acts_on_the_microscope_before_the_tip_is_withdrawn() -> None:
 
 def test_resumed_nothing_is_done_behind_a_gate_that_is_declined() -> None:
     first = CommissioningProgress(STEPS)
-    walk(first, {"late": StepOutcome.MISMATCH})
+    walk(first, {"late": CheckOutcome.FAILED})
     again = CommissioningProgress.resumed(STEPS, first.results)
-    assert walk(again, {"gate": StepOutcome.DECLINED}) == ["gate"]
-    assert again.results["late"].outcome is StepOutcome.BLOCKED
+    assert walk(again, {"gate": CheckOutcome.DECLINED}) == ["gate"]
+    assert again.results["late"].outcome is CheckOutcome.BLOCKED

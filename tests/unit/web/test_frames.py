@@ -129,6 +129,20 @@ def test_a_picture_is_drawn_once_for_all_who_look_at_it_alike() -> None:
     assert drawer.draw(frame, Look(Levelling.NONE)) is not plane
 
 
+def test_compared_pictures_are_drawn_with_one_range() -> None:
+    store, drawer = FrameStore(), PictureCache()
+    frames = []
+    for number, height in enumerate((1.0, 5.0), 1):
+        store.take_scan(Scan(REGION, "Height", "m", np.linspace(0.0, height, 64).reshape(8, 8)), number * S)
+        frames.append(store.newest())
+    first, second = frames
+    assert first is not None
+    assert second is not None
+    look = Look(Levelling.NONE)
+    assert drawer.draw(first, look, second).span == drawer.draw(second, look, first).span
+    assert drawer.draw(first, look).span != drawer.draw(second, look).span
+
+
 def test_the_head_says_what_is_needed_for_axes_and_fits_a_header() -> None:
     store = FrameStore()
     named = Scan(REGION, "Höhe \n\r Retrace", "m", np.ones((2, 3)), 1763600000123456789)

@@ -48,7 +48,7 @@ export function drawAxis(context, box, low, high, found, side, label) {
     context.stroke();
     context.fillText(plain(value, 6), side === "x" ? x : x - 6, side === "x" ? y + 6 : y);
   }
-  const text = found.unit ? `${label} [${found.unit}]` : label;
+  const text = found.unit ? `${label} / ${found.unit}` : label;
   if (side === "x") {
     context.textAlign = "right";
     context.fillText(text, box.x + box.width, box.y + box.height + 20);
@@ -71,7 +71,7 @@ export function drawColourBar(context, { x, y, width, height }, colours, { low, 
     context.fillText(plain(value), x + width + 5, y + height * (1 - at));
   }
   context.textBaseline = "bottom";
-  context.fillText(found.unit ? `[${found.unit}]` : "", x, y - 5);
+  context.fillText(found.unit, x, y - 5);
 }
 
 /** A bar of a round length, in the corner of the box. */

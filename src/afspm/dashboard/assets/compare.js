@@ -38,7 +38,8 @@ export class Comparison {
     const [first, second] = this.#scans();
     if (!first || !second) return;
     const look = { channel: this.find("channel").value, levelling: this.find("levelling").value };
-    const asked = [first, second].map((scan) => this.pictures.get("/live/image", { ...look, time: scan.time }));
+    const asked = [[first, second], [second, first]].map(([scan, other]) =>
+      this.pictures.get("/live/image", { ...look, time: scan.time, beside: other.time }));
     const change = this.mode !== "difference" ? null
       : this.pictures.get("/night/difference", { ...look, first: first.time, second: second.time });
     const [left, right, difference] = await Promise.all([...asked, change]);

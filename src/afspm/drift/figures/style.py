@@ -12,7 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from afspm.drawing.levelling import Levelling, levelled
+from afspm.drawing.levelling import flattened
+from afspm.drawing.raster import value_range
 from afspm.drift.registration import DriftScan
 from afspm.plain_data import Plain
 
@@ -73,14 +74,14 @@ def show_scan(ax: Axes, scan: DriftScan) -> None:
     """A scan in grey, levelled by the differences of its lines, in µm of its own frame (before it is turned)."""
     left, low = (1e6 * edge for edge in scan.region.top_left_m)
     width, height = (1e6 * size for size in scan.region.size_m)
-    level = levelled(levelled(scan.values, Levelling.DIFFERENCES), Levelling.PLANE)
-    dark, bright = np.nanpercentile(level, (0.5, 99.5)) if np.isfinite(level).any() else (0.0, 1.0)
+    level = flattened(scan.values)
+    span = value_range(level)
     # the first and last pixels lie on the border of the region: half of each reaches over it
     half_x, half_y = (
         size / (count - 1) / 2 for size, count in zip((width, height), scan.values.shape[::-1], strict=True)
     )
     extent = (left - half_x, left + width + half_x, low - half_y, low + height + half_y)
-    ax.imshow(level, cmap="gray", vmin=dark, vmax=bright, extent=extent, origin="lower", interpolation="nearest")
+    ax.imshow(level, cmap="gray", vmin=span.low, vmax=span.high, extent=extent, origin="lower", interpolation="nearest")
     ax.set_aspect("equal")
 
 

@@ -12,6 +12,7 @@ from typing import Final
 
 from afspm import units
 from afspm.errors import AfspmError, Refused
+from afspm.formatting import position_text
 from afspm.microscopes.gxsm.errors import BadReply
 from afspm.microscopes.gxsm.hardware import Doing
 from afspm.microscopes.gxsm.link import Asking
@@ -97,7 +98,7 @@ class ScanFrame:
         region = self.region()
         u_m, v_m = in_frame(region, xy_m)
         if self._ask.number("moveto_scan_xy", u_m / ANGSTROM_M, v_m / ANGSTROM_M) != 0.0:
-            reason = f"GXSM moves the tip only within the scan frame; ({xy_m[0]:g}, {xy_m[1]:g}) m is outside"
+            reason = f"GXSM moves the tip only within the scan frame; {position_text(xy_m)} is outside"
             raise Refused(ControlResponse.PARAM_ERROR, reason)
 
     def tip(self) -> tuple[float, float]:

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Final
 
+from afspm.formatting import lengths_text
 from afspm.microscopes.nanonis.protocol import BadReply
 from afspm.model import Region, names
 from afspm.translator.parameters import FEEDBACK_ON, Value, refuse_value
@@ -240,7 +241,10 @@ class Probe(Group):
         self._range_m = self._numbers("Piezo.RangeGet")[:2]
         for name, value, whole in zip(self.names, (x, y), self._range_m, strict=True):
             if abs(value) > whole / 2:
-                raise refuse_value(name, f"{value:g} m is beyond the scanner's {-whole / 2:g} to {whole / 2:g} m")
+                raise refuse_value(
+                    name,
+                    f"{lengths_text([value])} is beyond the scanner's {lengths_text((-whole / 2, whole / 2), ' to ')}",
+                )
         at_once = 0
         self._ask("FolMe.XYPosSet", x, y, at_once)
         self._goal_m = (x, y)

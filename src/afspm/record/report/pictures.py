@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from afspm import entry_points
 from afspm.drawing.image_html import Shown, shown
-from afspm.drawing.levelling import Levelling, levelled
+from afspm.drawing.levelling import flattened
 from afspm.errors import AfspmError
 from afspm.model import ControlMode, ControlState, ScanSet, names
 from afspm.record.bad_scans import bad_scans
@@ -39,7 +39,7 @@ class TopographyPicture:
 
     Attributes:
         image: in colour, levelled.
-        grey: for the figure of the night, [y, x] with y upwards.
+        grey: for the figure of the night: indices into a colour map, [y, x] with y upwards.
         is_bad: whether it is framed.
     """
 
@@ -93,13 +93,8 @@ def _read(run: Run, rows: Sequence[ScanRow]) -> Iterator[TopographyPicture]:
             continue
         scan = scans[topography(scans)]
         has_values = bool(np.isfinite(scan.values).any())
-        image = shown(flat(scan.values), LARGEST_PX, small=True) if has_values else None
+        image = shown(flattened(scan.values), LARGEST_PX, small=True) if has_values else None
         yield TopographyPicture(row, scan.channel, scan.unit, image, thumbnail(scan.values) if has_values else None)
-
-
-def flat(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return values with their rows brought to one height, and without their plane."""
-    return levelled(levelled(values, Levelling.DIFFERENCES), Levelling.PLANE)
 
 
 def topography(scans: ScanSet) -> str:
@@ -115,7 +110,7 @@ def draw(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -> No
         record = night_of(run, story, pictures)
         numbers = {number: story.overview.problems.name(number) for number in record.problems}
         night_figure.draw(record, run.folder / OWN_NIGHT, numbers, title=story.name, simulated=story.simulated)
-    title = f"{story.name} (simulated)" if story.simulated else story.name
+    title = f"{story.name}   SIMULATED" if story.simulated else story.name
     for name in entry_points.names(entry_points.FIGURES):
         try:
             entry_points.load(entry_points.FIGURES, name)(run, title)

@@ -6,7 +6,6 @@ tells with what was published and sent. `docs/reference/client-conformance.md` i
 
 from __future__ import annotations
 
-from afspm.testing.clients.report import ClientReport
-from afspm.testing.clients.runner import judge
+from afspm.testing.clients.runner import ClientReport, judge
 
 __all__ = ["ClientReport", "judge"]

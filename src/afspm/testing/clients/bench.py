@@ -12,6 +12,7 @@ from typing import Any
 import zmq
 
 from afspm.clock import Clock, ExperimentClock
+from afspm.errors import AfspmError, ConfigError
 from afspm.launch import Launch, Sockets
 from afspm.supervisor import run_identity
 from afspm.supervisor.ports import FreePorts
@@ -19,6 +20,7 @@ from afspm.testing.clients.experiment import CLIENT, JUDGE, KEYS, SCHEDULER, Jud
 from afspm.testing.clients.heartbeats import BeatRecorder
 from afspm.testing.clients.program import ClientProgram, Pump
 from afspm.testing.clients.scripted import ScriptedScheduler
+from afspm.testing.conformance import Check, Failed
 from afspm.transport import keys
 from afspm.transport.network import Network
 
@@ -74,14 +76,35 @@ class ClientBench:
         """Start a real experiment, which is the caller's to close."""
         return JudgedExperiment(self.folder / f"run-{next(self._runs)}", security)
 
+    def perform(self, check: Check) -> str | None:
+        """Do a check. Raises Failed, also for an answer that can't be read, and an experiment that goes wrong."""
+        try:
+            told: str | None = check.do(self)
+            return told
+        except ConfigError:
+            raise
+        except AfspmError as error:  # something that the judge itself did was not possible, with this client beside it
+            raise Failed("an experiment that goes on with the client in it", str(error)) from error
+        except (LookupError, TypeError, ValueError, AttributeError) as error:  # by indexing and converting an answer
+            raise Failed(
+                "an answer as the page of steps describes it", f"one that can't be read ({error!r})"
+            ) from error
+
+    def explain(self, check: Check, failure: Failed) -> tuple[str, ...]:
+        """Return the remedy; the next check gets an experiment of its own."""
+        self.begin_anew()
+        return (f"→ {check.remedy}",)
+
     def begin_anew(self) -> None:
         """End the shared experiment: what it has gone through is not the next check's fault."""
         if self._experiment is not None:
             self._experiment.close()
         self._experiment = None
 
-    def close(self) -> None:
-        """End everything."""
+    def __enter__(self) -> ClientBench:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         self.begin_anew()
 
     @contextmanager

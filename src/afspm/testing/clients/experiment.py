@@ -21,8 +21,8 @@ from afspm.supervisor import run_identity
 from afspm.supervisor.key_handout import hand_over
 from afspm.supervisor.log import RunLog
 from afspm.supervisor.ports import FreePorts
+from afspm.testing.conformance import Lost
 from afspm.testing.processes import Processes
-from afspm.testing.verdicts import Lost
 from afspm.transport import keys
 from afspm.transport.zmq_port import open_port
 

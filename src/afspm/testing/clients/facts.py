@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from afspm import wire
 from afspm.model import Packet, Scan, ScanLines, Spectrum
 from afspm.plain_data import Plain
-from afspm.testing.verdicts import Failed, near
+from afspm.testing.conformance import Failed, near
 
 EXACT = 1e-9
 Facts = Plain

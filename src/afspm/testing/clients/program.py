@@ -17,7 +17,7 @@ from typing import IO, Any, Protocol
 from afspm.errors import ConfigError
 from afspm.launch import Launch
 from afspm.plain_data import Plain
-from afspm.testing.verdicts import Failed, expect
+from afspm.testing.conformance import Failed, expect
 
 ANSWER_S = 30.0
 """Longest time for an answer, beside what the step itself may wait."""

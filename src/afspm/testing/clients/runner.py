@@ -1,33 +1,33 @@
-"""The run of all checks of a client, one after the other."""
+"""The run of all checks of a client, one after the other, and its report."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from datetime import UTC, datetime
-from importlib.metadata import version
+from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 
+from rich.console import Console
+
 from afspm.clock import ExperimentClock
-from afspm.errors import AfspmError, ConfigError
 from afspm.supervisor import run_folder
 from afspm.testing.clients.bench import ClientBench
-from afspm.testing.clients.registry import ClientCheck, all_client_checks
-from afspm.testing.clients.report import ClientReport
-from afspm.testing.verdicts import CheckOutcome, CheckResult, Failed, Lost
-
-REPORT_FILE = "report.json"
+from afspm.testing.clients.client_suite import CLIENT_SUITE
+from afspm.testing.conformance import CheckResult, SuiteReport, show_verdict
 
 
-def chosen_checks(only: Collection[str] = ()) -> list[ClientCheck]:
-    """Return the checks whose names have one of these in them; all, if none are given.
+@dataclass
+class ClientReport(SuiteReport):
+    """The results of all checks of one client.
 
-    Raises:
-        ConfigError: there are none.
+    Attributes:
+        command: the conformance program and its arguments.
     """
-    found = [one for one in all_client_checks() if not only or any(part in one.name for part in only)]
-    if not found:
-        raise ConfigError(f"there is no check {' or '.join(only)}", hint="afspm test-client --list")
-    return found
+
+    command: Sequence[str] = ()
+
+    def subject(self) -> dict[str, object]:
+        return {"command": list(self.command)}
 
 
 def judge(
@@ -41,50 +41,20 @@ def judge(
     Args:
         command: the client's conformance program, and its arguments.
         only: parts of the names of the checks to do; empty: all.
-        done: told of each result.
+        done: gets each result.
 
     Raises:
         ConfigError: the program can't be started, or there are no such checks.
     """
-    wanted = chosen_checks(only)
-    now = datetime.fromtimestamp(ExperimentClock.real().now_s(), UTC)
-    folder = run_folder.create(runs, "test-client", now.astimezone())
-    report = ClientReport(command, version("afspm"), now.isoformat(timespec="seconds"), str(folder))
-    bench = ClientBench(command, folder)
-    try:
-        for check in wanted:
-            result = _do(check, bench)
-            report.results.append(result)
-            done(result)
-    except Lost as lost:
-        report.lost = str(lost)
-    except KeyboardInterrupt:
-        report.lost = "interrupted"
-        raise
-    finally:
-        bench.close()
-        (folder / REPORT_FILE).write_text(report.to_json(), encoding="utf-8")
+    checks = CLIENT_SUITE.checks(only)
+    folder = run_folder.create(runs, "test-client", datetime.fromtimestamp(ExperimentClock.real().now_s()).astimezone())
+    report = ClientReport(str(folder), command=command)
+    with report.written(), ClientBench(command, folder) as bench:
+        report.run(checks, bench, done)
     return report
 
 
-def _do(check: ClientCheck, bench: ClientBench) -> CheckResult:
-    began_s = bench.clock.monotonic_s()
-
-    def result(outcome: CheckOutcome, line: str = "", *more: str) -> CheckResult:
-        return CheckResult(check.name, check.title, outcome, line, bench.clock.monotonic_s() - began_s, more)
-
-    try:
-        told = check.do(bench)
-    except Failed as failure:
-        bench.begin_anew()
-        return result(CheckOutcome.FAILED, str(failure), f"→ {check.remedy}")
-    except ConfigError:
-        raise
-    except AfspmError as error:  # what the judge itself wanted to do was not possible, with this client beside it
-        bench.begin_anew()
-        return result(CheckOutcome.FAILED, f"the experiment with the client in it: {error}", f"→ {check.remedy}")
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
-        bench.begin_anew()
-        line = f"expected an answer as the page of steps describes it; came one that can't be read ({error!r})"
-        return result(CheckOutcome.FAILED, line, f"→ {check.remedy}")
-    return result(CheckOutcome.PASSED, told or "")
+def show_client_end(report: ClientReport, console: Console) -> None:
+    """Print what came of it all."""
+    does = "does" if report.passed else "does not do"
+    show_verdict(report, f": the client {does} what it should", console)

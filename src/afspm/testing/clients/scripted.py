@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import zmq
 
@@ -13,7 +14,7 @@ from afspm.model import CLOCK_REQUEST, ControlResponse
 from afspm.transport.frames import receive_frames
 from afspm.transport.keys import Keys
 from afspm.transport.late_joiners import LONGEST, Marker
-from afspm.transport.network import Network
+from afspm.transport.network import ACCEPTED, Monitor, Network
 from afspm.transport.polling import Poller, WakeUp, milliseconds
 from afspm.wire.protocol import ANSWER, QUESTION
 
@@ -55,6 +56,7 @@ class ScriptedScheduler:
     Attributes:
         requests: as they came.
         greetings: the requests 101 that came.
+        connections: the number of connections to `control`, also of those that are refused for their keys.
         prefixes, markers: what was subscribed to.
         cached: packets, as frames, for who asks by a marker.
         reply: what to answer a request.
@@ -62,10 +64,11 @@ class ScriptedScheduler:
     """
 
     def __init__(self, clock: Clock, control: str, publish: str, keys: Keys | None) -> None:
-        self._clock, self._addresses, self._keys = clock, (control, publish), keys
+        self._clock, self._bound = clock, (control, publish, keys)
         self._woken: WakeUp[None] = WakeUp()
         self.requests: list[ScriptedRequest] = []
         self.greetings: list[ScriptedRequest] = []
+        self.connections = 0
         self.prefixes: list[bytes] = []
         self.markers: list[Marker] = []
         self.cached: list[list[bytes]] = []
@@ -75,10 +78,11 @@ class ScriptedScheduler:
 
     def open(self) -> None:
         """Bind the sockets, the first time or again."""
-        control, publish = self._addresses
-        self._network = Network(self._keys)
+        control, publish, keys = self._bound
+        self._network = Network(keys)
         self._router = self._network.socket(zmq.ROUTER)
         self._router.setsockopt(zmq.ROUTER_HANDOVER, 1)
+        monitor = Monitor(self._network, self._router, ACCEPTED)
         self._network.bind(self._router, control, requests=True)
         self._publisher = self._network.socket(zmq.XPUB, max_bytes=LONGEST + 1)
         self._publisher.setsockopt(zmq.XPUB_MANUAL, 1)
@@ -86,6 +90,7 @@ class ScriptedScheduler:
         self._network.bind(self._publisher, publish)
         self._poller: Poller[Callable[[], None]] = Poller(self._woken)
         self._poller.register(self._router, self._take_request)
+        self._poller.register(monitor.socket, partial(self._count_connections, monitor))
         self._poller.register(self._publisher, self._take_subscription)
 
     def shut(self) -> None:
@@ -126,6 +131,9 @@ class ScriptedScheduler:
     def send(self, peer: bytes, frames: Sequence[bytes]) -> None:
         """Send a response to a client."""
         self._router.send_multipart([peer, b"", *frames])
+
+    def _count_connections(self, monitor: Monitor) -> None:
+        self.connections += len(monitor.drain())
 
     def _take_request(self) -> None:
         peer, *frames = [frame.bytes for frame in receive_frames(self._router)]

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from afspm.clock import Clock
 from afspm.errors import UnitError
+from afspm.testing.commissioning.progress import CommissioningStep
+from afspm.testing.conformance import Declined, Failed, Lost, Skipped, Unsupported, near
 from afspm.testing.translators.measuring import CheckMeasurements
-from afspm.testing.verdicts import Failed, Skipped, near
 from afspm.units import convert, parse_quantity
 
 
@@ -27,10 +29,6 @@ class Prompts(Protocol):
 
     def choose(self, question: str, options: Sequence[str], default: str = "") -> str:
         """Ask for one of the options; an empty answer is the default, if there is one."""
-
-
-class StepDeclined(Exception):
-    """The person did not confirm; nothing was done."""
 
 
 UNSEEN = "unseen"
@@ -54,6 +52,29 @@ class Guide:
     has_panel: bool = True
     program_s: float = 0.0
     in_contact: bool = False
+
+    @property
+    def clock(self) -> Clock:
+        return self.kit.clock
+
+    def perform(self, step: CommissioningStep) -> str:
+        """Explain a step, have it confirmed if it moves anything, and do it. Raises a CheckEnded."""
+        if missing := self.kit.support.missing(step.needs):
+            raise Unsupported(", ".join(missing))
+        self.prompts.show(f"\n{step.title}\n{step.explained}")
+        if step.needs_panel and not self.has_panel:
+            raise Skipped(NO_PANEL)
+        if step.moves and not self.prompts.confirm("Shall afspm do this now?"):
+            raise Declined("not confirmed")
+        return step.do(self) or ""
+
+    def explain(self, step: CommissioningStep, failure: Failed) -> tuple[str, ...]:
+        """Stop what runs. Raises Lost: it does not stop."""
+        try:
+            self.kit.client.come_to_rest()
+        except Failed as restless:
+            raise Lost(str(restless)) from restless
+        return (f"What to do: {step.remedy}",)
 
     def unseen(self) -> str:
         """Return the line of a step whose outcome could not be seen at the panel; Skipped if there is one."""

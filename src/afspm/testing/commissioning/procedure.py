@@ -10,17 +10,16 @@ from pathlib import Path
 
 from afspm.experiment.tracing import trace_overlay
 from afspm.model import names
-from afspm.testing.commissioning.guide import NO_PANEL, Guide, Prompts, StepDeclined
-from afspm.testing.commissioning.progress import CommissioningProgress, CommissioningStep, StepOutcome, StepResult
+from afspm.testing.commissioning.guide import Guide, Prompts
+from afspm.testing.commissioning.progress import CommissioningProgress
 from afspm.testing.commissioning.report import InstrumentReport, steps_of
 from afspm.testing.commissioning.steps import all_steps
+from afspm.testing.conformance import CheckOutcome, Failed, Lost, Skipped, attempt, mark
 from afspm.testing.translators.report import CheckReport
-from afspm.testing.translators.runner import begin_report, restored
+from afspm.testing.translators.runner import restored
 from afspm.testing.translators.session import CheckOptions, CheckSession, opened, prepare
-from afspm.testing.verdicts import Failed, Lost, Skipped
 
 _NOT_WITHDRAWN = "THE TIP WAS NOT WITHDRAWN ({why}): withdraw it by hand, now."
-_MARKS = {StepOutcome.PASSED: "✓", StepOutcome.MISMATCH: "✗"}
 
 
 @dataclass
@@ -80,7 +79,8 @@ def commission(
 def _in_session(
     session: CheckSession, prompts: Prompts, result: CommissioningResult, tried_on: str, *, has_panel: bool
 ) -> None:
-    checks = begin_report(session)
+    checks = CheckReport()
+    checks.describe(session)
 
     def write() -> None:
         _report(session, checks, result.progress, tried_on).write(result.file)
@@ -110,10 +110,14 @@ class _Walk:
     def through(self) -> None:
         """Do what is left to do."""
         while (step := self._progress.next()) is not None:
-            result = self._progress.results[step.name] = self._done(step)
-            self._say(step, result)
+            result = self._progress.results[step.name] = attempt(step, self._guide)
+            symbol, _ = mark(result.outcome)
+            named = "" if result.outcome in (CheckOutcome.PASSED, CheckOutcome.FAILED) else f" {result.outcome.value}:"
+            self._guide.prompts.show(f"{symbol}{named} {step.title}: {result.line}")
+            for line in result.complaints:
+                self._guide.prompts.show(f"  {line}")
             self._write()
-            if step.contact or result.outcome is not StepOutcome.PASSED:
+            if step.contact or result.outcome is not CheckOutcome.PASSED:
                 self.withdraw()
 
     def withdraw(self) -> None:
@@ -129,39 +133,6 @@ class _Walk:
             self._guide.prompts.show("The tip was withdrawn.")
         except (Failed, Skipped, Lost) as error:
             self._guide.prompts.show(_NOT_WITHDRAWN.format(why=error))
-
-    def _done(self, step: CommissioningStep) -> StepResult:
-        missing = self._guide.kit.support.missing(step.needs)
-        if missing:
-            return StepResult(StepOutcome.UNSUPPORTED, ", ".join(missing))
-        prompts = self._guide.prompts
-        prompts.show(f"\n{step.title}\n{step.explained}")
-        if step.needs_panel and not self._guide.has_panel:
-            return StepResult(StepOutcome.SKIPPED, NO_PANEL)
-        if step.moves and not prompts.confirm("Shall afspm do this now?"):
-            return StepResult(StepOutcome.DECLINED, "not confirmed")
-        try:
-            line = step.do(self._guide)
-        except Failed as failure:
-            self._come_to_rest()
-            return StepResult(StepOutcome.MISMATCH, str(failure))
-        except Skipped as skipped:
-            return StepResult(StepOutcome.SKIPPED, str(skipped))
-        except StepDeclined as declined:
-            return StepResult(StepOutcome.DECLINED, str(declined))
-        return StepResult(StepOutcome.PASSED, line)
-
-    def _come_to_rest(self) -> None:
-        try:
-            self._guide.kit.client.come_to_rest()
-        except Failed as failure:
-            raise Lost(str(failure)) from failure
-
-    def _say(self, step: CommissioningStep, result: StepResult) -> None:
-        mark = _MARKS.get(result.outcome, f"– {result.outcome.value}:")
-        self._guide.prompts.show(f"{mark} {step.title}: {result.line}")
-        if result.outcome is StepOutcome.MISMATCH:
-            self._guide.prompts.show(f"  What to do: {step.remedy}")
 
 
 def _traced(options: CheckOptions, stack: ExitStack) -> CheckOptions:

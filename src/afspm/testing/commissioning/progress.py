@@ -2,76 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import Enum
-from typing import TYPE_CHECKING
+from typing import Final
 
-if TYPE_CHECKING:
-    from afspm.testing.commissioning.guide import Guide
+from afspm.testing.conformance import Check, CheckOutcome, CheckResult
 
-
-class StepOutcome(Enum):
-    """The outcome of a step."""
-
-    PASSED = "passed"
-    MISMATCH = "mismatch"
-    SKIPPED = "skipped"
-    UNSUPPORTED = "not supported"
-    DECLINED = "declined"
-    BLOCKED = "blocked"
-
-
-_GOES_ON = (StepOutcome.PASSED, StepOutcome.SKIPPED, StepOutcome.UNSUPPORTED)
+_MISMATCH: Final = "mismatch"
+"""The word for a failed step in reports and in the public matrix."""
+_GOES_ON = (CheckOutcome.PASSED, CheckOutcome.SKIPPED, CheckOutcome.UNSUPPORTED)
 """What is not supported, or not shown at the panel, keeps nothing else from being tried."""
 
 
 _WORSE = (
-    StepOutcome.UNSUPPORTED,
-    StepOutcome.SKIPPED,
-    StepOutcome.PASSED,
-    StepOutcome.BLOCKED,
-    StepOutcome.DECLINED,
-    StepOutcome.MISMATCH,
+    CheckOutcome.UNSUPPORTED,
+    CheckOutcome.SKIPPED,
+    CheckOutcome.PASSED,
+    CheckOutcome.BLOCKED,
+    CheckOutcome.DECLINED,
+    CheckOutcome.FAILED,
 )
 
 
-@dataclass(frozen=True)
-class CommissioningStep:
+def outcome_word(outcome: CheckOutcome) -> str:
+    """Return an outcome as reports and the public matrix have it."""
+    return _MISMATCH if outcome is CheckOutcome.FAILED else outcome.value
+
+
+def outcome_of(word: str) -> CheckOutcome:
+    """Return the outcome of a report's word. Raises ValueError."""
+    return CheckOutcome.FAILED if word == _MISMATCH else CheckOutcome(word)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommissioningStep(Check):
     """One step.
 
     Attributes:
-        explained: what is done, and what the person is asked; shown before anything is done.
-        remedy: what to do if it does not pass.
-        after: the steps that come first: none of them may have found a mismatch, or have been declined.
+        explained: the text shown to the person before anything is done.
+        after: the steps that come first: none of them may have failed, or have been declined.
         moves: it acts on the microscope, which the person has confirmed before.
         needs_panel: the person has to do something at the panel; skipped where there is none.
         contact: the tip is at the sample: it is withdrawn when the step is over.
         remembered: a resumed commissioning need not do it again; what concerns the tip is asked each time.
         operations: of the public matrix, that it tries.
-        needs: actions and parameters without which there is nothing to try.
     """
 
-    name: str
-    title: str
     explained: str
-    remedy: str
-    do: Callable[[Guide], str]
     after: tuple[str, ...] = ()
     moves: bool = True
     needs_panel: bool = False
     contact: bool = False
     remembered: bool = True
     operations: tuple[str, ...] = ()
-    needs: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class StepResult:
-    """The outcome of a step, in a line for people."""
-
-    outcome: StepOutcome
-    line: str = ""
 
 
 @dataclass
@@ -79,15 +62,15 @@ class CommissioningProgress:
     """The results so far, by the names of the steps."""
 
     steps: Sequence[CommissioningStep]
-    results: dict[str, StepResult] = field(default_factory=dict)
+    results: dict[str, CheckResult] = field(default_factory=dict)
 
     @classmethod
-    def resumed(cls, steps: Sequence[CommissioningStep], before: Mapping[str, StepResult]) -> CommissioningProgress:
+    def resumed(cls, steps: Sequence[CommissioningStep], before: Mapping[str, CheckResult]) -> CommissioningProgress:
         """Keep what has passed before and can be remembered; the rest is done again."""
         kept = {
             step.name: before[step.name]
             for step in steps
-            if step.remembered and step.name in before and before[step.name].outcome is StepOutcome.PASSED
+            if step.remembered and step.name in before and before[step.name].outcome is CheckOutcome.PASSED
         }
         return cls(steps, kept)
 
@@ -102,7 +85,9 @@ class CommissioningProgress:
             missing = [name for name in self._before(step) if self._outcome(name) not in _GOES_ON]
             if not missing:
                 return step
-            self.results[step.name] = StepResult(StepOutcome.BLOCKED, f"first: {', '.join(missing)}")
+            self.results[step.name] = CheckResult(
+                step.name, step.title, CheckOutcome.BLOCKED, f"first: {', '.join(missing)}"
+            )
         return None
 
     @property
@@ -113,13 +98,13 @@ class CommissioningProgress:
 
     def operations(self) -> dict[str, str]:
         """Return the outcome of each operation of the matrix: the worst of the steps that tried it."""
-        found: dict[str, StepOutcome] = {}
+        found: dict[str, CheckOutcome] = {}
         for step in self.steps:
             outcome = self._outcome(step.name)
             for operation in step.operations if outcome else ():
                 assert outcome is not None
                 found[operation] = max(outcome, found.get(operation, outcome), key=_WORSE.index)
-        return {operation: outcome.value for operation, outcome in found.items()}
+        return {operation: outcome_word(outcome) for operation, outcome in found.items()}
 
     def _is_wanted(self, step: CommissioningStep) -> bool:
         users = [other for other in self.steps if step.name in self._before(other)]
@@ -134,6 +119,6 @@ class CommissioningProgress:
             found |= dict.fromkeys(self._before(known[name]))
         return [one.name for one in self.steps if one.name in found]
 
-    def _outcome(self, name: str) -> StepOutcome | None:
+    def _outcome(self, name: str) -> CheckOutcome | None:
         result = self.results.get(name)
         return None if result is None else result.outcome

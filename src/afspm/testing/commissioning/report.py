@@ -12,7 +12,8 @@ from afspm.errors import FileError
 from afspm.experiment.toml_writer import dumps
 from afspm.plain_data import Plain
 from afspm.storage.atomic import write_atomic
-from afspm.testing.commissioning.progress import CommissioningProgress, StepOutcome, StepResult
+from afspm.testing.commissioning.progress import CommissioningProgress, outcome_of, outcome_word
+from afspm.testing.conformance import CheckResult
 
 FORMAT: Final = 1
 TRIED_ON: Final = ("instrument", "maker's program", "maker's client", "emulator")
@@ -74,11 +75,13 @@ class InstrumentReport:
         except (OSError, ValueError, TypeError) as error:
             raise FileError(f"is not a commissioning report: {error}", where=str(file)) from error
 
-    def results(self) -> dict[str, StepResult]:
+    def results(self) -> dict[str, CheckResult]:
         """Return the results of the steps."""
-        return {name: StepResult(StepOutcome(one["outcome"]), one["line"]) for name, one in self.steps.items()}
+        return {
+            name: CheckResult(name, "", outcome_of(one["outcome"]), one["line"]) for name, one in self.steps.items()
+        }
 
 
 def steps_of(progress: CommissioningProgress) -> dict[str, dict[str, str]]:
     """Return the results as they are written."""
-    return {name: {"outcome": one.outcome.value, "line": one.line} for name, one in progress.results.items()}
+    return {name: {"outcome": outcome_word(one.outcome), "line": one.line} for name, one in progress.results.items()}

@@ -1,6 +1,6 @@
 """The steps of a commissioning, in their order.
 
-Each returns a line that says what was seen, or raises Failed, Skipped or StepDeclined.
+Each returns a line that says what was seen, or raises Failed, Skipped or Declined.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import numpy as np
 
 from afspm.drawing import raster
 from afspm.model import ControlRequest, Feedback, RegionChange, Scan, ScanParameters, ScopeState, names
-from afspm.testing.commissioning.guide import Guide, StepDeclined
+from afspm.testing.commissioning.guide import Guide
 from afspm.testing.commissioning.progress import CommissioningStep
+from afspm.testing.conformance import Declined, Skipped, expect
 from afspm.testing.translators.checks import frames, picture, scans
 from afspm.testing.translators.measuring import SCAN_S, FrameSetting, Taken, number
-from afspm.testing.verdicts import Skipped, expect
 
 READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES = (
     "read", "frame", "angle", "scan", "end of a scan", "files", "stop", "lost connection", "axes",
@@ -39,7 +39,8 @@ def all_steps() -> tuple[CommissioningStep, ...]:
 def _step(title: str, explained: str, remedy: str, **facts: object) -> Callable[[Callable[[Guide], str]], None]:
     def marked(do: Callable[[Guide], str]) -> None:
         name = do.__name__.strip("_").replace("_", "-")
-        _STEPS.append(CommissioningStep(name, title, explained, remedy, do, **facts))  # type: ignore[arg-type]
+        step = CommissioningStep(name=name, title=title, do=do, remedy=remedy, explained=explained, **facts)  # type: ignore[arg-type]
+        _STEPS.append(step)
 
     return marked
 
@@ -129,7 +130,7 @@ def _compare_values(guide: Guide) -> int:
 )
 def _withdrawn(guide: Guide) -> str:
     if not guide.prompts.confirm("Is the tip so far from the sample that the scanner can't reach it?"):
-        raise StepDeclined("the tip is not withdrawn")
+        raise Declined("the tip is not withdrawn")
     return "confirmed"
 
 
@@ -325,7 +326,7 @@ def _contact(guide: Guide) -> str:
             "afspm can't withdraw the tip of this controller: stay at the panel until the steps are over."
         )
     if not guide.prompts.confirm("Is the tip at the sample, and the feedback stable?"):
-        raise StepDeclined("the tip stays withdrawn")
+        raise Declined("the tip stays withdrawn")
     guide.in_contact = True
     expect(guide.kit.support.has(names.STOP_SCAN), "a controller whose scans can be stopped", "they can't be")
     feedback = guide.kit.client.observations.newest(Feedback)

@@ -7,9 +7,9 @@ asks for everything that a component could ask for. The same as pytest items, on
 
 from __future__ import annotations
 
+from afspm.testing.conformance import CheckOutcome, CheckResult
 from afspm.testing.translators.report import CheckReport
 from afspm.testing.translators.runner import run
 from afspm.testing.translators.session import CheckOptions
-from afspm.testing.verdicts import CheckOutcome, CheckResult
 
 __all__ = ["CheckOptions", "CheckOutcome", "CheckReport", "CheckResult", "run"]

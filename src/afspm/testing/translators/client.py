@@ -24,7 +24,7 @@ from afspm.model import (
     names,
 )
 from afspm.process.parent import StopRequested
-from afspm.testing.verdicts import Failed, Lost, expect
+from afspm.testing.conformance import Failed, Lost, expect
 
 T = TypeVar("T")
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TypeVar
 
+from afspm.clock import Clock
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -21,9 +22,9 @@ from afspm.model import (
     Spectrum,
     names,
 )
+from afspm.testing.conformance import Check, Failed, Skipped, expect
 from afspm.testing.translators.client import CheckClient, Observation, answer_in_words, scans, spectra, told
 from afspm.testing.translators.support import Support
-from afspm.testing.verdicts import Failed, Skipped, expect
 from afspm.units import convert
 
 NEAR = 1e-3
@@ -176,13 +177,31 @@ class CheckMeasurements:
     ) -> None:
         self.client = client
         self.support = support
-        self.excused, self.complaints = excused, complaints
+        self._excused, self._complaints = excused, complaints
+        self._heeded = len(complaints)
         self._kept: dict[str, Taken | Exception] = {}
         initial = client.observations.newest(ScanParameters)
         region = None if initial is None else initial.region
         self._whole = region if isinstance(region, Region) else None
         if self._whole is not None and frame_m is not None:
             self._whole = replace(self._whole, size_m=(frame_m, frame_m))
+
+    @property
+    def clock(self) -> Clock:
+        return self.client.clock
+
+    def perform(self, check: Check) -> None:
+        """Do a check. Raises a CheckEnded: Skipped if the microscope does not have what it needs."""
+        self._heeded = len(self._complaints)
+        if missing := self.support.missing(check.needs):
+            raise Skipped(f"not supported: {', '.join(missing)}")
+        check.do(self)
+
+    def explain(self, check: Check, failure: Failed) -> tuple[str, ...]:
+        """Return the complaints since the check began. Raises Skipped: this controller can't pass the check."""
+        if check.name in self._excused:
+            raise Skipped(f"{self._excused[check.name]}: {failure}")
+        return tuple(self._complaints[self._heeded :])
 
     @property
     def frames(self) -> FrameSettings:

@@ -16,11 +16,11 @@ from typing import Any
 
 import pytest
 
+from afspm.testing.conformance import REPORT_FILE, Check, CheckOutcome, Lost, attempt
 from afspm.testing.translators import runner, session
 from afspm.testing.translators.measuring import CheckMeasurements
-from afspm.testing.translators.registry import Check, all_checks
 from afspm.testing.translators.report import CheckReport
-from afspm.testing.verdicts import CheckOutcome, CheckResult, Lost
+from afspm.testing.translators.translator_suite import TRANSLATOR_SUITE
 
 _REPORTS = pytest.StashKey[list[CheckReport]]()
 
@@ -45,7 +45,7 @@ class ExperimentFile(pytest.File):
     """The checks of one experiment file; they share one pass of its processes."""
 
     def collect(self) -> Iterable[pytest.Item]:
-        for check in all_checks():
+        for check in TRANSLATOR_SUITE.checks():
             yield CheckItem.from_parent(self, name=check.name, check=check)
 
     def setup(self) -> None:
@@ -61,14 +61,13 @@ class ExperimentFile(pytest.File):
         except Lost as lost:
             self.report.lost = str(lost)
             pytest.fail(str(lost), pytrace=False)
-        vars(self.report).update(vars(runner.begin_report(opened)))
+        self.report.describe(opened)
         self.kit: CheckMeasurements = self._stack.enter_context(runner.restored(opened, self.report))
 
     def teardown(self) -> None:
         self._stack.close()
         if self.report.folder:
-            file = Path(self.report.folder) / runner.REPORT_FILE
-            file.write_text(self.report.to_json(), encoding="utf-8")
+            self.report.write(Path(self.report.folder) / REPORT_FILE)
         if self.report.unrestored:
             pytest.fail("not restored: " + "; ".join(self.report.unrestored), pytrace=False)
 
@@ -86,7 +85,7 @@ class CheckItem(pytest.Item):
         if report.lost:
             pytest.fail(report.lost, pytrace=False)
         try:
-            result: CheckResult = runner.do(self._check, self.parent.kit)
+            result = attempt(self._check, self.parent.kit)
         except Lost as lost:
             report.lost = str(lost)
             pytest.fail(report.lost, pytrace=False)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -11,60 +10,44 @@ from rich.table import Table
 from rich.text import Text
 
 from afspm.model import names
+from afspm.testing.conformance import SuiteReport, show_verdict
+from afspm.testing.translators.session import CheckSession
 from afspm.testing.translators.support import Support
-from afspm.testing.verdicts import CheckOutcome, CheckResult
 
 
 @dataclass
-class CheckReport:
-    """All of them.
+class CheckReport(SuiteReport):
+    """The results of all checks of one translator.
 
     Attributes:
         translator: its class or command.
-        lost: why the checks could not be finished; empty if they were.
         unrestored: what could not be put back, a line each.
-        folder: with the log and all files.
     """
 
     translator: str = ""
     simulated: bool = False
-    afspm: str = ""
-    began: str = ""
-    results: list[CheckResult] = field(default_factory=list)
     support: Support = field(default_factory=Support)
-    lost: str = ""
     unrestored: list[str] = field(default_factory=list)
-    folder: str = ""
+
+    def describe(self, session: CheckSession) -> None:
+        """Note down the translator under test."""
+        self.translator, self.simulated = session.translator, session.simulated
+        self.support, self.folder = session.support, str(session.folder)
 
     @property
     def passed(self) -> bool:
-        """True if nothing was wrong; what is not supported is no fault."""
-        return bool(self.results) and not (self.failed or self.lost or self.unrestored or self.support.errors)
+        return super().passed and not (self.unrestored or self.support.errors)
 
-    @property
-    def failed(self) -> list[CheckResult]:
-        return [result for result in self.results if result.outcome is CheckOutcome.FAILED]
-
-    def count(self, outcome: CheckOutcome) -> int:
-        return sum(result.outcome is outcome for result in self.results)
-
-    def to_json(self) -> str:
-        """For programs: `passed`, the checks, and what is supported, with the controller's version."""
-        facts: dict[str, object] = {
-            "passed": self.passed,
+    def subject(self) -> dict[str, object]:
+        return {
             "translator": self.translator,
             "controller": self.support.controller,
             "simulated": self.simulated,
-            "afspm": self.afspm,
-            "began": self.began,
-            "lost": self.lost,
             "unrestored": self.unrestored,
             "wrong_answers": self.support.errors,
-            "checks": [{**asdict(result), "outcome": result.outcome.value} for result in self.results],
             "actions": [{"name": name, "supported": has} for name, has in self.support.actions.items()],
             "parameters": [self._parameter(name) for name in self.support.parameters],
         }
-        return json.dumps(facts, indent=2, ensure_ascii=False) + "\n"
 
     def _parameter(self, name: str) -> dict[str, object]:
         told = self.support.parameters[name]
@@ -93,20 +76,10 @@ def show_end(report: CheckReport, console: Console) -> None:
     for what, lines in (("wrong answer", report.support.errors), ("not restored", report.unrestored)):
         for line in lines:
             console.print(Text(f"{what}: {line}", "bold red"), soft_wrap=True)
-    if report.lost:
-        console.print(Text(f"not completed: {report.lost}", "bold red"), soft_wrap=True)
-    console.print(Text(summary(report), "bold green" if report.passed else "bold red"), soft_wrap=True)
-    if report.folder:
-        console.print(f"log, files and report.json: {report.folder}", markup=False, soft_wrap=True, style="dim")
-
-
-def summary(report: CheckReport) -> str:
-    """In one line."""
-    counts = [f"{report.count(outcome)} {outcome.value}" for outcome in CheckOutcome if report.count(outcome)]
-    unsupported = sum(told is None for told in report.support.parameters.values())
+    unsupported = sum(value is None for value in report.support.parameters.values())
     unsupported += sum(has is False for has in report.support.actions.values())
     verdict = "the translator passes the suite" if report.passed else "the translator fails the suite"
-    return f"{', '.join(counts) or 'nothing checked'}; {unsupported} actions and parameters not supported: {verdict}"
+    show_verdict(report, f"; {unsupported} actions and parameters not supported: {verdict}", console)
 
 
 def _actions(report: CheckReport) -> Table:

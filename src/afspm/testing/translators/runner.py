@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib.metadata import version
 
-from afspm.clock import Clock, ExperimentClock
-from afspm.errors import ConfigError
 from afspm.model import ControlRequest, Feedback, Parameter, ProbePosition, Region, ScanParameters, names
+from afspm.testing.conformance import CheckResult, Failed, Lost, near
 from afspm.testing.translators.client import CheckClient, answer_in_words
 from afspm.testing.translators.measuring import CheckMeasurements, FrameSetting, number
-from afspm.testing.translators.registry import Check, all_checks
 from afspm.testing.translators.report import CheckReport
 from afspm.testing.translators.session import CheckOptions, CheckSession, opened
 from afspm.testing.translators.support import Support
-from afspm.testing.verdicts import CheckOutcome, CheckResult, Failed, Lost, Skipped, near
+from afspm.testing.translators.translator_suite import TRANSLATOR_SUITE
 
 _LAST = (names.SCAN_SPEED, names.MOVE_SPEED)
 """A frame may change them."""
@@ -117,48 +113,6 @@ def _same(before: Parameter, now: Parameter) -> bool:
         return False
 
 
-REPORT_FILE = "report.json"
-
-
-def chosen(only: Collection[str] = ()) -> list[Check]:
-    """The checks whose names have one of these in them; all, if none are given.
-
-    Raises:
-        ConfigError: there are none.
-    """
-    found = [one for one in all_checks() if not only or any(part in one.name for part in only)]
-    if not found:
-        raise ConfigError(f"no check is called {' or '.join(only)}", hint="afspm test-translator --list")
-    return found
-
-
-def do(check: Check, kit: CheckMeasurements) -> CheckResult:
-    """Do one.
-
-    Raises:
-        Lost: nothing more can be checked.
-    """
-    clock: Clock = kit.client.clock
-    began_s, heard = clock.monotonic_s(), len(kit.complaints)
-
-    def result(outcome: CheckOutcome, line: str = "") -> CheckResult:
-        meanwhile = tuple(kit.complaints[heard:]) if outcome is CheckOutcome.FAILED else ()
-        return CheckResult(check.name, check.title, outcome, line, clock.monotonic_s() - began_s, meanwhile)
-
-    missing = kit.support.missing(check.needs)
-    if missing:
-        return result(CheckOutcome.SKIPPED, f"not supported: {', '.join(missing)}")
-    try:
-        check.do(kit)
-        return result(CheckOutcome.PASSED)
-    except Failed as failure:
-        if check.name in kit.excused:
-            return result(CheckOutcome.SKIPPED, f"{kit.excused[check.name]}: {failure}")
-        return result(CheckOutcome.FAILED, str(failure))
-    except Skipped as skipped:
-        return result(CheckOutcome.SKIPPED, str(skipped))
-
-
 @contextmanager
 def restored(session: CheckSession, report: CheckReport) -> Iterator[CheckMeasurements]:
     """Put back at the end of the block, however it ends, the settings of its beginning."""
@@ -172,52 +126,26 @@ def restored(session: CheckSession, report: CheckReport) -> Iterator[CheckMeasur
         report.unrestored = before.restore(session.client)
 
 
-def begin_report(session: CheckSession) -> CheckReport:
-    """A report with nothing checked yet."""
-    return CheckReport(
-        translator=session.translator,
-        simulated=session.simulated,
-        afspm=version("afspm"),
-        began=datetime.fromtimestamp(ExperimentClock.real().now_s(), UTC).isoformat(timespec="seconds"),
-        support=session.support,
-        folder=str(session.folder),
-    )
-
-
 def run(
     options: CheckOptions,
     begun: Callable[[CheckReport], None] = lambda report: None,
-    doing: Callable[[Check], None] = lambda check: None,
     done: Callable[[CheckResult], None] = lambda result: None,
 ) -> CheckReport:
     """Do all checks that are chosen, restore, and write `report.json` into the run's folder.
 
     Args:
-        begun, doing, done: told of how it goes.
+        begun: gets the report before the first check, `done` each result.
 
     Raises:
         ConfigError: the experiment file or the options are wrong; nothing was started.
         KeyboardInterrupt: after everything was put back, and the report of what was done was written.
     """
-    wanted = chosen(options.only)
+    checks = TRANSLATOR_SUITE.checks(options.only)
     report = CheckReport()
-    try:
-        with opened(options) as session:
-            report = begin_report(session)
-            begun(report)
-            try:
-                with restored(session, report) as kit:
-                    for check in wanted:
-                        doing(check)
-                        result = do(check, kit)
-                        report.results.append(result)
-                        done(result)
-                    session.support.ask_again(session.client)
-            except KeyboardInterrupt:
-                report.lost = "interrupted"
-                raise
-            finally:
-                (session.folder / REPORT_FILE).write_text(report.to_json(), encoding="utf-8")
-    except Lost as lost:
-        report.lost = str(lost)
+    with report.written(), opened(options) as session:
+        report.describe(session)
+        begun(report)
+        with restored(session, report) as kit:
+            report.run(checks, kit, done)
+            session.support.ask_again(session.client)
     return report

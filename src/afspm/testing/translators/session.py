@@ -28,10 +28,10 @@ from afspm.supervisor.log import RunLog
 from afspm.supervisor.ports import FreePorts, require_free
 from afspm.supervisor.run import addresses_of
 from afspm.supervisor.run_identity import RunIdentity
+from afspm.testing.conformance import Lost
 from afspm.testing.processes import Processes
 from afspm.testing.translators.client import CheckClient
 from afspm.testing.translators.support import Support, find_out
-from afspm.testing.verdicts import Lost
 from afspm.translator import Driver
 from afspm.transport.port import ParentGone, Port
 from afspm.transport.zmq_port import open_port

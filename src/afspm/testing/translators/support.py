@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from afspm.model import ControlRequest, ControlResponse, Parameter, names
+from afspm.testing.conformance import Failed
 from afspm.testing.translators.client import CheckClient, answer_in_words, value_in
-from afspm.testing.verdicts import Failed
 
 ACTIONS = names.BASE_ACTIONS + names.EXTENSION_ACTIONS
 PARAMETERS = (*names.BASE_PARAMETERS, *names.EXTENSION_PARAMETERS, names.DRIFT_RATE_X, names.DRIFT_RATE_Y)

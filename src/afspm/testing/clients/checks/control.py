@@ -7,10 +7,10 @@ from collections.abc import Callable
 from afspm.model import ControlMode, Region, ScopeState
 from afspm.testing.clients.bench import ClientBench
 from afspm.testing.clients.checks.measure import SCAN_S, require_scans, scan_step
+from afspm.testing.clients.client_suite import client_check
 from afspm.testing.clients.experiment import CLIENT, SCHEDULER, TRANSLATOR, JudgedExperiment
 from afspm.testing.clients.program import Answer, ClientProgram
-from afspm.testing.clients.registry import client_check
-from afspm.testing.verdicts import expect
+from afspm.testing.conformance import expect
 
 KNOWN_S = 5.0
 _PROBLEM = 1  # EP_TIP_SHAPE_CHANGED

@@ -5,10 +5,10 @@ from __future__ import annotations
 from afspm.exit_codes import ExitCode
 from afspm.model import OTHER_RUN_RESPONSE
 from afspm.testing.clients.bench import BEAT_S, TOKEN, ClientBench
+from afspm.testing.clients.client_suite import client_check
 from afspm.testing.clients.heartbeats import BeatRecorder
 from afspm.testing.clients.program import ClientProgram, Pump
-from afspm.testing.clients.registry import client_check
-from afspm.testing.verdicts import expect
+from afspm.testing.conformance import expect
 from afspm.wire import BEAT, KILL
 
 ENDED_S = 4.0

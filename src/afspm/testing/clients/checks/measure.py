@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from afspm.plain_data import Plain
 from afspm.testing.clients.bench import ClientBench
 from afspm.testing.clients.checks.launch import require_beats
+from afspm.testing.clients.client_suite import client_check
 from afspm.testing.clients.experiment import JudgedExperiment
 from afspm.testing.clients.facts import compare
 from afspm.testing.clients.program import Answer
-from afspm.testing.clients.registry import client_check
-from afspm.testing.verdicts import Failed, expect, near
+from afspm.testing.conformance import Failed, expect, near
 from afspm.units import si
 
 SCAN_S = 120.0

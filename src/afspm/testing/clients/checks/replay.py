@@ -6,11 +6,11 @@ import zmq
 
 from afspm.model import Packet
 from afspm.testing.clients.bench import ClientBench, ScriptedRun
+from afspm.testing.clients.client_suite import client_check
 from afspm.testing.clients.experiment import JudgedExperiment
 from afspm.testing.clients.facts import compare
 from afspm.testing.clients.golden import golden
-from afspm.testing.clients.registry import client_check
-from afspm.testing.verdicts import Failed, expect
+from afspm.testing.conformance import Failed, expect
 from afspm.transport.frames import receive_frames
 from afspm.transport.network import Network
 from afspm.wire import KILL, encode_time

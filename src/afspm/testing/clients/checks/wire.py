@@ -10,12 +10,12 @@ from google.protobuf import json_format
 from afspm.model import ControlRequest, ControlResponse, Packet, ScopeState
 from afspm.plain_data import Plain
 from afspm.testing.clients.bench import ClientBench, ScriptedRun
+from afspm.testing.clients.client_suite import client_check
 from afspm.testing.clients.facts import compare
 from afspm.testing.clients.golden import frames_of, golden
 from afspm.testing.clients.program import Answer
-from afspm.testing.clients.registry import client_check
 from afspm.testing.clients.scripted import success
-from afspm.testing.verdicts import Failed, expect
+from afspm.testing.conformance import Failed, expect
 from afspm.wire import decode_packet, encode_time, message_type
 
 _PACKET_S = 10.0

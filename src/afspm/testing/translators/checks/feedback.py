@@ -6,10 +6,10 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from afspm.model import ControlRequest, ControlResponse, Feedback, names
+from afspm.testing.conformance import Failed, Skipped, expect, near
 from afspm.testing.translators.client import answer_in_words, told
 from afspm.testing.translators.measuring import CheckMeasurements, number
-from afspm.testing.translators.registry import check
-from afspm.testing.verdicts import Failed, Skipped, expect, near
+from afspm.testing.translators.translator_suite import check
 
 _NUMBERS = {
     "proportional_gain": names.ZCTRL_PGAIN,

@@ -15,10 +15,10 @@ from afspm.model import (
     ShapeChange,
     names,
 )
+from afspm.testing.conformance import Failed, Skipped, expect, near
 from afspm.testing.translators.client import Observation, states, told
 from afspm.testing.translators.measuring import CheckMeasurements, FrameSetting, difference, number
-from afspm.testing.translators.registry import check
-from afspm.testing.verdicts import Failed, Skipped, expect, near
+from afspm.testing.translators.translator_suite import check
 
 
 @check("published/in-force", "the settings in force are published at the start, the state last")

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from afspm.model import ControlRequest, ControlResponse, Parameter, Response, names
+from afspm.testing.conformance import Skipped, expect, near
 from afspm.testing.translators.client import answer_in_words, value_in
 from afspm.testing.translators.measuring import CheckMeasurements, number
-from afspm.testing.translators.registry import check
-from afspm.testing.verdicts import Skipped, expect, near
+from afspm.testing.translators.translator_suite import check
 from afspm.units import convert
 
 _SMALLER = {"m": "nm", "m/s": "nm/s", "V": "mV", "deg": "rad", "A": "pA"}

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.model import Region, names
+from afspm.testing.conformance import Failed, Skipped
 from afspm.testing.translators.measuring import CheckMeasurements, FrameSetting, Taken
-from afspm.testing.translators.registry import check
-from afspm.testing.verdicts import Failed, Skipped
+from afspm.testing.translators.translator_suite import check
 
 Array = NDArray[np.float64]
 LIKE = 0.6

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 from afspm.model import ControlRequest, ProbePosition, names
+from afspm.testing.conformance import Failed, expect
 from afspm.testing.translators.checks.frames import require_told_once
 from afspm.testing.translators.measuring import NEAR, CheckMeasurements, in_words, number
-from afspm.testing.translators.registry import check
-from afspm.testing.verdicts import Failed, expect
+from afspm.testing.translators.translator_suite import check
 from afspm.wire import messages
 
 _NEEDS = (names.PROBE_POS_X, names.PROBE_POS_Y)

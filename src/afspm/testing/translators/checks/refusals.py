@@ -14,11 +14,11 @@ from afspm.model import (
     ScopeState,
     names,
 )
+from afspm.testing.conformance import expect
 from afspm.testing.translators.checks.parameters import require_param_error
 from afspm.testing.translators.client import answer_in_words, told
 from afspm.testing.translators.measuring import CheckMeasurements
-from afspm.testing.translators.registry import check
-from afspm.testing.verdicts import expect
+from afspm.testing.translators.translator_suite import check
 from afspm.wire import messages
 
 _UNKNOWN = "no-such-thing"

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from afspm.model import Scan, ScanParameters, ScopeState, ScopeStatus, names
+from afspm.testing.conformance import Failed, Skipped, expect
 from afspm.testing.translators.client import Observation, scans, states, told
 from afspm.testing.translators.measuring import SCAN_S, CheckMeasurements, Taken, difference
-from afspm.testing.translators.registry import check
-from afspm.testing.verdicts import Failed, Skipped, expect
+from afspm.testing.translators.translator_suite import check
 
 
 def broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> list[Observation]:

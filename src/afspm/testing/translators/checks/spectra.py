@@ -7,11 +7,11 @@ import math
 import numpy as np
 
 from afspm.model import ProbePosition, ScopeState, Spectrum, names
+from afspm.testing.conformance import Failed, Skipped, expect
 from afspm.testing.translators.checks.scans import CLOCK_S, asked_to_stop, require_broken_off, require_order
 from afspm.testing.translators.client import spectra, states, told
 from afspm.testing.translators.measuring import NEAR, CheckMeasurements, in_words
-from afspm.testing.translators.registry import check
-from afspm.testing.verdicts import Failed, Skipped, expect
+from afspm.testing.translators.translator_suite import check
 
 _NEEDS = (names.START_SPEC,)
 

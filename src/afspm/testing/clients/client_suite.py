@@ -1,0 +1,28 @@
+"""The suite of clients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+from afspm.testing.conformance import Check, Suite
+
+if TYPE_CHECKING:
+    from afspm.testing.clients.bench import ClientBench
+
+Judging = Callable[["ClientBench"], str | None]
+CLIENT_SUITE: Final = Suite[Check](
+    "afspm test-client",
+    f"{__package__}.checks",
+    ("wire", "launch", "replay", "requests", "measure", "control", "keys"),  # a check relies on what earlier ones check
+)
+
+
+def client_check(name: str, title: str, remedy: str) -> Callable[[Judging], Judging]:
+    """Add the decorated function to the suite of clients."""
+
+    def add(do: Judging) -> Judging:
+        CLIENT_SUITE.add(Check(name, title, do, remedy=remedy))
+        return do
+
+    return add

@@ -1,0 +1,347 @@
+"""The conformance kernel: checks of a translator, a client or a controller, done one after the other.
+
+Theory of operation. A `Suite` collects the checks of one kind of program, in order. A `Check` contains a function of
+the suite's fixture, which raises a `CheckEnded` unless the program passes. `attempt` makes a `CheckResult` of a check,
+and `SuiteReport.run` of several. The surroundings of a check differ from suite to suite (a question to a person, a new
+experiment after a failure): they are in the fixture's `perform` and `explain`. Each wait within a check has a time
+limit of its own, so that a check ends even if the program does not answer.
+
+| raised | because | outcome | then |
+| --- | --- | --- | --- |
+| `Failed` | the program does something else | failed | `explain` adds evidence; next check |
+| `Skipped`, `Unsupported`, `Declined` | there is nothing to check here | of that name | next check |
+| `Lost` | a process has ended, or control was taken away | none | no further check; the report says why |
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from enum import Enum
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import ClassVar, Generic, Protocol, TypeVar
+from xml.etree import ElementTree
+
+from rich.console import Console
+from rich.text import Text
+
+from afspm.clock import Clock, ExperimentClock
+from afspm.errors import ConfigError
+
+NAME_WIDTH = 29
+REPORT_FILE = "report.json"
+
+
+class CheckOutcome(Enum):
+    """The outcome of one check; `BLOCKED` if it needs another one that has not passed."""
+
+    PASSED = "passed"
+    FAILED = "failed"
+    SKIPPED = "skipped"
+    UNSUPPORTED = "not supported"
+    DECLINED = "declined"
+    BLOCKED = "blocked"
+
+
+class CheckEnded(Exception):
+    """A check ends without having passed; the text is the line of its result."""
+
+    outcome: ClassVar[CheckOutcome]
+
+
+class Failed(CheckEnded, AssertionError):
+    """The program under test does not do what it should.
+
+    Args:
+        expected, came: in words of a physicist, without a full stop.
+    """
+
+    outcome = CheckOutcome.FAILED
+
+    def __init__(self, expected: str, came: str) -> None:
+        super().__init__(f"expected {expected}; came {came}")
+
+
+class Skipped(CheckEnded):
+    """It can't be checked here; the text says why."""
+
+    outcome = CheckOutcome.SKIPPED
+
+
+class Unsupported(CheckEnded):
+    """The program does not have what the check needs; the text names it."""
+
+    outcome = CheckOutcome.UNSUPPORTED
+
+
+class Declined(CheckEnded):
+    """The person did not confirm; nothing was done."""
+
+    outcome = CheckOutcome.DECLINED
+
+
+class Lost(Exception):
+    """Nothing more can be checked: a process has ended, or control was taken away."""
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """One check.
+
+    Attributes:
+        line: what was expected and what came, or why it was skipped.
+        complaints: of a failed check, the evidence: warnings and errors logged meanwhile, the remedy.
+        real_s: its duration.
+    """
+
+    name: str
+    title: str
+    outcome: CheckOutcome
+    line: str = ""
+    real_s: float = 0.0
+    complaints: tuple[str, ...] = ()
+
+
+def expect(holds: object, expected: str, came: str) -> None:
+    """Raises Failed unless it holds."""
+    if not holds:
+        raise Failed(expected, came)
+
+
+def near(a: float, b: float, relative: float = 1e-3, absolute: float = 0.0) -> bool:
+    """True if two numbers are the same to a controller's precision."""
+    return math.isclose(a, b, rel_tol=relative, abs_tol=absolute)
+
+
+@dataclass(frozen=True)
+class Check:
+    """One requirement.
+
+    Attributes:
+        name: "scan/cancel": the subject, and the requirement.
+        title: a sentence that is true of a program that passes.
+        do: takes the suite's fixture; raises a CheckEnded, or returns a line worth knowing though all is well.
+        needs: actions and parameters without which there is nothing to check.
+        remedy: what to do if it fails.
+    """
+
+    name: str
+    title: str
+    do: Callable[..., str | None]
+    needs: tuple[str, ...] = ()
+    remedy: str = ""
+
+    @property
+    def listed(self) -> str:
+        """The line in a list of all checks."""
+        return f"{self.name:{NAME_WIDTH + 2}}{self.title}"
+
+
+K = TypeVar("K", bound=Check)
+K_contra = TypeVar("K_contra", bound=Check, contravariant=True)
+
+
+class Suite(Generic[K]):
+    """The checks of one kind of program, in order.
+
+    Args:
+        command: the command that does them.
+        package: contains the modules with the checks, which are imported when the checks are first asked for.
+        modules: their names, in order.
+    """
+
+    def __init__(self, command: str, package: str, modules: Sequence[str]) -> None:
+        self._command = command
+        self._modules = [f"{package}.{module}" for module in modules]
+        self._checks: list[K] = []
+
+    def add(self, check: K) -> None:
+        """Add a check; the checks of a module are done in the order of their addition."""
+        self._checks.append(check)
+
+    def checks(self, only: Collection[str] = ()) -> tuple[K, ...]:
+        """Return the checks with one of `only` in their names; all of them, if it is empty.
+
+        Raises:
+            ConfigError: there are none.
+        """
+        for module in self._modules:
+            import_module(module)
+        # any module may have been imported first, by a test or by its neighbour
+        ordered = sorted(self._checks, key=lambda one: self._modules.index(one.do.__module__))
+        found = tuple(one for one in ordered if not only or any(part in one.name for part in only))
+        if not found:
+            raise ConfigError(f"no check is called {' or '.join(only)}", hint=f"{self._command} --list")
+        return found
+
+
+class Fixture(Protocol[K_contra]):
+    """All that the checks of a suite work with."""
+
+    @property
+    def clock(self) -> Clock:
+        """The clock by which a check's duration is measured."""
+
+    def perform(self, check: K_contra) -> str | None:
+        """Do a check, unless something prevents it. Raises CheckEnded, Lost."""
+
+    def explain(self, check: K_contra, failure: Failed) -> tuple[str, ...]:
+        """Return the evidence of a failure, and get ready for the next check.
+
+        Raises:
+            Skipped: it is not the program's fault.
+            Lost: there can be no next check.
+        """
+
+
+def attempt(check: K, fixture: Fixture[K]) -> CheckResult:
+    """Do one check.
+
+    Raises:
+        Lost: nothing more can be checked.
+    """
+    began_s = fixture.clock.monotonic_s()
+    outcome, line = CheckOutcome.PASSED, ""
+    complaints: tuple[str, ...] = ()
+    try:
+        try:
+            line = fixture.perform(check) or ""
+        except Failed as failure:
+            complaints = fixture.explain(check, failure)
+            outcome, line = failure.outcome, str(failure)
+    except CheckEnded as verdict:
+        outcome, line = verdict.outcome, str(verdict)
+    return CheckResult(check.name, check.title, outcome, line, fixture.clock.monotonic_s() - began_s, complaints)
+
+
+@dataclass
+class SuiteReport:
+    """The results of a suite, for one program.
+
+    Attributes:
+        lost: why the checks could not be finished; empty if they were.
+        folder: of this run, with its log and files; empty before it is made.
+    """
+
+    folder: str = ""
+    results: list[CheckResult] = field(default_factory=list)
+    lost: str = ""
+    afspm: str = field(default_factory=lambda: version("afspm"))
+    began: str = field(default_factory=lambda: _now().isoformat(timespec="seconds"))
+
+    @property
+    def passed(self) -> bool:
+        """True if nothing was wrong; an unsupported action is no fault."""
+        return bool(self.results) and not (self.failed or self.lost)
+
+    @property
+    def failed(self) -> list[CheckResult]:
+        return [result for result in self.results if result.outcome is CheckOutcome.FAILED]
+
+    @property
+    def counts(self) -> str:
+        """The numbers of outcomes, in words."""
+        count = Counter(result.outcome for result in self.results)
+        return ", ".join(f"{count[outcome]} {outcome.value}" for outcome in CheckOutcome if count[outcome])
+
+    def subject(self) -> dict[str, object]:
+        """Return the facts about the program under test, for `to_json`."""
+        return {}
+
+    def to_json(self) -> str:
+        """Return the report for programs: `passed`, the checks, and the facts about the program."""
+        facts: dict[str, object] = {
+            "passed": self.passed,
+            "afspm": self.afspm,
+            "began": self.began,
+            "lost": self.lost,
+            "checks": [{**asdict(result), "outcome": result.outcome.value} for result in self.results],
+            **self.subject(),
+        }
+        return json.dumps(facts, indent=2, ensure_ascii=False) + "\n"
+
+    def to_junit(self) -> str:
+        """Return the report as JUnit's XML, for services that run tests."""
+        suite = ElementTree.Element("testsuite", name="afspm", timestamp=self.began, tests=str(len(self.results)))
+        for result in self.results:
+            group, _, name = result.name.rpartition("/")
+            facts = {"classname": group, "name": name, "time": f"{result.real_s:.3f}"}
+            case = ElementTree.SubElement(suite, "testcase", facts)
+            if result.outcome is CheckOutcome.FAILED:
+                ElementTree.SubElement(case, "failure", message=result.line).text = "\n".join(result.complaints)
+            elif result.outcome is not CheckOutcome.PASSED:
+                ElementTree.SubElement(case, "skipped", message=result.line)
+        if self.lost:
+            lost = ElementTree.SubElement(suite, "testcase", classname="", name="all checks are done")
+            ElementTree.SubElement(lost, "error", message=self.lost)
+        ElementTree.indent(suite)
+        return ElementTree.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"
+
+    def write(self, file: Path) -> None:
+        """Write the report into a file: JUnit's XML if its name ends with `.xml`, else JSON."""
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(self.to_junit() if file.suffix == ".xml" else self.to_json(), encoding="utf-8")
+
+    @contextmanager
+    def written(self) -> Iterator[None]:
+        """Write `report.json` into the folder at the end of the block, and note why the block was left early."""
+        try:
+            yield
+        except Lost as lost:
+            self.lost = str(lost)
+        except KeyboardInterrupt:
+            self.lost = "interrupted"
+            raise
+        finally:
+            if self.folder:
+                self.write(Path(self.folder) / REPORT_FILE)
+
+    def run(
+        self, checks: Iterable[K], fixture: Fixture[K], done: Callable[[CheckResult], None] = lambda result: None
+    ) -> None:
+        """Do checks one after the other; `done` gets each result. Raises Lost."""
+        for check in checks:
+            result = attempt(check, fixture)
+            self.results.append(result)
+            done(result)
+
+
+def _now() -> datetime:
+    return datetime.fromtimestamp(ExperimentClock.real().now_s(), UTC)
+
+
+_FAILED = ("✗", "bold red")
+_OTHERWISE = ("–", "yellow")
+_MARKS = {CheckOutcome.PASSED: ("✓", "green"), CheckOutcome.FAILED: _FAILED}
+
+
+def mark(outcome: CheckOutcome) -> tuple[str, str]:
+    """Return the mark of an outcome, and its style in a terminal."""
+    return _MARKS.get(outcome, _OTHERWISE)
+
+
+def show_result(result: CheckResult, console: Console) -> None:
+    """Print one check, with the line and the complaints below it."""
+    symbol, style = mark(result.outcome)
+    text = Text.assemble((symbol, style), f" {result.name:{NAME_WIDTH}} ", (result.title, "dim"))
+    for line in filter(None, (result.line, *result.complaints)):
+        text.append(f"\n    {line}", style)
+    console.print(text, soft_wrap=True)
+
+
+def show_verdict(report: SuiteReport, verdict: str, console: Console) -> None:
+    """Print how a run of checks ended, in a line, and its folder."""
+    if report.lost:
+        console.print(Text(f"not completed: {report.lost}", "bold red"), soft_wrap=True)
+    line = f"{report.counts or 'nothing checked'}{verdict}"
+    console.print(Text(line, "bold green" if report.passed else "bold red"), soft_wrap=True)
+    if report.folder:
+        line = f"log, files and {REPORT_FILE}: {report.folder}"
+        console.print(line, markup=False, soft_wrap=True, style="dim")
