@@ -19,6 +19,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from afspm import wire
 from afspm.errors import AfspmError
 from afspm.experiment import class_loader
 from afspm.experiment.document import Document
@@ -27,16 +28,18 @@ from afspm.experiment.sections import Section, parse
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.wiring_classes import WiringClass
 from afspm.logic.envelopes import CacheRule, Envelopes
-from afspm.model import PacketHeader
+from afspm.model import PacketHeader, Role
 from afspm.units import Length
 
+STATE = wire.MessageKind.STATE
 Count = Annotated[int, Field(ge=1)]
 
 _EXAMPLES = (
     PacketHeader("Scan2d", "Height", (1e-6, 1e-6)),
     PacketHeader("Spec1d", kind="IV"),
-    *map(PacketHeader, ("ScopeStateMsg", "ScanParameters2d", "ZCtrlParameters", "ProbePosition")),
+    *(PacketHeader(one.name) for one in wire.declared() if one.kind is STATE and one.source is Role.TRANSLATOR),
 )
+"""Headers with which a mapping is tried."""
 
 
 class CacheRuleSection(Section):

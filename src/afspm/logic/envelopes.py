@@ -6,30 +6,20 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from afspm.errors import ConfigError
+from afspm import wire
+from afspm.errors import ConfigError, WireError
 from afspm.model import PacketHeader
+from afspm.wire.messages import SCAN, SPECTRUM
 
 EnvelopeMapping = Callable[[PacketHeader], str]
-
-DEFAULT_HISTORY = {
-    "Scan2d": 5,
-    "Spec1d": 10,
-    "ScopeStateMsg": 10,
-    "DriftMapping": 10,
-    "ScanLines": 0,
-    "JournalEntries": 1000,
-    "LogLines": 1000,
-    "Note": 1000,
-}
-"""How many packets are kept of each envelope, by message; of all others one. Lines are of the moment."""
 
 
 def default_envelope(header: PacketHeader) -> str:
     """The wire format's: "Scan2d_2000.0_Height", "Spec1d_IV", or else the name of the message."""
-    if header.message == "Scan2d" and header.size_m is not None:
-        return f"Scan2d_{size_text(header.size_m[0])}_{header.channel or ''}"
-    if header.message == "Spec1d" and header.kind:
-        return f"Spec1d_{header.kind}"
+    if header.message == SCAN.name and header.size_m is not None:
+        return f"{SCAN.name}_{size_text(header.size_m[0])}_{header.channel or ''}"
+    if header.message == SPECTRUM.name and header.kind:
+        return f"{SPECTRUM.name}_{header.kind}"
     return header.message
 
 
@@ -120,7 +110,7 @@ class Envelopes:
     Args:
         rules: tried in their order; then the defaults.
         mapping: a function of the user's own that names the envelope instead of rules and defaults.
-        history: how many to keep, by message, over the defaults.
+        history: how many packets to keep, by message, instead of the number in the declaration.
     """
 
     def __init__(
@@ -131,7 +121,7 @@ class Envelopes:
     ) -> None:
         self._rules = tuple(rules)
         self._mapping = mapping
-        self._history = {**DEFAULT_HISTORY, **(history or {})}
+        self._history = history or {}
 
     def of(self, header: PacketHeader) -> tuple[str, int]:
         """The envelope of a packet, and how many of that envelope are kept."""
@@ -151,8 +141,13 @@ class Envelopes:
         return (default_envelope(header) if rule is None else rule.name(header)), history
 
     def history(self, message: str) -> int:
-        """Return how many of a message are kept where no rule says otherwise."""
-        return self._history.get(message, 1)
+        """Return how many packets of a message are kept where no rule says otherwise."""
+        if (own := self._history.get(message)) is not None:
+            return own
+        try:
+            return wire.declaration(wire.message_of(message)).history
+        except WireError:
+            return 1
 
     @staticmethod
     def _mapped(mapping: EnvelopeMapping, header: PacketHeader) -> object:
