@@ -5,7 +5,9 @@ from __future__ import annotations
 import ast
 import json
 import logging
+import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -16,11 +18,12 @@ from afspm import wire
 from afspm.client.component import Component
 from afspm.client.dispatch import MessageDispatcher
 from afspm.client.published_state import PublishedState
-from afspm.errors import InvalidValue
+from afspm.errors import ConfigError, InvalidValue
 from afspm.gateway.events import EventHistory
 from afspm.gateway.models import event_kinds
 from afspm.logic.cache import PacketCache
 from afspm.model import Packet, PacketHeader, ProblemNames, Role
+from afspm.process.message_types import register_all
 from afspm.record.journal import SCHEDULER
 from afspm.record.overview import Overview
 from afspm.record.run import open_run
@@ -119,6 +122,17 @@ def test_a_declared_message_comes_back_from_the_record(tilt: MessageDeclaration,
         for recorded, name, thing in run.messages(in_past):
             overview.take(name, thing, recorded.time_ns or 0, recorded.envelope)
     assert seen == [(0.5, 1), (1.0, 2)]
+
+
+def test_a_module_of_the_user_declares_its_messages(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = ModuleType("lab_level")
+    monkeypatch.setattr(messages, "_declared", dict(messages._declared))
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    with pytest.raises(ConfigError, match="holds no message types"):
+        register_all([module.__name__])
+    vars(module)["LEVEL"] = MessageDeclaration(type=message_class("StageLevel"), history=7)
+    register_all([module.__name__])
+    assert wire.declaration("StageLevel").history == 7
 
 
 def test_a_message_cannot_be_declared_in_two_ways(tilt: MessageDeclaration) -> None:
