@@ -273,7 +273,7 @@ def check_names_of_people(resolved: ResolvedExperiment) -> None:
     if keys is not None:
         names |= {file.stem for file in (keys / "public").glob("*.key")}
     any_role = False
-    for role, members in resolved.sections.control.roles:
+    for role, members in vars(resolved.sections.control.roles).items():
         for i, member in enumerate(members or ()):
             any_role, path = True, ("control", "roles", role, i)
             if not {member, component_of(member)} & names:

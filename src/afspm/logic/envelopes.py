@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 from afspm import wire
-from afspm.errors import ConfigError, WireError
+from afspm.errors import ConfigError, InvalidValue, WireError
 from afspm.model import PacketHeader
+from afspm.plain_data import SECTION, Count
+from afspm.units import Length
 from afspm.wire.messages import SCAN, SPECTRUM
 
 EnvelopeMapping = Callable[[PacketHeader], str]
@@ -44,36 +48,46 @@ def size_text(size_m: float) -> str:
 
 @dataclass(frozen=True)
 class CacheRule:
-    """One entry of the experiment file's [cache]: the first rule that fits a packet says how it is kept.
+    """A rule of [cache]: the first that matches a packet decides its envelope, and how many are kept.
 
     Attributes:
-        message, channel, kind: what it must be; None: any.
-        above_m, up_to_m: its region's width: above_m < width <= up_to_m.
-        envelope: text in which {message}, {channel}, {kind} and {size} (nm) are filled in; None for the default one.
-        history: how many are kept; None for the default number.
+        message: the name of the message; without the key: any.
+        channel: of a scan; without the key: any.
+        kind: of a spectrum; without the key: any.
+        above_m: the region is wider than this.
+        up_to_m: the region is not wider than this.
+        envelope: text in which {message}, {channel}, {kind} and {size} (nm) are filled in; without the key: the
+            default. It must begin with the name of its message, from which subscribers know its type, for example
+            `Scan2d_wide_{channel}`.
+        history: number of packets kept; without the key: the default.
+
+    Raises:
+        InvalidValue: no packet could match, or no subscriber could read the envelope.
     """
 
     message: str | None = None
     channel: str | None = None
     kind: str | None = None
-    above_m: float | None = None
-    up_to_m: float | None = None
+    above_m: Length | None = None
+    up_to_m: Length | None = None
     envelope: str | None = None
-    history: int | None = None
+    history: Count | None = None
+
+    __pydantic_config__: ClassVar[object] = SECTION
 
     def __post_init__(self) -> None:
         if self.history is not None and self.history < 1:
-            raise ConfigError(f"a history of {self.history} keeps nothing", where="[cache]", hint="1 or more")
+            raise InvalidValue(f"a history of {self.history} keeps nothing", where="[cache]", hint="1 or more")
         if self.envelope is not None:
             message = self.message or "AnyMessage"
             if not tells(self.name(PacketHeader(message, "", (0.0, 0.0), "")), message):
-                raise ConfigError(
+                raise InvalidValue(
                     f"the envelope {self.envelope!r} does not begin with the name of its message: nobody could read it",
                     where="[cache]",
                     hint=f"e.g. {self.message or '{message}'}_{self.envelope}",
                 )
         if self.above_m is not None and self.up_to_m is not None and self.above_m >= self.up_to_m:
-            raise ConfigError(f"no width is above {self.above_m:g} m and up to {self.up_to_m:g} m", where="[cache]")
+            raise InvalidValue("empty range: above must be less than up_to", where="[cache]")
 
     def fits(self, header: PacketHeader) -> bool:
         wanted = ((self.message, header.message), (self.channel, header.channel), (self.kind, header.kind))
@@ -97,11 +111,34 @@ class CacheRule:
                 message=header.message, channel=header.channel or "", kind=header.kind or "", size=size
             )
         except (KeyError, IndexError, ValueError) as error:
-            raise ConfigError(
+            raise InvalidValue(
                 f"{self.envelope!r} can't be filled in: {error}",
                 where="[cache]",
                 hint="use {message}, {channel}, {kind} and {size}",
             ) from error
+
+
+@dataclass(frozen=True)
+class CacheSettings:
+    """The packets that the scheduler keeps for late joiners.
+
+    Attributes:
+        history: number of packets kept for each envelope, by message: `{ Scan2d = 10 }`.
+        rules: list of tables; the first that matches a packet names the envelope under which it is published and kept.
+        mapping: `"module.function"`: names the envelope of a packet from its header (`message`, `channel`, `size_m`,
+            `kind`), instead of the rules.
+    """
+
+    history: Mapping[str, Count] = field(default_factory=dict)
+    rules: tuple[CacheRule, ...] = ()
+    mapping: str | None = None
+
+    __pydantic_config__: ClassVar[object] = SECTION
+
+    @property
+    def envelopes(self) -> tuple[str, ...]:
+        """The beginnings of the rules' envelopes, as far as they are fixed."""
+        return tuple(re.split(r"[{}]", rule.envelope)[0] for rule in self.rules if rule.envelope)
 
 
 class Envelopes:
@@ -117,7 +154,7 @@ class Envelopes:
         self,
         rules: Sequence[CacheRule] = (),
         mapping: EnvelopeMapping | None = None,
-        history: dict[str, int] | None = None,
+        history: Mapping[str, int] | None = None,
     ) -> None:
         self._rules = tuple(rules)
         self._mapping = mapping

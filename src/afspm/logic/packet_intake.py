@@ -43,7 +43,7 @@ def take_packet(draft: StateDraft, event: PacketIn) -> None:
     if published is None:
         return
     draft.effects.append(published)
-    by_variable = draft.env.settings.spectra_by_variable
+    by_variable = draft.env.settings.control.spectra_by_variable
     if draft.idempotency.ids_known is False and message == SPECTRUM.name and not by_variable:
         _log_once(draft, "WARNING", _DOUBT)
     if told is not None:
@@ -61,7 +61,7 @@ def _published(draft: StateDraft, packet: Packet, header: PacketHeader) -> Publi
         _log_once(draft, "WARNING", "the translator publishes a ControlState, which is the scheduler's: dropped")
         return None
     try:
-        if env.settings.spectra_by_variable and header.message == SPECTRUM.name:
+        if env.settings.control.spectra_by_variable and header.message == SPECTRUM.name:
             packet = Packet(packet.envelope, env.codec.by_point(packet.payload), packet.time_ns)
         if env.frame is not None:
             packet = env.frame.incoming(packet, header, draft.now_ns)
