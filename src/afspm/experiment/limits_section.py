@@ -154,7 +154,6 @@ class LimitsReader:
         return None if given is None else self._limit(given, path, None)
 
     def _table(self, table: object, path: tuple[str, ...], known: Collection[str]) -> Table | None:
-        """Return the table of a limit if it has known keys alone."""
         if not isinstance(table, Mapping):
             self.document.error(f"{name_of(path)} is a table of keys and values, not {table!r}", *path)
             return None
@@ -164,7 +163,6 @@ class LimitsReader:
         return None if unknown else table
 
     def _limit(self, given: Table, path: tuple[str, ...], unit: str | None) -> Limit:
-        """Return a limit in the unit of its parameter; errors are reported, and left out."""
         plain = {key: self._in(value, key, unit, path) if key in _QUANTITIES else value for key, value in given.items()}
         try:
             read = pydantic.TypeAdapter(Limit).validate_python(plain)
@@ -178,7 +176,6 @@ class LimitsReader:
         return replace(read, unit=unit, source=str(self.document.place(*path)))
 
     def _in(self, value: object, key: str, unit: str | None, path: tuple[str, ...]) -> float | None:
-        """Return a quantity of a limit in the unit of its parameter; a rate in that per second."""
         where = f"[{'.'.join(path)}] {key} = {value!r}"
         if isinstance(value, bool) or not isinstance(value, str | float | int):
             self.document.error(f"{where} is not a quantity", *path, key)

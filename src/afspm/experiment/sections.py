@@ -136,7 +136,6 @@ def keys_of(kind: type) -> dict[str, object]:
 
 
 def _fields_at(kind: type, location: tuple[str | int, ...]) -> tuple[str, ...]:
-    """The names that are valid where an error occurred: those of the (sub)section around it."""
     here = kind
     for part in location[:-1]:
         here = next(_sections_in(keys_of(here).get(str(part))), here)
@@ -144,7 +143,6 @@ def _fields_at(kind: type, location: tuple[str | int, ...]) -> tuple[str, ...]:
 
 
 def _sections_in(annotation: object) -> Iterator[type]:
-    """Return the sections that an annotation speaks of: itself, or within a union or a tuple."""
     if isinstance(annotation, type) and (issubclass(annotation, pydantic.BaseModel) or is_dataclass(annotation)):
         yield annotation
     for inner in get_args(annotation):

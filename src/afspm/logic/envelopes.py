@@ -182,7 +182,7 @@ class Envelopes:
         if (own := self._history.get(message)) is not None:
             return own
         try:
-            return wire.declaration(wire.message_of(message)).history
+            return wire.declaration(message).history
         except WireError:
             return 1
 

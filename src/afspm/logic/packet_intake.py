@@ -24,6 +24,7 @@ from afspm.model import (
 from afspm.wire.messages import CONTROL_STATE, SPECTRUM
 
 _MOST_LOGGED = 1000
+_STATE, _TRANSLATOR = wire.MessageKind.STATE, Role.TRANSLATOR
 _DOUBT = (
     "the translator is of version 1: those of the published implementation for Nanonis and Asylum send the values of a "
     "spectrum variable after variable; if curves look scrambled, set spectra_by_variable = true in [control]"
@@ -52,7 +53,7 @@ def take_packet(draft: StateDraft, event: PacketIn) -> None:
 
 def _is_state(message: str) -> bool:
     known = wire.declaration(message)
-    return known.kind is wire.MessageKind.STATE and known.source is Role.TRANSLATOR
+    return known.kind is _STATE and known.source is _TRANSLATOR
 
 
 def _published(draft: StateDraft, packet: Packet, header: PacketHeader) -> Publish | None:
@@ -62,7 +63,7 @@ def _published(draft: StateDraft, packet: Packet, header: PacketHeader) -> Publi
         return None
     try:
         if env.settings.control.spectra_by_variable and header.message == SPECTRUM.name:
-            packet = Packet(packet.envelope, env.codec.by_point(packet.payload), packet.time_ns)
+            packet = Packet(packet.envelope, wire.by_point(packet.payload), packet.time_ns)
         if env.frame is not None:
             packet = env.frame.incoming(packet, header, draft.now_ns)
         taken = env.cache.take(packet, header, draft.now_ns)

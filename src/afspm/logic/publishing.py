@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from afspm import wire
 from afspm.logic import answers
 from afspm.logic.arbitration import may
 from afspm.logic.events import Publish, RequestIn
@@ -33,7 +34,7 @@ def publish_entries(draft: StateDraft) -> None:
 
 def publish_for_process(draft: StateDraft, event: RequestIn) -> None:
     """Publish what a process tells; a supervisor is told in return what it is to do."""
-    codec, told = draft.env.codec, announcement(event, draft.env.codec)
+    told = announcement(event, draft.env.codec)
     if not told.envelope:
         answers.answer(draft, event, ControlResponse.FAILURE, told.why)
         return
@@ -48,7 +49,7 @@ def publish_for_process(draft: StateDraft, event: RequestIn) -> None:
     # if it is published already, we were killed before we could answer
     if not draft.env.cache.holds(told.envelope, payload):
         publish(draft, told.envelope, payload)
-    answers.answer(draft, event, ControlResponse.SUCCESS, payload=codec.encode_orders(orders))
+    answers.answer(draft, event, ControlResponse.SUCCESS, payload=wire.encode_orders(orders))
     draft.end = draft.end.processes_told(draft.supervisors.states_of(event.name), draft.now_s)
 
 

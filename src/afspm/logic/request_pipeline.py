@@ -426,7 +426,7 @@ def read_ahead(draft: StateDraft) -> None:
 
 def _read(draft: StateDraft, name: str, on_answer: OwnAnswer) -> None:
     parameter = Parameter(name)
-    request = Request(_PARAM, parameter, draft.env.codec.encode(parameter))
+    request = Request(_PARAM, parameter)
     draft.forwarder, _ = draft.forwarder.ask_own(request, draft.now_s, on_answer)
 
 

@@ -125,7 +125,6 @@ def _restore(core: SchedulerCore, state: StateFile, log: Path | None) -> None:
 
 
 def _section(type_: type[T], plain: Mapping[str, object], name: str) -> T:
-    """Raises ConfigError, naming the section: the launch line holds settings that are none, or make no sense."""
     try:
         made: T = from_plain(type_, plain)
     except (TypeError, ValueError, KeyError, AttributeError) as error:
@@ -134,7 +133,6 @@ def _section(type_: type[T], plain: Mapping[str, object], name: str) -> T:
 
 
 def _mapping(name: str) -> EnvelopeMapping:
-    """The user's function "module.name"."""
     module, _, function = name.rpartition(".")
     try:
         mapping = getattr(importlib.import_module(module), function)

@@ -17,7 +17,7 @@ What must hold: a name is declared once; no set, table or tuple of message names
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Final, TypeVar
 
@@ -75,6 +75,7 @@ class MessageDeclaration:
         event: its kind among the events of the gateway; empty: it is not streamed.
         in_past: an overview of an earlier part of a run needs all of its packets, not the newest alone.
         in_version_1: a cache of version 1 knows it, which ends over any other.
+        name: of the message, with which its envelopes begin.
     """
 
     type: type[Message]
@@ -89,15 +90,13 @@ class MessageDeclaration:
     event: str = ""
     in_past: bool = False
     in_version_1: bool = False
+    name: str = field(init=False)
 
     def __post_init__(self) -> None:
+        # kept, since each packet is compared with some: reading the descriptor takes longer
+        object.__setattr__(self, "name", self.type.DESCRIPTOR.name)
         if not self.handler:
             object.__setattr__(self, "handler", f"on_{snake_case(self.name)}")
-
-    @property
-    def name(self) -> str:
-        """The name of the message, with which its envelopes begin."""
-        return self.type.DESCRIPTOR.name
 
     @property
     def has_values(self) -> bool:

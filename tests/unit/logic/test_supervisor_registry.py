@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from logic_lab import Lab, published, replies
 
+from afspm import wire
 from afspm.logic.arbitration import RoleTable, Rules
 from afspm.logic.events import SaveState
 from afspm.logic.settings import SchedulerSettings
@@ -54,7 +55,7 @@ def tell(lab: Lab, thing: Any, name: str = HOST, id_: str = "", user: str | None
 
 def orders(lab: Lab, response: Response) -> tuple[str, ...]:
     assert response.code == OK, response
-    return tuple(lab.codec.decode(response.payload))
+    return wire.decode_orders(response.payload)
 
 
 def order(lab: Lab, process: str, who: str = "dashboard:Ada") -> Response:
