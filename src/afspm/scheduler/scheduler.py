@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from afspm.errors import ConfigError, FileError
+from afspm.errors import ConfigError, FileError, InvalidValue
 from afspm.exit_codes import ExitCode
 from afspm.logic.envelopes import CacheSettings, EnvelopeMapping, Envelopes
 from afspm.logic.fencing import Epoch
@@ -40,6 +40,9 @@ class Scheduler:
         control: the section [control] of the experiment file: `ControlSettings` as plain data.
         limits: the section [limits]: `ExperimentLimits`.
         cache: the section [cache]: `CacheSettings`.
+
+    Raises:
+        ConfigError: a setting is unknown, or can't be used.
     """
 
     def __init__(
@@ -48,9 +51,9 @@ class Scheduler:
         limits: Mapping[str, object] | None = None,
         cache: Mapping[str, object] | None = None,
     ) -> None:
-        self._control = control or {}
-        self._limits = limits or {}
-        self._cache = cache or {}
+        self._control = _section(ControlSettings, control or {}, "control")
+        self._limits = _section(ExperimentLimits, limits or {}, "limits")
+        self._cache = _section(CacheSettings, cache or {}, "cache")
 
     def run_process(self, context: ProcessContext) -> int:
         """Run until the experiment ends or we are told to stop; returns an exit code.
@@ -87,13 +90,16 @@ class Scheduler:
         return ExitCode.ENDED if shell.ended else ExitCode.ORPHAN
 
     def _settings(self, context: ProcessContext) -> SchedulerSettings:
-        launch, cache = context.launch, _section(CacheSettings, self._cache, "cache")
-        control = _section(ControlSettings, self._control, "control")
+        launch, control, cache = context.launch, self._control, self._cache
+        try:
+            rules = control.rules(context.problems)
+        except InvalidValue as error:
+            raise ConfigError(error.what, where="[control] end_on", hint=error.hint) from error
         return SchedulerSettings(
             control=replace(control, request_timeout_s=launch.request_timeout_s),
-            rules=control.rules(context.problems),
+            rules=rules,
             watchdog=control.watchdog(),
-            limits=_section(ExperimentLimits, self._limits, "limits"),
+            limits=self._limits,
             envelopes=Envelopes(cache.rules, _mapping(cache.mapping) if cache.mapping else None, cache.history),
             run=RunFacts(dict(launch.clock), launch.run, launch.simulated, asdict(versions_here())),
         )
