@@ -16,11 +16,16 @@ from typing import Any
 
 import python_api
 
-from afspm import Component, entry_points
+from afspm import Component, entry_points, wire
 from afspm.logic import arbitration, diagram
+from afspm.logic.arbitration import RoleTable
+from afspm.logic.envelopes import CacheRule, CacheSettings
+from afspm.logic.limits import Limit
+from afspm.logic.settings import ControlSettings
 from afspm.microscopes.simulator import Simulator
 from afspm.microscopes.simulator.faults import Fault
 from afspm.microscopes.simulator.instrument import PanelEvent
+from afspm.model import Role
 from afspm.simulation.drift import Relaxation
 from afspm.simulation.surfaces import KINDS
 from afspm.simulation.world import WorldSettings
@@ -29,6 +34,7 @@ from afspm.testing.commissioning.steps import OPERATIONS
 from afspm.units import Unit
 
 ROOT = Path(__file__).resolve().parents[1]
+SET_BY_AFSPM = ("unit", "source")  # of a limit: no keys of the file
 BLOCK = re.compile(r"(<!-- from the code: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -119,6 +125,51 @@ def simulator_page() -> str:
     parts += [_table_page("relaxing, in drift", Relaxation)]
     parts += [_table_page("each of faults", Fault), _table_page("each of panel", PanelEvent)]
     return "\n".join(parts)
+
+
+def section(cls: type) -> str:
+    """A table of the experiment file that a dataclass describes: keys, defaults if there are any, and meanings."""
+    _, meanings = _docstring(cls, "Attributes")
+    hints, key_of = typing.get_type_hints(cls, include_extras=True), vars(cls)["__pydantic_config__"]["alias_generator"]
+    rows = []
+    for one in dataclasses.fields(cls):
+        default = one.default if one.default_factory is dataclasses.MISSING else None
+        shown = "none" if default in (None, ()) else _value(default, hints[one.name], ())
+        if key_of(one.name) not in SET_BY_AFSPM:
+            rows.append((f"`{key_of(one.name)}`", shown, meanings[one.name].rstrip(".")))
+    if all(shown == "none" for _, shown, _ in rows):
+        rows = [(key, meaning) for key, _, meaning in rows]
+    heads = ("key", "default", "meaning") if len(rows[0]) == 3 else ("key", "meaning")
+    return _markdown(heads, rows)
+
+
+def messages() -> str:
+    """Each message that travels in a packet, as it is declared."""
+    rows = [
+        (
+            f"`{one.name}`",
+            PUBLISHERS[one.source],
+            _kept(one),
+            f"`{one.handler}`",
+            f"`{one.event}`" if one.event else "—",
+        )
+        for one in wire.declared()
+        if one.source is not None
+    ]
+    return _markdown(("message", "published by", "kept for late joiners", "handler", "event of the gateway"), rows)
+
+
+PUBLISHERS = {Role.TRANSLATOR: "translator", Role.SCHEDULER: "scheduler", Role.COMPONENT: "components"}
+
+
+def _kept(message: wire.MessageDeclaration) -> str:
+    count = {0: "none", 1: "the newest"}.get(message.history, f"the newest {message.history}")
+    return f"{count} of each envelope" if message.named else count
+
+
+def _markdown(heads: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    lines = [heads, ("---",) * len(heads), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def _table_page(title: str, cls: type) -> str:
@@ -231,7 +282,7 @@ def _value(default: Any, hint: Any, metadata: Any) -> str:
     if isinstance(default, bool):
         return f"`{str(default).lower()}`"
     if isinstance(default, (list, tuple)):
-        return f"`{list(default)}`"
+        return f"`{list(default)}`".replace("'", '"')
     if unit := _unit(hint, metadata):
         return f"`{default:g} {unit}`"
     return f"`{default!r}`".replace("'", '"')
@@ -245,6 +296,12 @@ PARTS: dict[str, Callable[[], str]] = {
     "components": component_pages,
     "simulator": simulator_page,
     "python-api": python_api.python_api,
+    "control": lambda: section(ControlSettings),
+    "roles": lambda: section(RoleTable),
+    "limit": lambda: section(Limit),
+    "cache": lambda: section(CacheSettings),
+    "cache-rule": lambda: section(CacheRule),
+    "messages": messages,
 }
 
 

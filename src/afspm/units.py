@@ -96,11 +96,13 @@ class Unit:
         si: the SI unit that the component gets, e.g. "m".
         is_written: whether the file has to write a unit, where a plain number could mean several (seconds, minutes).
         least: the smallest value, in that unit.
+        above: each value is above it.
     """
 
     si: str
     is_written: bool = False
     least: float = -math.inf
+    above: float = -math.inf
 
     def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> object:
         """Makes pydantic read the text too. Called by it alone, so that we need not load it here."""
@@ -123,11 +125,14 @@ class Unit:
             raise UnitError(f"{value!r} is not a finite number")
         if number < self.least:
             raise UnitError(f"{value!r} is below {self.least:g} {self.si}", hint=_hint(self.si))
+        if number <= self.above:
+            raise UnitError(f"{value!r} is not above {self.above:g} {self.si}", hint=_hint(self.si))
         return number
 
 
 Length = Annotated[float, Unit("m")]
 Duration = Annotated[float, Unit("s", least=0.0)]
+PositiveDuration = Annotated[float, Unit("s", above=0.0)]
 Period = Annotated[float, Unit("s", is_written=True, least=0.0)]
 """A duration on which a night depends: 10 may mean seconds or minutes, so the file names the unit."""
 PollPeriod = Annotated[float, Unit("s", least=1e-3)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 from typing import Any
 
+from afspm import wire
 from afspm.model import (
     RELAY_REQUEST,
     RESTART_REQUEST,
@@ -392,7 +393,7 @@ class Teller(Client):
                 "ProcessStates", self.codec.encode(ProcessStates(now_ns, self.name, self.processes()))
             )
             response = yield from self.ask(RELAY_REQUEST, told)
-            for name in self.codec.decode(response.payload) if response.code == _OK else ():
+            for name in wire.decode_orders(response.payload) if response.code == _OK else ():
                 self.ordered += 1
                 self.restart(name)
             yield from self.sleep(5.0)

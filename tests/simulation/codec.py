@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from afspm.model import Parameter
@@ -25,18 +24,9 @@ class TableCodec:
     def decode(self, payload: bytes | memoryview) -> Any:
         return self._objects[bytes(payload)]
 
-    def encode_orders(self, restart: Sequence[str]) -> bytes:
-        return self.encode(tuple(restart))
-
-    def encode_action(self, name: str) -> bytes:
-        return self.encode(name)
-
     def decode_parameter(self, payload: bytes) -> Parameter | None:
         thing = self.decode(payload)
         return thing if isinstance(thing, Parameter) else None
-
-    def by_point(self, spectrum: bytes | memoryview) -> bytes:
-        return bytes(spectrum)
 
     def decode_packet(self, message: str, payload: bytes | memoryview) -> Any:
         return self.decode(payload)

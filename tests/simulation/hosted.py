@@ -15,7 +15,7 @@ from afspm import wire
 from afspm.client.component import Component
 from afspm.launch import Launch, Sockets
 from afspm.model import Packet, Request, Response
-from afspm.process.context import MEASURED_MESSAGES, STATE_MESSAGES, ProcessActivity, ProcessContext
+from afspm.process.context import ProcessActivity, ProcessContext
 from afspm.process.memory import Memory
 from afspm.translator.driver import Driver
 from afspm.translator.translator import Translator
@@ -155,9 +155,7 @@ class HostedComponent(HostedProcess):
         self._inbox = []
         self._newest = {}
         self._line = ControlLine(self.timeline, self._weather, self, self._scheduler, self.name)
-        self._feed = Feed(
-            self.timeline, self._weather, self, self._scheduler, sorted({*STATE_MESSAGES, *MEASURED_MESSAGES})
-        )
+        self._feed = Feed(self.timeline, self._weather, self, self._scheduler, sorted(wire.followed_messages()))
 
     def disconnect(self) -> None:
         self._line.close()

@@ -177,7 +177,7 @@ class Invariants:
         holder = host.core.control.holder
         if holder is None or (absent_since_s := self._absent_since_s.get(holder, 0.0)) is None:
             return
-        allowed_s = max(self._settings.grace_s, self._settings.restart_grace_s) + _SLACK_S
+        allowed_s = max(self._settings.control.grace_s, self._settings.waits.restart_grace_s) + _SLACK_S
         since_s = max(absent_since_s, self._held_since_s, host.since_s)
         self._must(
             now_s - since_s <= allowed_s, f"{holder} has been dead for {now_s - since_s:.1f} s and is in control"
@@ -185,7 +185,7 @@ class Invariants:
 
     def _lease(self, host: SchedulerHost) -> None:
         """Nobody keeps control by doing nothing."""
-        lease_s = self._settings.lease_s
+        lease_s = self._settings.control.lease_s
         if lease_s is None:
             return
         now_ns = self._timeline.now_ns()
@@ -250,9 +250,9 @@ class Invariants:
         while self._open:
             key, (since_s, _) = next(iter(self._open.items()))
             since_s = max(since_s, host.since_s)
-            allowed_s = self._settings.request_timeout_s + _SLACK_S
+            allowed_s = self._settings.control.request_timeout_s + _SLACK_S
             if host.core.control.ended:  # the answers wait for the tip to be away, but not for ever
-                allowed_s += self._settings.patience_s
+                allowed_s += self._settings.waits.answer_s
             if now_s - since_s <= allowed_s:
                 return
             self.fail(f"{key} was accepted {now_s - since_s:.1f} s ago and has no answer")

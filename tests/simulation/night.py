@@ -10,7 +10,7 @@ from afspm.logic.arbitration import Cause, RoleTable, Rules
 from afspm.logic.envelopes import Envelopes
 from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.logic.microscope_status import FEEDBACK_OFF
-from afspm.logic.settings import SchedulerSettings
+from afspm.logic.settings import ControlSettings, SchedulerSettings
 from afspm.logic.supervision.child import ChildPolicy
 from afspm.logic.supervision.liveness import LivenessPolicy
 from afspm.logic.supervision.restart import RestartPolicy
@@ -392,10 +392,10 @@ def _settings(plan: Plan) -> SchedulerSettings:
     )
     return SchedulerSettings(
         rules=Rules(
-            RoleTable(end=("dawn",), mode=_PEOPLE, clear=_PEOPLE, operate=("adjuster",)),
+            RoleTable(end_experiment=("dawn",), set_mode=_PEOPLE, clear_problems=_PEOPLE, operate=("adjuster",)),
             adjustable=frozenset({names.ZCTRL_SETPOINT}),
         ),
-        lease_s=plan.lease_s,
+        control=ControlSettings(lease_s=plan.lease_s, grace_s=10.0),
         watchdog=watchdog,
         limits=limits,
         envelopes=Envelopes(),

@@ -232,7 +232,7 @@ def entries_are_not_kept_over_a_kill(patch: Patch) -> None:
     real = PacketCache.restore
 
     def restore(self: PacketCache, packets: Any, *args: Any) -> None:
-        real(self, [entry for entry in packets if entry[0].envelope != event_log.ENTRIES], *args)
+        real(self, [entry for entry in packets if entry[0].envelope != "JournalEntries"], *args)
 
     patch.setattr(PacketCache, "restore", restore)
 

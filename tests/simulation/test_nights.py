@@ -69,7 +69,7 @@ def test_who_has_ended_for_good_loses_control_as_soon_as_its_supervisor_tells() 
         is_over = "crasher" in (state.name for state in night.keeper.states() if state.condition is not _ALIVE)
         if is_over and night.scheduler.core.control.holder == crasher.name:
             over_s = min(over_s, night.timeline.monotonic_s())
-            assert night.timeline.monotonic_s() - over_s < night.settings.grace_s / 2.0
+            assert night.timeline.monotonic_s() - over_s < night.settings.control.grace_s / 2.0
     assert over_s < math.inf
 
 

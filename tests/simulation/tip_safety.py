@@ -84,7 +84,7 @@ class TipSafety:
         microscope, now_s = self._microscope, self._timeline.monotonic_s()
         if not (self._unattended and microscope.endangers_tip and microscope.habits.retracts):
             return
-        has_waited = not tip_is_safe and now_s - self._ended_s >= self._settings.request_timeout_s
+        has_waited = not tip_is_safe and now_s - self._ended_s >= self._settings.control.request_timeout_s
         self._must(has_waited or self._is_disturbed(host), "the experiment ended with the tip in danger")
 
     def _forget_told(self) -> None:
@@ -92,7 +92,7 @@ class TipSafety:
         now_s, settings = self._timeline.monotonic_s(), self._settings
         if self._microscope.endangers_tip:
             self._safe_since_s = now_s
-        elif now_s - self._safe_since_s > settings.request_timeout_s + settings.patience_s:
+        elif now_s - self._safe_since_s > settings.control.request_timeout_s + settings.waits.answer_s:
             self._is_told = False
 
     def _changed(self, before: ArbitrationState, after: ArbitrationState, who: str) -> None:
@@ -107,12 +107,12 @@ class TipSafety:
     def _roles(self, before: ArbitrationState, after: ArbitrationState, who: str) -> None:
         roles = self._settings.rules.roles
         if after.mode is not before.mode:
-            self._must(who in (roles.mode or ()), f"{who or 'nobody'} switched the mode")
+            self._must(who in (roles.set_mode or ()), f"{who or 'nobody'} switched the mode")
         if after.ended and not before.ended:
             self._ended_s = self._timeline.monotonic_s()
-            self._must(who in (roles.end or ()), f"{who or 'nobody'} ended the experiment")
+            self._must(who in (roles.end_experiment or ()), f"{who or 'nobody'} ended the experiment")
         if before.problems.get(_MALFUNCTION) == SCHEDULER and _MALFUNCTION not in after.problems:
-            may = who in (roles.clear or ()) or (who == before.holder and before.solving == _MALFUNCTION)
+            may = who in (roles.clear_problems or ()) or (who == before.holder and before.solving == _MALFUNCTION)
             self._must(may, f"{who or 'nobody'} cleared the malfunction that only a person may")
 
     def _look(self, host: SchedulerHost) -> None:
@@ -128,7 +128,8 @@ class TipSafety:
             return
         settings = self._settings
         since_s = max(self._danger_since_s, host.since_s, self._microscope.since_s, self._disturbed_until_s)
-        allowed_s = settings.request_timeout_s + settings.patience_s + settings.watchdog.longest_s + _SLACK_S
+        answered_s = settings.control.request_timeout_s + settings.waits.answer_s
+        allowed_s = answered_s + settings.watchdog.longest_s + _SLACK_S
         is_in_time = now_s - since_s <= (_SLACK_S if not self._microscope.habits.retracts else allowed_s)
         self._must(
             self._is_told or is_in_time, f"the tip has been in danger for {now_s - since_s:.1f} s, and nobody was told"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from afspm.logic.arbitration import ArbitrationState
-from afspm.logic.event_log import CONTROL, ENTRIES, PERIOD_S, SCHEDULER
+from afspm.logic.event_log import CONTROL, PERIOD_S, SCHEDULER
 from afspm.logic.events import Effect, Input, Publish, Reply
 from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.model import (
@@ -23,6 +23,7 @@ from afspm.model import (
     component_of,
     names,
 )
+from afspm.wire.messages import JOURNAL
 from tests.simulation.codec import TableCodec
 from tests.simulation.scheduler import SchedulerHost
 from tests.simulation.timeline import Timeline
@@ -105,7 +106,7 @@ class Written:
             self._begin(host)
         if isinstance(effect, Reply):
             self._reply(effect)
-        elif isinstance(effect, Publish) and effect.packet.envelope == ENTRIES:
+        elif isinstance(effect, Publish) and effect.packet.envelope == JOURNAL.name:
             self._publish(effect.packet, at_the_end=host.core.control.ended)
 
     def executed(self, request: Request) -> None:
@@ -126,7 +127,7 @@ class Written:
         """After each step."""
         if host.life != self._life:
             self._begin(host)
-        if any(isinstance(effect, Publish) and effect.packet.envelope == ENTRIES for effect in effects):
+        if any(isinstance(effect, Publish) and effect.packet.envelope == JOURNAL.name for effect in effects):
             is_so = _Derived.of(host.core.control)
             self._must(self._derived == is_so, f"by what is written {self._derived}, in truth {is_so}")
         now_s = self._timeline.monotonic_s()

@@ -11,8 +11,9 @@ from typing import Any
 
 from afspm_process import AfspmProcess
 
-from afspm.client.follower import SMALL, Follower
-from afspm.model import ControlState, JournalEntry
+from afspm import wire
+from afspm.client.follower import Follower
+from afspm.model import ControlState, JournalEntry, Role
 
 DEADLINE_S = 30.0
 Opened = Callable[..., Any]
@@ -75,7 +76,8 @@ class Night(AfspmProcess):
         super().__init__("run", str(file), "--runs", str(folder / "runs"), *options, folder=folder)
         try:
             self.url = self.wait_for_url("dashboard")
-            self.follower = Follower(self.folder, "terminal", (*SMALL, "Scan2d", "Spec1d", "ScanLines"))
+            published = [one.name for one in wire.declared() if one.source in (Role.TRANSLATOR, Role.SCHEDULER)]
+            self.follower = Follower(self.folder, "terminal", tuple(published))
         except BaseException:
             super().close()
             raise

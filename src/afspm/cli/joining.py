@@ -41,10 +41,13 @@ def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
     Args:
         lines: also of scans that are being taken.
     """
-    from afspm.client.follower import LINES, SMALL, Follower
+    from afspm import wire
+    from afspm.client.follower import Follower
+    from afspm.wire.messages import SCAN_LINES
 
     folder = _running(where)
-    with Follower(folder, TERMINAL, (*SMALL, LINES) if lines else SMALL) as follower:
+    envelopes = (*wire.messages_without_values(), *([SCAN_LINES.name] if lines else []))
+    with Follower(folder, TERMINAL, envelopes) as follower:
         with _only_if_running(folder):
             follower.catch_up()
         if follower.ended:

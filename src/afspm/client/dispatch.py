@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -13,16 +12,6 @@ from afspm.model import ControlState, Packet
 
 if TYPE_CHECKING:
     from afspm.client.component import Component
-
-HANDLERS = {
-    "Scan2d": "on_scan",
-    "Spec1d": "on_spectrum",
-    "ScopeStateMsg": "on_state",
-    "ControlState": "on_control",
-    "ScanParameters2d": "on_scan_parameters",
-    "ZCtrlParameters": "on_feedback",
-    "ProbePosition": "on_probe_position",
-}
 
 
 class MessageDispatcher:
@@ -85,7 +74,7 @@ class MessageDispatcher:
         return self._handler(message) is not None or (message == "ControlState" and self._has("on_problem"))
 
     def _handler(self, message: str) -> Callable[[str, object], None] | None:
-        name = HANDLERS.get(message) or f"on_{snake_case(message)}"
+        name = wire.declaration(message).handler
         if self._has(name):
             handle: Callable[[object], None] = getattr(self._component, name)
             return lambda envelope, thing: handle(thing)
@@ -99,8 +88,3 @@ class MessageDispatcher:
 def overrides(thing: object, base: type, name: str) -> bool:
     """Return whether the class of `thing` has another `name` than `base`."""
     return getattr(type(thing), name, None) is not getattr(base, name, None)
-
-
-def snake_case(name: str) -> str:
-    """Return "SpatialROIWithScoreList" as "spatial_roi_with_score_list"."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower()

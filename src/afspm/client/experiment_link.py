@@ -23,7 +23,7 @@ from afspm.model import (
     ResponseDetail,
     request_name,
 )
-from afspm.process.context import STATE_MESSAGES, ProcessActivity
+from afspm.process.context import ProcessActivity
 from afspm.process.parent import StopRequested
 from afspm.transport.port import (
     CaughtUp,
@@ -319,7 +319,7 @@ class ExperimentLink:
     def _look_at(self, packet: Packet) -> None:
         try:
             message = wire.message_of(packet.envelope)
-            if message in STATE_MESSAGES:
+            if wire.declaration(message).kind is wire.MessageKind.STATE:
                 self.view.take(message, wire.decode(message, packet.payload))
         except WireError as error:
             self.log.debug("a packet can't be read: %s", error)

@@ -18,12 +18,6 @@ from afspm.record.overview import Overview
 from afspm.record.run_lock import cut_off_message
 from afspm.transport.zmq_port import open_port
 
-SMALL = (
-    "ScopeStateMsg", "ControlState", "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "DriftMapping",
-    "DriftRescan", "JournalEntries", "ProcessStates", "LogLines", "Progress", "Note",
-)  # fmt: skip
-"""Envelopes of what carries no values of scans and spectra."""
-LINES = "ScanLines"
 HEARD_WITHIN_S = 5.0
 
 
@@ -33,7 +27,7 @@ class Follower:
     Args:
         folder: of the run.
         name: in whose name (and with whose key) it looks on.
-        envelopes: what is subscribed to, or how it begins.
+        envelopes: prefixes of the envelopes to subscribe to; None: all that carry no values of scans and spectra.
 
     Attributes:
         ended: the experiment has ended.
@@ -44,11 +38,12 @@ class Follower:
         ConfigError: it has nobody to connect to.
     """
 
-    def __init__(self, folder: Path, name: str = "terminal", envelopes: tuple[str, ...] = SMALL) -> None:
+    def __init__(self, folder: Path, name: str = "terminal", envelopes: tuple[str, ...] | None = None) -> None:
         guest = guest_of(folder, name)
         register_all(guest.messages)
         # no control: whoever only looks on need not be known to the scheduler
         sockets = dataclasses.replace(guest.sockets, control=None)
+        envelopes = envelopes or wire.messages_without_values()
         self.launch: Launch = dataclasses.replace(guest, sockets=sockets, envelopes=envelopes)
         self.folder = folder
         self.clock: Clock = ExperimentClock.from_dict(guest.clock)

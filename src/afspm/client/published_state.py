@@ -4,15 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 
+from afspm import wire
 from afspm.model import ControlState, Feedback, ProbePosition, ScanParameters, ScopeState, ScopeStatus
-
-_ATTRIBUTES = {
-    "ScopeStateMsg": "status",
-    "ControlState": "control",
-    "ScanParameters2d": "scan_parameters",
-    "ZCtrlParameters": "feedback",
-    "ProbePosition": "probe_position",
-}
 
 
 class PublishedState:
@@ -33,7 +26,7 @@ class PublishedState:
 
     def take(self, message: str, thing: object) -> None:
         """`thing` was published as `message`."""
-        setattr(self, _ATTRIBUTES[message], thing)
+        setattr(self, wire.declaration(message).attribute, thing)
         self._published[message] += 1
 
     def take_time(self, time_ns: int | None) -> None:

@@ -12,70 +12,26 @@ history = 3
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Annotated
 
-from pydantic import Field
-
+from afspm import wire
 from afspm.errors import AfspmError
 from afspm.experiment import class_loader
 from afspm.experiment.document import Document
 from afspm.experiment.published import length_m, wire_of
-from afspm.experiment.sections import Section, parse
-from afspm.experiment.toml_lines import Settings, Table
+from afspm.experiment.sections import parse
+from afspm.experiment.toml_lines import Table
 from afspm.experiment.wiring_classes import WiringClass
-from afspm.logic.envelopes import CacheRule, Envelopes
-from afspm.model import PacketHeader
-from afspm.units import Length
+from afspm.logic.envelopes import CacheRule, CacheSettings, Envelopes
+from afspm.model import PacketHeader, Role
 
-Count = Annotated[int, Field(ge=1)]
-
+STATE = wire.MessageKind.STATE
 _EXAMPLES = (
     PacketHeader("Scan2d", "Height", (1e-6, 1e-6)),
     PacketHeader("Spec1d", kind="IV"),
-    *map(PacketHeader, ("ScopeStateMsg", "ScanParameters2d", "ZCtrlParameters", "ProbePosition")),
+    *(PacketHeader(one.name) for one in wire.declared() if one.kind is STATE and one.source is Role.TRANSLATOR),
 )
-
-
-class CacheRuleSection(Section):
-    """[[cache.rules]]: the first that fits a packet says under which envelope it is kept, and how many are."""
-
-    message: str | None = None
-    channel: str | None = None
-    kind: str | None = None
-    above: Length | None = None
-    up_to: Length | None = None
-    envelope: str | None = None
-    history: Count | None = None
-
-
-class CacheSection(Section):
-    """[cache]. `mapping` names a function of the user's, from a packet's header to its envelope."""
-
-    history: dict[str, Count] = Field(default_factory=dict)
-    mapping: str | None = None
-    rules: tuple[CacheRuleSection, ...] = ()
-
-
-@dataclass(frozen=True)
-class CacheSettings:
-    """The settings of the scheduler's cache."""
-
-    rules: tuple[CacheRule, ...] = ()
-    mapping: str | None = None
-    history: Mapping[str, int] = field(default_factory=dict)
-
-    @property
-    def envelopes(self) -> tuple[str, ...]:
-        """The beginnings of the rules' envelopes, as far as they are fixed."""
-        return tuple(re.split(r"[{}]", rule.envelope)[0] for rule in self.rules if rule.envelope)
-
-    def to_settings(self) -> Settings:
-        """Return it in JSON's types; `CacheRule` by its fields."""
-        rules = [{k: v for k, v in vars(rule).items() if v is not None} for rule in self.rules]
-        return {"rules": rules, "mapping": self.mapping, "history": dict(self.history)}
+"""Headers with which a mapping is tried."""
 
 
 def read(table: Table, logic: Table | None, document: Document) -> CacheSettings:
@@ -84,22 +40,13 @@ def read(table: Table, logic: Table | None, document: Document) -> CacheSettings
     Args:
         logic: the table that the scheduler's cache refers to in the paper's form.
     """
-    section = parse(CacheSection, "cache", dict(table), document)
-    rules = []
-    for i, rule in enumerate(section.rules):
-        try:
-            rules.append(
-                CacheRule(rule.message, rule.channel, rule.kind, rule.above, rule.up_to, rule.envelope, rule.history)
-            )
-        except AfspmError as error:
-            document.error(f"[cache] rules[{i}]: {error.what}", "cache", "rules", i, hint=error.hint)
+    section = parse(CacheSettings, "cache", dict(table), document)
     if section.mapping is not None:
         _check_mapping(section.mapping, document)
-    history = dict(section.history)
-    if logic is not None and wire_of(logic) is WiringClass.CACHE_LOGIC:
-        history = _published_history(logic) | history
-        rules += _published_rules(logic)
-    return CacheSettings(tuple(rules), section.mapping, history)
+    if logic is None or wire_of(logic) is not WiringClass.CACHE_LOGIC:
+        return section
+    history = {**_published_history(logic), **section.history}
+    return CacheSettings(history, (*section.rules, *_published_rules(logic)), section.mapping)
 
 
 def _check_mapping(name: str, document: Document) -> None:

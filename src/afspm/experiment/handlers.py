@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 
 from afspm import wire
 from afspm.client.component import Component
-from afspm.client.dispatch import HANDLERS, snake_case
 from afspm.experiment.findings import closest
 from afspm.experiment.resolution import ResolvedExperiment
 from afspm.model import Role
@@ -45,7 +44,7 @@ def _methods(component: type[Component]) -> Iterator[tuple[str, Callable[..., ob
 
 def _hint_on_name(name: str, resolved: ResolvedExperiment) -> str:
     """Return what to do about a handler that is never called; empty: it is."""
-    valid = {*_CALLED, *(f"on_{snake_case(message)}" for message in wire.known_messages() if message not in HANDLERS)}
+    valid = {*_CALLED, *(message.handler for message in wire.declared())}
     near = closest(name, valid, _NEARLY)
     if name in valid or (near is None and resolved.messages):  # a handler of a message of the user's own
         return ""

@@ -21,40 +21,27 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
-from typing import Annotated, Final, TypeVar
+from dataclasses import dataclass, replace
+from typing import Final
 
 import pydantic
-from pydantic import Field
 
 from afspm.errors import AfspmError
 from afspm.experiment.document import Document
 from afspm.experiment.findings import nearest
 from afspm.experiment.sections import Section, parse
-from afspm.experiment.toml_lines import Settings, Table
-from afspm.experiment.validation_messages import report
+from afspm.experiment.toml_lines import Table
+from afspm.experiment.validation_messages import name_of, report
 from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.model import Parameter, Region, names
-from afspm.units import Angle, Duration, Length, parse_quantity, require_unit, si, si_unit
+from afspm.plain_data import Count
+from afspm.units import Angle, Length, parse_quantity, require_unit, si, si_unit
 
 Quantity = str | float
+_QUANTITIES: Final = ("min", "max", "step", "rate")
+_OF_ACTION: Final = ("only", "every")
+_OF_PARAMETER: Final = (*_QUANTITIES, *_OF_ACTION)
 Pair = tuple[Length, Length]
-
-
-class ActionLimit(Section):
-    """[limits.actions.<name>]."""
-
-    only: tuple[str, ...] | None = None
-    every: Annotated[Duration, Field(gt=0)] | None = None
-
-
-class ParameterLimit(ActionLimit):
-    """[limits.<parameter>]."""
-
-    min: Quantity | None = None
-    max: Quantity | None = None
-    step: Quantity | None = None
-    rate: Quantity | None = None
 
 
 class RegionSection(Section):
@@ -71,10 +58,9 @@ class LimitsSection(Section):
     """The keys of [limits] that are not parameters."""
 
     region: RegionSection | None = None
-    most_pixels: Annotated[int, Field(gt=0)] = 8192 * 8192
+    most_pixels: Count = ExperimentLimits.most_pixels
 
 
-L = TypeVar("L", bound=ActionLimit)
 _OWN: Final = (*LimitsSection.model_fields, "actions")
 
 
@@ -128,65 +114,72 @@ class LimitsReader:
             self.document.error(f"[limits] there is no parameter {name!r}", "limits", name, hint=hint)
             return None
         path = ("limits", name)
-        read = self._validated(ParameterLimit, table, path)
-        if read is None:
+        given = self._table(table, path, _OF_PARAMETER)
+        if given is None:
             return None
-        unit = self._unit(name, read, path)
-        low, high, step, rate = (self._in(read, key, unit, path) for key in ("min", "max", "step", "rate"))
-        for key, value in (("step", step), ("rate", rate)):
+        unit = self._unit(name, given, path)
+        read = self._limit(given, path, unit)
+        for key, value in (("step", read.step), ("rate", read.rate_per_s)):
             if value is not None and value <= 0:
                 self.document.error(f"[limits.{name}] {key} is not above zero", *path, key)
-        if low is not None and high is not None:
-            if low > high:
-                what = f"[limits.{name}] min = {read.min!r} is above max = {read.max!r}"
+        if read.low is not None and read.high is not None:
+            if read.low > read.high:
+                what = f"[limits.{name}] min = {given['min']!r} is above max = {given['max']!r}"
                 self.document.error(what, *path, "min", hint="nothing would be allowed")
-            elif step is not None and step > high - low:
+            elif read.step is not None and read.step > read.high - read.low:
                 self.document.warning(f"[limits.{name}] step is larger than the whole range", *path, "step")
-        return Limit(low, high, step, rate, read.every, read.only, unit, str(self.document.place(*path)))
+        return read
 
-    def _unit(self, name: str, read: ParameterLimit, path: tuple[str, ...]) -> str | None:
+    def _unit(self, name: str, given: Table, path: tuple[str, ...]) -> str | None:
         known = self.parameters.get(name)
-        if known is not None or all(value is None for value in (read.min, read.max, read.step, read.rate)):
+        if known is not None or not any(key in given for key in _QUANTITIES):
             return known
-        given = _unit_given(read)
-        if given is None:
+        unit = _unit_given(given)
+        if unit is None:
             if name in names.BASE_PARAMETERS:
                 what = f"[limits.{name}] has no unit, and the microscope's own unit is not known before it runs"
                 self.document.error(what, *path, hint='give one, as in "500 pA"')
             return ""
-        what = f"[limits.{name}] counts in {given}, as the microscope's own unit is not known before it runs"
-        hint = f"values without a unit are taken to be in {given}: see that the translator means the same"
+        what = f"[limits.{name}] counts in {unit}, as the microscope's own unit is not known before it runs"
+        hint = f"values without a unit are taken to be in {unit}: see that the translator means the same"
         self.document.warning(what, *path, hint=hint)
-        return given
+        return unit
 
     def _action(self, name: str, table: object) -> Limit | None:
         path = ("limits", "actions", name)
         if name not in self._known_actions and (self.actions is not None or not name.startswith("x-")):
             hint = nearest(name, self._known_actions)
             self.document.error(f"[limits.actions] there is no action {name!r}", *path, hint=hint)
-        read = self._validated(ActionLimit, table, path)
-        if read is None:
-            return None
-        return Limit(interval_s=read.every, only=read.only, source=str(self.document.place(*path)))
+        given = self._table(table, path, _OF_ACTION)
+        return None if given is None else self._limit(given, path, None)
 
-    def _validated(self, model: type[L], table: object, path: tuple[str, ...]) -> L | None:
-        try:
-            read = model.model_validate(table)
-        except pydantic.ValidationError as error:
-            report(error, table, path, self.document, lambda _: model.model_fields)
+    def _table(self, table: object, path: tuple[str, ...], known: Collection[str]) -> Table | None:
+        if not isinstance(table, Mapping):
+            self.document.error(f"{name_of(path)} is a table of keys and values, not {table!r}", *path)
             return None
+        unknown = [key for key in table if key not in known]
+        for key in unknown:
+            self.document.error(f"{name_of((*path, key))} is not a setting", *path, key, hint=nearest(key, known))
+        return None if unknown else table
+
+    def _limit(self, given: Table, path: tuple[str, ...], unit: str | None) -> Limit:
+        plain = {key: self._in(value, key, unit, path) if key in _QUANTITIES else value for key, value in given.items()}
+        try:
+            read = pydantic.TypeAdapter(Limit).validate_python(plain)
+        except pydantic.ValidationError as error:
+            report(error, plain, path, self.document)
+            read = Limit()
         for i, who in enumerate(read.only or ()):
             if who not in self.components:
                 what = f"[{'.'.join(path)}] only: there is no component {who!r}"
                 self.document.error(what, *path, "only", i, hint=nearest(who, self.components))
-        return read
+        return replace(read, unit=unit, source=str(self.document.place(*path)))
 
-    def _in(self, read: ParameterLimit, key: str, unit: str | None, path: tuple[str, ...]) -> float | None:
-        """Return a quantity of a limit in the unit of its parameter; a rate in that per second."""
-        value = getattr(read, key)
-        if value is None:
-            return None
+    def _in(self, value: object, key: str, unit: str | None, path: tuple[str, ...]) -> float | None:
         where = f"[{'.'.join(path)}] {key} = {value!r}"
+        if isinstance(value, bool) or not isinstance(value, str | float | int):
+            self.document.error(f"{where} is not a quantity", *path, key)
+            return None
         try:
             number = _rate(value, unit or "") if key == "rate" else si(value, unit or "")
         except AfspmError as error:
@@ -225,13 +218,13 @@ class LimitsReader:
                 self.document.error(what, "limits", name, "min", hint="no scan would be allowed")
 
 
-def _unit_given(read: ParameterLimit) -> str | None:
-    for key, value in (("min", read.min), ("max", read.max), ("step", read.step), ("rate", read.rate)):
-        if isinstance(value, str):
+def _unit_given(given: Table) -> str | None:
+    for key in _QUANTITIES:
+        if isinstance(value := given.get(key), str):
             with contextlib.suppress(AfspmError):  # reported when the value is read
-                given = parse_quantity(value)[1]
-                over, slash, _ = given.rpartition("/")
-                if unit := si_unit(over if key == "rate" and slash else given):
+                written = parse_quantity(value)[1]
+                over, slash, _ = written.rpartition("/")
+                if unit := si_unit(over if key == "rate" and slash else written):
                     return unit
     return None
 
@@ -246,27 +239,3 @@ def _rate(value: Quantity, unit: str) -> float:
     if not slash:
         return si(f"{number} {given}", f"{unit}/s" if unit else "1/s")
     return si(f"{number} {over}", unit) / si(f"1 {under}", "s")
-
-
-def to_settings(limits: ExperimentLimits) -> Settings:
-    """Return them as the scheduler gets them, in JSON's types; `Limit` and `Region` by their fields."""
-
-    def plain(limit: Limit) -> Settings:
-        fields = {key: value for key, value in asdict(limit).items() if value is not None}
-        return fields | ({"only": sorted(limit.only)} if limit.only is not None else {})
-
-    settings: Settings = {
-        "parameters": {name: plain(limit) for name, limit in limits.parameters.items()},
-        "actions": {name: plain(limit) for name, limit in limits.actions.items()},
-        "most_pixels": limits.most_pixels,
-        "sets": {name: [[one.name, one.value, one.unit] for one in given] for name, given in limits.sets.items()},
-    }
-    if limits.region is not None:
-        region = limits.region
-        settings["region"] = {
-            "center_m": list(region.center_m),
-            "size_m": list(region.size_m),
-            "angle_rad": region.angle_rad,
-        }
-        settings["region_source"] = limits.region_source
-    return settings

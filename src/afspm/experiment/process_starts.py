@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from afspm.addresses import connectable, reaches
 from afspm.errors import ConfigError
-from afspm.experiment import limits_section
 from afspm.experiment.experiment import ProcessStart
 from afspm.experiment.findings import Finding, Level, nearest
 from afspm.experiment.implied_parts import RECORDS
@@ -18,8 +17,8 @@ from afspm.experiment.toml_writer import SECRET
 from afspm.experiment.wiring import ProcessSockets
 from afspm.launch import Launch, Sockets
 from afspm.logic.microscope_status import FEEDBACK_OFF
-from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import Frame, Role
+from afspm.model.snapshot import to_plain
 from afspm.requirements import require
 
 if TYPE_CHECKING:
@@ -161,7 +160,7 @@ def _start(
         ),
         envelopes=process.envelopes,
         problems=resolved.named_problems,
-        request_timeout_s=wires.request_timeout_s or control.request_timeout,
+        request_timeout_s=wires.request_timeout_s or control.request_timeout_s,
         request_retries=control.request_retries if wires.request_retries is None else wires.request_retries,
         keys=_keys(resolved, links, addresses),
         messages=resolved.messages,
@@ -252,25 +251,20 @@ def _solved(resolved: ResolvedExperiment, without: Collection[str]) -> tuple[str
 
 def _retracts(resolved: ResolvedExperiment) -> bool:
     """Return whether a tip without feedback is to be retracted when nobody is in control any more."""
-    control = resolved.sections.control
-    dangerous = WatchdogSettings().dangerous if control.dangerous is None else control.dangerous
-    return control.retract and FEEDBACK_OFF in dangerous
-
-
-_OF_OTHERS = {"idle", "request_timeout", "request_retries", "solved_by_hand"}
-_IN_SECONDS = ("lease", "grace", "malfunction_after")
+    watchdog = resolved.sections.control.watchdog()
+    return watchdog.retract is not None and FEEDBACK_OFF in watchdog.dangerous
 
 
 def _for_scheduler(resolved: ResolvedExperiment) -> Settings:
-    """Return the sections that the scheduler enforces, as arguments of its constructor. Times in s, lengths in m."""
-    dumped = resolved.sections.control.model_dump(mode="json", exclude=_OF_OTHERS)
-    control = {f"{key}_s" if key in _IN_SECONDS else key: value for key, value in dumped.items()}
-    if control["roles"]["operate"] is None:
+    """Return the sections that the scheduler enforces, as arguments of its constructor: plain data, in SI."""
+    control = resolved.sections.control
+    if control.roles.operate is None:
         # components by which a person may command, and a dashboard that joins later, which is under no other's name
         operators = resolved.saying("operates")
-        control["roles"]["operate"] = operators if DASHBOARD in resolved.processes else [*operators, DASHBOARD]
+        operate = operators if DASHBOARD in resolved.processes else [*operators, DASHBOARD]
+        control = replace(control, roles=replace(control.roles, operate=tuple(operate)))
     return {
-        "control": control,
-        "limits": limits_section.to_settings(resolved.limits),
-        "cache": resolved.caching.to_settings(),
+        "control": to_plain(control),
+        "limits": to_plain(resolved.limits),
+        "cache": to_plain(resolved.caching),
     }

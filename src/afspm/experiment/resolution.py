@@ -20,7 +20,6 @@ from afspm.experiment import (
     validation_messages,
     wiring,
 )
-from afspm.experiment.cache_section import CacheSettings
 from afspm.experiment.capabilities import MicroscopeCapabilities
 from afspm.experiment.class_loader import ComponentDeclaration
 from afspm.experiment.document import Document
@@ -30,6 +29,7 @@ from afspm.experiment.planned_measurements import PlannedMeasurements
 from afspm.experiment.sections import ExperimentSections, read_sections
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.wiring import BoundSocket, Wiring, WiringKeys
+from afspm.logic.envelopes import CacheSettings
 from afspm.logic.limits import ExperimentLimits
 from afspm.model import Parameter, ProblemNames, Role
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import is_dataclass
 from datetime import datetime
 from functools import partial
-from typing import Annotated, Literal, TypeVar, get_args
+from typing import Annotated, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import pydantic
 from pydantic import Field, StrictBool
@@ -14,7 +15,9 @@ from afspm.experiment.document import Document
 from afspm.experiment.run_metadata import Orcid
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.validation_messages import report
-from afspm.units import Duration
+from afspm.logic.settings import ControlSettings
+from afspm.plain_data import file_key
+from afspm.units import Duration, PositiveDuration
 
 
 class Section(pydantic.BaseModel):
@@ -23,57 +26,12 @@ class Section(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
-DangerousState = Literal["MOVING", "SCANNING", "COARSE_MOTOR", "BUSY_PARAM", "SPEC", "feedback-off"]
-AdjustableParameter = Literal["zctrl-setpoint", "zctrl-pgain", "zctrl-igain", "tip-bias-voltage"]
-"""What a person may be allowed to set while a component measures: none of it moves the tip elsewhere."""
-PositiveDuration = Annotated[Duration, Field(gt=0)]
-
-
 class ClockSection(Section):
     """[clock]: when the experiment's time begins and how fast it goes (simulated microscopes only)."""
 
     start: datetime | None = None
     speed: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
     waits: StrictBool = True
-
-
-class RolesSection(Section):
-    """[control.roles]: who may do what concerns everyone; None: everyone may."""
-
-    end_experiment: tuple[str, ...] | None = None
-    set_mode: tuple[str, ...] | None = None
-    clear_problems: tuple[str, ...] | None = None
-    operate: tuple[str, ...] | None = None
-    """Who may command the microscope in MANUAL mode; None: the components that are made for it, such as a dashboard."""
-    restart: tuple[str, ...] | None = None
-
-
-class ControlSection(Section):
-    """[control]: how control is given and taken away."""
-
-    lease: PositiveDuration | None = None
-    grace: Annotated[Duration, Field(ge=0)] = 5.0
-    stop_scan_on_problem: StrictBool = True
-    stop_scan_on_manual: StrictBool = True
-    request_timeout: PositiveDuration = 5.0
-    request_retries: Annotated[int, Field(ge=0)] = 3
-    malfunction_after: Annotated[Duration, Field(ge=0)] = 5.0
-    """Real seconds that the microscope may be lost, before that is a malfunction and nobody stays in control."""
-    idle: Literal["end", "stay"] = "end"
-    """Whether the run ends when nothing that acts is left: no plan goes on, and no client is in control."""
-    solved_by_hand: tuple[str, ...] = ("device-malfunction",)
-    """Problems that a person puts right: they may be flagged though no component solves them."""
-    end_on: tuple[str, ...] = ()
-    """Problems that end the experiment when they are flagged."""
-    retract: StrictBool = True
-    """Whether the tip is retracted when control is left in a dangerous state, where the microscope can."""
-    dangerous: tuple[DangerousState, ...] | None = None
-    """Those states; None: what the watchdog takes for dangerous by itself."""
-    adjustable: tuple[AdjustableParameter, ...] = ()
-    """Parameters that who may operate sets in AUTOMATED mode, too, beside the component in control."""
-    spectra_by_variable: StrictBool = False
-    """Whether the translator sends the values of a spectrum variable after variable, as some of version 1 do."""
-    roles: RolesSection = RolesSection()
 
 
 class SecuritySection(Section):
@@ -139,7 +97,7 @@ class ExperimentSections(Section):
     """The sections that mean the same whatever components there are."""
 
     clock: ClockSection = ClockSection()
-    control: ControlSection = ControlSection()
+    control: ControlSettings = ControlSettings()
     security: SecuritySection = SecuritySection()
     restart: RestartSection = RestartSection()
     record: RecordSection = RecordSection()
@@ -157,30 +115,35 @@ def read_sections(tables: Mapping[str, Settings], document: Document) -> Experim
     )
 
 
-S = TypeVar("S", bound=Section)
+S = TypeVar("S")
 
 
-def parse(model: type[S], name: str, table: Settings, document: Document) -> S:
-    """Return the section `[name]`; what is wrong with it is reported, and its defaults returned."""
+def parse(kind: type[S], name: str, table: Settings, document: Document) -> S:
+    """Return the section `[name]`, a model or a dataclass; report errors, and return the defaults then."""
     try:
-        return model.model_validate(table)
+        return pydantic.TypeAdapter(kind).validate_python(table)
     except pydantic.ValidationError as error:
-        report(error, table, (name,), document, partial(_fields_at, model))
-        return model()
+        report(error, table, (name,), document, partial(_fields_at, kind))
+        return kind()
 
 
-def _fields_at(model: type[pydantic.BaseModel], location: tuple[str | int, ...]) -> tuple[str, ...]:
-    """The names that are valid where an error occurred: those of the (sub)section around it."""
-    here: type[pydantic.BaseModel] = model
+def keys_of(kind: type) -> dict[str, object]:
+    """Return the keys of a section in the file, with their annotations."""
+    if isinstance(kind, type) and issubclass(kind, pydantic.BaseModel):
+        return {name: field.annotation for name, field in kind.model_fields.items()}
+    hints = get_type_hints(kind, include_extras=True)
+    return {file_key(name): hint for name, hint in hints.items() if get_origin(hint) is not ClassVar}
+
+
+def _fields_at(kind: type, location: tuple[str | int, ...]) -> tuple[str, ...]:
+    here = kind
     for part in location[:-1]:
-        info = here.model_fields.get(str(part))
-        here = next(_sections_in(info.annotation), here) if info else here
-    return tuple(here.model_fields)
+        here = next(_sections_in(keys_of(here).get(str(part))), here)
+    return tuple(keys_of(here))
 
 
-def _sections_in(annotation: object) -> Iterator[type[pydantic.BaseModel]]:
-    """Return the sections that an annotation speaks of: itself, or within a union or a tuple."""
-    if isinstance(annotation, type) and issubclass(annotation, pydantic.BaseModel):
+def _sections_in(annotation: object) -> Iterator[type]:
+    if isinstance(annotation, type) and (issubclass(annotation, pydantic.BaseModel) or is_dataclass(annotation)):
         yield annotation
     for inner in get_args(annotation):
         yield from _sections_in(inner)

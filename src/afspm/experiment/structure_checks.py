@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Collection, Iterator
 from typing import Final
 
+from afspm import wire
 from afspm.addresses import EXAMPLE, hint_on, is_address, reaches
 from afspm.errors import InvalidValue
 from afspm.experiment import class_loader, wiring
@@ -19,25 +20,8 @@ from afspm.experiment.wiring_classes import WIRE_SETTINGS
 from afspm.model import Role, component_of, is_process_name
 from afspm.model.events import LONGEST_PROCESS_NAME, PERSON
 from afspm.transport.network import is_local
+from afspm.wire.messages import SCAN_LINES
 
-# What translators and schedulers publish by themselves; scans and spectra continue with their kind.
-PUBLISHED: Final = (
-    "Scan2d",
-    "Spec1d",
-    "ScopeStateMsg",
-    "ControlState",
-    "ScanParameters2d",
-    "ZCtrlParameters",
-    "ProbePosition",
-    "JournalEntries",
-    "ProcessStates",
-    "LogLines",
-    "Progress",
-    "Note",
-)
-CONTINUED: Final = ("Scan2d", "Spec1d", "ProcessStates", "Progress")
-LIVE: Final = "ScanLines"
-"""Published only where it is asked for."""
 ADDRESS: Final = "address"
 """By convention the setting of a translator that says where its controller is."""
 _WORD = re.compile(r"[A-Za-z_][\w-]*")
@@ -227,16 +211,18 @@ def _number(resolved: ResolvedExperiment, problem: str) -> int | None:
 def check_envelopes(resolved: ResolvedExperiment) -> None:
     """Require that every envelope subscribed to is published."""
     processes, made = resolved.processes.values(), resolved.caching.envelopes
-    published = {*PUBLISHED, *(e for process in processes for e in process.declared.publishes), *made}
+    declared = [one for one in wire.declared() if one.always and one.source in (Role.TRANSLATOR, Role.SCHEDULER)]
+    published = {*(one.name for one in declared), *made}
+    published.update(envelope for process in processes for envelope in process.declared.publishes)
     if any(map(_may_publish_lines, resolved.with_role(Role.TRANSLATOR))):
-        published.add(LIVE)
+        published.add(SCAN_LINES.name)
     for name, process in resolved.processes.items():
         for i, prefix in enumerate(process.envelopes or ()):
             if _is_published(prefix, published, made):
                 continue
             key = next((k for k in ("envelopes", "subscriber") if k in process.part.own), "class")
             path = (name, key, i) if key == "envelopes" else (name, key)
-            live = LIVE.startswith(prefix)
+            live = SCAN_LINES.name.startswith(prefix)
             hint = 'give the microscope live_lines_s = "1 s"' if live else nearest(prefix, published)
             what = f"[{name}] subscribes to {prefix!r}, which no component publishes"
             if resolved.caching.mapping is not None:
@@ -252,9 +238,8 @@ def _may_publish_lines(translator: ResolvedProcess) -> bool:
 
 def _is_published(prefix: str, published: set[str], made: Collection[str]) -> bool:
     """A prefix fits what it begins; scans, spectra and what rules of the cache fill in go on behind their beginning."""
-    return any(name.startswith(prefix) for name in published) or any(
-        prefix.startswith(start) for start in (*(f"{name}_" for name in CONTINUED), *filter(None, made))
-    )
+    continued = [*(f"{one.name}_" for one in wire.declared() if one.named), *filter(None, made)]
+    return any(name.startswith(prefix) for name in published) or prefix.startswith(tuple(continued))
 
 
 def check_controller(resolved: ResolvedExperiment) -> None:
@@ -288,7 +273,7 @@ def check_names_of_people(resolved: ResolvedExperiment) -> None:
     if keys is not None:
         names |= {file.stem for file in (keys / "public").glob("*.key")}
     any_role = False
-    for role, members in resolved.sections.control.roles:
+    for role, members in vars(resolved.sections.control.roles).items():
         for i, member in enumerate(members or ()):
             any_role, path = True, ("control", "roles", role, i)
             if not {member, component_of(member)} & names:

@@ -10,10 +10,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from google.protobuf.json_format import MessageToDict
+from google.protobuf.message import Message
+
 from afspm import wire
 from afspm.clock import iso_utc
 from afspm.errors import AfspmError, WireError
-from afspm.gateway.models import EventKind
 from afspm.model import (
     ControlResponse,
     ControlState,
@@ -31,21 +33,6 @@ from afspm.record.journal import JOURNAL_FILE
 from afspm.record.run import open_run
 from afspm.storage.packet_log import log_folder, logged_packets
 
-KINDS = {
-    "ControlState": EventKind.CONTROL,
-    "ScopeStateMsg": EventKind.STATE,
-    "Scan2d": EventKind.SCAN,
-    "Spec1d": EventKind.SPECTRUM,
-    "ScanParameters2d": EventKind.SCAN_PARAMETERS,
-    "ZCtrlParameters": EventKind.FEEDBACK,
-    "ProbePosition": EventKind.PROBE_POSITION,
-    "JournalEntries": EventKind.JOURNAL,
-    "ProcessStates": EventKind.PROCESSES,
-    "LogLines": EventKind.LOG,
-    "Note": EventKind.NOTE,
-    "Progress": EventKind.PROGRESS,
-}
-"""By the names of messages, of which the scheduler publishes all."""
 MOST_EVENTS, MOST_BYTES = 20_000, 16 << 20
 
 
@@ -53,7 +40,7 @@ class Event(NamedTuple):
     """An event as it is sent; `time_ns` is its id."""
 
     time_ns: int
-    kind: EventKind
+    kind: str
     text: str
 
 
@@ -99,9 +86,9 @@ class EventHistory:
 
     def take(self, message: str, thing: object, time_ns: int) -> None:
         """Add what was published; what is not newer (a replay) is passed over."""
-        kind = KINDS.get(message)
+        kind = wire.declaration(message).event
         with self._lock:
-            if kind is None or (self._events and time_ns <= self._events[-1].time_ns):
+            if not kind or (self._events and time_ns <= self._events[-1].time_ns):
                 return
             if isinstance(thing, ProcessStates) and not self._has_changed(thing):
                 return
@@ -112,7 +99,7 @@ class EventHistory:
             if len(self._events) > MOST_EVENTS or self._bytes > MOST_BYTES:
                 self._drop_oldest()
 
-    def after(self, time_ns: int, kinds: Collection[EventKind], most: int) -> EventBatch:
+    def after(self, time_ns: int, kinds: Collection[str], most: int) -> EventBatch:
         """Return the events after a time, of some kinds, as far as they are kept."""
         with self._lock:
             start = bisect_right(self._events, time_ns, key=lambda event: event.time_ns)
@@ -152,7 +139,7 @@ def _recorded(run_dir: Path, state_dir: Path | None) -> Iterator[tuple[str, obje
     if (run_dir / JOURNAL_FILE).is_file():
         try:
             with open_run(run_dir) as run:
-                for packet, message, thing in run.messages(tuple(KINDS)):
+                for packet, message, thing in run.messages([one.name for one in wire.declared() if one.event]):
                     newest_ns = packet.time_ns or newest_ns
                     yield message, thing, newest_ns
         except AfspmError:
@@ -161,7 +148,7 @@ def _recorded(run_dir: Path, state_dir: Path | None) -> Iterator[tuple[str, obje
         packet = entry.packet
         try:
             message = wire.message_of(packet.envelope)
-            if packet.time_ns is not None and packet.time_ns > newest_ns and message in KINDS:
+            if packet.time_ns is not None and packet.time_ns > newest_ns and wire.declaration(message).event:
                 yield message, wire.decode(message, packet.payload), packet.time_ns
         except WireError:
             continue
@@ -198,6 +185,8 @@ def _data(thing: object, time_ns: int, problems: ProblemNames) -> dict[str, obje
             }
         case JournalEntries():
             return {"entries": [_entry(one, problems) for one in thing.entries]}
+        case Message():
+            return MessageToDict(thing, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
     plain: dict[str, object] = _without_large_numbers(to_plain(thing, lists=True))
     return plain
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 from enum import Enum
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
 
+from afspm import wire
 from afspm.gateway.problems import RefusalModel
 from afspm.model.events import LONGEST_NOTE
 
@@ -267,23 +268,22 @@ class DoneModel(_Answer):
     done: Literal[True] = True
 
 
-class EventKind(Enum):
-    """The kinds of events."""
+MISSED, END = "missed", "end"
+"""Events of the gateway itself."""
 
-    CONTROL = "control"
-    STATE = "state"
-    SCAN = "scan"
-    SPECTRUM = "spectrum"
-    SCAN_PARAMETERS = "scan-parameters"
-    FEEDBACK = "feedback"
-    PROBE_POSITION = "probe-position"
-    JOURNAL = "journal"
-    PROCESSES = "processes"
-    LOG = "log"
-    NOTE = "note"
-    PROGRESS = "progress"
-    MISSED = "missed"
-    END = "end"
+
+def event_kinds() -> tuple[str, ...]:
+    """Return the kinds of events: one for each declared message that has one, then the gateway's own."""
+    return (*(message.event for message in wire.declared() if message.event), MISSED, END)
+
+
+def _known(kind: str) -> str:
+    if kind not in event_kinds():
+        raise ValueError(f"no kind of events: one of {', '.join(event_kinds())}")
+    return kind
+
+
+EventKind = Annotated[str, AfterValidator(_known), WithJsonSchema({"type": "string", "enum": list(event_kinds())})]
 
 
 class EventModel(_Answer):

@@ -26,6 +26,7 @@ from afspm.gateway.models import (
     SpectrumModel,
     StateModel,
     ValueFormat,
+    event_kinds,
 )
 from afspm.gateway.parameter_cache import ParameterCache
 from afspm.gateway.problems import RefusalCode, RefusedRequest
@@ -188,7 +189,7 @@ class ReadingRoutes:
             raise RefusedRequest(RefusalCode.TOO_MANY, f"{MOST_STREAMS} streams of events are open")
         told, newest_ns = last_event_id or after, services.history.newest_ns
         after_ns = int(told) if told else (-1 if newest_ns is None else newest_ns)
-        wanted = frozenset(kinds or EventKind)
+        wanted = frozenset(kinds or event_kinds())
         stream = server_sent(services.history, self._watch, services.bell, after_ns, wanted)
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         counted = services.streams.counted(stream)

@@ -6,7 +6,7 @@ import json
 from collections.abc import AsyncIterator, Collection
 
 from afspm.gateway.events import EventHistory
-from afspm.gateway.models import EventKind
+from afspm.gateway.models import END, MISSED
 from afspm.web.watch import Bell, Watch
 
 ALIVE_S = 10.0  # then a comment is sent, so that what is in between keeps the connection
@@ -16,7 +16,7 @@ MOST_STREAMS = 64
 
 
 async def server_sent(
-    history: EventHistory, watch: Watch, bell: Bell, after_ns: int, kinds: Collection[EventKind]
+    history: EventHistory, watch: Watch, bell: Bell, after_ns: int, kinds: Collection[str]
 ) -> AsyncIterator[str]:
     """Yield what was published after a time, and then whatever is, until the experiment ends.
 
@@ -28,20 +28,20 @@ async def server_sent(
         batch = history.after(after_ns, kinds, AT_ONCE)
         if batch.missed_until_ns is not None:
             missed = {"after": str(after_ns), "until": str(batch.missed_until_ns)}
-            yield _event(str(max(after_ns, 0)), EventKind.MISSED, json.dumps({"time": None, "data": missed}))
+            yield _event(str(max(after_ns, 0)), MISSED, json.dumps({"time": None, "data": missed}))
         if batch.events:
             yield "".join(_event(str(one.time_ns), one.kind, one.text) for one in batch.events)
         is_behind = batch.newest_ns > after_ns
         after_ns = batch.newest_ns
         if is_over and not is_behind:
-            yield _event(str(max(after_ns, 0)), EventKind.END, json.dumps({"time": None, "data": {}}))
+            yield _event(str(max(after_ns, 0)), END, json.dumps({"time": None, "data": {}}))
             return
         if not is_behind and not await bell.wait(ALIVE_S):
             yield ": alive\n\n"
 
 
-def _event(id_: str, kind: EventKind, text: str) -> str:
-    return f"id: {id_}\nevent: {kind.value}\ndata: {text}\n\n"
+def _event(id_: str, kind: str, text: str) -> str:
+    return f"id: {id_}\nevent: {kind}\ndata: {text}\n\n"
 
 
 class StreamCount:

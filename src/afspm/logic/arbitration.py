@@ -10,9 +10,11 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from enum import Enum, auto
 from types import MappingProxyType
+from typing import ClassVar
 
 from afspm.logic.frozen import replace
 from afspm.model import ControlMode, ControlResponse, ControlState, Problem, ProblemNames, component_of
+from afspm.plain_data import SECTION
 
 _NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
 
@@ -90,23 +92,28 @@ class ArbitrationState:
 
 @dataclass(frozen=True)
 class RoleTable:
-    """The roles: who may do what not everybody may. None: everybody; but nobody may `operate` unless named.
+    """The components and people with a role. Without the key, everyone has the role.
 
-    Who acts for a person ("dashboard:Ada") has the roles of the component and those given to just that person there.
+    A person who acts through a component ("dashboard:Ada") has the roles of the component and those given to that
+    person there.
 
     Attributes:
-        end: end the experiment.
-        mode: switch between MANUAL and AUTOMATED.
-        clear: remove flags of others (who flagged a problem, or is in control to solve it, may always).
-        operate: command the microscope in MANUAL mode.
-        restart: have a process started anew.
+        end_experiment: end the experiment.
+        set_mode: switch between MANUAL and AUTOMATED.
+        clear_problems: clear problems that others flagged. A component may always clear a problem that it flagged
+            itself, or is in control to solve.
+        operate: command the microscope in MANUAL mode, and set what is `adjustable`. Without the key: the dashboard,
+            and other components by which a person commands the microscope.
+        restart: restart a process.
     """
 
-    end: Collection[str] | None = None
-    mode: Collection[str] | None = None
-    clear: Collection[str] | None = None
-    operate: Collection[str] = ()
-    restart: Collection[str] | None = None
+    end_experiment: tuple[str, ...] | None = None
+    set_mode: tuple[str, ...] | None = None
+    clear_problems: tuple[str, ...] | None = None
+    operate: tuple[str, ...] | None = None
+    restart: tuple[str, ...] | None = None
+
+    __pydantic_config__: ClassVar[object] = SECTION
 
 
 @dataclass(frozen=True)
@@ -168,18 +175,18 @@ def may(role: Collection[str] | None, who: str) -> bool:
 def _may_clear(control: ArbitrationState, ask: ControlInput, rules: Rules) -> bool:
     flagged_by = control.problems.get(ask.number, ask.who)
     solves = control.holder == ask.who and control.solving == ask.number
-    return flagged_by == ask.who or solves or may(rules.roles.clear, ask.who)
+    return flagged_by == ask.who or solves or may(rules.roles.clear_problems, ask.who)
 
 
 OTHERWISE = Condition("otherwise", lambda c, a, r: True)
 IS_MANUAL = Condition("the mode is manual", lambda c, a, r: c.mode is ControlMode.MANUAL)
 IS_OPERATOR = Condition(
     "the mode is manual and it has the role `operate`",
-    lambda c, a, r: c.mode is ControlMode.MANUAL and may(r.roles.operate, a.who),
+    lambda c, a, r: c.mode is ControlMode.MANUAL and may(r.roles.operate or (), a.who),
 )
 IS_ADJUSTER = Condition(
     "it has the role `operate` and no problem is flagged",
-    lambda c, a, r: may(r.roles.operate, a.who) and not c.problems,
+    lambda c, a, r: may(r.roles.operate or (), a.who) and not c.problems,
 )
 ASKER_HOLDS = Condition("it is in control", lambda c, a, r: c.holder == a.who)
 OTHER_HOLDS = Condition("another component is in control", lambda c, a, r: c.holder not in (None, a.who))
@@ -210,10 +217,10 @@ MAY_NOT_CLEAR = Condition(
     lambda c, a, r: not _may_clear(c, a, r),
 )
 MAY_NOT_SET_MODE = Condition(
-    "the asker does not have the role `set_mode`", lambda c, a, r: not may(r.roles.mode, a.who)
+    "the asker does not have the role `set_mode`", lambda c, a, r: not may(r.roles.set_mode, a.who)
 )
 MAY_NOT_END = Condition(
-    "the asker does not have the role `end_experiment`", lambda c, a, r: not may(r.roles.end, a.who)
+    "the asker does not have the role `end_experiment`", lambda c, a, r: not may(r.roles.end_experiment, a.who)
 )
 NO_SUCH_MODE = Condition(
     "neither manual nor automated", lambda c, a, r: a.number not in (ControlMode.MANUAL, ControlMode.AUTOMATED)

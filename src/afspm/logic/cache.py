@@ -115,7 +115,8 @@ class PacketCache:
     def stamp(self, envelope: str, payload: bytes, now_ns: int) -> tuple[Packet, int]:
         """A packet of the scheduler's own, kept under its envelope."""
         out = Packet(envelope, payload, self._next_ns(now_ns))
-        return out, self._keep(out, None, self._envelopes.history(envelope))
+        message = envelope.partition("_")[0]  # no message of the scheduler has an underscore in its name
+        return out, self._keep(out, None, self._envelopes.history(message))
 
     def restore(self, packets: Iterable[LoggedPacket]) -> None:
         """Take up what was kept before a restart, oldest first."""

@@ -82,7 +82,7 @@ def begin_end(draft: StateDraft) -> None:
     """Begin the end of the experiment, which waits for the tip."""
     draft.watchdog = draft.watchdog.hurry(draft.now_s)
     settings = draft.env.settings
-    draft.end = draft.end.begin(draft.now_s + settings.request_timeout_s + settings.patience_s)
+    draft.end = draft.end.begin(draft.now_s + settings.control.request_timeout_s + settings.waits.answer_s)
 
 
 def answer_unless_ending(

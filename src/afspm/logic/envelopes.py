@@ -3,34 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
 
-from afspm.errors import ConfigError
-from afspm.formatting import lengths_text
+from afspm import wire
+from afspm.errors import ConfigError, InvalidValue, WireError
 from afspm.model import PacketHeader
+from afspm.plain_data import SECTION, Count
+from afspm.units import Length
+from afspm.wire.messages import SCAN, SPECTRUM
 
 EnvelopeMapping = Callable[[PacketHeader], str]
-
-DEFAULT_HISTORY = {
-    "Scan2d": 5,
-    "Spec1d": 10,
-    "ScopeStateMsg": 10,
-    "DriftMapping": 10,
-    "ScanLines": 0,
-    "JournalEntries": 1000,
-    "LogLines": 1000,
-    "Note": 1000,
-}
-"""How many packets are kept of each envelope, by message; of all others one. Lines are of the moment."""
 
 
 def default_envelope(header: PacketHeader) -> str:
     """The wire format's: "Scan2d_2000.0_Height", "Spec1d_IV", or else the name of the message."""
-    if header.message == "Scan2d" and header.size_m is not None:
-        return f"Scan2d_{size_text(header.size_m[0])}_{header.channel or ''}"
-    if header.message == "Spec1d" and header.kind:
-        return f"Spec1d_{header.kind}"
+    if header.message == SCAN.name and header.size_m is not None:
+        return f"{SCAN.name}_{size_text(header.size_m[0])}_{header.channel or ''}"
+    if header.message == SPECTRUM.name and header.kind:
+        return f"{SPECTRUM.name}_{header.kind}"
     return header.message
 
 
@@ -55,37 +48,46 @@ def size_text(size_m: float) -> str:
 
 @dataclass(frozen=True)
 class CacheRule:
-    """One entry of the experiment file's [cache]: the first rule that fits a packet says how it is kept.
+    """A rule of [cache]: the first that matches a packet decides its envelope, and how many are kept.
 
     Attributes:
-        message, channel, kind: what it must be; None: any.
-        above_m, up_to_m: its region's width: above_m < width <= up_to_m.
-        envelope: text in which {message}, {channel}, {kind} and {size} (nm) are filled in; None for the default one.
-        history: how many are kept; None for the default number.
+        message: the name of the message; without the key: any.
+        channel: of a scan; without the key: any.
+        kind: of a spectrum; without the key: any.
+        above_m: the region is wider than this.
+        up_to_m: the region is not wider than this.
+        envelope: text in which {message}, {channel}, {kind} and {size} (nm) are filled in; without the key: the
+            default. It must begin with the name of its message, from which subscribers know its type, for example
+            `Scan2d_wide_{channel}`.
+        history: number of packets kept; without the key: the default.
+
+    Raises:
+        InvalidValue: no packet could match, or no subscriber could read the envelope.
     """
 
     message: str | None = None
     channel: str | None = None
     kind: str | None = None
-    above_m: float | None = None
-    up_to_m: float | None = None
+    above_m: Length | None = None
+    up_to_m: Length | None = None
     envelope: str | None = None
-    history: int | None = None
+    history: Count | None = None
+
+    __pydantic_config__: ClassVar[object] = SECTION
 
     def __post_init__(self) -> None:
         if self.history is not None and self.history < 1:
-            raise ConfigError(f"a history of {self.history} keeps nothing", where="[cache]", hint="1 or more")
+            raise InvalidValue(f"a history of {self.history} keeps nothing", where="[cache]", hint="1 or more")
         if self.envelope is not None:
             message = self.message or "AnyMessage"
             if not tells(self.name(PacketHeader(message, "", (0.0, 0.0), "")), message):
-                raise ConfigError(
+                raise InvalidValue(
                     f"the envelope {self.envelope!r} does not begin with the name of its message: nobody could read it",
                     where="[cache]",
                     hint=f"e.g. {self.message or '{message}'}_{self.envelope}",
                 )
         if self.above_m is not None and self.up_to_m is not None and self.above_m >= self.up_to_m:
-            above, up_to = (lengths_text([width_m]) for width_m in (self.above_m, self.up_to_m))
-            raise ConfigError(f"no width is above {above} and up to {up_to}", where="[cache]")
+            raise InvalidValue("empty range: above must be less than up_to", where="[cache]")
 
     def fits(self, header: PacketHeader) -> bool:
         wanted = ((self.message, header.message), (self.channel, header.channel), (self.kind, header.kind))
@@ -109,11 +111,34 @@ class CacheRule:
                 message=header.message, channel=header.channel or "", kind=header.kind or "", size=size
             )
         except (KeyError, IndexError, ValueError) as error:
-            raise ConfigError(
+            raise InvalidValue(
                 f"{self.envelope!r} can't be filled in: {error}",
                 where="[cache]",
                 hint="use {message}, {channel}, {kind} and {size}",
             ) from error
+
+
+@dataclass(frozen=True)
+class CacheSettings:
+    """The packets that the scheduler keeps for late joiners.
+
+    Attributes:
+        history: number of packets kept for each envelope, by message: `{ Scan2d = 10 }`.
+        rules: list of tables; the first that matches a packet names the envelope under which it is published and kept.
+        mapping: `"module.function"`: names the envelope of a packet from its header (`message`, `channel`, `size_m`,
+            `kind`), instead of the rules.
+    """
+
+    history: Mapping[str, Count] = field(default_factory=dict)
+    rules: tuple[CacheRule, ...] = ()
+    mapping: str | None = None
+
+    __pydantic_config__: ClassVar[object] = SECTION
+
+    @property
+    def envelopes(self) -> tuple[str, ...]:
+        """The beginnings of the rules' envelopes, as far as they are fixed."""
+        return tuple(re.split(r"[{}]", rule.envelope)[0] for rule in self.rules if rule.envelope)
 
 
 class Envelopes:
@@ -122,18 +147,18 @@ class Envelopes:
     Args:
         rules: tried in their order; then the defaults.
         mapping: a function of the user's own that names the envelope instead of rules and defaults.
-        history: how many to keep, by message, over the defaults.
+        history: how many packets to keep, by message, instead of the number in the declaration.
     """
 
     def __init__(
         self,
         rules: Sequence[CacheRule] = (),
         mapping: EnvelopeMapping | None = None,
-        history: dict[str, int] | None = None,
+        history: Mapping[str, int] | None = None,
     ) -> None:
         self._rules = tuple(rules)
         self._mapping = mapping
-        self._history = {**DEFAULT_HISTORY, **(history or {})}
+        self._history = history or {}
 
     def of(self, header: PacketHeader) -> tuple[str, int]:
         """The envelope of a packet, and how many of that envelope are kept."""
@@ -153,8 +178,13 @@ class Envelopes:
         return (default_envelope(header) if rule is None else rule.name(header)), history
 
     def history(self, message: str) -> int:
-        """Return how many of a message are kept where no rule says otherwise."""
-        return self._history.get(message, 1)
+        """Return how many packets of a message are kept where no rule says otherwise."""
+        if (own := self._history.get(message)) is not None:
+            return own
+        try:
+            return wire.declaration(message).history
+        except WireError:
+            return 1
 
     @staticmethod
     def _mapped(mapping: EnvelopeMapping, header: PacketHeader) -> object:

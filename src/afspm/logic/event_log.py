@@ -30,7 +30,6 @@ from afspm.model import (
     names,
 )
 
-ENTRIES = "JournalEntries"
 PERIOD_S = 0.1
 """Real time between two publications, at least."""
 MOST = 1000

@@ -6,7 +6,7 @@ means something in the experiment.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -193,7 +193,7 @@ class Reply:
 class Forward:
     """Send a request to the translator, marked with `number`.
 
-    `request.payload` is to be sent as it is: also the requests of the scheduler's own are encoded already.
+    A client's `request.payload` is sent as it came. A request of the scheduler's own has none: its subject is encoded.
     """
 
     number: int
@@ -254,22 +254,13 @@ Effect = Reply | Forward | Publish | Replay | SaveState | Log | Kill
 
 
 class Codec(Protocol):
-    """The wire as far as decisions need it, so that they need not know the wire."""
+    """Objects to and from bytes, as decisions need them; in simulated nights a table takes the place of the wire."""
 
     def encode(self, thing: object) -> bytes:
-        """A model object as the payload of a packet."""
-
-    def encode_orders(self, restart: Sequence[str]) -> bytes:
-        """The object of the answer to a supervisor: processes that it is to start anew."""
-
-    def encode_action(self, name: str) -> bytes:
-        """An ActionMsg as the payload of a request."""
+        """Return a model object as the payload of a packet or an answer."""
 
     def decode_parameter(self, payload: bytes) -> Parameter | None:
-        """A ParameterMsg out of a response; None if it is not one."""
-
-    def by_point(self, spectrum: bytes | memoryview) -> bytes:
-        """A Spec1d whose values came variable after variable, with its values point by point. Raises AfspmError."""
+        """Return the ParameterMsg of a response; None if it is not one."""
 
     def decode_packet(self, message: str, payload: bytes | memoryview) -> object:
-        """The object of a small packet (ScopeStatus, Feedback, ProcessStates …); None if malformed."""
+        """Return the object of a small packet (ScopeStatus, Feedback, ProcessStates …); None if malformed."""

@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import ClassVar
 
 from afspm.model import Parameter, Region
+from afspm.units import PositiveDuration
+
+_KEYS = {"low": "min", "high": "max", "rate_per_s": "rate", "interval_s": "every"}
+
+
+def limit_key(name: str) -> str:
+    """Return the key in the experiment file of an attribute of a `Limit`."""
+    return _KEYS.get(name, name)
 
 
 @dataclass(frozen=True)
 class Limit:
-    """The limit of one parameter or action. None: no such limit.
+    """A limit of one parameter or action. Without a key there is no such limit; an action has `every` and `only` alone.
 
     Attributes:
-        low, high: the range, in `unit`, both allowed.
-        step: how far one request may change it at most, in `unit`.
-        rate_per_s: how fast it may change at most, in `unit` per second of experiment time since it last changed.
-        interval_s: how much experiment time lies between two requests at least. The only one an action can have,
-            beside `only`.
+        low: the lowest value allowed.
+        high: the highest value allowed.
+        step: the largest change in one request.
+        rate_per_s: the largest change per experiment time since the parameter last changed, such as `"1 V/s"`.
+        interval_s: the least experiment time between two requests.
         only: the components that may set it.
-        unit: of the values above; SI for the base parameters.
+        unit: of the values above (the rate: per second); SI for the base parameters.
         source: where it was set, e.g. "experiment.toml:42".
     """
 
@@ -28,10 +37,12 @@ class Limit:
     high: float | None = None
     step: float | None = None
     rate_per_s: float | None = None
-    interval_s: float | None = None
-    only: Collection[str] | None = None
+    interval_s: PositiveDuration | None = None
+    only: tuple[str, ...] | None = None
     unit: str | None = None
     source: str = "[limits]"
+
+    __pydantic_config__: ClassVar[object] = {"alias_generator": limit_key}
 
     @property
     def bounds_changes(self) -> bool:
@@ -63,7 +74,7 @@ class ExperimentLimits:
     region: Region | None = None
     region_source: str = "[limits] region"
     most_pixels: int = 8192 * 8192
-    sets: Mapping[str, Collection[Parameter]] = field(default_factory=dict)
+    sets: Mapping[str, tuple[Parameter, ...]] = field(default_factory=dict)
 
     @cached_property
     def bounded(self) -> frozenset[str]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from afspm import wire
 from afspm.errors import AfspmError
 from afspm.logic import control_change, safety_commands
 from afspm.logic.arbitration import ArbitrationEvent, ControlInput
 from afspm.logic.control_change import TRANSLATOR
 from afspm.logic.events import PacketIn, Publish
-from afspm.logic.publishing import CONTROL_STATE
 from afspm.logic.state import StateDraft
 from afspm.model import (
     ControlMode,
@@ -16,15 +16,15 @@ from afspm.model import (
     PacketHeader,
     ProbePosition,
     Problem,
+    Role,
     ScanParameters,
     ScopeState,
     ScopeStatus,
 )
+from afspm.wire.messages import CONTROL_STATE, SPECTRUM
 
-SPECTRUM = "Spec1d"
-_TELLING = frozenset({"ScopeStateMsg", "ZCtrlParameters", "ScanParameters2d", "ProbePosition"})
-"""Messages from which we learn what the microscope is in. All others pass unread."""
 _MOST_LOGGED = 1000
+_STATE, _TRANSLATOR = wire.MessageKind.STATE, Role.TRANSLATOR
 _DOUBT = (
     "the translator is of version 1: those of the published implementation for Nanonis and Asylum send the values of a "
     "spectrum variable after variable; if curves look scrambled, set spectra_by_variable = true in [control]"
@@ -34,7 +34,8 @@ _DOUBT = (
 def take_packet(draft: StateDraft, event: PacketIn) -> None:
     """Publish a packet, and learn from it what the microscope does."""
     message, codec, move = event.header.message, draft.env.codec, draft.pending.move
-    told = codec.decode_packet(message, event.packet.payload) if message in _TELLING else None
+    # all other messages pass unread: they change nothing that the scheduler decides by
+    told = codec.decode_packet(message, event.packet.payload) if _is_state(message) else None
     if move is not None and move.hides(told):
         if draft.env.cache.pass_over(event.packet):
             _learn(draft, told)
@@ -43,21 +44,26 @@ def take_packet(draft: StateDraft, event: PacketIn) -> None:
     if published is None:
         return
     draft.effects.append(published)
-    by_variable = draft.env.settings.spectra_by_variable
-    if draft.idempotency.ids_known is False and message == SPECTRUM and not by_variable:
+    by_variable = draft.env.settings.control.spectra_by_variable
+    if draft.idempotency.ids_known is False and message == SPECTRUM.name and not by_variable:
         _log_once(draft, "WARNING", _DOUBT)
     if told is not None:
         _learn(draft, told)
 
 
+def _is_state(message: str) -> bool:
+    known = wire.declaration(message)
+    return known.kind is _STATE and known.source is _TRANSLATOR
+
+
 def _published(draft: StateDraft, packet: Packet, header: PacketHeader) -> Publish | None:
     env, source_ns = draft.env, packet.time_ns
-    if header.message == CONTROL_STATE:
+    if header.message == CONTROL_STATE.name:
         _log_once(draft, "WARNING", "the translator publishes a ControlState, which is the scheduler's: dropped")
         return None
     try:
-        if env.settings.spectra_by_variable and header.message == SPECTRUM:
-            packet = Packet(packet.envelope, env.codec.by_point(packet.payload), packet.time_ns)
+        if env.settings.control.spectra_by_variable and header.message == SPECTRUM.name:
+            packet = Packet(packet.envelope, wire.by_point(packet.payload), packet.time_ns)
         if env.frame is not None:
             packet = env.frame.incoming(packet, header, draft.now_ns)
         taken = env.cache.take(packet, header, draft.now_ns)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+from afspm import wire
 from afspm.logic import answers
 from afspm.logic.arbitration import may
-from afspm.logic.event_log import ENTRIES
 from afspm.logic.events import Publish, RequestIn
 from afspm.logic.state import StateDraft
 from afspm.logic.supervisor_registry import announcement
 from afspm.model import HAS_ENDED, ControlResponse, ResponseDetail
-
-CONTROL_STATE = "ControlState"
-NOTE = "Note"
+from afspm.wire.messages import CONTROL_STATE, JOURNAL, NOTE
 
 
 def publish(draft: StateDraft, envelope: str, payload: bytes, time_ns: int | None = None) -> None:
@@ -24,23 +22,23 @@ def publish(draft: StateDraft, envelope: str, payload: bytes, time_ns: int | Non
 def publish_control(draft: StateDraft) -> None:
     """Tell all peers who is in control; with that, the startup is over."""
     draft.barrier = draft.barrier.opened(draft.now_s)
-    publish(draft, CONTROL_STATE, draft.env.codec.encode(draft.control.published()))
+    publish(draft, CONTROL_STATE.name, draft.env.codec.encode(draft.control.published()))
 
 
 def publish_entries(draft: StateDraft) -> None:
     """Publish what has happened since the last time."""
     draft.event_log, entries = draft.event_log.take(draft.env.settings.rules.problems, draft.now_ns)
     if entries.entries:
-        publish(draft, ENTRIES, draft.env.codec.encode(entries))
+        publish(draft, JOURNAL.name, draft.env.codec.encode(entries))
 
 
 def publish_for_process(draft: StateDraft, event: RequestIn) -> None:
     """Publish what a process tells; a supervisor is told in return what it is to do."""
-    codec, told = draft.env.codec, announcement(event, draft.env.codec)
+    told = announcement(event, draft.env.codec)
     if not told.envelope:
         answers.answer(draft, event, ControlResponse.FAILURE, told.why)
         return
-    if draft.control.ended and told.envelope == NOTE:  # its author is told, and writes it into the record
+    if draft.control.ended and told.envelope == NOTE.name:  # its author is told, and writes it into the record
         ended = ResponseDetail.EXPERIMENT_ENDED
         answers.answer(draft, event, ControlResponse.FAILURE, HAS_ENDED, detail=ended)
         return
@@ -51,7 +49,7 @@ def publish_for_process(draft: StateDraft, event: RequestIn) -> None:
     # if it is published already, we were killed before we could answer
     if not draft.env.cache.holds(told.envelope, payload):
         publish(draft, told.envelope, payload)
-    answers.answer(draft, event, ControlResponse.SUCCESS, payload=codec.encode_orders(orders))
+    answers.answer(draft, event, ControlResponse.SUCCESS, payload=wire.encode_orders(orders))
     draft.end = draft.end.processes_told(draft.supervisors.states_of(event.name), draft.now_s)
 
 

@@ -96,7 +96,7 @@ def admit(draft: StateDraft, event: RequestIn) -> bool:
 
 
 def _may_speak(draft: StateDraft, event: RequestIn) -> bool:
-    name, request_id, run = event.name, event.request.id, draft.env.settings.run
+    name, request_id, run = event.name, event.request.id, draft.env.settings.run.name
     if not name:
         answers.refuse_peer(draft, event, "a client without a name: set the socket's identity to the component's name")
         return False
@@ -201,9 +201,9 @@ def _renew_lease(draft: StateDraft, event: RequestIn) -> None:
 
 def _tell_time(draft: StateDraft, event: RequestIn) -> None:
     """Tell what all parts of an experiment have in common: the run, what time it is, and how it passes."""
-    settings = draft.env.settings
-    common = {"run": settings.run, "simulated": settings.simulated, "now_ns": draft.now_ns, "in_use": _in_use(draft)}
-    told = json.dumps({**settings.clock, **common, "versions": dict(settings.versions)}).encode()
+    run = draft.env.settings.run
+    common = {"run": run.name, "simulated": run.simulated, "now_ns": draft.now_ns, "in_use": _in_use(draft)}
+    told = json.dumps({**run.clock, **common, "versions": dict(run.versions)}).encode()
     response = Response(int(ControlResponse.SUCCESS), told, "", event.request.id)
     draft.effects.append(Reply(event.connection, event.name, response, CLOCK_REQUEST))
 
@@ -426,7 +426,7 @@ def read_ahead(draft: StateDraft) -> None:
 
 def _read(draft: StateDraft, name: str, on_answer: OwnAnswer) -> None:
     parameter = Parameter(name)
-    request = Request(_PARAM, parameter, draft.env.codec.encode(parameter))
+    request = Request(_PARAM, parameter)
     draft.forwarder, _ = draft.forwarder.ask_own(request, draft.now_s, on_answer)
 
 

@@ -13,7 +13,7 @@ _ID = "scheduler/are-ids-known"
 def begin(draft: StateDraft) -> None:
     """Ask a new translator: does it retract, and does it know ids (ours do, those of version 1 do not)?"""
     action = draft.watchdog.question
-    request = Request(int(ControlRequest.ACTION_SUPPORT), action, draft.env.codec.encode_action(action), _ID)
+    request = Request(int(ControlRequest.ACTION_SUPPORT), action, id=_ID)
     draft.forwarder, _ = draft.forwarder.ask_own(request, draft.now_s)
     draft.watchdog = draft.watchdog.translator_is_there(draft.now_s)
     send(draft)
@@ -25,7 +25,7 @@ def send(draft: StateDraft) -> None:
         draft.watchdog, action = draft.watchdog.next_action(draft.microscope)
         if action is None:
             return
-        request = Request(int(ControlRequest.ACTION), action, draft.env.codec.encode_action(action))
+        request = Request(int(ControlRequest.ACTION), action)
         draft.forwarder, job = draft.forwarder.ask_own(request, draft.now_s)
         if job is None:
             draft.watchdog = draft.watchdog.unsent(draft.now_s)

@@ -11,7 +11,7 @@ from afspm.logic.arbitration import ArbitrationEvent, ArbitrationState, ControlI
 from afspm.logic.cache import TIME_STEP_NS, PacketCache
 from afspm.logic.control_change import TRANSLATOR
 from afspm.logic.coordinate_frame import CoordinateFrame
-from afspm.logic.event_log import ENTRIES, SCHEDULER, SentStart, start_entry, unreadable_entry
+from afspm.logic.event_log import SCHEDULER, SentStart, start_entry, unreadable_entry
 from afspm.logic.events import (
     Announced,
     Codec,
@@ -49,6 +49,7 @@ from afspm.model import (
     Response,
     component_of,
 )
+from afspm.wire.messages import JOURNAL
 
 _MALFUNCTION = Problem.DEVICE_MALFUNCTION
 _AT_ONCE_S = 0.0  # in real monotonic time: always past
@@ -139,8 +140,8 @@ class SchedulerCore:
     def _entries_since(self, starts: Sequence[SentStart]) -> Iterator[JournalEntry]:
         oldest_ns = min((start.sent_ns for start in starts), default=0)
         for packet, *_ in self._env.cache if starts else ():
-            if packet.envelope == ENTRIES and (packet.time_ns or 0) >= oldest_ns:
-                found = self._env.codec.decode_packet(ENTRIES, packet.payload)
+            if packet.envelope == JOURNAL.name and (packet.time_ns or 0) >= oldest_ns:
+                found = self._env.codec.decode_packet(JOURNAL.name, packet.payload)
                 yield from found.entries if isinstance(found, JournalEntries) else ()
 
     def put_off(self, until_s: float) -> None:

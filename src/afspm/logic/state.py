@@ -91,21 +91,21 @@ class SchedulerState:
 
     @classmethod
     def initial(cls, settings: SchedulerSettings) -> SchedulerState:
-        dog = settings.watchdog
+        dog, control, waits = settings.watchdog, settings.control, settings.waits
         return cls(
             control=ArbitrationState(),
-            lease=Lease(None if settings.lease_s is None else round(settings.lease_s * 1e9)),
-            holder_timeout=HolderTimeout(settings.grace_s, settings.restart_grace_s),
-            sessions=SessionTable(settings.takeover_s),
+            lease=Lease(None if control.lease_s is None else round(control.lease_s * 1e9)),
+            holder_timeout=HolderTimeout(control.grace_s, waits.restart_grace_s),
+            sessions=SessionTable(waits.takeover_s),
             idempotency=IdempotencyCache(),
             pending=PendingRequests(),
-            forwarder=Forwarder(settings.request_timeout_s, settings.patience_s, settings.longest_queue),
+            forwarder=Forwarder(control.request_timeout_s, waits.answer_s, waits.longest_queue),
             limits=LimitChecker(settings.limits),
-            microscope=MicroscopeStatus(dog.dangerous, settings.malfunction_after_s),
+            microscope=MicroscopeStatus(dog.dangerous, control.malfunction_after_s),
             watchdog=Watchdog(dog),
             supervisors=SupervisorRegistry(),
             event_log=EventLog(),
-            barrier=StartupBarrier(settings.catch_up_s),
+            barrier=StartupBarrier(waits.catch_up_s),
             end=ExperimentEnd(),
             by_hand=HandSettings(),
             logged=frozenset(),

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from afspm.errors import InvalidValue
 from afspm.plain_data import Plain
@@ -64,6 +64,8 @@ def to_plain(value: object, *, lists: bool = False) -> Any:
         if isinstance(value, np.generic):
             return value.item()
     if isinstance(value, Mapping):
+        if all(isinstance(key, str) for key in value):
+            return {key: to_plain(one, lists=lists) for key, one in value.items()}
         return [[to_plain(key, lists=lists), to_plain(one, lists=lists)] for key, one in value.items()]
     if isinstance(value, list | tuple | deque):
         return [to_plain(one, lists=lists) for one in value]
@@ -82,6 +84,8 @@ def from_plain(type_: Any, plain: Any) -> Any:
     origin, arguments = get_origin(type_), get_args(type_)
     if type_ is Any:
         return plain
+    if origin is Literal:
+        return _one_of(arguments, plain)
     if origin in (Union, types.UnionType):
         return _from_union(arguments, plain)
     if (np := _numpy()) is not None and origin is np.ndarray:
@@ -109,6 +113,12 @@ def _from_union(arguments: Sequence[object], plain: object) -> object:
     return from_plain(only, plain)
 
 
+def _one_of(allowed: Sequence[object], plain: object) -> object:
+    if plain not in allowed:
+        raise ValueError(f"{plain!r} is none of {', '.join(map(repr, allowed))}")
+    return plain
+
+
 def _from_fields(type_: Any, plain: Mapping[str, object]) -> object:
     hints = _hints(type_)
     known = {field.name: hints[field.name] for field in fields(type_) if field.init}
@@ -120,7 +130,8 @@ def _from_fields(type_: Any, plain: Mapping[str, object]) -> object:
 def _from_collection(origin: Any, arguments: Sequence[Any], plain: Any) -> object:
     if issubclass(origin, Mapping):
         key, value = arguments
-        return {from_plain(key, one): from_plain(value, other) for one, other in plain}
+        pairs = plain.items() if isinstance(plain, Mapping) else plain
+        return {from_plain(key, one): from_plain(value, other) for one, other in pairs}
     if origin is tuple and not (len(arguments) == 2 and arguments[1] is Ellipsis):
         return tuple(from_plain(one, value) for one, value in zip(arguments, plain, strict=True))
     made = [from_plain(arguments[0], value) for value in plain]

@@ -17,10 +17,6 @@ from afspm.transport.port import Port
 
 DEFAULT_LONGEST_STEP_S = 30.0
 
-STATE_MESSAGES = frozenset({"ScopeStateMsg", "ControlState", "ScanParameters2d", "ZCtrlParameters", "ProbePosition"})
-MEASURED_MESSAGES = frozenset({"Scan2d", "Spec1d"})
-"""Every component's port subscribes to both: its `Scope` follows the state, and its own measurements."""
-
 
 class ProcessActivity:
     """The age of the current step, which tells a busy process from a frozen one.

@@ -18,8 +18,6 @@ from afspm.launch import Launch
 from afspm.process import failure, log
 from afspm.process.context import (
     DEFAULT_LONGEST_STEP_S,
-    MEASURED_MESSAGES,
-    STATE_MESSAGES,
     ProcessActivity,
     ProcessContext,
     new_session,
@@ -134,7 +132,7 @@ def _open_port(launch: Launch, clock: Clock, parent: ParentWatch, heard: tuple[s
     if heard is not None:
         envelopes = heard
     elif launch.sockets.control is not None:
-        envelopes = tuple(sorted({*envelopes, *STATE_MESSAGES, *MEASURED_MESSAGES}))
+        envelopes = tuple(sorted({*envelopes, *wire.followed_messages()}))
     launch = replace(launch, envelopes=envelopes)
     port = open_port(launch, clock)
     parent.when_gone(lambda: port.wake_up(ParentGone()))

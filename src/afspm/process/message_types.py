@@ -1,4 +1,4 @@
-"""Message types of the user: Python modules that protoc made, or .proto files compiled here."""
+"""Messages of the user: Python modules that protoc made or that declare them, or .proto files compiled here."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from afspm.errors import ConfigError
 def register_all(sources: Iterable[str]) -> None:
     """Make the messages of modules ("my_lab.messages_pb2") and files ("peaks.proto") known by their names.
 
+    A module may hold `MessageDeclaration`s instead, by which more than the type of its messages is known.
+
     Raises:
         ConfigError: there is no such module or file, it has errors, or it holds no messages.
     """
@@ -23,8 +25,15 @@ def register_all(sources: Iterable[str]) -> None:
         module = _compiled(Path(source)) if source.endswith(".proto") else _imported(source)
         descriptor = getattr(module, "DESCRIPTOR", None)
         names = list(getattr(descriptor, "message_types_by_name", ()))
-        if not names:
-            raise ConfigError("holds no message types", where=source, hint="name a module that protoc has made")
+        declarations = [one for one in vars(module).values() if isinstance(one, wire.MessageDeclaration)]
+        for declaration in declarations:
+            wire.declare(declaration)
+        if not (names or declarations):
+            raise ConfigError(
+                "holds no message types",
+                where=source,
+                hint="name a module that protoc has made, or that holds declarations",
+            )
         for name in names:
             wire.register(getattr(module, name))
 

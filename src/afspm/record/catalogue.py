@@ -21,6 +21,7 @@ from afspm.record.journal import not_a_table
 from afspm.record.run import Run, open_run
 from afspm.record.run_json import RUN_FILE
 from afspm.record.run_lock import describe_state
+from afspm.wire.messages import CONTROL_STATE, DRIFT_RESCAN, JOURNAL
 
 INDEX_FILE: Final = "runs.sqlite"
 _FORMAT: Final = 2
@@ -211,7 +212,7 @@ def _summary(folder: Path) -> RunSummary:
 
 
 def _read(run: Run) -> RunSummary:
-    overview = run.overview(("ControlState", "JournalEntries", "DriftRescan"))
+    overview = run.overview((CONTROL_STATE.name, JOURNAL.name, DRIFT_RESCAN.name))
     began = next(iter(overview.controls.spans), None)
     return RunSummary(
         folder="",

@@ -14,7 +14,7 @@ from afspm.record.run import open_run
 from afspm.record.run_json import STATE_DIR
 from afspm.record.run_lock import lock_run
 from afspm.record.store import RecordStore
-from afspm.wire import Topic
+from afspm.wire.messages import NOTE
 
 _STEP_NS = 1_000
 
@@ -39,7 +39,7 @@ def append_note(
         folder, end_ns = run.folder, run.newest_ns
     about_ns = next(one for one in (time_ns, scan_ns, end_ns) if one is not None)
     note = Note(about_ns, who, text, scan_ns, written_ns)
-    packet = Packet(Topic.NOTE, wire.encode(note)[1], end_ns + _STEP_NS)
+    packet = Packet(NOTE.name, wire.encode(note)[1], end_ns + _STEP_NS)
     try:
         (folder / STATE_DIR).mkdir(exist_ok=True)  # a copy of a run may lack it
         with lock_run(folder), closing(RecordStore(folder)) as store:

@@ -11,7 +11,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from afspm import wire
 from afspm.clock import NS_PER_S
+from afspm.errors import WireError
 from afspm.model import (
     ControlEvent,
     ControlMode,
@@ -334,10 +336,11 @@ class Overview:
             return
         self._taken_ns[key] = time_ns
         self.newest_ns = max(self.newest_ns, time_ns)
-        if (taker := _TAKERS.get(message)) is not None:
-            taker(self, thing, time_ns)
+        handler: Callable[[object, int], None] | None = getattr(self, f"_{_handler(message)}", None)
+        if handler is not None:
+            handler(thing, time_ns)
 
-    def _take_status(self, status: ScopeStatus, time_ns: int) -> None:
+    def _on_state(self, status: ScopeStatus, time_ns: int) -> None:
         before, self.status = self.status, status
         self.states.change(sys.intern(status.state.name.lower()), time_ns)
         if status.state is ScopeState.SCANNING:
@@ -362,11 +365,11 @@ class Overview:
                 )
             )  # fmt: skip
 
-    def _take_lines(self, lines: ScanLines, time_ns: int) -> None:
+    def _on_scan_lines(self, lines: ScanLines, time_ns: int) -> None:
         if self.running is not None:
             self.running.take(lines)
 
-    def _take_scan(self, scan: Scan, time_ns: int) -> None:
+    def _on_scan(self, scan: Scan, time_ns: int) -> None:
         began_ns, holder = None, self.control.holder if self.control else None
         if self.running is not None:
             began_ns, holder = self.running.began_ns, self.running.holder
@@ -388,7 +391,7 @@ class Overview:
         setpoint = self.running.setpoint if self.running else None
         _keep(self._scans, key, replace(taken, number=number, setpoint=setpoint))
 
-    def _take_spectrum(self, spectrum: Spectrum, time_ns: int) -> None:
+    def _on_spectrum(self, spectrum: Spectrum, time_ns: int) -> None:
         taken_ns, holder = spectrum.time_ns or time_ns, self.control.holder if self.control else None
         taken = SpectrumSummary(
             taken_ns, spectrum.kind, spectrum.position_m, spectrum.frame, spectrum.names, spectrum.units,
@@ -396,7 +399,7 @@ class Overview:
         )  # fmt: skip
         _keep(self._spectra, (taken_ns, spectrum.kind, spectrum.position_m), taken)
 
-    def _take_control(self, control: ControlState, time_ns: int) -> None:
+    def _on_control(self, control: ControlState, time_ns: int) -> None:
         self.control = control
         self.controls.change(control.holder or NOBODY, time_ns)
         self.modes.change(control.mode.name.lower() if control.mode is not ControlMode.UNDEFINED else None, time_ns)
@@ -416,7 +419,7 @@ class Overview:
                 return entry.who
         return ""
 
-    def _take_entries(self, entries: JournalEntries, time_ns: int) -> None:
+    def _on_journal_entries(self, entries: JournalEntries, time_ns: int) -> None:
         for entry in entries.entries:
             # thousands of entries are kept, and most have the same words
             who, what, kind = map(sys.intern, (entry.who, entry.what, entry.kind))
@@ -447,7 +450,7 @@ class Overview:
                 label = self.problems.name(entry.problem) if is_flagged else None
                 self.problem_timelines[entry.problem].change(label, entry.time_ns, by=entry.who)
 
-    def _take_processes(self, states: ProcessStates, time_ns: int) -> None:
+    def _on_process_states(self, states: ProcessStates, time_ns: int) -> None:
         for state in states.processes:
             self.processes_told_ns[state.name] = time_ns
             before, self.processes[state.name] = self.processes.get(state.name), state
@@ -459,16 +462,16 @@ class Overview:
             if state.starts > (before.starts if before else 1):
                 self.restarts.append(ProcessRestart(state.since_ns, state.name, state.starts, state.last_exit))
 
-    def _take_progress(self, progress: Progress, time_ns: int) -> None:
+    def _on_progress(self, progress: Progress, time_ns: int) -> None:
         self.told_progress[progress.name] = progress
 
-    def _take_log(self, lines: LogLines, time_ns: int) -> None:
+    def _on_log_lines(self, lines: LogLines, time_ns: int) -> None:
         self.log.extend(lines.lines)
 
-    def _take_note(self, note: Note, time_ns: int) -> None:
+    def _on_note(self, note: Note, time_ns: int) -> None:
         self.notes.append(note)
 
-    def _take_mapping(self, message: Any, time_ns: int) -> None:
+    def _on_drift_mapping(self, message: Any, time_ns: int) -> None:
         if len(message.matrix) != 6 or len(message.center) != 2:
             return
         drift_x, drift_y = drift_at(np.array(message.matrix).reshape(2, 3), message.center)
@@ -480,11 +483,11 @@ class Overview:
         )  # fmt: skip
         _keep(self._drift, at_ns, point)
 
-    def _take_rescan(self, message: Any, time_ns: int) -> None:
+    def _on_drift_rescan(self, message: Any, time_ns: int) -> None:
         if message.kind == RescanKind.OPPOSITE:
             self._opposite_ns.append(message.timestamp.ToNanoseconds())
 
-    def _take_points(self, message: Any, time_ns: int) -> None:
+    def _on_spatial_point_with_score_list(self, message: Any, time_ns: int) -> None:
         found = ((one.spatial.point, one.spatial.units or "m", one) for one in message.spatials[-MOST_TARGETS:])
         self._targets[message.channel] = tuple(
             FoundPlace(
@@ -495,13 +498,13 @@ class Overview:
             if same_kind(unit, "m")
         )
 
-    def _take_parameters(self, parameters: ScanParameters, time_ns: int) -> None:
+    def _on_scan_parameters(self, parameters: ScanParameters, time_ns: int) -> None:
         self.scan_parameters = parameters
 
-    def _take_feedback(self, feedback: Feedback, time_ns: int) -> None:
+    def _on_feedback(self, feedback: Feedback, time_ns: int) -> None:
         self.feedback = feedback
 
-    def _take_position(self, position: ProbePosition, time_ns: int) -> None:
+    def _on_probe_position(self, position: ProbePosition, time_ns: int) -> None:
         self.probe_position = position
 
 
@@ -521,6 +524,13 @@ def _sharing(taken: ScanSummary, last: ScanSummary | None) -> ScanSummary:
     )
 
 
+def _handler(message: str) -> str:
+    try:
+        return wire.declaration(message).handler
+    except WireError:  # a message of a package that is not installed here
+        return ""
+
+
 def _one(before: V, now: V) -> V:
     return before if before == now else now
 
@@ -535,23 +545,3 @@ def _keep(kept: dict[K, V], key: K, thing: V) -> None:
     kept.setdefault(key, thing)
     if len(kept) > MOST_MEASURED:
         del kept[next(iter(kept))]
-
-
-_TAKERS: dict[str, Callable[[Overview, Any, int], None]] = {
-    "ScopeStateMsg": Overview._take_status,
-    "ControlState": Overview._take_control,
-    "ScanParameters2d": Overview._take_parameters,
-    "ZCtrlParameters": Overview._take_feedback,
-    "ProbePosition": Overview._take_position,
-    "ScanLines": Overview._take_lines,
-    "Scan2d": Overview._take_scan,
-    "Spec1d": Overview._take_spectrum,
-    "JournalEntries": Overview._take_entries,
-    "ProcessStates": Overview._take_processes,
-    "LogLines": Overview._take_log,
-    "Progress": Overview._take_progress,
-    "Note": Overview._take_note,
-    "SpatialPointWithScoreList": Overview._take_points,
-    "DriftMapping": Overview._take_mapping,
-    "DriftRescan": Overview._take_rescan,
-}

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import importlib
 import threading
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from afspm.errors import FileError
+from afspm.errors import ConfigError, FileError, InvalidValue
 from afspm.exit_codes import ExitCode
+from afspm.logic.envelopes import CacheSettings, EnvelopeMapping, Envelopes
 from afspm.logic.fencing import Epoch
+from afspm.logic.limits import ExperimentLimits
 from afspm.logic.scheduler_core import SchedulerCore
-from afspm.logic.settings import SchedulerSettings
+from afspm.logic.settings import ControlSettings, RunFacts, SchedulerSettings
+from afspm.model.snapshot import from_plain
 from afspm.process.context import ProcessContext
-from afspm.scheduler.settings import scheduler_settings
 from afspm.scheduler.shell import SchedulerShell
 from afspm.scheduler.state_file import StateFile
 from afspm.scheduler.wire_codec import WireCodec
@@ -24,6 +27,8 @@ from afspm.transport.probe import versions_here
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.scheduler_sockets import SchedulerSockets
 
+T = TypeVar("T")
+
 
 class Scheduler:
     """Lets one component at a time command the microscope, and gives everybody what was published.
@@ -32,9 +37,12 @@ class Scheduler:
     disk before anybody is told of them.
 
     Args:
-        control: the section [control] of the experiment file, durations in s.
-        limits: the section [limits].
-        cache: the section [cache].
+        control: the section [control] of the experiment file: `ControlSettings` as plain data.
+        limits: the section [limits]: `ExperimentLimits`.
+        cache: the section [cache]: `CacheSettings`.
+
+    Raises:
+        ConfigError: a setting is unknown, or can't be used.
     """
 
     def __init__(
@@ -43,9 +51,9 @@ class Scheduler:
         limits: Mapping[str, object] | None = None,
         cache: Mapping[str, object] | None = None,
     ) -> None:
-        self._control = control or {}
-        self._limits = limits or {}
-        self._cache = cache or {}
+        self._control = _section(ControlSettings, control or {}, "control")
+        self._limits = _section(ExperimentLimits, limits or {}, "limits")
+        self._cache = _section(CacheSettings, cache or {}, "cache")
 
     def run_process(self, context: ProcessContext) -> int:
         """Run until the experiment ends or we are told to stop; returns an exit code.
@@ -82,13 +90,18 @@ class Scheduler:
         return ExitCode.ENDED if shell.ended else ExitCode.ORPHAN
 
     def _settings(self, context: ProcessContext) -> SchedulerSettings:
-        settings = scheduler_settings(
-            self._control, self._limits, self._cache, context.problems, context.launch.request_timeout_s
-        )
-        launch = context.launch
-        versions = asdict(versions_here())
-        return replace(
-            settings, clock=dict(launch.clock), run=launch.run, simulated=launch.simulated, versions=versions
+        launch, control, cache = context.launch, self._control, self._cache
+        try:
+            rules = control.rules(context.problems)
+        except InvalidValue as error:
+            raise ConfigError(error.what, where="[control] end_on", hint=error.hint) from error
+        return SchedulerSettings(
+            control=replace(control, request_timeout_s=launch.request_timeout_s),
+            rules=rules,
+            watchdog=control.watchdog(),
+            limits=self._limits,
+            envelopes=Envelopes(cache.rules, _mapping(cache.mapping) if cache.mapping else None, cache.history),
+            run=RunFacts(dict(launch.clock), launch.run, launch.simulated, asdict(versions_here())),
         )
 
     def _core(self, context: ProcessContext) -> SchedulerCore:
@@ -115,3 +128,22 @@ def _restore(core: SchedulerCore, state: StateFile, log: Path | None) -> None:
         ) from error
     if log is not None:
         core.restore_cache(cached_packets(log))
+
+
+def _section(type_: type[T], plain: Mapping[str, object], name: str) -> T:
+    try:
+        made: T = from_plain(type_, plain)
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        raise ConfigError(f"the settings can't be used: {error}", where=f"[{name}]") from error
+    return made
+
+
+def _mapping(name: str) -> EnvelopeMapping:
+    module, _, function = name.rpartition(".")
+    try:
+        mapping = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"the mapping {name!r} can't be loaded: {error}", where="[cache] mapping") from error
+    if not callable(mapping):
+        raise ConfigError(f"{name!r} is not a function", where="[cache] mapping")
+    return mapping  # type: ignore[no-any-return]

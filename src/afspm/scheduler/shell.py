@@ -26,6 +26,7 @@ from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
 from afspm.transport.state_delay import StateDelay
 from afspm.transport.translator_link import LinkReply, LinkUp
+from afspm.wire.messages import SCOPE_STATE
 from afspm.wire.protocol import LONGEST_ID
 
 if TYPE_CHECKING:
@@ -277,7 +278,7 @@ class SchedulerShell:
 
     def _publish(self, packet: Packet) -> None:
         publisher, now_s = self._sockets.publisher, self._clock.monotonic_s()
-        for one in self._state_delay.take(packet, now_s, wanted=publisher.has_plain_subscriber(wire.Topic.SCOPE_STATE)):
+        for one in self._state_delay.take(packet, now_s, wanted=publisher.has_plain_subscriber(SCOPE_STATE.name)):
             publisher.publish(one)
         if self._state_delay.due_s is not None:
             self._look_at_s = min(self._look_at_s, self._state_delay.due_s)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from afspm import wire
 from afspm.errors import AfspmError
 from afspm.model import Parameter
@@ -11,9 +9,6 @@ from afspm.model import Parameter
 
 class WireCodec:
     """See `logic.events.Codec`."""
-
-    def encode_action(self, name: str) -> bytes:
-        return wire.encode_subject(name)
 
     def decode_parameter(self, payload: bytes) -> Parameter | None:
         try:
@@ -24,16 +19,10 @@ class WireCodec:
     def encode(self, thing: object) -> bytes:
         return wire.encode(thing)[1]
 
-    def encode_orders(self, restart: Sequence[str]) -> bytes:
-        return wire.encode_orders(restart)
-
     def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
         """See `scheduler.drift.places.PlaceCodec`."""
         of = "ProbePosition" if message in ("Spec1d", "ProbePosition") else "ScanParameters2d"
         return wire.relocated(message, payload, wire.place_in(of, told))
-
-    def by_point(self, spectrum: bytes | memoryview) -> bytes:
-        return wire.by_point(spectrum)
 
     def decode_packet(self, message: str, payload: bytes | memoryview) -> object:
         try:

@@ -20,13 +20,9 @@ from afspm.translator.sequence import SequenceStep, StatusSequence
 from afspm.translator.setters import apply, wanted_values
 from afspm.translator.setting_groups import MOVES, of_message
 from afspm.translator.temporary_settings import TemporarySettings, state_for
-from afspm.wire import encode
+from afspm.wire import declared, encode
 
-_ANNOUNCED = {
-    ControlRequest.SET_SCAN_PARAMS: "ScanParameters2d",
-    ControlRequest.SET_ZCTRL_PARAMS: "ZCtrlParameters",
-    ControlRequest.SET_PROBE_POS: "ProbePosition",
-}
+_ANNOUNCED = {one.set_by: one.name for one in declared() if one.set_by is not None}
 _SETTERS = (*_ANNOUNCED, ControlRequest.PARAM)
 
 

@@ -10,6 +10,8 @@ from afspm.errors import InvalidValue, Refused
 from afspm.model import ControlResponse, Feedback, ProbePosition, Region, ScanParameters, names
 from afspm.plain_data import Plain
 from afspm.translator.parameters import FEEDBACK_ON, ParameterTable, Value, refuse_value
+from afspm.wire.messages import FEEDBACK as FEEDBACK_STATE
+from afspm.wire.messages import PROBE_POSITION, SCAN_PARAMETERS
 
 Published = ScanParameters | Feedback | ProbePosition
 
@@ -26,6 +28,7 @@ EXTENT: Final = (names.SCAN_SIZE_X, names.SCAN_RESOLUTION_Y, names.SCAN_RESOLUTI
 """What, with the speed, a scan's duration depends on: the width, the rows, and perhaps the rest."""
 FEEDBACK: Final = (FEEDBACK_ON, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN, names.ZCTRL_SETPOINT)
 POSITION: Final = (names.PROBE_POS_X, names.PROBE_POS_Y)
+_FRAME_MESSAGE, _FEEDBACK_MESSAGE, _POSITION_MESSAGE = SCAN_PARAMETERS.name, FEEDBACK_STATE.name, PROBE_POSITION.name
 
 MOVES: Final = frozenset(FRAME + POSITION)
 
@@ -93,17 +96,17 @@ def messages(values: Mapping[str, Value]) -> dict[str, Published]:
     """Return the messages to publish of the values, by name: those that the microscope has all the parameters for."""
     published: dict[str, Published] = {}
     if all(name in values for name in FRAME if name != names.SCAN_ANGLE):
-        published["ScanParameters2d"] = scan_parameters(values)
+        published[_FRAME_MESSAGE] = scan_parameters(values)
     if any(name in values for name in FEEDBACK):
-        published["ZCtrlParameters"] = feedback(values)
+        published[_FEEDBACK_MESSAGE] = feedback(values)
     if all(name in values for name in POSITION):
-        published["ProbePosition"] = ProbePosition((_number(values, POSITION[0]), _number(values, POSITION[1])))
+        published[_POSITION_MESSAGE] = ProbePosition((_number(values, POSITION[0]), _number(values, POSITION[1])))
     return published
 
 
 def of_message(message: str) -> tuple[str, ...]:
-    """The parameters that a published message tells."""
-    return {"ScanParameters2d": FRAME, "ZCtrlParameters": FEEDBACK, "ProbePosition": POSITION}[message]
+    """Return the parameters that a published message contains."""
+    return {_FRAME_MESSAGE: FRAME, _FEEDBACK_MESSAGE: FEEDBACK, _POSITION_MESSAGE: POSITION}[message]
 
 
 def scan_parameters(values: Mapping[str, Value]) -> ScanParameters:

@@ -6,7 +6,8 @@ from collections import deque
 
 from afspm.errors import WireError
 from afspm.model import Packet, ScopeState
-from afspm.wire import Topic, decode, message_of
+from afspm.wire import decode, message_of
+from afspm.wire.messages import SCOPE_STATE
 
 DELAY_S = 0.1
 """Real time that a passing state lasts at least."""
@@ -53,7 +54,7 @@ class StateDelay:
 
 def _state(packet: Packet) -> ScopeState | None:
     """The state that a packet tells; None: it tells none."""
-    if not packet.envelope.startswith(Topic.SCOPE_STATE):
+    if not packet.envelope.startswith(SCOPE_STATE.name):
         return None
     try:
         state: ScopeState = decode(message_of(packet.envelope), packet.payload).state

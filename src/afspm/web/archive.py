@@ -8,6 +8,7 @@ import tomllib
 from collections import OrderedDict
 from pathlib import Path
 
+from afspm import wire
 from afspm.errors import AfspmError
 from afspm.model import ProblemNames, Region, Scan, Spectrum
 from afspm.plain_data import Plain
@@ -19,12 +20,6 @@ from afspm.units import si
 from afspm.web.frames import ChannelFrame, FrameKey
 
 KEPT = 6
-PAST = (
-    "ProcessStates", "JournalEntries", "ControlState", "ScopeStateMsg", "ScanParameters2d", "Scan2d", "Spec1d",
-    "ZCtrlParameters", "DriftMapping", "DriftRescan", "Note",
-)  # fmt: skip
-"""Messages with which an `Overview` has the time line, the map, drift and refusals. Of others the scheduler has kept
-enough for a late joiner."""
 
 
 class Archive:
@@ -46,7 +41,8 @@ class Archive:
             return None
         try:
             with open_run(self._folder) as run:
-                return run.overview(PAST, problems)
+                # of all others the scheduler has kept enough for a late joiner
+                return run.overview([one.name for one in wire.declared() if one.in_past], problems)
         except (AfspmError, ImportError) as error:
             self._log.debug("the earlier part of the run can't be read: %s", error)
             return None

@@ -16,7 +16,20 @@ from afspm.wire.frames import (
     encode_time,
 )
 from afspm.wire.mapping import decode_orders, encode_orders
-from afspm.wire.messages import known_messages, message_of, message_type, messages_of_the_experiment, register
+from afspm.wire.messages import (
+    MessageDeclaration,
+    MessageKind,
+    declaration,
+    declare,
+    declared,
+    followed_messages,
+    known_messages,
+    message_of,
+    message_type,
+    messages_of_the_experiment,
+    messages_without_values,
+    register,
+)
 from afspm.wire.protocol import (
     BEAT,
     CLOSE,
@@ -24,7 +37,6 @@ from afspm.wire.protocol import (
     KILL,
     PROTOCOL_VERSION,
     VERSION_2_ACTION,
-    Topic,
     Version,
     version_of,
 )
@@ -39,9 +51,13 @@ __all__ = [
     "PROTOCOL_VERSION",
     "VERSION_2_ACTION",
     "Buffer",
-    "Topic",
+    "MessageDeclaration",
+    "MessageKind",
     "Version",
     "by_point",
+    "declaration",
+    "declare",
+    "declared",
     "decode",
     "decode_orders",
     "decode_packet",
@@ -57,11 +73,13 @@ __all__ = [
     "encode_response",
     "encode_subject",
     "encode_time",
+    "followed_messages",
     "header",
     "known_messages",
     "message_of",
     "message_type",
     "messages_of_the_experiment",
+    "messages_without_values",
     "place_in",
     "register",
     "relocated",

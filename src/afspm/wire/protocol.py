@@ -10,11 +10,12 @@ ids of its requests, a scheduler or translator by its answer to a `QUESTION` tha
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from enum import Enum, StrEnum, auto
+from enum import Enum, auto
 from typing import Final
 
 from afspm.model import ControlRequest, ControlResponse, Response
 from afspm.wire.generated import control_pb2
+from afspm.wire.messages import declared
 
 PROTOCOL_VERSION: Final = 2
 
@@ -29,30 +30,8 @@ LONGEST_ENVELOPE: Final = 1000
 """Bytes."""
 
 
-class Topic(StrEnum):
-    """The messages that are published. An envelope is one of these names, or begins with it and an underscore."""
-
-    SCAN = "Scan2d"
-    SPECTRUM = "Spec1d"
-    SCOPE_STATE = "ScopeStateMsg"
-    SCAN_PARAMETERS = "ScanParameters2d"
-    FEEDBACK = "ZCtrlParameters"
-    PROBE_POSITION = "ProbePosition"
-    CONTROL_STATE = "ControlState"
-    REGIONS = "SpatialROIWithScoreList"
-    POINTS = "SpatialPointWithScoreList"
-    SCAN_LINES = "ScanLines"
-    DRIFT_MAPPING = "DriftMapping"
-    DRIFT_RESCAN = "DriftRescan"
-    JOURNAL = "JournalEntries"
-    PROCESSES = "ProcessStates"
-    LOG = "LogLines"
-    PROGRESS = "Progress"
-    NOTE = "Note"
-
-
-VERSION_1_TOPICS: Final = tuple(Topic)[:9]
-"""The messages that a cache of version 1 knows; it ends over any other."""
+VERSION_1_MESSAGES: Final = tuple(one.name for one in declared() if one.in_version_1)
+"""The messages that a cache of version 1 knows."""
 
 
 class Version(Enum):
@@ -117,5 +96,5 @@ def prefixes_of_version_1(prefixes: Iterable[str]) -> list[str]:
     """
     found: list[str] = []
     for prefix in prefixes:
-        found += [name for name in (*VERSION_1_TOPICS, KILL.decode()) if name.startswith(prefix)] or [prefix]
+        found += [name for name in (*VERSION_1_MESSAGES, KILL.decode()) if name.startswith(prefix)] or [prefix]
     return found

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from afspm import wire
-from afspm.logic.envelopes import DEFAULT_HISTORY
 from afspm.model import Region, Scan
 from afspm.transport.tcp_guard import MOST_UNSENT_BYTES
+from afspm.wire.messages import SCAN
 
 pytestmark = pytest.mark.skipif(
     sys.platform != "linux", reason="a process is stopped by a signal, and its peak memory is read from /proc"
@@ -99,7 +99,7 @@ def test_what_waits_for_a_stopped_subscriber_is_bounded_in_bytes_and_others_miss
     stopped.process.send_signal(signal.SIGCONT)
     rig.until(lambda: stopped.times[-1] == healthy.times[-1])
     assert stopped.times == sorted(set(stopped.times))
-    kept = DEFAULT_HISTORY["Scan2d"]
+    kept = SCAN.history
     assert stopped.times[-kept:] == healthy.times[-kept:]
     assert len(stopped.times) < SCANS  # the others were dropped
     publish(SCANS + 1)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import pytest
 
-from afspm.experiment.limits_section import to_settings
 from afspm.logic.limit_checker import LimitChecker
-from afspm.model import ControlRequest, Feedback, Parameter, ProblemNames, Request
-from afspm.scheduler.settings import scheduler_settings
+from afspm.logic.limits import ExperimentLimits
+from afspm.model import ControlRequest, Feedback, Parameter, Request
+from afspm.model.snapshot import from_plain, to_plain
 
 from .conftest import Write, errors, line_of, only_error
 
@@ -207,7 +208,7 @@ def test_what_an_added_action_sets_is_limited_too(write: Write) -> None:
 def test_what_added_actions_set_reaches_the_scheduler(write: Write) -> None:
     experiment = write(CORRECTOR + BIAS + 'only = ["repair"]\n', frame=SIMULATED + ADDED)
     assert not errors(experiment)
-    limits = scheduler_settings({}, to_settings(experiment.resolved.limits), {}, ProblemNames(), 5.0).limits
+    limits = from_plain(ExperimentLimits, json.loads(json.dumps(to_plain(experiment.resolved.limits))))
     assert limits.sets == experiment.resolved.limits.sets
     guard = LimitChecker(limits)
     high = Request(int(ControlRequest.ACTION), "x-high")

@@ -371,7 +371,7 @@ def test_the_short_form_is_the_same_experiment(write: Write, tmp_path: Path) -> 
     for part in brief.parts.components:
         (same,) = [other for other in long.parts.components if other.name == part.name]
         assert brief.resolved.processes[part.name].envelopes == long.resolved.processes[same.name].envelopes
-    assert brief.resolved.sections.control.request_timeout == 5.0
+    assert brief.resolved.sections.control.request_timeout_s == 5.0
 
 
 def test_addresses_of_other_computers_stay_in_the_short_form(write: Write, tmp_path: Path) -> None:

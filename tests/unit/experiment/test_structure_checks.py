@@ -186,7 +186,7 @@ BROKEN = {
     "no such folder of keys": ('[security]\nkeys = "keys"\n', FRAME, "there is no folder"),
     "a lease of no time": ('[control]\nlease = "0 s"\n', FRAME, "[control] lease"),
     "a rule of the cache that fits nothing": (
-        '[[cache.rules]]\nabove = "2 um"\nup_to = "1 um"\n', FRAME, "no width is above"
+        '[[cache.rules]]\nabove = "2 um"\nup_to = "1 um"\n', FRAME, "above must be less than up_to"
     ),
     "an envelope that does not say what is in it": (
         '[[cache.rules]]\nmessage = "Scan2d"\nenvelope = "wide_{channel}"\n', FRAME, "nobody could read it"

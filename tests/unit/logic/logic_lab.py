@@ -233,6 +233,6 @@ def resumed(lab: Lab, settings: SchedulerSettings) -> Lab:
     """The same, when it has caught up with the translator."""
     again = killed(lab, settings)
     for _ in range(3):  # one decision in each
-        again.later(real_s=settings.catch_up_s)
+        again.later(real_s=settings.waits.catch_up_s)
         again.step(Tick())
     return again

@@ -67,7 +67,7 @@ def test_each_event_has_a_last_row_that_always_applies() -> None:
 
 
 def test_every_row_can_apply() -> None:
-    roles = RoleTable(end={"boss"}, mode={"boss"}, clear={"boss"}, operate={"boss"})
+    roles = RoleTable(end_experiment=("boss",), set_mode=("boss",), clear_problems=("boss",), operate=("boss",))
     met = set()
     for rules in (RULES, Rules(roles), Rules(end_on=frozenset({TIP}))):
         for control in _states():
@@ -113,7 +113,7 @@ def test_anybody_may_clear_a_flag_unless_roles_are_given(who: str) -> None:
 
 
 def test_with_roles_the_flag_of_another_is_cleared_only_by_its_solver_or_the_role() -> None:
-    rules = Rules(RoleTable(clear={"boss"}))
+    rules = Rules(RoleTable(clear_problems=("boss",)))
     flagged = flag("classifier", TIP)
     control, row = after(flagged, clear("stranger", TIP), rules=rules)
     assert (set(control.problems), row.response) == ({TIP}, ControlResponse.FAILURE)
@@ -222,7 +222,7 @@ def test_only_the_holder_commands_and_everybody_reads() -> None:
 
 
 def test_an_operator_commands_in_manual_only() -> None:
-    rules = Rules(RoleTable(operate={"console"}))
+    rules = Rules(RoleTable(operate=("console",)))
     command = ControlInput(ArbitrationEvent.COMMAND, "console")
     assert after(mode(MANUAL), command, rules=rules)[1].response is None
     assert after(command, rules=rules)[1].response is ControlResponse.NOT_IN_CONTROL
@@ -230,7 +230,7 @@ def test_an_operator_commands_in_manual_only() -> None:
 
 
 def test_an_operator_adjusts_beside_the_holder_while_no_problem_is_flagged() -> None:
-    rules = Rules(RoleTable(operate={"console"}))
+    rules = Rules(RoleTable(operate=("console",)))
 
     def response(who: str, *before: ControlInput) -> ControlResponse | None:
         return after(*before, ControlInput(ArbitrationEvent.ADJUST, who), rules=rules)[1].response
@@ -244,7 +244,7 @@ def test_an_operator_adjusts_beside_the_holder_while_no_problem_is_flagged() -> 
 
 
 def test_roles_say_who_may_end_and_switch() -> None:
-    rules = Rules(RoleTable(end={"boss"}, mode={"boss"}))
+    rules = Rules(RoleTable(end_experiment=("boss",), set_mode=("boss",)))
     assert after(ControlInput(ArbitrationEvent.END, "other"), rules=rules)[1].response is ControlResponse.FAILURE
     assert after(ControlInput(ArbitrationEvent.END, "boss"), rules=rules)[0].ended
     assert after(mode(MANUAL, "other"), rules=rules)[1].response is ControlResponse.FAILURE

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from afspm.errors import ConfigError
+from afspm.errors import ConfigError, InvalidValue
 from afspm.logic.cache import TIME_STEP_NS, PacketCache
 from afspm.logic.envelopes import CacheRule, Envelopes, default_envelope, size_text
 from afspm.model import Packet, PacketHeader
@@ -113,7 +113,7 @@ def test_a_mapping_that_fails_is_an_error_of_the_configuration() -> None:
     ],
 )
 def test_a_rule_that_can_not_work_is_refused(rule: dict[str, object]) -> None:
-    with pytest.raises(ConfigError):
+    with pytest.raises(InvalidValue):
         CacheRule("Scan2d", **rule)  # type: ignore[arg-type]
 
 

@@ -6,7 +6,7 @@ import pytest
 from logic_lab import Lab
 
 from afspm.logic.events import Tick
-from afspm.logic.settings import SchedulerSettings
+from afspm.logic.settings import ControlSettings, SchedulerSettings
 from afspm.model import ControlResponse, Problem, ScopeState
 
 LOST = Problem.DEVICE_MALFUNCTION
@@ -15,7 +15,7 @@ PATIENCE_S = 3.0
 
 @pytest.fixture
 def lab() -> Lab:
-    made = Lab(SchedulerSettings(malfunction_after_s=PATIENCE_S))
+    made = Lab(SchedulerSettings(control=ControlSettings(malfunction_after_s=PATIENCE_S)))
     made.translator()
     made.scope_is(ScopeState.FREE)
     assert made.take_control("series") is ControlResponse.SUCCESS

@@ -12,7 +12,7 @@ from afspm.model import ControlRequest, ProcessCondition, ProcessState
 
 ALIVE, RESTARTING = ProcessCondition.ALIVE, ProcessCondition.RESTARTING
 ENDED, GIVEN_UP = ProcessCondition.ENDED, ProcessCondition.GIVEN_UP
-GRACE_S = SchedulerSettings().grace_s
+GRACE_S = SchedulerSettings().control.grace_s
 
 
 def state(condition: ProcessCondition, name: str = "series", starts: int = 1) -> ProcessState:

@@ -28,7 +28,7 @@ from afspm.logic.events import (
     TranslatorUp,
 )
 from afspm.logic.limits import ExperimentLimits, Limit
-from afspm.logic.settings import SchedulerSettings
+from afspm.logic.settings import ControlSettings, RunFacts, SchedulerSettings
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import (
     CLOCK_REQUEST,
@@ -146,7 +146,7 @@ def test_what_a_former_holder_has_waiting_is_not_sent_any_more(lab: Lab) -> None
 def test_a_holder_that_is_gone_is_given_up_after_its_grace(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.step(Disconnected(lab.connections["experiment"]))
-    dead_s = lab.now_s + 10.0
+    dead_s = lab.now_s + SchedulerSettings().control.grace_s
     lab.entries()
     assert lab.core.deadline_s() == dead_s
     lab.now_s = dead_s - 0.1
@@ -217,7 +217,7 @@ def test_the_tip_of_a_holder_that_died_in_danger_is_retracted_and_nobody_disturb
 
 
 def test_a_holder_that_does_nothing_loses_control_with_its_lease() -> None:
-    lab = Lab(SchedulerSettings(lease_s=60.0))
+    lab = Lab(SchedulerSettings(control=ControlSettings(lease_s=60.0)))
     lab.translator()
     lab.scope_is(ScopeState.FREE)
     lab.take_control("greedy")
@@ -508,13 +508,13 @@ def test_the_end_is_saved_answered_and_then_told_to_all(lab: Lab) -> None:
 
 
 def test_only_who_has_the_role_ends_the_experiment() -> None:
-    lab = Lab(SchedulerSettings(rules=Rules(RoleTable(end={"boss"}))))
+    lab = Lab(SchedulerSettings(rules=Rules(RoleTable(end_experiment=("boss",)))))
     assert lab.says("other", ControlRequest.END_EXPERIMENT) is ControlResponse.FAILURE
     assert not any(isinstance(e, Kill) for e in lab.effects)
 
 
 def test_an_operator_commands_in_manual() -> None:
-    lab = Lab(SchedulerSettings(rules=Rules(RoleTable(operate={"console"}))))
+    lab = Lab(SchedulerSettings(rules=Rules(RoleTable(operate=("console",)))))
     lab.translator()
     assert lab.says("console", ACTION, "start-scan") is NOT_IN_CONTROL
     lab.mode("console", ControlMode.MANUAL)
@@ -522,7 +522,7 @@ def test_an_operator_commands_in_manual() -> None:
 
 
 def test_only_what_the_file_names_is_adjusted_beside_the_holder() -> None:
-    lab = Lab(SchedulerSettings(rules=Rules(RoleTable(operate={"console"}), adjustable=frozenset({"zctrl-setpoint"}))))
+    lab = Lab(SchedulerSettings(rules=Rules(RoleTable(operate=("console",)), adjustable=frozenset({"zctrl-setpoint"}))))
     lab.translator()
     lab.take_control("experiment")
     setpoint, bias = Parameter("zctrl-setpoint", "0.5"), Parameter("tip-bias-voltage", "1", "V")
@@ -533,7 +533,7 @@ def test_only_what_the_file_names_is_adjusted_beside_the_holder() -> None:
 
 
 def test_what_is_set_by_hand_and_stays_in_force_is_said_when_components_go_on() -> None:
-    lab = Lab(SchedulerSettings(rules=Rules(RoleTable(operate={"console"}))))
+    lab = Lab(SchedulerSettings(rules=Rules(RoleTable(operate=("console",)))))
     lab.translator()
     lab.publish("ZCtrlParameters", Feedback(on=True, setpoint=1e-9))
     lab.mode("console", ControlMode.MANUAL)
@@ -592,7 +592,7 @@ def test_odd_requests_are_answered(lab: Lab, garbage: Request) -> None:
 
 
 def test_whoever_asks_is_told_the_time_of_the_experiment_and_how_it_passes() -> None:
-    lab = Lab(SchedulerSettings(clock={"origin_s": 5.0, "start_s": 7.0, "speed": 600.0}))
+    lab = Lab(SchedulerSettings(run=RunFacts({"origin_s": 5.0, "start_s": 7.0, "speed": 600.0})))
     answer = replies(lab.ask("elsewhere", CLOCK_REQUEST, id_="elsewhere/a/1"))[0].response
     assert (answer.code, answer.id) == (OK, "elsewhere/a/1")
     clock = {"origin_s": 5.0, "start_s": 7.0, "speed": 600.0, "now_ns": lab.now_ns}

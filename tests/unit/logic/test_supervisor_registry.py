@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from logic_lab import Lab, published, replies
 
+from afspm import wire
 from afspm.logic.arbitration import RoleTable, Rules
 from afspm.logic.events import SaveState
 from afspm.logic.settings import SchedulerSettings
@@ -54,7 +55,7 @@ def tell(lab: Lab, thing: Any, name: str = HOST, id_: str = "", user: str | None
 
 def orders(lab: Lab, response: Response) -> tuple[str, ...]:
     assert response.code == OK, response
-    return tuple(lab.codec.decode(response.payload))
+    return wire.decode_orders(response.payload)
 
 
 def order(lab: Lab, process: str, who: str = "dashboard:Ada") -> Response:
@@ -179,7 +180,7 @@ def test_a_supervisor_that_is_silent_is_given_no_orders(lab: Lab) -> None:
 
 
 def test_it_takes_the_role_to_order() -> None:
-    lab = Lab(SchedulerSettings(rules=Rules(RoleTable(restart={"dashboard"}))))
+    lab = Lab(SchedulerSettings(rules=Rules(RoleTable(restart=("dashboard",)))))
     tell(lab, states("a"))
     assert order(lab, "a", "stranger:Ada").reason == "stranger:Ada does not have the role restart ([control.roles])"
     assert order(lab, "a", "dashboard:Ada").code == OK
@@ -214,7 +215,7 @@ def test_after_the_end_last_words_are_taken_and_no_orders(lab: Lab) -> None:
 
 
 def test_a_person_has_the_roles_of_the_component_that_acts_for_it() -> None:
-    roles = RoleTable(end={"dashboard:Ada"}, mode={"dashboard"}, operate={"dashboard"})
+    roles = RoleTable(end_experiment=("dashboard:Ada",), set_mode=("dashboard",), operate=("dashboard",))
     lab = Lab(SchedulerSettings(rules=Rules(roles)))
     lab.translator()
     assert lab.mode("dashboard:Eve", ControlMode.MANUAL) is OK

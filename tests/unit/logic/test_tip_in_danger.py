@@ -6,7 +6,7 @@ import pytest
 from logic_lab import Lab, in_control, killed, kinds, replies, resumed
 
 from afspm.logic.events import Kill, Log, Stopped, Tick, TranslatorDown, TranslatorUp
-from afspm.logic.settings import SchedulerSettings
+from afspm.logic.settings import ControlSettings, SchedulerSettings, Waits
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import (
     ControlMode,
@@ -74,7 +74,7 @@ def test_a_tip_brought_back_by_hand_is_withdrawn_again_when_it_is_endangered_aga
 
 
 def test_a_tip_that_is_withdrawn_when_nobody_waits_for_it_any_more_is_left_to_people() -> None:
-    lab = feedback_off(SchedulerSettings(request_timeout_s=1.0, patience_s=1.0))
+    lab = feedback_off(SchedulerSettings(control=ControlSettings(request_timeout_s=1.0), waits=Waits(answer_s=1.0)))
     lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
     overdue = lab.forwarded[-1]
     lab.ask("person", ControlRequest.SET_CONTROL_MODE, int(ControlMode.MANUAL))
@@ -144,7 +144,7 @@ def test_who_resumes_a_run_that_was_stopped_without_danger_is_not_called() -> No
 
 
 def test_a_lease_that_runs_out_leaves_no_danger() -> None:
-    lab = feedback_off(SchedulerSettings(lease_s=60.0))
+    lab = feedback_off(SchedulerSettings(control=ControlSettings(lease_s=60.0)))
     lab.later(experiment_s=60.0)
     lab.step(Tick())
     assert lab.holder is None

@@ -11,7 +11,7 @@ from logic_lab import Lab, killed
 from afspm.logic.arbitration import Cause
 from afspm.logic.events import Tick
 from afspm.logic.holder_timeout import Lease
-from afspm.logic.settings import SchedulerSettings
+from afspm.logic.settings import ControlSettings, SchedulerSettings, Waits
 from afspm.logic.watchdog import SafetyResult, WatchdogSettings
 from afspm.model import LEASE_REQUEST, ControlEvent, ControlRequest, ControlResponse, ScopeState
 
@@ -373,7 +373,7 @@ def test_a_holder_that_does_nothing_has_a_deadline_and_using_control_moves_it() 
 
 
 def test_while_the_microscope_works_its_holder_is_not_idle() -> None:
-    lab = Lab(SchedulerSettings(lease_s=60.0))
+    lab = Lab(SchedulerSettings(control=ControlSettings(lease_s=60.0)))
     lab.translator()
     lab.take_control("experiment")
     assert lab.core.deadline_ns() is not None
@@ -444,7 +444,8 @@ def test_only_the_holder_has_a_lease() -> None:
 
 
 def test_a_lease_outlives_the_scheduler_and_begins_anew() -> None:
-    lab = killed(leased(Lab(SchedulerSettings(restart_grace_s=1000.0))), SchedulerSettings(restart_grace_s=1000.0))
+    settings = SchedulerSettings(waits=Waits(restart_grace_s=1000.0))
+    lab = killed(leased(Lab(settings)), settings)
     lab.later(real_s=19.0)
     lab.step(Tick())
     assert lab.holder == "gateway:Ada"

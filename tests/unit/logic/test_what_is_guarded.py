@@ -120,7 +120,7 @@ def test_value_is_read_again_after_an_unanswered_change() -> None:
     lab = in_control(STEPS)
     lab.ask("experiment", PARAM, Parameter(BIAS, "0.1", "V"), "experiment/a/1")
     told(lab, "0")
-    lab.later(STEPS.request_timeout_s + STEPS.patience_s)
+    lab.later(STEPS.control.request_timeout_s + STEPS.waits.answer_s)
     lab.step(Tick())  # overdue, and the next may be sent
     lab.ask("experiment", PARAM, Parameter(BIAS, "-0.1", "V"), "experiment/a/2")
     (reply,) = replies(told(lab, "0.1"))
@@ -178,7 +178,7 @@ def test_refused_repetition_is_answered_as_unknown_outcome() -> None:
     lab = in_control(STEPS)
     lab.ask("experiment", PARAM, Parameter(BIAS, "0.1", "V"), "experiment/a/1")
     told(lab, "0")
-    lab.later(STEPS.request_timeout_s + STEPS.patience_s)
+    lab.later(STEPS.control.request_timeout_s + STEPS.waits.answer_s)
     lab.step(Tick())
     lab.ask("experiment", PARAM, Parameter(BIAS, "0.1", "V"), "experiment/a/1")
     (reply,) = replies(told(lab, "3"))
@@ -251,7 +251,7 @@ def test_what_can_not_be_read_is_not_set() -> None:
 def test_one_whose_value_the_microscope_does_not_tell_in_time_may_ask_again() -> None:
     lab = in_control(STEPS)
     lab.ask("experiment", PARAM, Parameter(BIAS, "0.2", "V"), "experiment/a/1")
-    lab.later(STEPS.request_timeout_s)
+    lab.later(STEPS.control.request_timeout_s)
     (reply,) = replies(lab.step(Tick()))
     assert reply.response.code == ControlResponse.NO_RESPONSE
     assert reply.response.detail is ResponseDetail.NOT_SENT

@@ -39,6 +39,7 @@ from afspm.scheduler.drift.positions import (
     value_in,
 )
 from afspm.scheduler.drift.scan_timing import ScanDurations
+from afspm.wire.messages import PROBE_POSITION, SCAN_LINES, SCAN_PARAMETERS, SPECTRUM
 
 MOVES_PX = 0.01
 """A region that lies this far off in the tip's coordinates is set again before it is scanned."""
@@ -268,10 +269,10 @@ class DriftFrame:
 
     def incoming(self, packet: Packet, header: PacketHeader, now_ns: int) -> Packet:
         handler = {
-            "ScanParameters2d": self._region_told,
-            "ProbePosition": self._probe_told,
-            "Spec1d": self._spectrum_told,
-            "ScanLines": self._lines_told,
+            SCAN_PARAMETERS.name: self._region_told,
+            PROBE_POSITION.name: self._probe_told,
+            SPECTRUM.name: self._spectrum_told,
+            SCAN_LINES.name: self._lines_told,
         }.get(header.message)
         if handler is None:
             return packet

@@ -18,7 +18,7 @@ def facts_of(packet: Packet) -> Facts:
     """Return the facts of a packet that can be compared."""
     message = wire.message_of(packet.envelope)
     facts: Facts = {"envelope": packet.envelope, "message": message, "timestamp_ns": packet.time_ns}
-    if message in ("Scan2d", "ScanLines", "Spec1d"):
+    if wire.declaration(message).has_values:
         facts |= _measured(wire.decode(message, packet.payload))
     return facts
 

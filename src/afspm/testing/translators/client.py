@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Final, TypeVar
+from typing import Any, TypeVar
 
 from afspm import wire
 from afspm.client.experiment_link import ExperimentLink
@@ -17,6 +17,7 @@ from afspm.model import (
     Packet,
     Parameter,
     Response,
+    Role,
     Scan,
     ScopeState,
     ScopeStatus,
@@ -27,11 +28,6 @@ from afspm.process.parent import StopRequested
 from afspm.testing.conformance import Failed, Lost, expect
 
 T = TypeVar("T")
-
-_OF_A_MICROSCOPE: Final = frozenset(
-    {"Scan2d", "Spec1d", "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "ScopeStateMsg"}
-)
-"""The rest is others' doing: who is in control, what the scheduler notes down, lines that only those want who asked."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +73,8 @@ class Observations:
             thing = wire.decode(message, bytes(packet.payload))
         except WireError as error:
             thing = error
-        if message in _OF_A_MICROSCOPE or isinstance(thing, WireError):
+        # the rest comes from the scheduler, or only where a client asks for it
+        if isinstance(thing, WireError) or _is_always_published(wire.declaration(message)):
             self.all.append(Observation(message, thing, packet.time_ns))
 
     def mark(self) -> int:
@@ -100,6 +97,10 @@ class Observations:
         """When it was first said after `mark`, experiment time; None: not yet."""
         times = (one.time_ns for one in self.all[mark:] if one.state is state and one.time_ns is not None)
         return next((time_ns / 1e9 for time_ns in times), None)
+
+
+def _is_always_published(message: wire.MessageDeclaration) -> bool:
+    return message.source is Role.TRANSLATOR and message.always
 
 
 def told(heard: Iterable[Observation]) -> str:

@@ -13,10 +13,8 @@ from afspm.testing.clients.golden import golden
 from afspm.testing.conformance import Failed, expect
 from afspm.transport.frames import receive_frames
 from afspm.transport.network import Network
-from afspm.wire import KILL, encode_time
+from afspm.wire import KILL, encode_time, followed_messages
 
-_STATE = ("ScopeStateMsg", "ControlState", "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "Scan2d", "Spec1d")
-"""A client may always follow these, to know the state and its own measurements."""
 _FIRST_NS = 1_767_225_600_000_000_000
 _PACKET_S = 10.0
 
@@ -51,7 +49,8 @@ def marker(bench: ClientBench) -> None:
             expect(not more, "one marker for a connection", f"{len(more) + 1}")
             expect(asked.since_ns == -1, "a marker that asks for all (-1)", f"since {asked.since_ns}")
             wanted = {"", KILL.decode()} if envelopes is None else {*envelopes, KILL.decode()}
-            unasked = set(asked.prefixes) - wanted - set(_STATE)
+            # every client may follow the state and its own measurements
+            unasked = set(asked.prefixes) - wanted - set(followed_messages())
             expect(not unasked, f"the prefixes {sorted(wanted)}, and those of the state", f"also {sorted(unasked)}")
             missing = (wanted - {KILL.decode()}) - set(asked.prefixes)
             expect(not missing, f"the prefixes {sorted(wanted)}", f"none for {sorted(missing)}")

@@ -16,7 +16,7 @@ from afspm.testing.clients.golden import frames_of, golden
 from afspm.testing.clients.program import Answer
 from afspm.testing.clients.scripted import success
 from afspm.testing.conformance import Failed, expect
-from afspm.wire import decode_packet, encode_time, message_type
+from afspm.wire import declaration, decode_packet, encode_time, message_type
 
 _PACKET_S = 10.0
 _FIRST_NS = 1_767_225_600_123_456_000
@@ -158,7 +158,7 @@ def packets(bench: ClientBench) -> None:
         sent: dict[str, list[bytes]] = {entry["envelope"]: frames_of(entry) for entry in golden()["published"]}
         for entry in golden()["messages"]:
             envelope = f"{entry['type']}_{entry['name'].replace(' ', '-')}"
-            if entry["type"] in ("Scan2d", "ScanLines", "Spec1d"):
+            if declaration(entry["type"]).has_values:
                 sent[envelope] = [envelope.encode(), bytes.fromhex(entry["hex"]), b""]
         for i, frames in enumerate(sent.values()):
             frames[2] = encode_time(_FIRST_NS + i * 1_000_000)
