@@ -58,8 +58,7 @@ def _published(draft: StateDraft, packet: Packet, header: PacketHeader) -> Publi
     try:
         if env.settings.spectra_by_variable and header.message == SPECTRUM:
             packet = Packet(packet.envelope, env.codec.by_point(packet.payload), packet.time_ns)
-        if env.frame is not None:
-            packet = env.frame.incoming(packet, header, draft.now_ns)
+        draft.frame, packet = draft.frame.incoming(packet, header, draft.now_ns)
         taken = env.cache.take(packet, header, draft.now_ns)
     except AfspmError as error:
         _log_once(draft, "ERROR", f"{header.message} is not published: {error}")

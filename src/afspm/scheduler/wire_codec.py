@@ -27,11 +27,6 @@ class WireCodec:
     def encode_orders(self, restart: Sequence[str]) -> bytes:
         return wire.encode_orders(restart)
 
-    def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
-        """See `scheduler.drift.places.PlaceCodec`."""
-        of = "ProbePosition" if message in ("Spec1d", "ProbePosition") else "ScanParameters2d"
-        return wire.relocated(message, payload, wire.place_in(of, told))
-
     def by_point(self, spectrum: bytes | memoryview) -> bytes:
         return wire.by_point(spectrum)
 

@@ -27,6 +27,7 @@ from afspm.model import (
 )
 from afspm.scheduler.drift.messages import NotRegistered, WorkerGone
 from afspm.scheduler.drift.settings import Compensate, DriftCompensationSettings
+from afspm.scheduler.drift.state import SavedDrift
 
 DRIFT = (100e-9, -50e-9)
 BACK = (-100e-9, 50e-9)
@@ -200,11 +201,10 @@ def test_it_is_saved_before_it_is_published(lab: Lab) -> None:
     lab.says(registered(lab.worker.jobs[0], forecast(DRIFT)))
     kinds = [type(effect).__name__ for effect in lab.effects]
     assert kinds.index("SaveState") < kinds.index("Publish")
-    frame = lab.saved().frame
-    assert frame is not None
-    beside = json.loads(frame)["beside"]
-    assert beside["knowledge"]["forecast"] == forecast(DRIFT)
-    assert beside["scans"][0][0] == lab.worker.jobs[0].key
+    saved = lab.saved().frame
+    assert isinstance(saved, SavedDrift)
+    assert json.loads(saved.forecast.text or "") == forecast(DRIFT)
+    assert list(saved.settled) == [lab.worker.jobs[0].key]
 
 
 def test_a_restarted_scheduler_announces_itself_after_the_scans_that_wait(lab: Lab) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from afspm import wire
 from afspm.clock import NS_PER_S
 from afspm.model.geometry import XY
 from afspm.scheduler.drift.messages import Matrix, Registered, RescanWanted
@@ -11,7 +12,11 @@ from afspm.wire.messages import DriftMapping, DriftRescan, ScanParameters2d
 
 
 class DriftWireCodec(WireCodec):
-    """See `scheduler.drift.told.DriftCodec`."""
+    """See `scheduler.drift.messages.DriftCodec`."""
+
+    def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
+        of = "ProbePosition" if message in ("Spec1d", "ProbePosition") else "ScanParameters2d"
+        return wire.relocated(message, payload, wire.place_in(of, told))
 
     def encode_mapping(self, registered: Registered, filename: str, center_m: XY, *, correcting: bool) -> bytes:
         return DriftMapping(

@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
 from afspm.errors import ConfigError
 from afspm.model import Frame
 from afspm.plain_data import PlainMapping
 from afspm.process.context import ProcessContext
 from afspm.scheduler.drift.codec import DriftWireCodec
-from afspm.scheduler.drift.core import MAPPING, DriftCore
-from afspm.scheduler.drift.messages import Forecasted
 from afspm.scheduler.drift.response import RESCAN
+from afspm.scheduler.drift.sample_frame import SampleFrame
+from afspm.scheduler.drift.scan_intake import MAPPING
 from afspm.scheduler.drift.settings import DriftCompensationSettings
 from afspm.scheduler.drift.worker_process import DriftWorkerProcess
-from afspm.scheduler.scheduler import Scheduler
-from afspm.scheduler.shell import SchedulerShell
-from afspm.transport.scheduler_sockets import SchedulerSockets
-
-if TYPE_CHECKING:
-    from afspm.logic.scheduler_core import SchedulerCore
-    from afspm.transport.scheduler_sockets import Source
+from afspm.scheduler.scheduler import Coordinates, Scheduler
 
 
 class DriftCompensatedScheduler(Scheduler):
@@ -74,38 +68,12 @@ class DriftCompensatedScheduler(Scheduler):
                 hint='tracker = "bank", or leave compensate out',
             )
 
-    def _core(self, context: ProcessContext) -> SchedulerCore:
+    def coordinates(self, context: ProcessContext) -> Coordinates:
         launch = context.launch
         file = Path(launch.state_dir) / f"{launch.name}.drift.npz" if launch.state_dir else None
         drift = self.drift.beside(launch.solved)
         if drift != self.drift:
             context.log.info("no component solves thermal-drift: the first scan is not taken in both directions")
-        self._registrar = DriftWorkerProcess(drift, file, context.log)
-        self._registrar.late = context.clock.late
-        return DriftCore(self._settings(context), drift, DriftWireCodec(), self._registrar, launch.name)
-
-    def _shell(self, core: SchedulerCore, sockets: SchedulerSockets, *others: object) -> SchedulerShell:
-        assert isinstance(core, DriftCore)
-        self._registrar.wake = sockets.wake_up
-        return DriftShell(self._registrar, core, sockets, *others)
-
-
-class DriftShell(SchedulerShell):
-    """A shell that also hears the worker."""
-
-    def __init__(self, registrar: DriftWorkerProcess, core: DriftCore, sockets: SchedulerSockets, *others: Any) -> None:
-        super().__init__(core, sockets, *others)
-        self._registrar = registrar
-        self._drift_core = core
-
-    def handle(self, ready: list[Source]) -> None:
-        if not self.ended:
-            for said in self._registrar.said():
-                self._carry_out(self._drift_core.said(said, self._clock.monotonic_s(), self._clock.now_ns()))
-                if not isinstance(said, Forecasted):
-                    self._registrar.caught_up()
-        super().handle(ready)
-
-    def close(self) -> None:
-        self._registrar.close()
-        super().close()
+        worker = DriftWorkerProcess(drift, file, context.log)
+        worker.late = context.clock.late
+        return Coordinates(SampleFrame.initial(drift, DriftWireCodec(), launch.name), worker)
