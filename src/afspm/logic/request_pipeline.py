@@ -347,6 +347,8 @@ def _not_allowed_now(draft: StateDraft, job: ForwardedRequest) -> Response | Non
 def _tip_comes_first(draft: StateDraft) -> str | None:
     """Return why nobody commands, since the tip was left in danger; None: whoever is in control may."""
     dog, sees_to_tip = draft.watchdog, draft.control.sees_to_tip
+    if dog.tip.may_come and draft.forwarder.up:
+        return "a retract of before the scheduler's restart may still be carried out, until the translator answers"
     if not (dog.owes_retract and draft.forwarder.up):
         if not dog.left_to_people or sees_to_tip:
             return None

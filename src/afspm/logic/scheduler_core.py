@@ -256,6 +256,7 @@ def _on_announced(draft: StateDraft, event: Announced) -> None:
 def _on_reply(draft: StateDraft, event: TranslatorReply) -> None:
     draft.forwarder, settled = draft.forwarder.answered(event.number, event.response)
     if settled is not None:
+        draft.watchdog = draft.watchdog.translator_answered()
         request_pipeline.settle(draft, settled)
 
 
