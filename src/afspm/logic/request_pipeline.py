@@ -114,8 +114,10 @@ def _may_speak(draft: StateDraft, event: RequestIn) -> bool:
     if run and run_of(name, request_id) not in ("", run):
         answers.refuse_peer(draft, event, _ANOTHER_RUN, OTHER_RUN_RESPONSE)
         return False
-    sessions, hearing = draft.peers.sessions.hear(event.connection, name, request_id, draft.now_s)
-    draft.peers, pending = replace(draft.peers, sessions=sessions), draft.pending
+    pending, known = draft.pending, draft.peers.sessions
+    sessions, hearing = known.hear(event.connection, name, request_id, draft.now_s)
+    if sessions is not known:
+        draft.peers = replace(draft.peers, sessions=sessions)
     if hearing is Hearing.UNCLEAR and name not in pending.unclear and event.connection not in pending.refused:
         draft.pending = pending.with_unclear(event, draft.now_s)
     elif hearing in (Hearing.TAKEN, Hearing.UNCLEAR):

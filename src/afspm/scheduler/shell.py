@@ -225,7 +225,9 @@ class SchedulerShell:
             self._answer(asked, response)
             self._take(events.Unreadable(name, response))
             return
-        self._take(events.RequestIn(asked.connection, name, request, asked.user))
+        now_s = self._clock.monotonic_s()
+        event = events.RequestIn(asked.connection, name, request, asked.user, now_s)
+        self._carry_out(self._core.step(event, now_s, self._clock.now_ns()))
 
     def _answer(self, asked: PeerAsked, response: Response) -> None:
         number = int.from_bytes(asked.frames[0][:1]) if asked.frames else 0

@@ -53,7 +53,6 @@ from afspm.model import (
     names,
 )
 from afspm.model.snapshot import restored, snapshot
-from afspm.scheduler.drift.codec import DriftWireCodec
 from afspm.scheduler.drift.messages import (
     Compensated,
     Forecasted,
@@ -63,6 +62,7 @@ from afspm.scheduler.drift.messages import (
     WorkerReport,
 )
 from afspm.scheduler.drift.sample_frame import SampleFrame
+from afspm.scheduler.drift.scheduler import DriftWireCodec
 from afspm.scheduler.drift.settings import DriftCompensationSettings
 from afspm.scheduler.drift.state import DriftState
 from afspm.wire.generated.spectroscopy_pb2 import ProbePosition as ProbePositionMessage

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import FrozenInstanceError
 
 import numpy as np
 import pytest
@@ -21,11 +22,13 @@ from afspm.model import (
     Request,
     RescanKind,
     Scan,
+    ScanParameters,
     ScopeState,
     ScopeStatus,
     names,
 )
 from afspm.scheduler.drift.messages import NotRegistered, WorkerGone
+from afspm.scheduler.drift.sample_frame import SampleFrame
 from afspm.scheduler.drift.settings import Compensate, DriftCompensationSettings
 from afspm.scheduler.drift.state import SavedDrift
 
@@ -205,6 +208,22 @@ def test_it_is_saved_before_it_is_published(lab: Lab) -> None:
     assert isinstance(saved, SavedDrift)
     assert json.loads(saved.forecast.text or "") == forecast(DRIFT)
     assert list(saved.settled) == [lab.worker.jobs[0].key]
+
+
+def test_step_changes_neither_the_state_before_it_nor_its_input(lab: Lab) -> None:
+    lab.take_control()
+    lab.scan()
+    before = lab.core.state
+    assert isinstance(before.frame, SampleFrame)
+    parts = [*vars(before).values(), *vars(before.frame.state).values(), *vars(before.frame.state.places).values()]
+    shown = [repr(part) for part in parts]
+    report = registered(lab.worker.jobs[0], forecast(DRIFT), rescan="too far")
+    lab.says(report)
+    lab.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(HERE))
+    assert lab.core.state is not before
+    assert [repr(part) for part in parts] == shown
+    with pytest.raises(FrozenInstanceError):
+        RequestIn(1, "series", Request(1, None)).heard_s = 1.0  # type: ignore[misc]
 
 
 def test_a_restarted_scheduler_announces_itself_after_the_scans_that_wait(lab: Lab) -> None:

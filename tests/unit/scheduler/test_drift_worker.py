@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
+import subprocess
+import sys
+import textwrap
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from drift_parts import Brightest
 
@@ -267,3 +273,51 @@ def test_a_worker_ends_with_the_scheduler(work: Callable[..., Heard], monkeypatc
     assert process is not None
     heard.registrar.close()
     assert process.exitcode == 0
+
+
+def test_worker_ends_with_a_killed_scheduler_even_while_it_registers(tmp_path: Path) -> None:
+    """Else it would write the state that the worker of the next scheduler reads."""
+    program = """
+        import logging, sys, time
+        from afspm.scheduler.drift.messages import StartWorker
+        from afspm.scheduler.drift.settings import DriftCompensationSettings
+        from afspm.scheduler.drift.worker_process import DriftWorkerProcess
+        from test_drift_worker import Heard, job
+        from afspm.scheduler.drift.messages import Registered
+
+        worker = DriftWorkerProcess(
+            DriftCompensationSettings(estimator="drift_parts.Hangs", tracker="paper"), None, logging.getLogger()
+        )
+        heard = Heard(worker)
+        worker.take(StartWorker())
+        worker.take(job(0, 30, 30))
+        heard.next(Registered)
+        worker.take(job(1, 33, 28))
+        print(worker._process.pid, flush=True)
+        time.sleep(600)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(program)]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True) as scheduler:
+        assert scheduler.stdout is not None
+        worker = psutil.Process(int(scheduler.stdout.readline()))
+        scheduler.kill()
+        _, alive = psutil.wait_procs([worker], DEADLINE_S)
+    assert not alive
+
+
+def test_simulated_time_passes_again_when_a_hanging_worker_is_restarted(work: Callable[..., Heard]) -> None:
+    heard = work()
+    heard.next(Forecasted)
+    held: list[str] = []
+
+    @contextlib.contextmanager
+    def late() -> Iterator[None]:
+        held.append("held")
+        yield
+        held.append("passes")
+
+    heard.registrar.late = late
+    heard.registrar.take(job(0, 30, 30))
+    heard.registrar.take(StartWorker())
+    assert held == ["held", "passes"]

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 
+from afspm.drift.mapping import Mapping as DriftMapping
+from afspm.drift.trackers import forecast_from_dict
+from afspm.drift.tracking import Forecast, Prediction
 from afspm.logic.arbitration import ArbitrationState
 from afspm.logic.coordinate_frame import FrameOutput
 from afspm.logic.events import Log, PacketIn, TranslatorCaughtUp
 from afspm.logic.frozen import replace
 from afspm.model import Scan
 from afspm.model.geometry import XY
-from afspm.scheduler.drift.forecast import CurrentForecast
+from afspm.plain_data import Plain
 from afspm.scheduler.drift.messages import DriftCodec, Matrix, Registered, ScanJob
 from afspm.scheduler.drift.place_mapper import Places, SavedPlaces
 from afspm.scheduler.drift.scan_timing import ScanStartTracker
@@ -22,6 +26,49 @@ from afspm.units import same_kind
 Waits = PacketIn | TranslatorCaughtUp
 
 _SETTLED = 32
+
+
+@dataclass(frozen=True)
+class CurrentForecast:
+    """The newest forecast.
+
+    Attributes:
+        start_s: experiment time at which the experiment began; None: before that.
+        lost: whether the position of the sample is unknown, as of the newest registered scan.
+        text: the forecast as JSON, which only its tracker understands; None: nothing is known yet.
+
+    Raises:
+        InvalidValue: the text is no forecast.
+    """
+
+    start_s: float | None = None
+    lost: bool = False
+    text: str | None = None
+    forecast: Forecast | None = field(init=False, default=None, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.text is not None:
+            object.__setattr__(self, "forecast", forecast_from_dict(json.loads(self.text)))
+
+    def learn(self, forecast: Plain | None) -> CurrentForecast:
+        """Take a forecast of the worker; None: it knows nothing new. Raises InvalidValue if it is no forecast."""
+        return self if forecast is None else CurrentForecast(self.start_s, self.lost, json.dumps(forecast))
+
+    def predicted(self, time_s: float) -> Prediction | None:
+        """Return the prediction for a time; None: nothing is known yet."""
+        return None if self.forecast is None else self.forecast.at(time_s)
+
+    def corrects(self, settings: DriftCompensationSettings, time_s: float) -> bool:
+        """Return whether components are given sample coordinates at a time."""
+        since_s = 0.0 if self.start_s is None else time_s - self.start_s
+        return settings.correct and since_s >= settings.correct_after
+
+    def mapping_at(self, settings: DriftCompensationSettings, time_s: float) -> DriftMapping | None:
+        """Return the mapping from tip to sample coordinates; None: components are given tip coordinates."""
+        if not self.corrects(settings, time_s):
+            return None
+        predicted = self.predicted(time_s)
+        return DriftMapping.identity() if predicted is None else predicted.mapping
 
 
 @dataclass(frozen=True)
