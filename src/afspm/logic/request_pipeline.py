@@ -5,7 +5,7 @@
 | 1. admitted | at arrival | session, idempotency |
 | 2. authorised | at arrival, and again when it is sent | the arbitration table |
 | 3. queued | at arrival | the forwarder: one line to the translator, in order |
-| 4. within limits | as its turn comes, right before it is sent | limits, drift frame, the microscope itself |
+| 4. within limits | as its turn comes, right before it is sent | limits, coordinate frame, the microscope itself |
 | 5. settled | at the answer, or when it is overdue | |
 
 Nothing is done twice, and every request gets an answer.
@@ -16,7 +16,7 @@ have settled, and the scheduler first reads the values from the microscope. A re
 special case: the values that it may have changed are read before the next request that depends on them, or that one is
 refused. An overdue request may still be carried out; since the translator serves one request after the other, a value
 that it answers later is newer. A turn takes up to three steps: values are read, the microscope is moved to where the
-sample has drifted, values are read again. Meanwhile requests that only read pass, and the scheduler's own
+place is in its coordinates, values are read again. Meanwhile requests that only read pass, and the scheduler's own
 (`safety_commands`) always go first.
 """
 
