@@ -21,6 +21,7 @@ MODULES = (
     "codec",
     "control",
     "scans",
+    "sample_scans",
     "late_joiner",
     "translator",
     "controllers",

@@ -43,7 +43,13 @@ class Roles(ExitStack):
         return process.stdout.readline().strip()
 
     def scheduler(
-        self, translator_publish: str, translator_serve: str, *, recorded: bool = False, **settings: Any
+        self,
+        translator_publish: str,
+        translator_serve: str,
+        *,
+        recorded: bool = False,
+        class_: str = "afspm.scheduler.Scheduler",
+        **settings: Any,
     ) -> tuple[str, str]:
         """The real scheduler, which keeps its state on disk; returns the addresses (publish, serve).
 
@@ -61,7 +67,7 @@ class Roles(ExitStack):
             self._host(line)
         launch = Launch(
             "scheduler",
-            "afspm.scheduler.Scheduler",
+            class_,
             settings,
             sockets=Sockets(publish, (translator_publish,), serve, translator_serve),
             state_dir=folder,

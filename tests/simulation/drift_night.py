@@ -10,11 +10,20 @@ import numpy as np
 
 from afspm.drift.mapping import Mapping
 from afspm.drift.trackers.paper import PaperForecast
-from afspm.logic.events import Effect, Publish
+from afspm.logic.events import Delegate, Effect, Publish
+from afspm.logic.scheduler_core import SchedulerCore
 from afspm.model import Packet, Region, RegistrationOutcome, Scan, ScanParameters, ScopeState
 from afspm.model.geometry import XY
-from afspm.scheduler.drift.core import DriftCore
-from afspm.scheduler.drift.messages import Forecasted, Registered, RescanWanted, ScanJob, WorkerGone, WorkerSaid
+from afspm.scheduler.drift.messages import (
+    Forecasted,
+    Registered,
+    RescanWanted,
+    ScanJob,
+    StartWorker,
+    WorkerGone,
+    WorkerReport,
+)
+from afspm.scheduler.drift.sample_frame import SampleFrame
 from afspm.scheduler.drift.settings import DriftCompensationSettings, RescanRule
 from tests.simulation.codec import TableCodec
 from tests.simulation.invariants import InvariantViolated
@@ -104,11 +113,15 @@ class PlayedWorker:
         self.registered = 0
         self.failed = 0
 
-    def start(self) -> None:
-        self._life += 1
-        self._say(Forecasted(self._night.known))
+    def take(self, job: object) -> None:
+        if isinstance(job, StartWorker):
+            self._life += 1
+            self._say(Forecasted(self._night.known))
+        else:
+            assert isinstance(job, ScanJob), "nothing is handed over"
+            self._register(job)
 
-    def register(self, job: ScanJob) -> None:
+    def _register(self, job: ScanJob) -> None:
         chance = self._night.timeline.random.random()
         if chance < self._night.trouble / 2:
             self.failed += 1
@@ -117,9 +130,6 @@ class PlayedWorker:
             self._say(self._answer(job))
         else:
             self.failed += 1  # it hangs
-
-    def compensated(self, time_s: float, velocity_m_s: tuple[float, float]) -> None:
-        raise AssertionError("nothing is handed over")
 
     def _answer(self, job: ScanJob) -> Registered:
         said = self._night.answers
@@ -145,16 +155,14 @@ class PlayedWorker:
             [0.0, 0.0], [], "", forecast, [],
         )  # fmt: skip
 
-    def _say(self, said: WorkerSaid) -> None:
+    def _say(self, said: WorkerReport) -> None:
         host: SchedulerHost | None = getattr(self._night, "scheduler", None)
         if host is not None:
             host.later(0.3 * self._night.timeline.random.random(), self._arrive, host, self._life, said)
 
-    def _arrive(self, host: SchedulerHost, life: int, said: WorkerSaid) -> None:
+    def _arrive(self, host: SchedulerHost, life: int, said: WorkerReport) -> None:
         if life == self._life:
-            timeline = self._night.timeline
-            assert isinstance(host.core, DriftCore)
-            host.carry_out(host.core.said(said, timeline.monotonic_s(), timeline.now_ns()))
+            host.reported(said)
 
 
 class DriftNight(Night):
@@ -186,11 +194,14 @@ class DriftNight(Night):
 
     def make_core(self) -> Callable[[], Any]:
         drift = DriftCompensationSettings(rescan=RescanRule("never"), longest_registration=LONGEST_S)
-        return lambda: DriftCore(self.settings, drift, self.codec, self.worker, "scheduler")  # type: ignore[arg-type]
+        frame = SampleFrame.initial(drift, self.codec, "scheduler")  # type: ignore[arg-type]
+        return lambda: SchedulerCore(self.settings, self.codec, frame)
 
     def carried_out(self, host: SchedulerHost, effect: Effect) -> None:
         self._carried_out(host, effect)
-        if isinstance(effect, Publish):
+        if isinstance(effect, Delegate):
+            self.worker.take(effect.job)
+        elif isinstance(effect, Publish):
             self._look_at(effect.packet)
 
     def _look_at(self, packet: Packet) -> None:

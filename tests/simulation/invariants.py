@@ -21,8 +21,8 @@ from afspm.logic.events import (
     RequestIn,
     SaveState,
 )
+from afspm.logic.saved_state import SavedState
 from afspm.logic.settings import SchedulerSettings
-from afspm.logic.state import SavedState
 from afspm.model import (
     ControlMode,
     ControlRequest,

@@ -14,6 +14,7 @@ from afspm.logic.events import (
     Disconnected,
     Effect,
     Forward,
+    FrameReported,
     Greeted,
     Input,
     Kill,
@@ -30,9 +31,9 @@ from afspm.logic.events import (
     TranslatorReply,
     TranslatorUp,
 )
+from afspm.logic.saved_state import KIND, VERSION, SavedState
 from afspm.logic.scheduler_core import SchedulerCore
 from afspm.logic.settings import SchedulerSettings
-from afspm.logic.state import KIND, VERSION, SavedState
 from afspm.model import (
     HAS_ENDED,
     RELAY_REQUEST,
@@ -237,9 +238,9 @@ class SchedulerHost(Process):
 
     # --- steps ---
 
-    def carry_out(self, effects: Sequence[Effect]) -> None:
-        """What the core wants done that nobody asked for."""
-        self._carry_out(None, effects)
+    def reported(self, report: object) -> None:
+        """The worker of the coordinate frame reports something."""
+        self._step(FrameReported(report))
 
     @property
     def _has_ended(self) -> bool:

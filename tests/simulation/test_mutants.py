@@ -275,8 +275,7 @@ def limits_are_decided_at_arrival(patch: Patch) -> None:
 
     def enqueue(draft: StateDraft, event: RequestIn) -> None:
         job = ForwardedRequest.of(event, command=not request_pipeline.reads(event.request))
-        frame = draft.env.frame
-        mapped = None if frame is None else frame.outgoing(job.client, job.request, draft.now_ns)
+        draft.frame, mapped = draft.frame.outgoing(job.client, job.request, draft.now_ns)
         if job.command and isinstance(mapped, MappedRequest | None):
             names = None if mapped is None else mapped.names
             sent = job.request if mapped is None else mapped.request

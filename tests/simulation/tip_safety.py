@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 from afspm.logic.arbitration import ArbitrationState
 from afspm.logic.event_log import SCHEDULER
-from afspm.logic.events import Effect, Forward, Input, Kill, Log, Reply, RequestIn
+from afspm.logic.events import Effect, Input, Kill, Log, Reply, RequestIn
 from afspm.logic.settings import SchedulerSettings
 from afspm.model import ControlMode, ControlRequest, Parameter, Problem, Request, names
 from tests.simulation.microscope import FakeMicroscope
@@ -53,7 +53,6 @@ class TipSafety:
         self.dangers = 0
         self.memory_is_certain = True
         self._life = 0
-        self._has_asked = self._is_late = False
 
     def disturbed(self, for_s: float) -> None:
         """The connection between scheduler and microscope, or either of them, does not work for so long."""
@@ -62,7 +61,7 @@ class TipSafety:
     def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:
         """After each step of the scheduler."""
         if host.life != self._life:  # it may have been killed before what it had decided was seen
-            self._life, self._before, self._has_asked = host.life, host.core.control, False
+            self._life, self._before = host.life, host.core.control
             self._unattended = self._unattended and self.memory_is_certain
         self._forget_told()
         before, after = self._before, host.core.control
@@ -70,9 +69,7 @@ class TipSafety:
             self._changed(before, after, _who(event, effects))
             self._before = after
         for effect in effects:
-            if isinstance(effect, Forward) and _is_retract(effect.request):
-                self._has_asked = True
-            elif isinstance(effect, Log):
+            if isinstance(effect, Log):
                 if effect.level == "CRITICAL" or (effect.level == "WARNING" and after is not before):
                     self._is_told, self._safe_since_s = True, self._timeline.monotonic_s()
             elif isinstance(effect, Kill):
@@ -147,11 +144,9 @@ class TipSafety:
         subject = request.subject
         if subject == names.RETRACT and not request.id:
             self.retractions += 1
-            # asked for by a scheduler that was killed since, of a microscope that hung: its successor can't know of it
-            self._is_late = not self._has_asked
         if request.kind == ControlRequest.ACTION and subject in (names.START_SCAN, names.START_SPEC):
             away = self._microscope.tip_is_away and self._timeline.monotonic_s() > self._disturbed_until_s
-            self._must(not away or self._is_late, "a measurement was begun with the tip withdrawn")
+            self._must(not away, "a measurement was begun with the tip withdrawn")
         if isinstance(subject, Parameter) and subject.value is not None:
             self._within_limits(subject)
         limit = self._settings.limits.actions.get(str(subject)) if request.kind == ControlRequest.ACTION else None
@@ -166,10 +161,6 @@ class TipSafety:
         value = float(parameter.value)
         within = (limit.low is None or value >= limit.low) and (limit.high is None or value <= limit.high)
         self._must(within, f"{parameter.name} was set to {value:g}, outside of its limits")
-
-
-def _is_retract(request: Request) -> bool:
-    return request.kind == ControlRequest.ACTION and request.subject == names.RETRACT
 
 
 def _who(event: Input | None, effects: Sequence[Effect]) -> str:

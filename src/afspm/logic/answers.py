@@ -73,7 +73,7 @@ def take_back(draft: StateDraft, job: ForwardedRequest) -> None:
 def answer_job(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
     """Answer over the newest connection of the client; without an id only over the one that it asked by."""
     write_down(draft, job.client, job.request, response, job.heard_s, sent_ns=job.sent_ns)
-    connection = draft.sessions.connection_of(job.client)
+    connection = draft.peers.sessions.connection_of(job.client)
     if connection is not None and (job.request.id or connection == job.connection):
         draft.effects.append(Reply(connection, job.client, response, job.request.kind))
 

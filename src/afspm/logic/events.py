@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
+from afspm.logic.arbitration import ArbitrationState
+from afspm.logic.saved_state import SavedState
 from afspm.model import Packet, PacketHeader, Parameter, Request, Response
-
-if TYPE_CHECKING:
-    from afspm.logic.state import SavedState
 
 # --- inputs ---------------------------------------------------------------------------------------------------------
 
@@ -41,13 +40,13 @@ class Greeted:
     user: str | None = None
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class RequestIn:
     """A request came by `connection` from the peer that calls itself `name`.
 
     Attributes:
         user: whose key it was, where connections are authenticated; None where they are not.
-        heard_s: when it was taken in for the first time, real; the scheduler fills that in.
+        heard_s: when it came first, real; negative: in this step.
     """
 
     connection: int
@@ -57,7 +56,7 @@ class RequestIn:
     heard_s: float = -1.0
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Unreadable:
     """A message from the peer `name` was no request, and was refused with `response`."""
 
@@ -65,7 +64,7 @@ class Unreadable:
     response: Response
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class PacketIn:
     """The translator published a packet."""
 
@@ -107,7 +106,7 @@ class TranslatorCaughtUp:
     """All that the translator published while we were not there has been taken in."""
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class TranslatorReply:
     """The translator answered the request that was forwarded under `number`."""
 
@@ -151,6 +150,37 @@ class Tick:
     """Nothing happened, but a deadline (`SchedulerCore.deadline_s`) has come."""
 
 
+@dataclass(frozen=True, slots=True)
+class FrameReported:
+    """The worker of the coordinate frame has a result, or has ended; only that frame knows what is in it."""
+
+    report: object
+
+
+# --- inputs that a step itself raises, for the coordinate frame ------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Started:
+    """The scheduler starts, for the first time or after a restart."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameAnswered:
+    """A request that the coordinate frame made has its answer."""
+
+    purpose: object
+    response: Response
+
+
+@dataclass(frozen=True, slots=True)
+class ControlChanged:
+    """This step changed the holder, the mode or the problems."""
+
+    before: ArbitrationState
+    after: ArbitrationState
+
+
 Input = (
     Connected
     | Disconnected
@@ -167,6 +197,10 @@ Input = (
     | Announced
     | Stopped
     | Tick
+    | FrameReported
+    | Started
+    | FrameAnswered
+    | ControlChanged
 )
 
 
@@ -250,7 +284,14 @@ class Kill:
     stop: str = ""
 
 
-Effect = Reply | Forward | Publish | Replay | SaveState | Log | Kill
+@dataclass(slots=True)
+class Delegate:
+    """Hand a job to the worker of the coordinate frame; what comes of it is an input, `FrameReported`."""
+
+    job: object
+
+
+Effect = Reply | Forward | Publish | Replay | SaveState | Log | Kill | Delegate
 
 
 class Codec(Protocol):

@@ -11,18 +11,44 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from afspm.logic.coordinate_frame import MappedRequest
 from afspm.logic.events import Forward, RequestIn
 from afspm.logic.frozen import replace
 from afspm.model import ControlResponse, Request, Response, ResponseDetail
 
-if TYPE_CHECKING:
-    from afspm.logic.state import StateDraft
 
-OwnAnswer = Callable[["StateDraft", Response], None]
-"""Called with the answer to a request of the scheduler's own."""
+@dataclass(frozen=True, slots=True)
+class ReadForTurn:
+    """The value of `name` is read before the request `number` is decided."""
+
+    number: int
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class MoveForTurn:
+    """The microscope is moved before the action `number`."""
+
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReadAhead:
+    """The value of `name` is read when a translator comes."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class AskForFrame:
+    """The coordinate frame asked, for a purpose that it knows."""
+
+    purpose: object
+
+
+OwnPurpose = ReadForTurn | MoveForTurn | ReadAhead | AskForFrame
 
 
 class ForwardedRequest(NamedTuple):
@@ -40,7 +66,7 @@ class ForwardedRequest(NamedTuple):
         heard_s: when it was asked, real.
         sent_ns: when it was sent, experiment time; None: it was not.
         is_repeated: it was sent before under its id, with an unknown outcome.
-        on_answer: takes the answer to one of the scheduler's own.
+        purpose: of one of the scheduler's own; None: it is for the tip's safety.
     """
 
     client: str
@@ -56,7 +82,7 @@ class ForwardedRequest(NamedTuple):
     heard_s: float = 0.0
     sent_ns: int | None = None
     is_repeated: bool = False
-    on_answer: OwnAnswer | None = None
+    purpose: OwnPurpose | None = None
 
     @classmethod
     def of(cls, event: RequestIn, *, command: bool = True, is_repeated: bool = False) -> ForwardedRequest:
@@ -144,7 +170,7 @@ class Forwarder:
         return replace(self, number=job.number, queue=(*self.queue, job)), None
 
     def ask_own(
-        self, request: Request, now_s: float, on_answer: OwnAnswer | None = None, mapped: MappedRequest | None = None
+        self, request: Request, now_s: float, purpose: OwnPurpose | None = None, mapped: MappedRequest | None = None
     ) -> tuple[Forwarder, ForwardedRequest | None]:
         """Have a request of the scheduler's own sent before all that wait. None: the translator is not connected."""
         if not self.up:
@@ -152,7 +178,7 @@ class Forwarder:
         number, deadline_s = self.number + 1, now_s + self.timeout_s
         job = ForwardedRequest(
             "", request, command=True, number=number, deadline_s=deadline_s,
-            mapped=mapped, heard_s=now_s, on_answer=on_answer,
+            mapped=mapped, heard_s=now_s, purpose=purpose,
         )  # fmt: skip
         return replace(self, number=number, own=(*self.own, job)), job
 

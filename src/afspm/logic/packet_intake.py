@@ -64,8 +64,7 @@ def _published(draft: StateDraft, packet: Packet, header: PacketHeader) -> Publi
     try:
         if env.settings.control.spectra_by_variable and header.message == SPECTRUM.name:
             packet = Packet(packet.envelope, wire.by_point(packet.payload), packet.time_ns)
-        if env.frame is not None:
-            packet = env.frame.incoming(packet, header, draft.now_ns)
+        draft.frame, packet = draft.frame.incoming(packet, header, draft.now_ns)
         taken = env.cache.take(packet, header, draft.now_ns)
     except AfspmError as error:
         _log_once(draft, "ERROR", f"{header.message} is not published: {error}")

@@ -6,8 +6,9 @@ from afspm import wire
 from afspm.logic import answers
 from afspm.logic.arbitration import may
 from afspm.logic.events import Publish, RequestIn
+from afspm.logic.frozen import replace
 from afspm.logic.state import StateDraft
-from afspm.logic.supervisor_registry import announcement
+from afspm.logic.supervisor_registry import SupervisorRegistry, announcement
 from afspm.model import HAS_ENDED, ControlResponse, ResponseDetail
 from afspm.wire.messages import CONTROL_STATE, JOURNAL, NOTE
 
@@ -43,21 +44,23 @@ def publish_for_process(draft: StateDraft, event: RequestIn) -> None:
         answers.answer(draft, event, ControlResponse.FAILURE, HAS_ENDED, detail=ended)
         return
     if told.states is not None:
-        draft.supervisors = draft.supervisors.told(event.name, told.states, draft.now_s)
-    draft.supervisors, orders = draft.supervisors.orders_for(event.name)
+        _replace_supervisors(draft, draft.peers.supervisors.told(event.name, told.states, draft.now_s))
+    supervisors, orders = draft.peers.supervisors.orders_for(event.name)
+    _replace_supervisors(draft, supervisors)
     payload = event.request.subject.payload
     # if it is published already, we were killed before we could answer
     if not draft.env.cache.holds(told.envelope, payload):
         publish(draft, told.envelope, payload)
     answers.answer(draft, event, ControlResponse.SUCCESS, payload=wire.encode_orders(orders))
-    draft.end = draft.end.processes_told(draft.supervisors.states_of(event.name), draft.now_s)
+    draft.end = draft.end.processes_told(draft.peers.supervisors.states_of(event.name), draft.now_s)
 
 
 def order_restart(draft: StateDraft, event: RequestIn) -> None:
     """Order that a process is started anew."""
     process = str(event.request.subject)
     if may(draft.env.settings.rules.roles.restart, event.name):
-        draft.supervisors, why = draft.supervisors.order(process, draft.now_s)
+        supervisors, why = draft.peers.supervisors.order(process, draft.now_s)
+        _replace_supervisors(draft, supervisors)
     else:
         why = f"{event.name} does not have the role restart ([control.roles])"
     if why:
@@ -66,3 +69,7 @@ def order_restart(draft: StateDraft, event: RequestIn) -> None:
     draft.save()
     draft.log("INFO", f"{event.name} ordered a restart of {process}")
     answers.answer(draft, event, ControlResponse.SUCCESS)
+
+
+def _replace_supervisors(draft: StateDraft, supervisors: SupervisorRegistry) -> None:
+    draft.peers = replace(draft.peers, supervisors=supervisors)

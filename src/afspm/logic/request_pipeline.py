@@ -5,7 +5,7 @@
 | 1. admitted | at arrival | session, idempotency |
 | 2. authorised | at arrival, and again when it is sent | the arbitration table |
 | 3. queued | at arrival | the forwarder: one line to the translator, in order |
-| 4. within limits | as its turn comes, right before it is sent | limits, drift frame, the microscope itself |
+| 4. within limits | as its turn comes, right before it is sent | limits, coordinate frame, the microscope itself |
 | 5. settled | at the answer, or when it is overdue | |
 
 Nothing is done twice, and every request gets an answer.
@@ -16,21 +16,29 @@ have settled, and the scheduler first reads the values from the microscope. A re
 special case: the values that it may have changed are read before the next request that depends on them, or that one is
 refused. An overdue request may still be carried out; since the translator serves one request after the other, a value
 that it answers later is newer. A turn takes up to three steps: values are read, the microscope is moved to where the
-sample has drifted, values are read again. Meanwhile requests that only read pass, and the scheduler's own
+place is in its coordinates, values are read again. Meanwhile requests that only read pass, and the scheduler's own
 (`safety_commands`) always go first.
 """
 
 from __future__ import annotations
 
 import json
-from functools import partial
 
 from afspm.logic import answers, control_change, publishing, safety_commands
 from afspm.logic.arbitration import ArbitrationEvent, ControlChange, ControlInput, Rules, reason, row_for
 from afspm.logic.coordinate_frame import MappedRequest
 from afspm.logic.event_log import SCHEDULER
-from afspm.logic.events import Reply, RequestIn
-from afspm.logic.forwarder import ForwardedRequest, ForwardOutcome, OwnAnswer, SettledRequest
+from afspm.logic.events import FrameAnswered, Reply, RequestIn
+from afspm.logic.forwarder import (
+    AskForFrame,
+    ForwardedRequest,
+    ForwardOutcome,
+    MoveForTurn,
+    OwnPurpose,
+    ReadAhead,
+    ReadForTurn,
+    SettledRequest,
+)
 from afspm.logic.frozen import replace
 from afspm.logic.idempotency_cache import TOO_OLD, RequestStatus
 from afspm.logic.limit_checker import is_get
@@ -76,7 +84,7 @@ _CONTROL_EVENTS = {
 def handle(draft: StateDraft, event: RequestIn) -> None:
     """Take a request through the stages that are decided at its arrival."""
     if event.heard_s < 0.0:
-        event.heard_s = draft.now_s
+        event = replace(event, heard_s=draft.now_s)
     if admit(draft, event) and authorise(draft, event):
         enqueue(draft, event)
 
@@ -106,8 +114,10 @@ def _may_speak(draft: StateDraft, event: RequestIn) -> bool:
     if run and run_of(name, request_id) not in ("", run):
         answers.refuse_peer(draft, event, _ANOTHER_RUN, OTHER_RUN_RESPONSE)
         return False
-    draft.sessions, hearing = draft.sessions.hear(event.connection, name, request_id, draft.now_s)
-    pending = draft.pending
+    pending, known = draft.pending, draft.peers.sessions
+    sessions, hearing = known.hear(event.connection, name, request_id, draft.now_s)
+    if sessions is not known:
+        draft.peers = replace(draft.peers, sessions=sessions)
     if hearing is Hearing.UNCLEAR and name not in pending.unclear and event.connection not in pending.refused:
         draft.pending = pending.with_unclear(event, draft.now_s)
     elif hearing in (Hearing.TAKEN, Hearing.UNCLEAR):
@@ -299,7 +309,7 @@ def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None
     draft.forwarder = draft.forwarder.sent(job, draft.now_s)
     if not request.id:
         return
-    is_kept = request.kind == _ACTION and (draft.env.frame is not None or not draft.idempotency.ids_known)
+    is_kept = request.kind == _ACTION and (draft.frame.is_moving or not draft.idempotency.ids_known)
     if is_kept or (job.command and draft.limits.counts(job.outgoing)):
         draft.idempotency = draft.idempotency.sent(name, request)
     elif mapped is not None:
@@ -339,6 +349,8 @@ def _not_allowed_now(draft: StateDraft, job: ForwardedRequest) -> Response | Non
 def _tip_comes_first(draft: StateDraft) -> str | None:
     """Return why nobody commands, since the tip was left in danger; None: whoever is in control may."""
     dog, sees_to_tip = draft.watchdog, draft.control.sees_to_tip
+    if dog.tip.may_come and draft.forwarder.up:
+        return "a retract of before the scheduler's restart may still be carried out, until the translator answers"
     if not (dog.owes_retract and draft.forwarder.up):
         if not dog.left_to_people or sees_to_tip:
             return None
@@ -353,9 +365,7 @@ def _tip_comes_first(draft: StateDraft) -> str | None:
 
 
 def _mapped(draft: StateDraft, job: ForwardedRequest) -> MappedRequest | Response | None:
-    if draft.env.frame is None:
-        return None
-    outgoing = draft.env.frame.outgoing(job.client, job.request, draft.now_ns)
+    draft.frame, outgoing = draft.frame.outgoing(job.client, job.request, draft.now_ns)
     if isinstance(outgoing, Response):
         _refuse(draft, job, outgoing)
     return outgoing  # None: it is sent as it is
@@ -375,18 +385,16 @@ def _is_within_limits(draft: StateDraft, job: ForwardedRequest, mapped: MappedRe
 
 
 def _reads_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
-    frame = draft.env.frame
-    is_mapped = frame is not None and frame.maps(draft.now_ns)
-    needed = draft.limits.depends_on(job.request, is_mapped=is_mapped)
+    needed = draft.limits.depends_on(job.request, is_mapped=draft.frame.maps(draft.now_ns))
     if not needed:
         return False
     draft.pending = replace(draft.pending, turn=turn.reading(frozenset(needed)))
     for name in needed:
-        _read(draft, name, partial(_was_read, job.number, name))
+        _read(draft, name, ReadForTurn(job.number, name))
     return True
 
 
-def _was_read(number: int, name: str, draft: StateDraft, response: Response) -> None:
+def _was_read(draft: StateDraft, number: int, name: str, response: Response) -> None:
     turn, job = draft.pending.turn, draft.forwarder.waiting(number)
     if turn is None or job is None or turn.number != number:
         return  # it was called back
@@ -406,12 +414,11 @@ def _take_values(draft: StateDraft, turn: Turn) -> None:
     if not turn.values:
         return
     draft.limits = draft.limits.was_read(turn.values, draft.now_ns)
-    position, frame = draft.limits.state.position, draft.env.frame
-    if frame is not None:
-        if position.region is not None and names.SCAN_SIZE_X in turn.values:
-            frame.in_force(position.region, draft.now_ns)
-        if position.probe_m is not None and names.PROBE_POS_X in turn.values:
-            frame.in_force(ProbePosition(position.probe_m), draft.now_ns)
+    position = draft.limits.state.position
+    if position.region is not None and names.SCAN_SIZE_X in turn.values:
+        draft.frame = draft.frame.in_force(position.region, draft.now_ns)
+    if position.probe_m is not None and names.PROBE_POS_X in turn.values:
+        draft.frame = draft.frame.in_force(ProbePosition(position.probe_m), draft.now_ns)
 
 
 def _failed_before(response: Response) -> Response:
@@ -421,32 +428,25 @@ def _failed_before(response: Response) -> Response:
 def read_ahead(draft: StateDraft) -> None:
     """Ask for the values of which it counts for how long they hold."""
     for name in draft.limits.to_be_known():
-        _read(draft, name, partial(_forget_unread, name))
+        _read(draft, name, ReadAhead(name))
 
 
-def _read(draft: StateDraft, name: str, on_answer: OwnAnswer) -> None:
+def _read(draft: StateDraft, name: str, purpose: OwnPurpose) -> None:
     parameter = Parameter(name)
     request = Request(_PARAM, parameter)
-    draft.forwarder, _ = draft.forwarder.ask_own(request, draft.now_s, on_answer)
-
-
-def _forget_unread(name: str, draft: StateDraft, response: Response) -> None:
-    if not response.ok:
-        draft.limits = draft.limits.forget(name)
+    draft.forwarder, _ = draft.forwarder.ask_own(request, draft.now_s, purpose)
 
 
 def _moves_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
-    frame = draft.env.frame
-    if frame is None or draft.idempotency.was_sent(job.client, job.request):
+    if draft.idempotency.was_sent(job.client, job.request):
         return False
-    move = frame.move_before(str(job.request.subject), draft.now_ns)
+    draft.frame, move = draft.frame.move_before(str(job.request.subject), draft.now_ns)
     if move is None:
         return False
     if not _is_within_limits(draft, job, move):
         return True
-    on_answer = partial(_moved, job.number)
     draft.limits = draft.limits.sending(job.client, move.request, draft.now_ns, ())
-    draft.forwarder, own = draft.forwarder.ask_own(move.request, draft.now_s, on_answer, move)
+    draft.forwarder, own = draft.forwarder.ask_own(move.request, draft.now_s, MoveForTurn(job.number), move)
     assert own is not None  # the line is free
     own = own._replace(deadline_s=job.deadline_s)
     draft.pending = replace(draft.pending, turn=turn.moving(PrePositioner(own, draft.microscope.states_seen)))
@@ -454,7 +454,7 @@ def _moves_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
     return True
 
 
-def _moved(number: int, draft: StateDraft, response: Response) -> None:
+def _moved(draft: StateDraft, number: int, response: Response) -> None:
     turn, job = draft.pending.turn, draft.forwarder.waiting(number)
     if turn is None or turn.move is None or job is None or turn.number != number:
         return  # the action was called back
@@ -502,10 +502,22 @@ def settle(draft: StateDraft, settled: SettledRequest) -> None:
 def _settle_own(draft: StateDraft, job: ForwardedRequest, end: ForwardOutcome, response: Response) -> None:
     if not reads(job.request):
         answers.write_down(draft, SCHEDULER, job.request, response, job.heard_s)
-    if job.on_answer is None:
+    if job.purpose is None:
         safety_commands.settle(draft, job, end, response)
-    elif end is not ForwardOutcome.LATE:  # who asked was told before that there was no answer
-        job.on_answer(draft, response)
+    elif end is not ForwardOutcome.LATE:  # its purpose had the answer before that none had come
+        _serve_purpose(draft, job.purpose, response)
+
+
+def _serve_purpose(draft: StateDraft, purpose: OwnPurpose, response: Response) -> None:
+    match purpose:
+        case ReadForTurn():
+            _was_read(draft, purpose.number, purpose.name, response)
+        case MoveForTurn():
+            _moved(draft, purpose.number, response)
+        case AskForFrame():
+            draft.raised.append(FrameAnswered(purpose.purpose, response))
+        case ReadAhead() if not response.ok:
+            draft.limits = draft.limits.forget(purpose.name)
 
 
 def _settle_late(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
@@ -531,16 +543,15 @@ def _see_feedback(draft: StateDraft, job: ForwardedRequest, response: Response) 
 
 def _learn(draft: StateDraft, job: ForwardedRequest, response: Response) -> Response:
     """Take what a success changed, or told. Returns the answer, in the coordinates of its client."""
-    request, frame, now_ns = job.request, draft.env.frame, draft.now_ns
+    request, now_ns = job.request, draft.now_ns
     told = None
     if request.kind == _PARAM and response.payload:
         told = draft.env.codec.decode_parameter(response.payload)
     draft.limits = draft.limits.carried_out(job.outgoing, now_ns, told, _names_meant(job), job.client)
-    if frame is not None:
-        frame.carried_out(job.outgoing, told, now_ns)
-        is_asked = request.kind == _PARAM and bool(job.client)  # the scheduler itself needs the microscope's values
-        if is_asked and (mapped := frame.answer(request, told, now_ns)) is not None:
-            response = replace(response, payload=draft.env.codec.encode(mapped))
+    draft.frame = draft.frame.carried_out(job.outgoing, told, now_ns)
+    is_asked = request.kind == _PARAM and bool(job.client)  # the scheduler itself needs the microscope's values
+    if is_asked and (mapped := draft.frame.answer(request, told, now_ns)) is not None:
+        response = replace(response, payload=draft.env.codec.encode(mapped))
     if request.kind == _ACTION:
         _action_started(draft, job, is_certain=True)
     elif (feedback := feedback_of(request)) is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
@@ -10,22 +9,35 @@ from afspm.logic import answers, control_change, packet_intake, publishing, requ
 from afspm.logic.arbitration import ArbitrationEvent, ArbitrationState, ControlInput
 from afspm.logic.cache import TIME_STEP_NS, PacketCache
 from afspm.logic.control_change import TRANSLATOR
-from afspm.logic.coordinate_frame import CoordinateFrame
+from afspm.logic.coordinate_frame import (
+    TIP_FRAME,
+    AskMicroscope,
+    CoordinateFrame,
+    HoldControl,
+    Reconsider,
+    SaveNow,
+)
 from afspm.logic.event_log import SCHEDULER, SentStart, start_entry, unreadable_entry
 from afspm.logic.events import (
     Announced,
     Codec,
     Connected,
+    ControlChanged,
+    Delegate,
     Disconnected,
     Effect,
+    FrameAnswered,
+    FrameReported,
     Greeted,
     Input,
     Kill,
+    Log,
     PacketIn,
     ProblemSeen,
     Replay,
     ReplayRequested,
     RequestIn,
+    Started,
     Stopped,
     Tick,
     TranslatorCaughtUp,
@@ -34,10 +46,12 @@ from afspm.logic.events import (
     TranslatorUp,
     Unreadable,
 )
+from afspm.logic.forwarder import AskForFrame
 from afspm.logic.frozen import replace
 from afspm.logic.microscope_status import STOPS
+from afspm.logic.saved_state import SavedState
 from afspm.logic.settings import SchedulerSettings
-from afspm.logic.state import Environment, SavedState, SchedulerState, StateDraft, restored_state, saved_state
+from afspm.logic.state import Environment, SchedulerState, StateDraft, restored_state, saved_state
 from afspm.model import (
     ControlMode,
     ControlState,
@@ -45,16 +59,12 @@ from afspm.model import (
     JournalEntry,
     LoggedPacket,
     Problem,
-    Request,
-    Response,
     component_of,
 )
 from afspm.wire.messages import JOURNAL
 
 _MALFUNCTION = Problem.DEVICE_MALFUNCTION
 _AT_ONCE_S = 0.0  # in real monotonic time: always past
-OwnEnd = Callable[[Response, float, int], Iterable[Effect]]
-"""Takes the answer to a request of the scheduler's own, with now_s and now_ns; returns what follows from it."""
 
 
 def step(
@@ -62,10 +72,21 @@ def step(
 ) -> tuple[SchedulerState, list[Effect]]:
     """Return the state after an event, and what is to be done, in order."""
     draft = StateDraft(state, env, now_s, now_ns)
-    _HANDLERS[type(event)](draft, event)
+    _take(draft, event)
+    while draft.raised:
+        _take(draft, draft.raised.pop(0))
     request_pipeline.send_next(draft)
+    if draft.control is not state.control:
+        _take(draft, ControlChanged(state.control, draft.control))
     _end_when_safe(draft)
     return draft.finish()
+
+
+def _take(draft: StateDraft, event: Input) -> None:
+    """Have the coordinate frame look at an input first: it may keep it, and add to it."""
+    draft.frame, outputs = draft.frame.step(event, draft.control, draft.now_s, draft.now_ns)
+    for output in outputs:
+        _HANDLERS[type(output)](draft, output)
 
 
 def due_s(state: SchedulerState) -> float | None:
@@ -79,28 +100,28 @@ class SchedulerCore:
 
         core = SchedulerCore(settings, codec)
         core.restore(saved); core.restore_cache(packets)     # after a restart only
-        effects = core.start(now_s, now_ns)                  # then, for whatever happens:
+        effects = core.start(now_s, now_ns)                  # then, for each input:
         effects = core.step(RequestIn(...), now_s, now_ns)
 
-    Whoever hosts it carries out the effects in their order, and steps with `Tick()` when `deadline_s` or
-    `deadline_ns` has come, however much else there is to do.
+    The host carries out the effects in their order, and steps with `Tick()` when `deadline_s` or `deadline_ns` has
+    come, however much else there is to do.
 
     Args:
-        frame: the coordinates that components speak of, where they are not those of the microscope.
+        frame: the coordinates of components, if they differ from those of the microscope.
 
     Attributes:
         state: all that it decides by; replaced by every step.
     """
 
-    def __init__(self, settings: SchedulerSettings, codec: Codec, frame: CoordinateFrame | None = None) -> None:
-        self._env = Environment(settings, codec, PacketCache(settings.envelopes, settings.cache_bytes), frame)
-        self.state = SchedulerState.initial(settings)
+    def __init__(self, settings: SchedulerSettings, codec: Codec, frame: CoordinateFrame = TIP_FRAME) -> None:
+        self._env = Environment(settings, codec, PacketCache(settings.envelopes, settings.cache_bytes))
+        self.state = SchedulerState.initial(settings, frame)
         self._restored: SavedState | None = None
 
     def start(self, now_s: float, now_ns: int) -> list[Effect]:
         """Begin. The control state is published as soon as the translator's packets have been caught up with."""
         draft, is_restart = StateDraft(self.state, self._env, now_s, now_ns), self._restored is not None
-        draft.holder_timeout = replace(draft.holder_timeout, started_s=now_s)
+        draft.peers = replace(draft.peers, timeout=replace(draft.peers.timeout, started_s=now_s))
         draft.watchdog = draft.watchdog.begun(now_s)
         draft.lease = draft.lease.held_by(draft.control.holder, now_ns)
         if self._restored is not None:
@@ -115,26 +136,13 @@ class SchedulerCore:
             draft.barrier = draft.barrier.begin(now_s, is_restart=is_restart)
             entry = start_entry(now_ns, draft.control, is_restart=is_restart)
             draft.event_log = draft.event_log.add(now_s, entry)
-        return self._finish(draft)
+        _take(draft, Started())
+        self.state, effects = draft.finish()
+        return effects
 
     def step(self, event: Input, now_s: float, now_ns: int) -> list[Effect]:
         """Take an event; `now_s` is real and monotonic, `now_ns` the experiment's time."""
         self.state, effects = step(self.state, event, self._env, now_s, now_ns)
-        return effects
-
-    def ask_own(self, request: Request, now_s: float, ended: OwnEnd) -> list[Effect]:
-        """Ask the microscope in the scheduler's own name, if it is there."""
-        draft = StateDraft(self.state, self._env, now_s, 0)
-
-        def on_answer(draft: StateDraft, response: Response) -> None:
-            draft.effects += ended(response, draft.now_s, draft.now_ns)
-
-        draft.forwarder, _ = draft.forwarder.ask_own(request, now_s, on_answer)
-        request_pipeline.send_own(draft)
-        return self._finish(draft)
-
-    def _finish(self, draft: StateDraft) -> list[Effect]:
-        self.state, effects = draft.finish()
         return effects
 
     def _entries_since(self, starts: Sequence[SentStart]) -> Iterator[JournalEntry]:
@@ -143,10 +151,6 @@ class SchedulerCore:
             if packet.envelope == JOURNAL.name and (packet.time_ns or 0) >= oldest_ns:
                 found = self._env.codec.decode_packet(JOURNAL.name, packet.payload)
                 yield from found.entries if isinstance(found, JournalEntries) else ()
-
-    def put_off(self, until_s: float) -> None:
-        """Wait longer before telling who is in control: more of what was published before a restart is to come."""
-        self.state = replace(self.state, barrier=self.state.barrier.put_off(until_s))
 
     def deadline_s(self) -> float | None:
         """Return when, in real monotonic time, a Tick is due at the latest; None: no deadline."""
@@ -161,16 +165,16 @@ class SchedulerCore:
         return saved_state(self.state, self._env)
 
     def restore(self, saved: SavedState) -> None:
-        """Take up what `snapshot` gave, before `start`."""
+        """Take up what `snapshot` gave and a file of plain data returned, before `start`."""
         self._restored = saved
-        self.state = restored_state(saved, self._env.settings)
+        self.state = restored_state(saved, self._env.settings, self.state.frame)
         self._env.cache.not_before(saved.last_ns)
-        if self._env.frame is not None and saved.frame is not None:
-            self._env.frame.restore(json.loads(saved.frame))
 
     def restore_cache(self, packets: Iterable[LoggedPacket]) -> None:
         """Take up packets that were published (with their `source_ns`), oldest first, before `start`."""
-        self._env.cache.restore(packets)
+        logged = list(packets)
+        self._env.cache.restore(logged)
+        self.state = replace(self.state, frame=self.state.frame.recalled(logged))
 
     def cached(self) -> Iterable[LoggedPacket]:
         """Return what is cached now (with `source_ns`), oldest first."""
@@ -201,20 +205,21 @@ class SchedulerCore:
 
 
 def _on_connected(draft: StateDraft, event: Connected) -> None:
-    draft.sessions = draft.sessions.connected(event.connection)
+    draft.peers = replace(draft.peers, sessions=draft.peers.sessions.connected(event.connection))
 
 
 def _on_disconnected(draft: StateDraft, event: Disconnected) -> None:
     draft.pending = replace(draft.pending, refused=draft.pending.refused - {event.connection})
-    draft.sessions, name = draft.sessions.disconnected(event.connection, draft.now_s)
+    sessions, name = draft.peers.sessions.disconnected(event.connection, draft.now_s)
+    draft.peers = replace(draft.peers, sessions=sessions)
     if name is None:
         return
     draft.pending, waiting = draft.pending.clear_up(name)
-    timeout = draft.holder_timeout
+    timeout = draft.peers.timeout
     if waiting is not None:
         request_pipeline.handle(draft, waiting)
     elif name == draft.control.holder and draft.now_s >= timeout.told_again_s:
-        draft.holder_timeout = timeout.told(draft.now_s)
+        draft.peers = replace(draft.peers, timeout=timeout.told(draft.now_s))
         draft.log(
             "WARNING", f"lost contact with {name}, which is in control; it has {timeout.grace_s:g} s to come back"
         )
@@ -222,7 +227,8 @@ def _on_disconnected(draft: StateDraft, event: Disconnected) -> None:
 
 def _on_greeted(draft: StateDraft, event: Greeted) -> None:
     if event.name and (event.user is None or event.user == component_of(event.name)):
-        draft.sessions, _ = draft.sessions.hear(event.connection, event.name, None, draft.now_s)
+        sessions, _ = draft.peers.sessions.hear(event.connection, event.name, None, draft.now_s)
+        draft.peers = replace(draft.peers, sessions=sessions)
 
 
 def _on_unreadable(draft: StateDraft, event: Unreadable) -> None:
@@ -251,6 +257,7 @@ def _on_announced(draft: StateDraft, event: Announced) -> None:
 def _on_reply(draft: StateDraft, event: TranslatorReply) -> None:
     draft.forwarder, settled = draft.forwarder.answered(event.number, event.response)
     if settled is not None:
+        draft.watchdog = draft.watchdog.translator_answered()
         request_pipeline.settle(draft, settled)
 
 
@@ -273,6 +280,33 @@ def _on_translator_down(draft: StateDraft, event: TranslatorDown) -> None:
 def _on_translator_caught_up(draft: StateDraft, event: TranslatorCaughtUp) -> None:
     if draft.barrier.until_s is not None:
         publishing.publish_control(draft)
+
+
+# --- the coordinate frame ------------------------------------------------------------------------------------------
+
+
+def _on_reconsidered(draft: StateDraft, output: Reconsider) -> None:
+    _take(draft, output.event)
+
+
+def _on_frame_asks(draft: StateDraft, output: AskMicroscope) -> None:
+    draft.forwarder, _ = draft.forwarder.ask_own(output.request, draft.now_s, AskForFrame(output.purpose))
+
+
+def _on_hold_control(draft: StateDraft, output: HoldControl) -> None:
+    draft.barrier = draft.barrier.put_off(output.until_s)
+
+
+def _on_save_now(draft: StateDraft, output: SaveNow) -> None:
+    draft.save()
+
+
+def _add_effect(draft: StateDraft, output: Log | Delegate) -> None:
+    draft.effects.append(output)
+
+
+def _on_frame_input(draft: StateDraft, event: Input) -> None:
+    """Inputs that only a coordinate frame acts upon."""
 
 
 # --- the end, and time ----------------------------------------------------------------------------------------------
@@ -298,9 +332,9 @@ def _end_when_safe(draft: StateDraft) -> None:
     if owes_retract:
         draft.log("CRITICAL", "the experiment ended with the tip in danger: the microscope did not retract it")
     for event, code, why, detail in kept:
-        newest = draft.sessions.connection_of(event.name)
-        if event.request.id and newest is not None:
-            event.connection = newest  # a client that lost its connection meanwhile asks again by another
+        newest = draft.peers.sessions.connection_of(event.name)
+        if event.request.id and newest is not None:  # a client that lost its connection asks again by another
+            event = replace(event, connection=newest)
         answers.answer(draft, event, code, why, detail=detail)
     draft.send_forwards()
     publishing.publish_entries(draft)
@@ -380,8 +414,7 @@ def _dead_at_s(state: SchedulerState | StateDraft) -> float | None:
     holder, told_at_s = state.control.holder, state.barrier.until_s
     if holder is None:
         return None
-    over_since_s = state.supervisors.over_since_s(component_of(holder))
-    dead_at_s = state.holder_timeout.dead_at_s(holder, state.sessions, over_since_s)
+    dead_at_s = state.peers.dead_at_s(holder)
     return dead_at_s if dead_at_s is None or told_at_s is None else max(dead_at_s, told_at_s)
 
 
@@ -415,4 +448,15 @@ _HANDLERS: dict[type, Callable[[StateDraft, Any], None]] = {
     Announced: _on_announced,
     Stopped: _on_stopped,
     Tick: _on_tick,
+    Reconsider: _on_reconsidered,
+    AskMicroscope: _on_frame_asks,
+    HoldControl: _on_hold_control,
+    SaveNow: _on_save_now,
+    Log: _add_effect,
+    Delegate: _add_effect,
+    Started: _on_frame_input,
+    FrameReported: _on_frame_input,
+    FrameAnswered: _on_frame_input,
+    ControlChanged: _on_frame_input,
 }
+"""By the type of an input or of a frame's output."""

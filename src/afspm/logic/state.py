@@ -1,67 +1,48 @@
-"""The state of a scheduler: a tree of frozen parts, the draft of its next state, and what survives a restart."""
+"""The state of a scheduler: a tree of frozen parts, the draft of its next state, and its way over a restart."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 
 from afspm.logic.arbitration import ArbitrationState
 from afspm.logic.cache import PacketCache
-from afspm.logic.coordinate_frame import CoordinateFrame
-from afspm.logic.event_log import EventLog, SentStart
-from afspm.logic.events import Codec, Effect, Log, SaveState
+from afspm.logic.coordinate_frame import TIP_FRAME, CoordinateFrame
+from afspm.logic.event_log import EventLog
+from afspm.logic.events import Codec, Effect, FrameAnswered, Log, SaveState
 from afspm.logic.forwarder import Forwarder
 from afspm.logic.frozen import replace
 from afspm.logic.hand_settings import HandSettings
 from afspm.logic.holder_timeout import HolderTimeout, Lease
-from afspm.logic.idempotency_cache import IdempotencyCache, SentAction
+from afspm.logic.idempotency_cache import IdempotencyCache
 from afspm.logic.lifecycle import ExperimentEnd, StartupBarrier
 from afspm.logic.limit_checker import LimitChecker
-from afspm.logic.limit_state import LimitState
-from afspm.logic.microscope_status import MicroscopeStatus, TipRisk
+from afspm.logic.microscope_status import MicroscopeStatus
 from afspm.logic.pending_requests import PendingRequests
+from afspm.logic.saved_state import SavedState
 from afspm.logic.sessions import SessionTable
 from afspm.logic.settings import SchedulerSettings
-from afspm.logic.supervisor_registry import SavedSupervisor, SupervisorRegistry
-from afspm.logic.watchdog import RetractState, Watchdog
-
-KIND, VERSION = "scheduler", 1
-"""Of snapshots of `SavedState`."""
+from afspm.logic.supervisor_registry import SupervisorRegistry
+from afspm.logic.watchdog import Watchdog
+from afspm.model import component_of
 
 
 @dataclass(frozen=True)
-class SavedState:
-    """The state that survives a restart.
+class Peers:
+    """The processes of the experiment, as far as they are there.
 
     Attributes:
-        granted_to: the token of the life of the holder that was granted control.
-        lease_s: that the holder asked for.
-        sessions: the token of each session that was connected.
-        forgotten: see `idempotency_cache.Floors`.
-        last_ns: the time of the newest packet.
-        recent: (translator's time, ours) of the packets published last.
-        frame: of a scheduler whose components have other coordinates, as JSON.
+        timeout: the grace period of a holder without a connection.
+        supervisors: report which processes have ended.
     """
 
-    control: ArbitrationState = field(default_factory=ArbitrationState)
-    granted_to: str | None = None
-    lease_s: float | None = None
-    sessions: Mapping[str, str] = field(default_factory=dict)
-    sent_actions: tuple[SentAction, ...] = ()
-    starts: tuple[SentStart, ...] = ()
-    forgotten: Mapping[str, int] = field(default_factory=dict)
-    limits: LimitState = field(default_factory=LimitState)
-    tip: RetractState = field(default_factory=RetractState)
-    tip_risk: TipRisk = field(default_factory=TipRisk)
-    supervisors: Mapping[str, SavedSupervisor] = field(default_factory=dict)
-    last_ns: int = 0
-    recent: tuple[tuple[int, int], ...] = ()
-    frame: str | None = None
+    sessions: SessionTable
+    timeout: HolderTimeout
+    supervisors: SupervisorRegistry = field(default_factory=SupervisorRegistry)
 
-    def without_holder(self) -> SavedState:
-        """Return the state with nobody in control: an older state does not know who was."""
-        return replace(self, control=replace(self.control, holder=None, solving=0), granted_to=None, lease_s=None)
+    def dead_at_s(self, holder: str) -> float | None:
+        """Return when (real) control is revoked unless the holder comes back; None while it is connected."""
+        over_since_s = self.supervisors.over_since_s(component_of(holder))
+        return self.timeout.dead_at_s(holder, self.sessions, over_since_s)
 
 
 @dataclass(frozen=True)
@@ -69,46 +50,45 @@ class SchedulerState:
     """All that a scheduler decides by, but for the packets in its cache.
 
     Attributes:
-        logged: what is logged only once.
+        logged: texts that are logged only once.
+        frame: the coordinates of components.
     """
 
     control: ArbitrationState
     lease: Lease
-    holder_timeout: HolderTimeout
-    sessions: SessionTable
+    peers: Peers
     idempotency: IdempotencyCache
     pending: PendingRequests
     forwarder: Forwarder
     limits: LimitChecker
     microscope: MicroscopeStatus
     watchdog: Watchdog
-    supervisors: SupervisorRegistry
     event_log: EventLog
     barrier: StartupBarrier
     end: ExperimentEnd
     by_hand: HandSettings
     logged: frozenset[str]
+    frame: CoordinateFrame
 
     @classmethod
-    def initial(cls, settings: SchedulerSettings) -> SchedulerState:
+    def initial(cls, settings: SchedulerSettings, frame: CoordinateFrame = TIP_FRAME) -> SchedulerState:
         dog, control, waits = settings.watchdog, settings.control, settings.waits
         return cls(
             control=ArbitrationState(),
             lease=Lease(None if control.lease_s is None else round(control.lease_s * 1e9)),
-            holder_timeout=HolderTimeout(control.grace_s, waits.restart_grace_s),
-            sessions=SessionTable(waits.takeover_s),
+            peers=Peers(SessionTable(waits.takeover_s), HolderTimeout(control.grace_s, waits.restart_grace_s)),
             idempotency=IdempotencyCache(),
             pending=PendingRequests(),
             forwarder=Forwarder(control.request_timeout_s, waits.answer_s, waits.longest_queue),
             limits=LimitChecker(settings.limits),
             microscope=MicroscopeStatus(dog.dangerous, control.malfunction_after_s),
             watchdog=Watchdog(dog),
-            supervisors=SupervisorRegistry(),
             event_log=EventLog(),
             barrier=StartupBarrier(waits.catch_up_s),
             end=ExperimentEnd(),
             by_hand=HandSettings(),
             logged=frozenset(),
+            frame=frame,
         )
 
     def saved_parts(self) -> tuple[object, ...]:
@@ -124,6 +104,7 @@ class SchedulerState:
             self.end.by_s,
             self.pending.due_s(line_is_free=self.forwarder.is_free),
             self.watchdog.due_s,
+            self.frame.deadline_s(),
         )
         return min((due_s for due_s in dues if due_s is not None), default=None)
 
@@ -135,13 +116,11 @@ class Environment:
     Attributes:
         cache: the packets published lately; the one part that is changed in place, since it holds up to all memory that
             it may.
-        frame: the coordinates that components speak of, where they are not those of the microscope.
     """
 
     settings: SchedulerSettings
     codec: Codec
     cache: PacketCache
-    frame: CoordinateFrame | None = None
 
 
 class StateParts:
@@ -149,20 +128,19 @@ class StateParts:
 
     control: ArbitrationState
     lease: Lease
-    holder_timeout: HolderTimeout
-    sessions: SessionTable
+    peers: Peers
     idempotency: IdempotencyCache
     pending: PendingRequests
     forwarder: Forwarder
     limits: LimitChecker
     microscope: MicroscopeStatus
     watchdog: Watchdog
-    supervisors: SupervisorRegistry
     event_log: EventLog
     barrier: StartupBarrier
     end: ExperimentEnd
     by_hand: HandSettings
     logged: frozenset[str]
+    frame: CoordinateFrame
 
 
 _PARTS = tuple(one.name for one in fields(SchedulerState))
@@ -174,6 +152,7 @@ class StateDraft(StateParts):
     Attributes:
         now_s: real and monotonic, for timeouts.
         now_ns: of the experiment, for whatever means something in it.
+        raised: inputs that this step has raised itself; the frame takes them within it.
     """
 
     def __init__(self, state: SchedulerState, env: Environment, now_s: float, now_ns: int) -> None:
@@ -182,6 +161,7 @@ class StateDraft(StateParts):
         self.now_s = now_s
         self.now_ns = now_ns
         self.effects: list[Effect] = []
+        self.raised: list[FrameAnswered] = []
         self._before = state
         self._is_to_be_saved = False
 
@@ -213,31 +193,40 @@ def saved_state(state: SchedulerState, env: Environment) -> SavedState:
         control=state.control,
         granted_to=state.lease.token,
         lease_s=state.lease.asked_s,
-        sessions=state.sessions.tokens(),
+        sessions=state.peers.sessions.tokens(),
         sent_actions=state.idempotency.sent_actions,
         starts=state.event_log.starts,
         forgotten=state.idempotency.floors.numbers,
         limits=state.limits.state,
         tip=state.watchdog.tip,
         tip_risk=state.microscope.risk,
-        supervisors=state.supervisors.saved(),
+        supervisors=state.peers.supervisors.saved(),
         last_ns=env.cache.last_ns,
         recent=tuple(env.cache.recent()),
-        frame=None if env.frame is None else json.dumps(env.frame.snapshot()),
+        frame=state.frame.saved(),
     )
 
 
-def restored_state(saved: SavedState, settings: SchedulerSettings) -> SchedulerState:
-    """Return the state in which a scheduler goes on after a restart."""
-    state = SchedulerState.initial(settings)
+def restored_state(
+    saved: SavedState, settings: SchedulerSettings, frame: CoordinateFrame = TIP_FRAME
+) -> SchedulerState:
+    """Return the state in which a scheduler goes on after a restart.
+
+    Args:
+        frame: as it is without a restart.
+    """
+    state = SchedulerState.initial(settings, frame.restored(saved.frame))
+    sessions, supervisors = (
+        state.peers.sessions.restored(saved.sessions),
+        SupervisorRegistry.restored(saved.supervisors),
+    )
     return replace(
         state,
         control=saved.control,
         lease=replace(state.lease, token=saved.granted_to),
-        sessions=state.sessions.restored(saved.sessions),
+        peers=replace(state.peers, sessions=sessions, supervisors=supervisors),
         idempotency=state.idempotency.restored(saved.sent_actions, saved.forgotten),
         limits=replace(state.limits, state=saved.limits),
         watchdog=state.watchdog.restored(saved.tip),
         microscope=replace(state.microscope, risk=saved.tip_risk),
-        supervisors=SupervisorRegistry.restored(saved.supervisors),
     )

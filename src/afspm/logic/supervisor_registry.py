@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from afspm.formatting import duration_text
 from afspm.logic.events import Codec, RequestIn
 from afspm.logic.frozen import replace
+from afspm.logic.saved_state import SavedSupervisor
 from afspm.model import (
     LogLines,
     Note,
@@ -50,15 +51,6 @@ class KnownSupervisor:
     orders: tuple[str, ...] = ()
     over: Mapping[str, tuple[int, float]] = field(default_factory=dict)
     states: tuple[ProcessState, ...] = ()
-
-
-@dataclass(frozen=True)
-class SavedSupervisor:
-    """The part of a supervisor that survives a restart of ours."""
-
-    processes: tuple[str, ...]
-    orders: tuple[str, ...]
-    over: Mapping[str, int]
 
 
 @dataclass(frozen=True)

@@ -100,12 +100,15 @@ class RetractState:
         calls_people: it has retracted the tip, or could not, and nobody was called yet: to go on is for a person.
         stops: actions wanted before the tip is retracted.
         for_feedback: why the tip is to be retracted.
+        may_come: the scheduler was killed after it asked for a retract: the translator may still have that in its
+            queue, and its answer goes to the life that asked.
     """
 
     duty: TipDuty = TipDuty.NONE
     calls_people: bool = False
     stops: tuple[str, ...] = ()
     for_feedback: bool = False
+    may_come: bool = False
 
 
 @dataclass(frozen=True)
@@ -140,8 +143,20 @@ class Watchdog:
 
     def restored(self, tip: RetractState) -> Watchdog:
         """Take up the duty of before a restart: what the microscope was being asked is not known any more."""
-        duty = TipDuty.OWED if tip.duty is TipDuty.ASKED else tip.duty
-        return replace(self, tip=replace(tip, duty=duty))
+        was_asked = tip.duty is TipDuty.ASKED
+        duty = TipDuty.OWED if was_asked else tip.duty
+        return replace(self, tip=replace(tip, duty=duty, may_come=was_asked or tip.may_come))
+
+    def translator_answered(self) -> Watchdog:
+        """Take an answer to this life of the scheduler: everything that an earlier life asked for is done, or lost.
+
+        A tip that is still to be retracted is retracted again, which does no harm. Where a person has seen to it
+        meanwhile, it may have been withdrawn after that: a person looks again.
+        """
+        if not self.tip.may_come:
+            return self
+        dog = replace(self, tip=replace(self.tip, may_come=False))
+        return dog if dog.owes_retract else dog._see(TipEvent.RETRACTED_LATE)
 
     def begun(self, now_s: float) -> Watchdog:
         """Wait: what has happened meanwhile is heard of first, and the translator may not be there."""

@@ -1,11 +1,12 @@
 """Snapshots: trees of dataclasses as plain data, and back, with the kind and the version that they are of.
 
-Plain data are what JSON holds, and numpy arrays, which the caller stores beside it (or asks for as lists). Only the
-types of the fields say what is read: nothing in a snapshot names code.
+Plain data are what JSON holds (bytes as base64), and numpy arrays, which the caller stores beside it (or asks for as
+lists). Only the types of the fields say what is read: nothing in a snapshot names code.
 """
 
 from __future__ import annotations
 
+import base64
 import sys
 import types
 from collections import deque
@@ -63,6 +64,8 @@ def to_plain(value: object, *, lists: bool = False) -> Any:
             return value.tolist() if lists else value
         if isinstance(value, np.generic):
             return value.item()
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode()
     if isinstance(value, Mapping):
         if all(isinstance(key, str) for key in value):
             return {key: to_plain(one, lists=lists) for key, one in value.items()}
@@ -100,6 +103,8 @@ def from_plain(type_: Any, plain: Any) -> Any:
         return _from_collection(origin, arguments, plain)
     if type_ is float:
         return float(plain)
+    if type_ is bytes:
+        return base64.b64decode(plain, validate=True)
     if not isinstance(plain, type_):
         raise TypeError(f"{plain!r} is no {type_.__name__}")
     return plain

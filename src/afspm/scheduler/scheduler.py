@@ -5,12 +5,13 @@ from __future__ import annotations
 import importlib
 import threading
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from afspm.errors import ConfigError, FileError, InvalidValue
 from afspm.exit_codes import ExitCode
+from afspm.logic.coordinate_frame import TIP_FRAME, CoordinateFrame
 from afspm.logic.envelopes import CacheSettings, EnvelopeMapping, Envelopes
 from afspm.logic.fencing import Epoch
 from afspm.logic.limits import ExperimentLimits
@@ -18,7 +19,7 @@ from afspm.logic.scheduler_core import SchedulerCore
 from afspm.logic.settings import ControlSettings, RunFacts, SchedulerSettings
 from afspm.model.snapshot import from_plain
 from afspm.process.context import ProcessContext
-from afspm.scheduler.shell import SchedulerShell
+from afspm.scheduler.shell import FrameWorker, SchedulerShell
 from afspm.scheduler.state_file import StateFile
 from afspm.scheduler.wire_codec import WireCodec
 from afspm.scheduler.write_ahead import WriteAhead
@@ -28,6 +29,19 @@ from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.scheduler_sockets import SchedulerSockets
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """The coordinate frame of a scheduler.
+
+    Attributes:
+        frame: as it is without a restart.
+        worker: takes the frame's jobs; None: it has none.
+    """
+
+    frame: CoordinateFrame = TIP_FRAME
+    worker: FrameWorker | None = None
 
 
 class Scheduler:
@@ -64,7 +78,8 @@ class Scheduler:
         launch, clock, log = context.launch, context.clock, context.log
         folder = Path(launch.state_dir) if launch.state_dir else None
         state = StateFile(folder and folder / f"{launch.name}.json", log)
-        core = self._core(context)
+        coordinates = self.coordinates(context)
+        core = SchedulerCore(self._settings(context), WireCodec(), coordinates.frame)
         _restore(core, state, log_folder(folder) if folder else None)
         write_ahead = WriteAhead(state, PacketLog(log_folder(folder)) if folder else None, core.cached, log)
         warnings = RateLimitedLog(log, clock)
@@ -76,7 +91,7 @@ class Scheduler:
             sockets.wake_up()
 
         context.when_stopping(stop)
-        shell = self._shell(core, sockets, clock, write_ahead, warnings, log)
+        shell = SchedulerShell(core, sockets, clock, write_ahead, warnings, log, coordinates.worker)
         try:
             shell.start()
             while not (shell.over or stopping.is_set()):
@@ -104,11 +119,9 @@ class Scheduler:
             run=RunFacts(dict(launch.clock), launch.run, launch.simulated, asdict(versions_here())),
         )
 
-    def _core(self, context: ProcessContext) -> SchedulerCore:
-        return SchedulerCore(self._settings(context), WireCodec())
-
-    def _shell(self, core: SchedulerCore, sockets: SchedulerSockets, *others: Any) -> SchedulerShell:
-        return SchedulerShell(core, sockets, *others)
+    def coordinates(self, context: ProcessContext) -> Coordinates:
+        """Return the coordinates of components: those of the tip, but for a subclass that knows others."""
+        return Coordinates()
 
 
 def _epoch(context: ProcessContext) -> bytes:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Hashable, Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Hashable, Iterable
+from typing import TYPE_CHECKING, Protocol
 
 from afspm import wire
 from afspm.errors import WireError
@@ -31,8 +31,8 @@ from afspm.wire.protocol import LONGEST_ID
 
 if TYPE_CHECKING:
     from afspm.clock import Clock
+    from afspm.logic.saved_state import SavedState
     from afspm.logic.scheduler_core import SchedulerCore
-    from afspm.logic.state import SavedState
     from afspm.scheduler.write_ahead import WriteAhead
     from afspm.transport.rate_limited_log import RateLimitedLog
     from afspm.transport.scheduler_sockets import SchedulerSockets, Source
@@ -47,6 +47,28 @@ _WRITTEN_DOWN_LATE = (bytes([RELAY_REQUEST]), bytes([ControlRequest.ADD_EXP_PRBL
 """Requests that are still written down after the end."""
 
 
+class FrameWorker(Protocol):
+    """The worker of a coordinate frame. It has threads or processes of its own: no call waits.
+
+    Attributes:
+        wake: called from any thread when there is a report.
+    """
+
+    wake: Callable[[], None]
+
+    def take(self, job: object) -> None:
+        """Take the job of a `Delegate` effect."""
+        ...
+
+    def reports(self) -> Iterable[object]:
+        """Yield the reports since the last call, oldest first; the next one once the last was handled."""
+        ...
+
+    def close(self) -> None:
+        """End it."""
+        ...
+
+
 class SchedulerShell:
     """One scheduler at work: `start`, then `handle` what `wait` returns until it is `over`."""
 
@@ -58,6 +80,7 @@ class SchedulerShell:
         write_ahead: WriteAhead,
         warnings: RateLimitedLog,
         log: logging.Logger,
+        worker: FrameWorker | None = None,
     ) -> None:
         self._core = core
         self._sockets = sockets
@@ -70,6 +93,9 @@ class SchedulerShell:
         self._look_at_s = 0.0  # at the deadlines, in real monotonic time
         self.ended = False
         self._tip_is_safe = True
+        self._worker = worker
+        if worker is not None:
+            worker.wake = sockets.wake_up
         sockets.publisher.history = self._history
 
     def start(self) -> None:
@@ -90,6 +116,8 @@ class SchedulerShell:
         if self.ended:
             self._handle_late(ready)
             return
+        for report in () if self._worker is None else self._worker.reports():
+            self._take(events.FrameReported(report))
         sockets = self._sockets
         for source in ready:
             if source in (sockets.router, sockets.router.monitor):
@@ -161,7 +189,9 @@ class SchedulerShell:
             self._take(events.Stopped())
 
     def close(self) -> None:
-        """Make sure of what was written."""
+        """End the frame's worker, and make sure of what was written."""
+        if self._worker is not None:
+            self._worker.close()
         self._write_ahead.close()
 
     # --- what comes in ---
@@ -196,7 +226,9 @@ class SchedulerShell:
             self._answer(asked, response)
             self._take(events.Unreadable(name, response))
             return
-        self._take(events.RequestIn(asked.connection, name, request, asked.user))
+        now_s = self._clock.monotonic_s()
+        event = events.RequestIn(asked.connection, name, request, asked.user, now_s)
+        self._carry_out(self._core.step(event, now_s, self._clock.now_ns()))
 
     def _answer(self, asked: PeerAsked, response: Response) -> None:
         number = int.from_bytes(asked.frames[0][:1]) if asked.frames else 0
@@ -263,6 +295,9 @@ class SchedulerShell:
                     self._replay = effect.packets
                 case events.Log():
                     self._log.log(_LEVELS.get(effect.level, logging.INFO), "%s", effect.text)
+                case events.Delegate():
+                    assert self._worker is not None, "a frame with jobs has a worker"
+                    self._worker.take(effect.job)
                 case events.Kill():
                     self._release()
                     sockets.publisher.serve()  # whoever subscribes at this moment is to hear it too

@@ -7,7 +7,7 @@ import logging
 from pathlib import Path
 
 from afspm.errors import InvalidValue
-from afspm.logic.state import KIND, VERSION, SavedState
+from afspm.logic.saved_state import KIND, VERSION, SavedState
 from afspm.model.snapshot import restored, snapshot
 from afspm.storage.atomic import CheckpointFile, OutageLog, load_checkpoint
 

@@ -19,11 +19,6 @@ class WireCodec:
     def encode(self, thing: object) -> bytes:
         return wire.encode(thing)[1]
 
-    def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
-        """See `scheduler.drift.places.PlaceCodec`."""
-        of = "ProbePosition" if message in ("Spec1d", "ProbePosition") else "ScanParameters2d"
-        return wire.relocated(message, payload, wire.place_in(of, told))
-
     def decode_packet(self, message: str, payload: bytes | memoryview) -> object:
         try:
             return wire.decode(message, payload)

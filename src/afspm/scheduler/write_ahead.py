@@ -6,7 +6,7 @@ import contextlib
 import logging
 from collections.abc import Callable, Iterable, Sequence
 
-from afspm.logic.state import SavedState
+from afspm.logic.saved_state import SavedState
 from afspm.model import LoggedPacket
 from afspm.scheduler.state_file import StateFile
 from afspm.storage.atomic import OutageLog

@@ -210,7 +210,9 @@ def worker_of(run: AfspmRun) -> int:
     children = Path(f"/proc/{scheduler}/task/{scheduler}/children")
     if not children.exists():
         pytest.skip("who has started whom is only told by Linux")
-    (pid,) = map(int, children.read_text().split())
+    # beside it runs the resource tracker of multiprocessing
+    pids = children.read_text().split()
+    (pid,) = [int(pid) for pid in pids if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
     return pid
 
 

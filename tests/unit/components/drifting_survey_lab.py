@@ -16,9 +16,9 @@ from afspm.drift.registration import DriftScan, Estimator
 from afspm.drift.trackers import tracker
 from afspm.experiment import load
 from afspm.model import Frame, Region, Scan
-from afspm.scheduler.drift.codec import DriftWireCodec
 from afspm.scheduler.drift.estimation import Estimation
 from afspm.scheduler.drift.messages import Registered
+from afspm.scheduler.drift.scheduler import DriftWireCodec
 from afspm.scheduler.drift.settings import RescanRule
 from afspm.simulation import World
 

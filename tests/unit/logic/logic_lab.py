@@ -26,9 +26,9 @@ from afspm.logic.events import (
     TranslatorUp,
 )
 from afspm.logic.limit_checker import is_get
+from afspm.logic.saved_state import KIND, VERSION, SavedState
 from afspm.logic.scheduler_core import SchedulerCore
 from afspm.logic.settings import SchedulerSettings
-from afspm.logic.state import KIND, VERSION, SavedState
 from afspm.model import (
     RELAY_REQUEST,
     ControlMode,

@@ -473,3 +473,39 @@ def test_a_scheduler_that_is_killed_while_it_ends_sees_to_the_tip_first() -> Non
 def test_an_experiment_without_danger_ends_at_once() -> None:
     lab = in_control(SchedulerSettings())
     assert kinds(lab.ask("experiment", END))[-1] == "Kill"
+
+
+def restarted_over_a_retract() -> Lab:
+    """A scheduler that was killed over a retract; a person took over and gave back, and the translator still hangs."""
+    lab = feedback_off()
+    lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
+    assert sent(lab) == ["x-retract"]
+    again = Lab(state=lab.core.snapshot(), now=(lab.now_s, lab.now_ns))
+    again.later(5.0)
+    again.step(Tick())
+    for mode in (ControlMode.MANUAL, ControlMode.AUTOMATED):
+        again.mode("person", mode)
+    again.take_control("corrector", Problem.TIP_SHAPE_CHANGED)
+    again.step(TranslatorUp())
+    assert not again.core.state.watchdog.owes_retract
+    return again
+
+
+def test_retract_of_before_a_restart_keeps_the_microscope_until_the_translator_answers() -> None:
+    lab = restarted_over_a_retract()
+    assert lab.says("corrector", ACTION, "start-scan") is ControlResponse.NOT_FREE
+    assert "start-scan" not in sent(lab)
+
+
+def test_retract_that_a_killed_scheduler_asked_for_and_a_person_called_off_calls_a_person() -> None:
+    lab = restarted_over_a_retract()
+    lab.answer(lab.forwarded[0])  # the first question: the translator has served everything before it
+    assert lab.core.state.watchdog.left_to_people
+    lab.step(Tick())
+    assert Problem.DEVICE_MALFUNCTION in lab.core.control.problems
+
+
+def test_second_kill_does_not_forget_the_retract_of_the_first_life() -> None:
+    again = Lab(state=restarted_over_a_retract().core.snapshot())
+    again.step(TranslatorUp())
+    assert again.says("corrector", ACTION, "start-scan") is ControlResponse.NOT_FREE

@@ -34,10 +34,19 @@ class Tree:
     queue: deque[int] = field(default_factory=deque)
     by_number: dict[int, Leaf] = field(default_factory=dict)
     names: frozenset[str] = frozenset()
+    message: bytes = b""
 
 
 LEAF = Leaf("a", (1.5, 2))
-TREE = Tree(np.array([[0.1, np.pi], [1e-300, -0.0]]), LEAF, (LEAF, LEAF), deque([1, 2]), {3: LEAF}, frozenset({"x"}))
+TREE = Tree(
+    np.array([[0.1, np.pi], [1e-300, -0.0]]),
+    LEAF,
+    (LEAF, LEAF),
+    deque([1, 2]),
+    {3: LEAF},
+    frozenset({"x"}),
+    bytes(range(256)),
+)
 
 
 @pytest.mark.parametrize("lists", [False, True])
@@ -45,7 +54,7 @@ def test_a_tree_comes_back_to_the_last_bit(lists: bool) -> None:
     plain = snapshot(TREE, "tree", 1, lists=lists)
     again = restored(Tree, json.loads(json.dumps(plain)) if lists else plain, "tree", 1)
     assert again.values.tobytes() == TREE.values.tobytes()
-    for name in ("leaf", "leaves", "queue", "by_number", "names"):
+    for name in ("leaf", "leaves", "queue", "by_number", "names", "message"):
         assert getattr(again, name) == getattr(TREE, name)
 
 
@@ -57,7 +66,14 @@ def test_another_kind_or_version_is_refused(changed: dict[str, object]) -> None:
 
 @pytest.mark.parametrize(
     "changed",
-    [{"values": None}, {"leaf": 1}, {"leaves": [{"name": 3, "pair": [1.0, 2]}]}, {"leaf": {}}, {"unheard_of": 1}],
+    [
+        {"values": None},
+        {"leaf": 1},
+        {"leaves": [{"name": 3, "pair": [1.0, 2]}]},
+        {"leaf": {}},
+        {"unheard_of": 1},
+        {"message": "no base64"},
+    ],
 )
 def test_a_damaged_snapshot_is_refused(changed: dict[str, object]) -> None:
     with pytest.raises(InvalidValue, match="damaged"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
@@ -13,8 +14,10 @@ from afspm.drift.trackers import forecast_from_dict
 from afspm.drift.trackers.paper import PaperForecast
 from afspm.logic.events import (
     Connected,
+    Delegate,
     Effect,
     Forward,
+    FrameReported,
     Input,
     PacketIn,
     Publish,
@@ -29,8 +32,9 @@ from afspm.logic.events import (
 from afspm.logic.limit_checker import is_get
 from afspm.logic.limits import ExperimentLimits
 from afspm.logic.positions import PROBE_CHANGES, REGION_CHANGES, scan_values
+from afspm.logic.saved_state import KIND, VERSION, SavedState
+from afspm.logic.scheduler_core import SchedulerCore
 from afspm.logic.settings import SchedulerSettings
-from afspm.logic.state import SavedState
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -48,10 +52,19 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
-from afspm.scheduler.drift.codec import DriftWireCodec
-from afspm.scheduler.drift.core import DriftCore
-from afspm.scheduler.drift.messages import Forecasted, Registered, ScanJob, WorkerSaid
+from afspm.model.snapshot import restored, snapshot
+from afspm.scheduler.drift.messages import (
+    Compensated,
+    Forecasted,
+    Registered,
+    ScanJob,
+    StartWorker,
+    WorkerReport,
+)
+from afspm.scheduler.drift.sample_frame import SampleFrame
+from afspm.scheduler.drift.scheduler import DriftWireCodec
 from afspm.scheduler.drift.settings import DriftCompensationSettings
+from afspm.scheduler.drift.state import DriftState
 from afspm.wire.generated.spectroscopy_pb2 import ProbePosition as ProbePositionMessage
 
 NS = 10**9
@@ -61,21 +74,20 @@ SHAPE = (128, 128)
 
 
 class FakeWorker:
-    """Remembers what it was told."""
+    """Remembers its jobs."""
 
     def __init__(self) -> None:
         self.starts = 0
         self.jobs: list[ScanJob] = []
         self.velocities: list[tuple[float, tuple[float, float]]] = []
 
-    def start(self) -> None:
-        self.starts += 1
-
-    def register(self, job: ScanJob) -> None:
-        self.jobs.append(job)
-
-    def compensated(self, time_s: float, velocity_m_s: tuple[float, float]) -> None:
-        self.velocities.append((time_s, velocity_m_s))
+    def take(self, job: object) -> None:
+        if isinstance(job, StartWorker):
+            self.starts += 1
+        elif isinstance(job, ScanJob):
+            self.jobs.append(job)
+        elif isinstance(job, Compensated):
+            self.velocities.append((job.time_s, job.velocity_m_s))
 
 
 def forecast(
@@ -129,6 +141,11 @@ def registered(
     )
 
 
+def as_saved(state: SavedState) -> SavedState:
+    """The state as it comes out of its file."""
+    return restored(SavedState, json.loads(json.dumps(snapshot(state, KIND, VERSION))), KIND, VERSION)
+
+
 def _asks_for_a_place(effect: Effect) -> bool:
     if not isinstance(effect, Forward) or effect.request.id or not is_get(effect.request):
         return False
@@ -165,15 +182,11 @@ class Lab:
         self.worker = FakeWorker()
         self.now_s = now_s
         settings = SchedulerSettings(limits=limits or ExperimentLimits())
-        self.core = DriftCore(
-            settings,
-            drift or DriftCompensationSettings(at_start="nothing"),
-            DriftWireCodec(),
-            self.worker,
-            "scheduler",
-        )
+        self._drift = drift or DriftCompensationSettings(at_start="nothing")
+        codec = DriftWireCodec()
+        self.core = SchedulerCore(settings, codec, SampleFrame.initial(self._drift, codec, "scheduler"))
         if state is not None:
-            self.core.restore(state)
+            self.core.restore(as_saved(state))
         self.effects: list[Effect] = []
         self.asked = 0
         self.places: dict[str, float] = {}
@@ -192,8 +205,23 @@ class Lab:
     def now_ns(self) -> int:
         return round(self.now_s * NS)
 
+    @property
+    def drift(self) -> DriftState:
+        frame = self.core.state.frame
+        assert isinstance(frame, SampleFrame)
+        return frame.state
+
+    def mapping_now(self) -> Mapping:
+        """The mapping that holds now."""
+        mapping = self.drift.forecast.mapping_at(self._drift, self.now_s)
+        assert mapping is not None
+        return mapping
+
     def done(self, effects: list[Effect]) -> list[Effect]:
         self.effects += effects
+        for effect in effects:
+            if isinstance(effect, Delegate):
+                self.worker.take(effect.job)
         return effects
 
     def step(self, event: Input) -> list[Effect]:
@@ -224,7 +252,7 @@ class Lab:
     def follow(self) -> list[Effect]:
         """What is due at once, as whoever hosts the core would see to it."""
         done: list[Effect] = []
-        while self.core._following:
+        while self.drift.following:
             done += self.done(self.core.step(Tick(), self.now_s, self.now_ns))
         return done
 
@@ -232,9 +260,9 @@ class Lab:
         """The worker has this forecast."""
         self.says(Forecasted(plain))
 
-    def says(self, said: WorkerSaid) -> list[Effect]:
-        """The worker says something."""
-        done = self.done(self.core.said(said, self.now_s, self.now_ns))
+    def says(self, report: WorkerReport) -> list[Effect]:
+        """The worker reports something."""
+        done = self.done(self.core.step(FrameReported(report), self.now_s, self.now_ns))
         return done + self.follow()
 
     # --- components ---

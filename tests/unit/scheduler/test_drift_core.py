@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import FrozenInstanceError
 
 import numpy as np
 import pytest
@@ -21,12 +22,15 @@ from afspm.model import (
     Request,
     RescanKind,
     Scan,
+    ScanParameters,
     ScopeState,
     ScopeStatus,
     names,
 )
 from afspm.scheduler.drift.messages import NotRegistered, WorkerGone
+from afspm.scheduler.drift.sample_frame import SampleFrame
 from afspm.scheduler.drift.settings import Compensate, DriftCompensationSettings
+from afspm.scheduler.drift.state import SavedDrift
 
 DRIFT = (100e-9, -50e-9)
 BACK = (-100e-9, 50e-9)
@@ -200,11 +204,26 @@ def test_it_is_saved_before_it_is_published(lab: Lab) -> None:
     lab.says(registered(lab.worker.jobs[0], forecast(DRIFT)))
     kinds = [type(effect).__name__ for effect in lab.effects]
     assert kinds.index("SaveState") < kinds.index("Publish")
-    frame = lab.saved().frame
-    assert frame is not None
-    beside = json.loads(frame)["beside"]
-    assert beside["knowledge"]["forecast"] == forecast(DRIFT)
-    assert beside["scans"][0][0] == lab.worker.jobs[0].key
+    saved = lab.saved().frame
+    assert isinstance(saved, SavedDrift)
+    assert json.loads(saved.forecast.text or "") == forecast(DRIFT)
+    assert list(saved.settled) == [lab.worker.jobs[0].key]
+
+
+def test_step_changes_neither_the_state_before_it_nor_its_input(lab: Lab) -> None:
+    lab.take_control()
+    lab.scan()
+    before = lab.core.state
+    assert isinstance(before.frame, SampleFrame)
+    parts = [*vars(before).values(), *vars(before.frame.state).values(), *vars(before.frame.state.places).values()]
+    shown = [repr(part) for part in parts]
+    report = registered(lab.worker.jobs[0], forecast(DRIFT), rescan="too far")
+    lab.says(report)
+    lab.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(HERE))
+    assert lab.core.state is not before
+    assert [repr(part) for part in parts] == shown
+    with pytest.raises(FrozenInstanceError):
+        RequestIn(1, "series", Request(1, None)).heard_s = 1.0  # type: ignore[misc]
 
 
 def test_a_restarted_scheduler_announces_itself_after_the_scans_that_wait(lab: Lab) -> None:

@@ -87,7 +87,7 @@ def test_a_part_of_a_region_is_put_onto_what_components_know_and_mapped_whole(la
     lab.knows(forecast((-7e-9, 3e-9), angle_rad=-TURN))
     sent = set_region(lab, change)
     assert isinstance(sent.region, Region)
-    same(sent.region, lab.core.knowledge.mapping_at(lab.now_s).to_tip(change.onto(THERE)))  # type: ignore[union-attr]
+    same(sent.region, lab.mapping_now().to_tip(change.onto(THERE)))
 
 
 def test_a_part_of_a_region_that_is_not_known_is_refused_with_a_hint() -> None:
@@ -200,7 +200,7 @@ def test_a_parameter_of_the_region_is_set_as_a_part_of_the_whole(
     assert forward.request.kind == ControlRequest.SET_SCAN_PARAMS
     assert forward.request.id == "series/life/p"
     sent = wire.decode("ScanParameters2d", forward.request.payload)
-    same(sent.region, lab.core.knowledge.mapping_at(lab.now_s).to_tip(change.onto(THERE)))  # type: ignore[union-attr]
+    same(sent.region, lab.mapping_now().to_tip(change.onto(THERE)))
     lab.answer(forward)
     (reply,) = lab.replies()
     assert wire.decode_parameter(reply.payload) == Parameter(name, value, unit)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
+import subprocess
+import sys
+import textwrap
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from drift_parts import Brightest
 
@@ -17,7 +23,15 @@ from afspm.errors import ConfigError, FileError
 from afspm.model import Frame, Region, Scan
 from afspm.scheduler.drift import worker_process
 from afspm.scheduler.drift.estimation import Estimation
-from afspm.scheduler.drift.messages import Forecasted, NotRegistered, Registered, ScanJob, WorkerGone, WorkerSaid
+from afspm.scheduler.drift.messages import (
+    Forecasted,
+    NotRegistered,
+    Registered,
+    ScanJob,
+    StartWorker,
+    WorkerGone,
+    WorkerReport,
+)
 from afspm.scheduler.drift.settings import DriftCompensationSettings, RescanRule
 from afspm.scheduler.drift.worker_process import DriftWorkerProcess
 from afspm.scheduler.drift.worker_state import WorkerStateFile
@@ -129,7 +143,7 @@ class Heard:
 
     def __init__(self, registrar: DriftWorkerProcess) -> None:
         self.registrar = registrar
-        self.all: list[WorkerSaid] = []
+        self.all: list[WorkerReport] = []
         self._changed = threading.Condition()
         registrar.wake = self._wake
 
@@ -137,9 +151,9 @@ class Heard:
         with self._changed:
             self._changed.notify_all()
 
-    def next(self, kind: type[WorkerSaid], count: int = 1) -> WorkerSaid:
-        def found() -> list[WorkerSaid]:
-            self.all += self.registrar.said()
+    def next(self, kind: type[WorkerReport], count: int = 1) -> WorkerReport:
+        def found() -> list[WorkerReport]:
+            self.all += self.registrar.reports()
             return [one for one in self.all if isinstance(one, kind)]
 
         with self._changed:
@@ -150,14 +164,13 @@ class Heard:
 @pytest.fixture
 def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Heard]]:
     """Starts workers with an estimator of `drift_parts`."""
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
     made: list[DriftWorkerProcess] = []
 
     def start(estimator: str = "Brightest") -> Heard:
         settings = DriftCompensationSettings(estimator=f"drift_parts.{estimator}", tracker="paper")
         made.append(DriftWorkerProcess(settings, tmp_path / "drift.npz", logging.getLogger("test")))
         heard = Heard(made[-1])
-        made[-1].start()
+        made[-1].take(StartWorker())
         return heard
 
     yield start
@@ -168,8 +181,8 @@ def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[.
 def test_a_user_s_own_estimator_registers_scans(work: Callable[..., Heard]) -> None:
     heard = work("Talks")
     assert heard.next(Forecasted) == Forecasted(None)
-    heard.registrar.register(job(0, 30, 30))
-    heard.registrar.register(job(1, 33, 28))
+    heard.registrar.take(job(0, 30, 30))
+    heard.registrar.take(job(1, 33, 28))
     answer = heard.next(Registered, 2)
     assert isinstance(answer, Registered)
     assert answer.mapping.translation_m == pytest.approx([-3e-9, 2e-9], abs=1e-18)
@@ -177,37 +190,37 @@ def test_a_user_s_own_estimator_registers_scans(work: Callable[..., Heard]) -> N
 
 def test_a_worker_that_is_killed_knows_everything_when_it_is_started_again(work: Callable[..., Heard]) -> None:
     heard = work()
-    heard.registrar.register(job(0, 30, 30))
-    heard.registrar.register(job(1, 33, 28))
+    heard.registrar.take(job(0, 30, 30))
+    heard.registrar.take(job(1, 33, 28))
     answer = heard.next(Registered, 2)
     assert isinstance(answer, Registered)
     assert heard.registrar._process is not None
     heard.registrar._process.kill()
     assert isinstance(heard.next(WorkerGone), WorkerGone)
-    heard.registrar.start()
-    heard.registrar.register(job(1, 33, 28))
+    heard.registrar.take(StartWorker())
+    heard.registrar.take(job(1, 33, 28))
     assert heard.next(Registered, 3) == answer
     assert Forecasted(answer.forecast) in heard.all
 
 
 def test_an_estimator_that_takes_the_process_with_it_is_told_of(work: Callable[..., Heard]) -> None:
     heard = work("Dies")
-    heard.registrar.register(job(0, 30, 30))
-    heard.registrar.register(job(1, 33, 28))
+    heard.registrar.take(job(0, 30, 30))
+    heard.registrar.take(job(1, 33, 28))
     gone = heard.next(WorkerGone)
     assert gone == WorkerGone("exit code 7")
 
 
 def test_a_worker_that_hangs_is_killed_by_being_started_anew(work: Callable[..., Heard]) -> None:
     heard = work("Hangs")
-    heard.registrar.register(job(0, 30, 30))
+    heard.registrar.take(job(0, 30, 30))
     heard.next(Registered)
-    heard.registrar.register(job(1, 33, 28))
+    heard.registrar.take(job(1, 33, 28))
     former = heard.registrar._process
     assert former is not None
-    heard.registrar.start()
-    assert former.wait(DEADLINE_S) != 0
-    heard.registrar.register(job(0, 30, 30))
+    heard.registrar.take(StartWorker())
+    assert former.exitcode != 0
+    heard.registrar.take(job(0, 30, 30))
     heard.next(Registered, 2)  # what it had registered it remembers
     assert not [one for one in heard.all if isinstance(one, WorkerGone)]  # on purpose
 
@@ -233,7 +246,7 @@ def test_where_nothing_can_be_saved_scans_are_registered_all_the_same(
     heard.next(Forecasted)
     (tmp_path / "drift.npz").mkdir()  # as good as a full disk
     for number in range(2):
-        heard.registrar.register(job(number, 30, 30))
+        heard.registrar.take(job(number, 30, 30))
     heard.next(Registered, 2)
     (told,) = (record.message for record in caplog.records if "can't be saved" in record.message)
     assert "drift.npz" in told
@@ -241,9 +254,9 @@ def test_where_nothing_can_be_saved_scans_are_registered_all_the_same(
 
 def test_a_scan_out_of_its_turn_is_refused_and_the_next_is_not(work: Callable[..., Heard]) -> None:
     heard = work()
-    heard.registrar.register(job(5, 30, 30))
-    heard.registrar.register(job(2, 30, 30))
-    heard.registrar.register(job(6, 31, 30))
+    heard.registrar.take(job(5, 30, 30))
+    heard.registrar.take(job(2, 30, 30))
+    heard.registrar.take(job(6, 31, 30))
     refused = heard.next(NotRegistered)
     assert isinstance(refused, NotRegistered)
     assert refused.key == "2.nc 0"
@@ -259,4 +272,52 @@ def test_a_worker_ends_with_the_scheduler(work: Callable[..., Heard], monkeypatc
     process = heard.registrar._process
     assert process is not None
     heard.registrar.close()
-    assert process.returncode == 0
+    assert process.exitcode == 0
+
+
+def test_worker_ends_with_a_killed_scheduler_even_while_it_registers(tmp_path: Path) -> None:
+    """Else it would write the state that the worker of the next scheduler reads."""
+    program = """
+        import logging, sys, time
+        from afspm.scheduler.drift.messages import StartWorker
+        from afspm.scheduler.drift.settings import DriftCompensationSettings
+        from afspm.scheduler.drift.worker_process import DriftWorkerProcess
+        from test_drift_worker import Heard, job
+        from afspm.scheduler.drift.messages import Registered
+
+        worker = DriftWorkerProcess(
+            DriftCompensationSettings(estimator="drift_parts.Hangs", tracker="paper"), None, logging.getLogger()
+        )
+        heard = Heard(worker)
+        worker.take(StartWorker())
+        worker.take(job(0, 30, 30))
+        heard.next(Registered)
+        worker.take(job(1, 33, 28))
+        print(worker._process.pid, flush=True)
+        time.sleep(600)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(program)]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True) as scheduler:
+        assert scheduler.stdout is not None
+        worker = psutil.Process(int(scheduler.stdout.readline()))
+        scheduler.kill()
+        _, alive = psutil.wait_procs([worker], DEADLINE_S)
+    assert not alive
+
+
+def test_simulated_time_passes_again_when_a_hanging_worker_is_restarted(work: Callable[..., Heard]) -> None:
+    heard = work()
+    heard.next(Forecasted)
+    held: list[str] = []
+
+    @contextlib.contextmanager
+    def late() -> Iterator[None]:
+        held.append("held")
+        yield
+        held.append("passes")
+
+    heard.registrar.late = late
+    heard.registrar.take(job(0, 30, 30))
+    heard.registrar.take(StartWorker())
+    assert held == ["held", "passes"]

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from afspm.clock import ExperimentClock
-from afspm.logic.state import SavedState
+from afspm.logic.saved_state import SavedState
 from afspm.model import LoggedPacket, Packet
 from afspm.scheduler.state_file import StateFile
 from afspm.scheduler.write_ahead import WriteAhead

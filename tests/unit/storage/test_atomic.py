@@ -13,7 +13,7 @@ import pytest
 
 from afspm.errors import FileError
 from afspm.logic.arbitration import ArbitrationState
-from afspm.logic.state import SavedState
+from afspm.logic.saved_state import SavedState
 from afspm.model import ControlMode
 from afspm.process.memory import Memory
 from afspm.scheduler.state_file import StateFile

@@ -1,4 +1,4 @@
-"""Messages about drift: to and from the worker, and to the components."""
+"""Messages about drift: jobs and reports of the worker, and wishes to components."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Registered:
     failures: list[str]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "outcome", RegistrationOutcome(self.outcome))  # from JSON it comes as a number
+        object.__setattr__(self, "outcome", RegistrationOutcome(self.outcome))  # out of a file it is a number
 
     @property
     def matched(self) -> bool:
@@ -69,7 +69,7 @@ class Registered:
 
 @dataclass(frozen=True)
 class Forecasted:
-    """The worker is there, or knows something new without a scan."""
+    """The worker runs, or knows something new without a scan."""
 
     forecast: Plain | None
 
@@ -89,7 +89,7 @@ class WorkerGone:
     reason: str
 
 
-WorkerSaid = Registered | Forecasted | NotRegistered | WorkerGone
+WorkerReport = Registered | Forecasted | NotRegistered | WorkerGone
 
 
 @dataclass(frozen=True)
@@ -110,17 +110,21 @@ class ScanJob:
     asked: Region | None
 
 
-class Worker(Protocol):
-    """The process that registers scans, as far as decisions need it. What it says comes later, as an input."""
+@dataclass(frozen=True)
+class StartWorker:
+    """Start the worker; one that runs is killed, and its job forgotten."""
 
-    def start(self) -> None:
-        """Begin, or begin anew: whatever it was at is forgotten."""
 
-    def register(self, job: ScanJob) -> None:
-        """Register a scan, which the worker may have registered already."""
+@dataclass(frozen=True)
+class Compensated:
+    """From that time on the controller moves the tip along with this velocity."""
 
-    def compensated(self, time_s: float, velocity_m_s: tuple[float, float]) -> None:
-        """From that time on the controller moves the tip along with this velocity."""
+    time_s: float
+    velocity_m_s: tuple[float, float]
+
+
+WorkerJob = StartWorker | ScanJob | Compensated
+"""Jobs for the worker. A scan may come twice: then it is answered as the first time."""
 
 
 @dataclass(frozen=True)

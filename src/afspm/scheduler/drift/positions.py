@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import base64
 import math
-from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 from afspm.logic.events import Codec
@@ -55,34 +53,31 @@ class PositionPair(Generic[P]):
     tip: P
     sent: bytes
 
-    def to_list(self) -> list[str]:
-        """As plain JSON."""
-        return [base64.b64encode(part).decode() for part in (self.said, self.sent)]
 
-
+@dataclass(frozen=True)
 class TargetPosition(Generic[P]):
-    """The place in force, and those that were lately sent: what is published may come before the answer to it."""
+    """The place in force, and the places sent lately: a packet may come before the answer to its request."""
 
-    def __init__(self) -> None:
-        self.current: PositionPair[P] | None = None
-        self._sent: deque[PositionPair[P]] = deque(maxlen=_CANDIDATES)
+    current: PositionPair[P] | None = None
+    sent: tuple[PositionPair[P], ...] = ()
 
-    def sending(self, place: PositionPair[P]) -> None:
-        """The microscope is going to be set to this."""
-        self._sent.append(place)
+    def at(self, place: PositionPair[P]) -> TargetPosition[P]:
+        """Put a place in force."""
+        return replace(self, current=place)
 
-    def was_set(self, sent: bytes) -> None:
-        """The microscope accepted it."""
-        self.current = next((place for place in reversed(self._sent) if place.sent == sent), self.current)
+    def sending(self, place: PositionPair[P]) -> TargetPosition[P]:
+        """Add a place to which the microscope will be set."""
+        return replace(self, sent=(*self.sent, place)[-_CANDIDATES:])
 
-    def told(self, tip: P) -> PositionPair[P] | None:
-        """The place that the microscope tells, if it is one that we set; it is in force from now on."""
-        known: list[PositionPair[P]] = [*self._sent] if self.current is None else [self.current, *self._sent]
+    def was_set(self, sent: bytes) -> TargetPosition[P]:
+        """Put a place in force: the microscope accepted the message."""
+        return replace(self, current=next((place for place in reversed(self.sent) if place.sent == sent), self.current))
+
+    def published(self, tip: P) -> TargetPosition[P] | None:
+        """Return the target with the place that the microscope publishes in force; None: the scheduler set no such."""
+        known: list[PositionPair[P]] = [*self.sent] if self.current is None else [self.current, *self.sent]
         near = [place for place in reversed(known) if is_same(place.tip, tip)]  # the newest first, of those as near
-        if not near:
-            return None
-        self.current = min(near, key=lambda place: away_m(place.tip, tip))
-        return self.current
+        return self.at(min(near, key=lambda place: away_m(place.tip, tip))) if near else None
 
 
 def away_m(a: Region | ProbePosition, b: Region | ProbePosition) -> float:

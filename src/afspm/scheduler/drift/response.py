@@ -1,13 +1,14 @@
-"""The response to a registered scan: flags, scans to be taken again, a rate handed over."""
+"""The response to a registered scan: flags, scans to be taken again, a rate handed over to the controller."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from afspm.logic.events import Announced, Effect, Input, Log, ProblemSeen
-from afspm.logic.scheduler_core import OwnEnd, SchedulerCore
+from afspm.logic.coordinate_frame import AskMicroscope
+from afspm.logic.events import Announced, Delegate, ProblemSeen
+from afspm.logic.frozen import replace
 from afspm.model import (
     ControlMode,
     ControlRequest,
@@ -19,196 +20,177 @@ from afspm.model import (
     Response,
     names,
 )
-from afspm.plain_data import Plain
-from afspm.scheduler.drift.forecast import CurrentForecast
-from afspm.scheduler.drift.frame import DriftFrame
-from afspm.scheduler.drift.messages import DriftCodec, Registered, RescanWanted, ScanJob, Worker
-from afspm.scheduler.drift.settings import DriftCompensationSettings
-from afspm.scheduler.drift.tally import LATELY, RegistrationTally
+from afspm.scheduler.drift.messages import Compensated, RescanWanted
+from afspm.scheduler.drift.state import CallPerson, DriftDraft, FollowUp, RespondToFailure, RespondToScan
+from afspm.scheduler.drift.tally import LATELY
 
 RESCAN = "DriftRescan"
 _DRIFT, _MALFUNCTION = int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFUNCTION)
 _MOST_UNREGISTERED = 3
-"""So many scans in a row that nobody could register are as good as a sample that is lost: that of the trackers."""
+"""As many unregistered scans in a row are as good as a lost sample: the number of the trackers."""
 _AT_START = "a scan in the other direction gives the velocity of the drift"
 
-Step = Callable[[Input], list[Effect]]
+
+def respond(draft: DriftDraft, what: FollowUp) -> None:
+    """Give a response that was put off until its scan was published."""
+    match what:
+        case RespondToScan():
+            _to_scan(draft, what)
+        case RespondToFailure():
+            _to_failure(draft, what.why)
+        case CallPerson():
+            _call_person(draft)
 
 
-class DriftResponse:
-    """Decides what is to be done; `step` has the scheduler do it.
+def is_given_up(draft: DriftDraft) -> bool:
+    """Return whether a person was called to a worker that always ends."""
+    return _MALFUNCTION in draft.control.problems
 
-    Args:
-        name: of the scheduler, in which it flags problems.
+
+def _to_scan(draft: DriftDraft, what: RespondToScan) -> None:
+    registered = what.registered
+    draft.duties = replace(draft.duties, unregistered=0)
+    if not draft.corrects:
+        draft.duties = replace(draft.duties, started=True)  # before correction the velocity has time to show
+    elif draft.control.mode is ControlMode.MANUAL:
+        # a person's scan is followed, and not scanned again
+        if registered.matched and not registered.lost:
+            _clear_own_flag(draft)
+    elif registered.lost:
+        _search(draft, f"the sample is lost: {registered.reason}")
+    elif not draft.duties.started:
+        _scan_in_opposite_direction(draft, what.job.upwards)
+    elif draft.tally.exceeds(draft.env.settings.most_unregistered):
+        _too_few(draft)
+    else:
+        if registered.matched:
+            _clear_own_flag(draft)
+        if registered.rescan:
+            _want(draft, RescanKind.AGAIN, registered.rescan)
+
+
+def _to_failure(draft: DriftDraft, why: str) -> None:
+    if not draft.corrects or draft.control.mode is ControlMode.MANUAL:
+        return
+    unregistered = draft.duties.unregistered + 1
+    if unregistered < _MOST_UNREGISTERED:
+        draft.duties = replace(draft.duties, unregistered=unregistered)
+        if draft.tally.exceeds(draft.env.settings.most_unregistered):
+            _too_few(draft)
+        return
+    draft.duties = replace(draft.duties, unregistered=0)  # a component that goes on gets the flag after as many again
+    draft.tally = draft.tally.share_restarted()
+    _search(draft, f"{_MOST_UNREGISTERED} scans in a row could not be registered: {why}")
+
+
+def _call_person(draft: DriftDraft) -> None:
+    """Flag a malfunction until a person has looked; a worker whose drift is never corrected delays no component."""
+    if not draft.env.settings.correct:
+        return
+    draft.worker = replace(draft.worker, waits_for_person=True)
+    draft.outputs.append(ProblemSeen(_MALFUNCTION, flagged=True, name=draft.env.name))
+
+
+def _too_few(draft: DriftDraft) -> None:
+    draft.tally = draft.tally.share_restarted()
+    share = f"more than {draft.env.settings.most_unregistered:.0%} of the last {LATELY} scans were not registered"
+    _search(draft, f"{share}: {draft.tally.summary()}")
+
+
+def _search(draft: DriftDraft, why: str) -> None:
+    draft.outputs.append(ProblemSeen(_DRIFT, flagged=True, name=draft.env.name))
+    # a component that searches has widened the region: the region of the scans before is what was asked for
+    if draft.control.solving != _DRIFT:
+        _want(draft, RescanKind.SEARCH, why)
+
+
+def _scan_in_opposite_direction(draft: DriftDraft, upwards: bool | None) -> None:
+    """Have the first scan taken in the other direction before any component goes on."""
+    draft.duties = replace(draft.duties, started=True)
+    if upwards is None:
+        why = f"the microscope does not report {names.SCAN_DIRECTION}"
+        draft.log("INFO", f"{why}: the first scan is not taken in both directions")
+        return
+    draft.log("INFO", "thermal-drift is flagged until the first scan was taken in both directions: normal at the start")
+    draft.outputs.append(ProblemSeen(_DRIFT, flagged=True, name=draft.env.name))
+    _want(draft, RescanKind.OPPOSITE, _AT_START, upwards=not upwards)
+
+
+def _clear_own_flag(draft: DriftDraft) -> None:
+    """Clear the scheduler's flag; a component that solves it restores its own changes first."""
+    control = draft.control
+    if control.problems.get(_DRIFT) == draft.env.name and control.solving != _DRIFT:
+        draft.outputs.append(ProblemSeen(_DRIFT, flagged=False, name=draft.env.name))
+
+
+def _want(draft: DriftDraft, kind: RescanKind, reason: str, *, upwards: bool | None = None) -> None:
+    place = draft.places.region.current
+    if place is None:
+        draft.log("ERROR", f"{reason}, and the region to scan again is unknown")
+        return
+    wanted = RescanWanted(kind, place.said, draft.places.shape, reason, draft.now_ns, upwards)
+    level = "INFO" if kind is RescanKind.OPPOSITE else "WARNING"  # one belongs to the beginning of every night
+    draft.log(level, f"requesting a rescan: {reason}")
+    draft.outputs.append(Announced(RESCAN, draft.env.codec.encode_rescan(wanted)))
+
+
+# --- a controller that compensates by itself --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RateGiven:
+    """The controller was asked to compensate `value_m_s` along an axis.
+
+    Attributes:
+        is_new: the worker has to reckon with it from now on.
     """
 
-    def __init__(
-        self,
-        settings: DriftCompensationSettings,
-        core: SchedulerCore,
-        codec: DriftCodec,
-        frame: DriftFrame,
-        knowledge: CurrentForecast,
-        tally: RegistrationTally,
-        worker: Worker,
-        name: str,
-    ) -> None:
-        self._settings = settings
-        self._core = core
-        self._codec = codec
-        self._frame = frame
-        self._knowledge = knowledge
-        self._tally = tally
-        self._worker = worker
-        self._name = name
-        self._started = settings.at_start == "nothing"
-        self._unregistered = 0
-        self._given_m_s = [0.0, 0.0]
-
-    def of(self, registered: Registered, job: ScanJob, step: Step, now_ns: int) -> list[Effect]:
-        """Respond to a scan after it was published. A person's scan is followed, and not scanned again."""
-        self._unregistered = 0
-        if not self._knowledge.corrects(now_ns * 1e-9):
-            self._started = True  # until it is corrected there is time enough to learn the velocity
-            return []
-        if self._core.control.mode is ControlMode.MANUAL:
-            return self._found(step) if registered.matched and not registered.lost else []
-        if registered.lost:
-            return self._lost(f"the sample is lost: {registered.reason}", step, now_ns)
-        if not self._started:
-            return self._begin(job.upwards, step, now_ns)
-        if self._tally.exceeds(self._settings.most_unregistered):
-            return self._too_few(step, now_ns)
-        effects = self._found(step) if registered.matched else []
-        if registered.rescan:
-            effects += self._want(RescanKind.AGAIN, registered.rescan, step, now_ns)
-        return effects
-
-    def unregistered(self, why: str, step: Step, now_ns: int) -> list[Effect]:
-        """Respond to a scan that was published as predicted, since it could not be registered."""
-        if not self._knowledge.corrects(now_ns * 1e-9) or self._core.control.mode is ControlMode.MANUAL:
-            return []
-        self._unregistered += 1
-        if self._unregistered < _MOST_UNREGISTERED:
-            exceeds = self._tally.exceeds(self._settings.most_unregistered)
-            return self._too_few(step, now_ns) if exceeds else []
-        self._unregistered = 0  # who goes on in spite of it is told again after as many
-        self._tally.judge_anew()
-        return self._lost(f"{_MOST_UNREGISTERED} scans in a row could not be registered: {why}", step, now_ns)
-
-    def give_up(self, step: Step) -> list[Effect]:
-        """Nothing will be registered any more: a person has to look, and says so by removing the problem."""
-        return step(ProblemSeen(_MALFUNCTION, flagged=True, name=self._name))
-
-    @property
-    def is_given_up(self) -> bool:
-        """True while that problem is flagged."""
-        return _MALFUNCTION in self._core.control.problems
-
-    def _too_few(self, step: Step, now_ns: int) -> list[Effect]:
-        """Too many of the last scans lie where they were predicted: the prediction is not to be relied on."""
-        self._tally.judge_anew()  # the share counts again from here, should it go on in spite of it
-        share = f"more than {self._settings.most_unregistered:.0%} of the last {LATELY} scans were not registered"
-        return self._lost(f"{share}: {self._tally.summary()}", step, now_ns)
-
-    def _lost(self, why: str, step: Step, now_ns: int) -> list[Effect]:
-        """Nobody scans on, but for whoever searches."""
-        searching = self._core.control.solving == _DRIFT
-        effects = step(ProblemSeen(_DRIFT, flagged=True, name=self._name))
-        # whoever searches already has widened the region: it is that of the scans before which was asked for
-        return effects if searching else effects + self._want(RescanKind.SEARCH, why, step, now_ns)
-
-    def _begin(self, upwards: bool | None, step: Step, now_ns: int) -> list[Effect]:
-        """The first scan is there: nobody goes on before it has been taken in the other direction."""
-        self._started = True
-        if upwards is None:
-            why = f"the microscope does not report {names.SCAN_DIRECTION}"
-            return [Log("INFO", f"{why}: the first scan is not taken in both directions")]
-        told = "thermal-drift is flagged until the first scan was taken in both directions: normal at the start"
-        effects = [Log("INFO", told), *step(ProblemSeen(_DRIFT, flagged=True, name=self._name))]
-        return effects + self._want(RescanKind.OPPOSITE, _AT_START, step, now_ns, upwards=not upwards)
-
-    def _found(self, step: Step) -> list[Effect]:
-        """Remove a flag of ours; but who is in control to solve it first puts right what it changed for that."""
-        control = self._core.control
-        if control.problems.get(_DRIFT) != self._name or control.solving == _DRIFT:
-            return []
-        return step(ProblemSeen(_DRIFT, flagged=False, name=self._name))
-
-    def _want(
-        self, kind: RescanKind, reason: str, step: Step, now_ns: int, *, upwards: bool | None = None
-    ) -> list[Effect]:
-        place = self._frame.region.current
-        if place is None:
-            return [Log("ERROR", f"{reason}, and the region to scan again is unknown")]
-        wanted = RescanWanted(kind, place.said, self._frame.shape, reason, now_ns, upwards)
-        level = "INFO" if kind is RescanKind.OPPOSITE else "WARNING"  # one belongs to the beginning of every night
-        return [
-            Log(level, f"requesting a rescan: {reason}"),
-            *step(Announced(RESCAN, self._codec.encode_rescan(wanted))),
-        ]
-
-    # --- a controller that compensates by itself ---
-
-    def begin_compensation(self, now_s: float) -> list[Effect]:
-        """Have the controller compensate what we reckon with: nothing at first, whatever the night before has left."""
-        compensate = self._settings.compensate
-        if compensate is None:
-            return []
-        effects: list[Effect] = []
-        for axis, value_m_s in zip((compensate.x, compensate.y), self._given_m_s, strict=True):
-            effects += self._core.ask_own(self._set(axis, value_m_s), now_s, self._told(axis))
-        return effects
-
-    def hand_over(self, now_s: float, now_ns: int) -> list[Effect]:
-        """Tell the controller the newest rate, if there is one beyond what it has been told; nothing is changed under
-        the hands of a person."""
-        if self._core.control.mode is ControlMode.MANUAL:
-            return []
-        compensate, time_s = self._settings.compensate, now_ns * 1e-9
-        predicted = self._knowledge.predicted(time_s)
-        if compensate is None or predicted is None or not self._knowledge.corrects(time_s):
-            return []
-        sd_m_s = np.sqrt(np.diagonal(predicted.rate_covariance))
-        if np.hypot(*predicted.rate_m_s) <= np.hypot(*sd_m_s):
-            return []
-        effects: list[Effect] = []
-        for axis, name in enumerate((compensate.x, compensate.y)):
-            value_m_s = float(self._given_m_s[axis] + predicted.rate_m_s[axis])
-            effects += self._core.ask_own(self._set(name, value_m_s), now_s, self._answered(axis, name, value_m_s))
-        return effects
-
-    def _set(self, name: str, value_m_s: float) -> Request:
-        parameter = Parameter(name, f"{value_m_s:.9g}", "m/s")
-        return Request(int(ControlRequest.PARAM), parameter, self._codec.encode(parameter))
-
-    def _told(self, name: str) -> OwnEnd:
-        return lambda response, now_s, now_ns: _refusal(name, response)
-
-    def _answered(self, axis: int, name: str, value_m_s: float) -> OwnEnd:
-        """Each axis by itself: the controller may take one and refuse the other."""
-
-        def ended(response: Response, now_s: float, now_ns: int) -> list[Effect]:
-            if not response.ok:
-                return _refusal(name, response)
-            self._given_m_s[axis] = value_m_s
-            self._worker.compensated(now_ns * 1e-9, (self._given_m_s[0], self._given_m_s[1]))
-            return []
-
-        return ended
-
-    # --- over a kill ---
-
-    def to_dict(self) -> Plain:
-        """As plain JSON."""
-        return {"started": self._started, "unregistered": self._unregistered, "given_m_s": self._given_m_s}
-
-    def restore(self, plain: Plain) -> None:
-        self._started, self._given_m_s = bool(plain["started"]), [float(v) for v in plain["given_m_s"]]
-        self._unregistered = int(plain["unregistered"])
+    axis: int
+    name: str
+    value_m_s: float
+    is_new: bool
 
 
-def _refusal(axis: str, response: Response) -> list[Effect]:
-    if response.ok or response.code == ControlResponse.NOT_FREE:
-        return []  # a scan has begun already: it is handed over after the next
-    return [Log("ERROR", f"the controller refused the drift rate, {axis}: {response.reason}")]
+def restore_compensation(draft: DriftDraft) -> None:
+    """Have the controller compensate what is reckoned with: nothing at first, whatever a night before has left."""
+    for axis, name in enumerate(_axes(draft)):
+        _ask_rate(draft, RateGiven(axis, name, draft.duties.given_m_s[axis], is_new=False))
+
+
+def hand_over(draft: DriftDraft) -> None:
+    """Give the controller the newest rate, if it is significant; nothing is changed under the hands of a person."""
+    predicted = draft.forecast.predicted(draft.now_ns * 1e-9)
+    if draft.control.mode is ControlMode.MANUAL or predicted is None or not draft.corrects:
+        return
+    sd_m_s = np.sqrt(np.diagonal(predicted.rate_covariance))
+    if np.hypot(*predicted.rate_m_s) <= np.hypot(*sd_m_s):
+        return
+    for axis, name in enumerate(_axes(draft)):
+        value_m_s = float(draft.duties.given_m_s[axis] + predicted.rate_m_s[axis])
+        _ask_rate(draft, RateGiven(axis, name, value_m_s, is_new=True))
+
+
+def rate_answered(draft: DriftDraft, given: RateGiven, response: Response) -> None:
+    """Take the answer for one axis: the controller may take one and refuse the other."""
+    if not response.ok:
+        # not free: a scan has begun already, and the rate is handed over after the next
+        if response.code != ControlResponse.NOT_FREE:
+            draft.log("ERROR", f"the controller refused the drift rate, {given.name}: {response.reason}")
+        return
+    if not given.is_new:
+        return
+    x_m_s, y_m_s = draft.duties.given_m_s
+    now_given = (given.value_m_s, y_m_s) if given.axis == 0 else (x_m_s, given.value_m_s)
+    draft.duties = replace(draft.duties, given_m_s=now_given)
+    draft.outputs.append(Delegate(Compensated(draft.now_ns * 1e-9, now_given)))
+
+
+def _axes(draft: DriftDraft) -> tuple[str, ...]:
+    compensate = draft.env.settings.compensate
+    return () if compensate is None else (compensate.x, compensate.y)
+
+
+def _ask_rate(draft: DriftDraft, given: RateGiven) -> None:
+    parameter = Parameter(given.name, f"{given.value_m_s:.9g}", "m/s")
+    request = Request(int(ControlRequest.PARAM), parameter, draft.env.codec.encode(parameter))
+    draft.outputs.append(AskMicroscope(request, given))

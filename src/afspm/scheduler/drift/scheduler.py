@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
+from afspm import wire
+from afspm.clock import NS_PER_S
 from afspm.errors import ConfigError
 from afspm.model import Frame
+from afspm.model.geometry import XY
 from afspm.plain_data import PlainMapping
 from afspm.process.context import ProcessContext
-from afspm.scheduler.drift.codec import DriftWireCodec
-from afspm.scheduler.drift.core import MAPPING, DriftCore
-from afspm.scheduler.drift.messages import Forecasted
+from afspm.scheduler.drift.messages import Matrix, Registered, RescanWanted
 from afspm.scheduler.drift.response import RESCAN
+from afspm.scheduler.drift.sample_frame import SampleFrame
+from afspm.scheduler.drift.scan_intake import MAPPING
 from afspm.scheduler.drift.settings import DriftCompensationSettings
 from afspm.scheduler.drift.worker_process import DriftWorkerProcess
-from afspm.scheduler.scheduler import Scheduler
-from afspm.scheduler.shell import SchedulerShell
-from afspm.transport.scheduler_sockets import SchedulerSockets
-
-if TYPE_CHECKING:
-    from afspm.logic.scheduler_core import SchedulerCore
-    from afspm.transport.scheduler_sockets import Source
+from afspm.scheduler.scheduler import Coordinates, Scheduler
+from afspm.scheduler.wire_codec import WireCodec
+from afspm.wire.mapping import timestamp
+from afspm.wire.messages import DriftMapping, DriftRescan, ScanParameters2d
 
 
 class DriftCompensatedScheduler(Scheduler):
@@ -74,38 +74,57 @@ class DriftCompensatedScheduler(Scheduler):
                 hint='tracker = "bank", or leave compensate out',
             )
 
-    def _core(self, context: ProcessContext) -> SchedulerCore:
+    def coordinates(self, context: ProcessContext) -> Coordinates:
         launch = context.launch
         file = Path(launch.state_dir) / f"{launch.name}.drift.npz" if launch.state_dir else None
         drift = self.drift.beside(launch.solved)
         if drift != self.drift:
             context.log.info("no component solves thermal-drift: the first scan is not taken in both directions")
-        self._registrar = DriftWorkerProcess(drift, file, context.log)
-        self._registrar.late = context.clock.late
-        return DriftCore(self._settings(context), drift, DriftWireCodec(), self._registrar, launch.name)
-
-    def _shell(self, core: SchedulerCore, sockets: SchedulerSockets, *others: object) -> SchedulerShell:
-        assert isinstance(core, DriftCore)
-        self._registrar.wake = sockets.wake_up
-        return DriftShell(self._registrar, core, sockets, *others)
+        worker = DriftWorkerProcess(drift, file, context.log)
+        worker.late = context.clock.late
+        return Coordinates(SampleFrame.initial(drift, DriftWireCodec(), launch.name), worker)
 
 
-class DriftShell(SchedulerShell):
-    """A shell that also hears the worker."""
+class DriftWireCodec(WireCodec):
+    """See `scheduler.drift.messages.DriftCodec`."""
 
-    def __init__(self, registrar: DriftWorkerProcess, core: DriftCore, sockets: SchedulerSockets, *others: Any) -> None:
-        super().__init__(core, sockets, *others)
-        self._registrar = registrar
-        self._drift_core = core
+    def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
+        of = "ProbePosition" if message in ("Spec1d", "ProbePosition") else "ScanParameters2d"
+        return wire.relocated(message, payload, wire.place_in(of, told))
 
-    def handle(self, ready: list[Source]) -> None:
-        if not self.ended:
-            for said in self._registrar.said():
-                self._carry_out(self._drift_core.said(said, self._clock.monotonic_s(), self._clock.now_ns()))
-                if not isinstance(said, Forecasted):
-                    self._registrar.caught_up()
-        super().handle(ready)
+    def encode_mapping(self, registered: Registered, filename: str, center_m: XY, *, correcting: bool) -> bytes:
+        return DriftMapping(
+            timestamp=timestamp(round(registered.time_s * NS_PER_S)),
+            matrix=_flat(registered.matrix[:2]),
+            covariance=_flat(registered.covariance_m2),
+            rate=registered.rate_m_s,
+            rate_covariance=_flat(registered.rate_covariance),
+            matched=registered.matched,
+            lost=registered.lost,
+            reason=registered.reason,
+            residual=registered.residual_m,
+            references=registered.references,
+            filename=filename,
+            center=center_m,
+            correcting=correcting,
+            rescan=registered.rescan,
+            outcome=int(registered.outcome),  # type: ignore[arg-type]
+            failures=len(registered.failures),
+        ).SerializeToString()
 
-    def close(self) -> None:
-        self._registrar.close()
-        super().close()
+    def encode_rescan(self, wanted: RescanWanted) -> bytes:
+        params = ScanParameters2d.FromString(wanted.said)
+        if wanted.shape is not None:
+            params.data.shape.y, params.data.shape.x = wanted.shape
+        message = DriftRescan(
+            timestamp=timestamp(wanted.time_ns),
+            params=params,
+            kind=int(wanted.kind),  # type: ignore[arg-type]
+            reason=wanted.reason,
+            upwards=wanted.upwards,
+        )
+        return message.SerializeToString()
+
+
+def _flat(rows: Matrix) -> list[float]:
+    return [value for row in rows for value in row]

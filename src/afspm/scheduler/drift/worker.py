@@ -1,150 +1,129 @@
-"""`python -m afspm.scheduler.drift.worker`: registers scans in a process of its own, so that nobody waits for it who
-need not, and whatever a user's own estimator does, the scheduler lives.
+"""The process that registers scans: whatever an estimator of a user does, and however long, the scheduler goes on.
 
-The first message on its standard input says what it is; the end of that input ends it.
+It takes jobs one after the other, and saves its state before it reports. The end of its jobs ends it, and so does the
+death of the scheduler's process, even while it registers: the worker of the next scheduler knows more by then.
 """
 
 from __future__ import annotations
 
+import multiprocessing
 import os
-import queue
 import sys
 import threading
-from dataclasses import asdict
+from dataclasses import dataclass
+from multiprocessing import connection
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import IO
 
+import numpy as np
+
+from afspm.drift.estimators import PairFailure, estimator
+from afspm.drift.registration import DriftScan
+from afspm.drift.trackers import tracker
 from afspm.errors import AfspmError, FileError
+from afspm.exit_codes import ExitCode
 from afspm.plain_data import Plain
-from afspm.process.parent import leave_interrupts_to_parent, take_standard_input
-from afspm.scheduler.drift import pipe
+from afspm.process.parent import leave_interrupts_to_parent
+from afspm.scheduler.drift.estimation import Estimation
+from afspm.scheduler.drift.messages import (
+    Compensated,
+    Forecasted,
+    NotRegistered,
+    ScanJob,
+    WorkerGone,
+    WorkerReport,
+)
 from afspm.scheduler.drift.settings import DriftCompensationSettings
+from afspm.scheduler.drift.worker_state import WorkerStateFile
 
 
-def main() -> int:
-    """Until the scheduler has gone."""
+@dataclass(frozen=True)
+class Complaint:
+    """An error for the log; the worker goes on."""
+
+    reason: str
+
+
+def main(jobs: Connection, reports: Connection, settings: DriftCompensationSettings, file: Path | None) -> None:
+    """Register scans until there are no more jobs."""
     leave_interrupts_to_parent()
-    orders, answers = _Orders(take_standard_input()), _own_output()
-    first = orders.next()
-    if first is None:
-        return 0
+    # a print of a user's estimator goes to where errors go
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
     try:
-        worker = _Worker(first[0], orders, answers)
+        worker = _Worker(settings, WorkerStateFile(file), reports)
     except AfspmError as error:
-        pipe.write(answers, {"is": "broken", "reason": str(error)})
-        return 1
-    try:
-        while (message := orders.next()) is not None:
-            worker.take(*message)
-    except BrokenPipeError:
-        return 0
-    return 0
+        reports.send(WorkerGone(str(error)))
+        sys.exit(1)
+    while True:
+        try:
+            job: ScanJob | Compensated = jobs.recv()
+        except EOFError:
+            return
+        worker.take(job)
 
 
-class _Orders:
-    """The scheduler's messages, read by a thread, so that its end is noticed while a scan is registered.
-
-    Attributes:
-        ended: the scheduler has gone, or wants no more.
-    """
-
-    def __init__(self, descriptor: int) -> None:
-        self.ended = False
-        self._pipe = os.fdopen(descriptor, "rb")
-        self._read: queue.SimpleQueue[tuple[Plain, bytes] | None] = queue.SimpleQueue()
-        threading.Thread(target=self._read_all, name="orders", daemon=True).start()
-
-    def next(self) -> tuple[Plain, bytes] | None:
-        """Wait for the next message; None: there are no more."""
-        return self._read.get()
-
-    def _read_all(self) -> None:
-        while (message := pipe.read(self._pipe)) is not None:
-            self._read.put(message)
-        self.ended = True
-        self._read.put(None)
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    connection.wait([parent.sentinel])
+    os._exit(ExitCode.ORPHAN)
 
 
 class _Worker:
-    """Answers what it is asked, one after the other."""
+    def __init__(self, settings: DriftCompensationSettings, store: WorkerStateFile, reports: Connection) -> None:
+        self._settings = settings
+        self._store = store
+        self._reports = reports
+        self._is_full_logged = False
+        self._estimation = self._saved()
+        self._report(Forecasted(self._estimation.forecast))
 
-    def __init__(self, settings: Plain, orders: _Orders, answers: IO[bytes]) -> None:
-        from afspm.scheduler.drift.worker_state import WorkerStateFile
-
-        self._drift = DriftCompensationSettings.from_table(settings["drift"])
-        self._store = WorkerStateFile(Path(settings["file"]) if settings["file"] else None)
-        self._orders = orders
-        self._answers = answers
-        self._told_full = False
-        self._begin()
-        self._tell_forecast()
-
-    def _begin(self) -> None:
-        """As it was when a scan was registered last."""
-        from afspm.drift.estimators import PairFailure, estimator
-        from afspm.drift.trackers import tracker
-        from afspm.scheduler.drift.estimation import Estimation
-
+    def _saved(self) -> Estimation:
+        """The estimation as it was when a scan was registered last."""
         failures: list[PairFailure] = []
-        made = tracker(self._drift.tracker, estimator(self._drift.estimator, failures.append))
-        self._estimation = Estimation(made, self._drift.rescan, self._save, failures)
+        made = tracker(self._settings.tracker, estimator(self._settings.estimator, failures.append))
+        estimation = Estimation(made, self._settings.rescan, self._save, failures)
         if (state := self._store.load()) is None:
-            return
+            return estimation
         try:
-            self._estimation.restore(state)
+            estimation.restore(state)
         except (AfspmError, LookupError, TypeError, ValueError) as error:
             reason = f"the saved state is of another tracker, or damaged: {error}"
             hint = "use the tracker that wrote it, or remove the file: the position of the sample is then unknown"
             raise FileError(reason, where=str(self._store.path), hint=hint) from error
+        return estimation
 
     def _save(self, state: Plain) -> None:
-        """Unless the scheduler was killed meanwhile: the next one's worker knows more by now."""
-        if self._orders.ended:
-            raise BrokenPipeError
         try:
             self._store.save(state)
-        except FileError as error:  # what is known of the drift now is worth more than what a kill would lose
-            if not self._told_full:
-                self._complain(f"the state of the drift can't be saved: {error}")
-            self._told_full = True
+        except FileError as error:  # the knowledge of the drift now is worth more than what a kill would lose
+            if not self._is_full_logged:
+                self._report(Complaint(f"the state of the drift can't be saved: {error}"))
+            self._is_full_logged = True
         else:
-            self._told_full = False
+            self._is_full_logged = False
 
-    def take(self, head: Plain, data: bytes) -> None:
-        if head["do"] == "register":
-            self._register(head, data)
+    def take(self, job: ScanJob | Compensated) -> None:
+        if isinstance(job, ScanJob):
+            self._report(self._register(job))
             return
         try:
-            self._estimation.compensated(head["time_s"], tuple(head["velocity_m_s"]))
+            self._estimation.compensated(job.time_s, job.velocity_m_s)
         except AfspmError as error:
-            self._complain(str(error))
-        self._tell_forecast()
+            self._report(Complaint(str(error)))
+        self._report(Forecasted(self._estimation.forecast))
 
-    def _register(self, head: Plain, data: bytes) -> None:
+    def _register(self, job: ScanJob) -> WorkerReport:
+        scan, name = job.scan, job.scan.filename or job.key
+        values = np.ascontiguousarray(scan.values, np.float64)
+        drift_scan = DriftScan(values, scan.region, job.start_s, job.end_s, job.upwards, name)
         try:
-            answer = self._estimation.register(*pipe.job_from_head(head, data))
-        except BrokenPipeError:
-            raise
-        except Exception as error:  # of a user's own estimator or tracker, too: it is the reason
+            return self._estimation.register(job.key, drift_scan, job.asked)
+        except Exception as error:  # of a user's own estimator or tracker, too: its text is the reason
             reason = str(error) if isinstance(error, AfspmError) else f"{type(error).__name__}: {error}"
-            self._begin()  # what was half done is not to be built on
-            pipe.write(self._answers, {"is": "not registered", "key": head["key"], "reason": reason})
-            return
-        pipe.write(self._answers, {"is": "registered", **asdict(answer)})
+            self._estimation = self._saved()  # without what was half done
+            return NotRegistered(job.key, reason)
 
-    def _complain(self, reason: str) -> None:
-        pipe.write(self._answers, {"is": "complaint", "reason": reason})
-
-    def _tell_forecast(self) -> None:
-        pipe.write(self._answers, {"is": "forecast", "forecast": self._estimation.forecast})
-
-
-def _own_output() -> IO[bytes]:
-    """Standard output for our answers alone: what libraries and users print goes where errors go."""
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    return answers
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    def _report(self, report: WorkerReport | Complaint) -> None:
+        self._reports.send(report)

@@ -1,140 +1,149 @@
-"""The worker as the scheduler sees it: a process that is told scans, and whose answers come by a thread."""
+"""The worker as the scheduler's process has it: a child that takes jobs, and whose reports come by a thread."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import multiprocessing
 import os
 import queue
-import subprocess
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from dataclasses import asdict
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
 
-from afspm.interpreter import python_command, python_environment
-from afspm.plain_data import Plain
-from afspm.scheduler.drift import pipe
-from afspm.scheduler.drift.messages import Forecasted, NotRegistered, Registered, ScanJob, WorkerGone, WorkerSaid
+from afspm.scheduler.drift.messages import Forecasted, ScanJob, StartWorker, WorkerGone, WorkerReport
 from afspm.scheduler.drift.settings import DriftCompensationSettings
+from afspm.scheduler.drift.worker import Complaint, main
 
 _FAREWELL_S = 1.0
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+# forked, the child would hold the scheduler's sockets and locks
+_CONTEXT = multiprocessing.get_context("spawn")
 
 
 class DriftWorkerProcess:
-    """See `told.Worker`. What it says is taken by `said`, after `wake` was called.
+    """See `scheduler.shell.FrameWorker`.
 
     Args:
         file: where the worker keeps its state; None: nowhere.
 
     Attributes:
-        wake: called from another thread when there is something to take.
+        wake: called from another thread when there is a report.
         late: keeps a simulated time from running away while a scan is registered.
     """
 
     def __init__(self, settings: DriftCompensationSettings, file: Path | None, log: logging.Logger) -> None:
-        self._first = {"drift": asdict(settings), "file": str(file) if file else ""}
-        self._log = log
         self.wake: Callable[[], None] = lambda: None
         self.late: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext
+        self._settings = settings
+        self._file = file
+        self._log = log
         self._late = contextlib.ExitStack()
-        self._said: deque[tuple[int, WorkerSaid]] = deque()
+        self._reports: deque[tuple[int, WorkerReport]] = deque()
         self._life = 0
-        self._process: subprocess.Popen[bytes] | None = None
-        self._orders: queue.SimpleQueue[tuple[Plain, object] | None] = queue.SimpleQueue()
+        self._process: BaseProcess | None = None
+        self._reader = threading.Thread()
+        self._jobs: queue.SimpleQueue[object] = queue.SimpleQueue()
 
-    def start(self) -> None:
-        """Begin, or kill what is there and begin anew."""
-        self._end(kill=True)
-        self._life += 1
-        command = python_command("afspm.scheduler.drift.worker")
-        try:
-            # it complains where we do; small matrices are not worth more threads than one
-            environment = {**dict.fromkeys(_THREADS, "1"), **os.environ, **python_environment()}
-            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
-        except OSError as error:
-            self._tell(self._life, WorkerGone(f"it can't be started: {error}"))
+    def take(self, job: object) -> None:
+        """Hand a `WorkerJob` to the worker; returns at once."""
+        if isinstance(job, StartWorker):
+            self._start()
             return
-        self._orders = queue.SimpleQueue()
-        for run, name in ((_write_all, "orders"), (self._read_all, "answers")):
-            arguments = (self._process, self._orders) if run is _write_all else (self._process, self._life)
-            threading.Thread(target=run, args=arguments, name=f"drift {name}", daemon=True).start()
-        self._orders.put((self._first, None))
+        if isinstance(job, ScanJob):
+            self._late.enter_context(self.late())
+        self._jobs.put(job)
 
-    def register(self, job: ScanJob) -> None:
-        self._late.enter_context(self.late())
-        self._orders.put((pipe.job_to_head(job), job.scan.values))
+    def reports(self) -> Iterator[WorkerReport]:
+        """Yield the reports since the last call, oldest first; those of a former worker are dropped.
 
-    def compensated(self, time_s: float, velocity_m_s: tuple[float, float]) -> None:
-        self._orders.put(({"do": "compensated", "time_s": time_s, "velocity_m_s": velocity_m_s}, None))
-
-    def said(self) -> list[WorkerSaid]:
-        """Return the worker's messages since the last call, oldest first; those of a former worker are dropped."""
-        said = []
-        while self._said:
-            life, event = self._said.popleft()
+        Simulated time passes again once the report about a scan was handled.
+        """
+        while self._reports:
+            life, report = self._reports.popleft()
             if life == self._life:
-                said.append(event)
-        return said
-
-    def caught_up(self) -> None:
-        """Let simulated time pass again: the worker's messages about scans are handled."""
-        self._late.close()
+                yield report
+                if not isinstance(report, Forecasted):
+                    self._late.close()
 
     def close(self) -> None:
         """End the worker: its state is on disk."""
-        self._late.close()
         self._life += 1
-        self._end(kill=False)
+        self._end(within_s=_FAREWELL_S)
 
-    def _end(self, *, kill: bool) -> None:
+    def _start(self) -> None:
+        self._end(within_s=0.0)
+        self._life += 1
+        from_us, jobs = _CONTEXT.Pipe(duplex=False)
+        reports, to_us = _CONTEXT.Pipe(duplex=False)
+        process = _CONTEXT.Process(
+            target=main, args=(from_us, to_us, self._settings, self._file), name="drift worker", daemon=True
+        )
+        try:
+            with _one_thread_each():
+                process.start()
+        except OSError as error:
+            for end in (jobs, reports):
+                end.close()
+            self._add(self._life, WorkerGone(f"it can't be started: {error}"))
+            return
+        finally:  # only the child holds these: so that their end is the end of the child
+            from_us.close()
+            to_us.close()
+        self._process, self._jobs = process, queue.SimpleQueue()
+        threading.Thread(target=_write_all, args=(jobs, self._jobs), name="drift jobs", daemon=True).start()
+        arguments = (process, reports, self._life)
+        self._reader = threading.Thread(target=self._read_all, args=arguments, name="drift reports", daemon=True)
+        self._reader.start()
+
+    def _end(self, *, within_s: float) -> None:
+        self._late.close()
         process, self._process = self._process, None
         if process is None:
             return
-        self._orders.put(None)
-        if kill:
-            process.kill()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(_FAREWELL_S)
+        self._jobs.put(None)
+        self._reader.join(within_s)
         process.kill()
-        process.wait()
+        self._reader.join()  # it alone waits for the process: of two waits, one would miss the exit code
 
-    def _read_all(self, process: subprocess.Popen[bytes], life: int) -> None:
-        """In a thread: from the worker's first word to its end."""
-        reason = ""
-        assert process.stdout is not None
-        with contextlib.suppress(OSError, ValueError), process.stdout:
-            while (message := pipe.read(process.stdout)) is not None:
-                head, _ = message
-                kind = head.pop("is")
-                if kind == "broken":
-                    reason = head["reason"]
-                elif kind == "complaint":
-                    self._log.error("drift: %s", head["reason"])
+    def _read_all(self, process: BaseProcess, reports: Connection, life: int) -> None:
+        """In a thread: from the worker's first report to its end."""
+        gone = None
+        with contextlib.suppress(EOFError, OSError), reports:
+            while True:
+                report = reports.recv()
+                if isinstance(report, WorkerGone):
+                    gone = report
+                elif isinstance(report, Complaint):
+                    self._log.error("drift: %s", report.reason)
                 else:
-                    self._tell(life, _SAID[kind](**head))
-        code = process.wait()
-        self._tell(life, WorkerGone(reason or f"exit code {code}"))
+                    self._add(life, report)
+        process.join()
+        self._add(life, gone or WorkerGone(f"exit code {process.exitcode}"))
 
-    def _tell(self, life: int, event: WorkerSaid) -> None:
-        self._said.append((life, event))
+    def _add(self, life: int, report: WorkerReport) -> None:
+        self._reports.append((life, report))
         self.wake()
 
 
-_SAID: dict[str, Callable[..., WorkerSaid]] = {
-    "registered": Registered,
-    "not registered": NotRegistered,
-    "forecast": Forecasted,
-}
-
-
-def _write_all(process: subprocess.Popen[bytes], orders: queue.SimpleQueue[tuple[Plain, Any] | None]) -> None:
+def _write_all(jobs: Connection, waiting: queue.SimpleQueue[object]) -> None:
     """In a thread: a worker that is busy does not read, and the scheduler must not wait for it."""
-    assert process.stdin is not None
-    with contextlib.suppress(OSError, ValueError), process.stdin:
-        while (order := orders.get()) is not None:
-            pipe.write(process.stdin, *order)
+    with contextlib.suppress(OSError), jobs:
+        while (job := waiting.get()) is not None:
+            jobs.send(job)
+
+
+@contextlib.contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Small matrices are not worth more threads than one; libraries of the child read it as they are loaded."""
+    added = [name for name in _THREADS if name not in os.environ]
+    os.environ.update(dict.fromkeys(added, "1"))
+    try:
+        yield
+    finally:
+        for name in added:
+            del os.environ[name]

@@ -1,11 +1,10 @@
-"""Components speak of the sample, the microscope of its tip: every request and packet between them is mapped."""
+"""Maps every request and packet between components, in sample coordinates, and the microscope, in tip coordinates."""
 
 from __future__ import annotations
 
-import base64
-from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping as Table
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from afspm.drift.mapping import Mapping
@@ -28,7 +27,6 @@ from afspm.model import (
     ScanParameters,
     names,
 )
-from afspm.plain_data import Plain
 from afspm.scheduler.drift.positions import (
     PlaceCodec,
     PositionPair,
@@ -56,52 +54,111 @@ MappingAt = Callable[[float], Mapping | None]
 
 
 @dataclass(frozen=True)
-class _Remembered:
-    """The mapped form of a request with an id."""
+class SavedPlace:
+    """A `PositionPair` as its two messages."""
+
+    said: bytes
+    sent: bytes
+
+
+@dataclass(frozen=True)
+class MappedBefore:
+    """The mapped form of a request with an id, which is sent again as it was."""
 
     kind: int
-    place: PositionPair[Any]
+    place: SavedPlace
     payload: bytes
 
 
-class DriftFrame:
-    """See `logic.frame.CoordinateFrame`. What is in force is known in both coordinates.
+@dataclass(frozen=True)
+class Places:
+    """The scan and the probe in force at the microscope, in both coordinates.
 
     Attributes:
-        upwards: the direction of the slow axis that is set; None: not known.
-        beside: gives what its owner wants to be kept with it, plain JSON; after a restart that is in `restored`.
-
-    Args:
-        mapping_at: changes whenever more is known of the drift.
+        shape: (rows, columns) in force; None: not known.
+        upwards: the direction of the slow axis in force; None: not known.
+        remembered: by client and id.
     """
 
-    def __init__(self, codec: PlaceCodec, mapping_at: MappingAt) -> None:
-        self.upwards: bool | None = None
-        self.beside: Callable[[], Plain] = dict
-        self.restored: Plain = {}
-        self.durations = ScanDurations()
-        self.region: TargetPosition[Region] = TargetPosition()
-        self.probe: TargetPosition[ProbePosition] = TargetPosition()
-        self.shape: tuple[int, int] | None = None
+    region: TargetPosition[Region] = field(default_factory=TargetPosition)
+    probe: TargetPosition[ProbePosition] = field(default_factory=TargetPosition)
+    shape: tuple[int, int] | None = None
+    upwards: bool | None = None
+    durations: ScanDurations = field(default_factory=ScanDurations)
+    remembered: Table[str, MappedBefore] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SavedPlaces:
+    """The part of `Places` that survives a kill."""
+
+    region: SavedPlace | None
+    probe: SavedPlace | None
+    shape: tuple[int, int] | None
+    upwards: bool | None
+    durations: ScanDurations
+    remembered: Table[str, MappedBefore]
+
+    @classmethod
+    def of(cls, places: Places) -> SavedPlaces:
+        region, probe = (
+            None if one is None else SavedPlace(one.said, one.sent)
+            for one in (places.region.current, places.probe.current)
+        )
+        return cls(region, probe, places.shape, places.upwards, places.durations, places.remembered)
+
+    def restored(self, codec: PlaceCodec) -> Places:
+        """Raises ValueError: a place can't be read."""
+        region = None if self.region is None else _place(codec, _SET_SCAN, self.region)
+        probe = None if self.probe is None else _place(codec, _SET_PROBE, self.probe)
+        return Places(
+            TargetPosition(region), TargetPosition(probe),
+            self.shape, self.upwards, self.durations, self.remembered,
+        )  # fmt: skip
+
+
+_PARTS = tuple(one.name for one in fields(Places))
+
+
+class PlaceMapper:
+    """One step of mapping in progress: the places so far.
+
+    Args:
+        mapping_at: by what is known of the drift now.
+    """
+
+    region: TargetPosition[Region]
+    probe: TargetPosition[ProbePosition]
+    shape: tuple[int, int] | None
+    upwards: bool | None
+    durations: ScanDurations
+    remembered: Table[str, MappedBefore]
+
+    def __init__(self, places: Places, codec: PlaceCodec, mapping_at: MappingAt) -> None:
+        self.__dict__.update(places.__dict__)
         self._codec = codec
         self._mapping_at = mapping_at
-        self._remembered: OrderedDict[str, _Remembered] = OrderedDict()
+
+    def finish(self) -> Places:
+        """Return the places after the step."""
+        return Places(**{name: self.__dict__[name] for name in _PARTS})
 
     # --- requests ---
-
-    def maps(self, now_ns: int) -> bool:
-        return self._mapping_at(now_ns * 1e-9) is not None
 
     def in_force(self, place: Region | ProbePosition, now_ns: int) -> None:
         mapping = self._mapping_at(now_ns * 1e-9)
         if isinstance(place, Region):
-            if self.region.told(place) is None:
+            if (known := self.region.published(place)) is None:
                 region = place if mapping is None else mapping.to_sample(place)
                 said, sent = (self._codec.encode(ScanParameters(one)) for one in (region, place))
-                self.region.current = PositionPair(region, said, place, sent)
-        elif self.probe.told(place) is None:
+                known = self.region.at(PositionPair(region, said, place, sent))
+            self.region = known
+            return
+        if (known_probe := self.probe.published(place)) is None:
             probe = place if mapping is None else _position(mapping, place.xy_m)
-            self.probe.current = PositionPair(probe, self._codec.encode(probe), place, self._codec.encode(place))
+            pair = PositionPair(probe, self._codec.encode(probe), place, self._codec.encode(place))
+            known_probe = self.probe.at(pair)
+        self.probe = known_probe
 
     def outgoing(self, who: str, request: Request, now_ns: int) -> MappedRequest | Response | None:
         now_s = now_ns * 1e-9
@@ -110,7 +167,7 @@ class DriftFrame:
         if mapping is None or change is None:
             return None
         key = f"{who} {request.id}"
-        if request.id and (known := self._remembered.get(key)) is not None:
+        if request.id and (known := self.remembered.get(key)) is not None:
             return self._again(known, request)
         asks = isinstance(request.subject, Parameter) and request.subject.value is None
         try:
@@ -132,17 +189,23 @@ class DriftFrame:
         place, subject = self._to_tip(sample, request.payload if is_whole else None, rest, now_s)
         payload = self._codec.encode(subject)
         if request.id:
-            self._remembered[key] = _Remembered(kind, place, payload)
-            if len(self._remembered) > _REMEMBERED:
-                self._remembered.popitem(last=False)
+            newest = MappedBefore(kind, SavedPlace(place.said, place.sent), payload)
+            self.remembered = dict([*self.remembered.items(), (key, newest)][-_REMEMBERED:])
         return MappedRequest(Request(kind, subject, payload, request.id), _names(asked), _said(place))
 
-    def _again(self, known: _Remembered, request: Request) -> MappedRequest:
-        (self.region if known.kind == _SET_SCAN else self.probe).sending(known.place)
+    def _again(self, known: MappedBefore, request: Request) -> MappedRequest:
+        place = _place(self._codec, known.kind, known.place)
+        self._sending(place)
         subject = self._codec.decode_packet(_MESSAGES[known.kind], known.payload)
         return MappedRequest(
-            Request(known.kind, subject, known.payload, request.id), _names(request.subject), _said(known.place)
+            Request(known.kind, subject, known.payload, request.id), _names(request.subject), _said(place)
         )
+
+    def _sending(self, place: PositionPair[Any]) -> None:
+        if isinstance(place.tip, Region):
+            self.region = self.region.sending(place)
+        else:
+            self.probe = self.probe.sending(place)
 
     def move_before(self, action: str, now_ns: int) -> MappedRequest | None:
         now_s = now_ns * 1e-9
@@ -183,11 +246,11 @@ class DriftFrame:
             if said is None:
                 said = self._codec.encode(ScanParameters(sample))
             region_place = PositionPair(sample, said, tip, self._codec.encode(subject))
-            self.region.sending(region_place)
+            self._sending(region_place)
             return region_place, subject
         said = self._codec.encode(sample) if said is None else said
         probe_place = PositionPair(sample, said, tip, self._codec.encode(tip))
-        self.probe.sending(probe_place)
+        self._sending(probe_place)
         return probe_place, tip
 
     def _tolerance_m(self, tip: Region | ProbePosition) -> float:
@@ -220,15 +283,15 @@ class DriftFrame:
 
     def carried_out(self, sent: Request, told: Parameter | None, now_ns: int) -> None:
         if sent.kind == _SET_SCAN:
-            self.region.was_set(sent.payload)
+            self.region = self.region.was_set(sent.payload)
             if isinstance(sent.subject, ScanParameters) and isinstance(sent.subject.shape, tuple):
                 self.shape = sent.subject.shape
         elif sent.kind == _SET_PROBE:
-            self.probe.was_set(sent.payload)
+            self.probe = self.probe.was_set(sent.payload)
         elif isinstance(sent.subject, Parameter):
             parameter = told or sent.subject
             if parameter.name == names.SCAN_SPEED and sent.subject.value is not None:
-                self.durations.forget()
+                self.durations = ScanDurations()
             elif parameter.name == names.SCAN_DIRECTION and parameter.value is not None:
                 self.upwards = {names.UP: True, names.DOWN: False}.get(parameter.value)
 
@@ -285,31 +348,39 @@ class DriftFrame:
             return None
         if isinstance(told.shape, tuple):
             self.shape = told.shape
-        mapping, place = self._mapping_at(time_s), self.region.told(told.region)
-        if place is None or mapping is None:
+        mapping, known = self._mapping_at(time_s), self.region.published(told.region)
+        if known is None or mapping is None:
             sample = told.region if mapping is None else mapping.to_sample(told.region)
             place = PositionPair(sample, self._codec.encode(ScanParameters(sample)), told.region, bytes(payload))
-            self.region.current = place
-        return None if mapping is None else self._codec.relocated("ScanParameters2d", payload, place.said)
+            known = self.region.at(place)
+        self.region = known
+        if mapping is None or known.current is None:
+            return None
+        return self._codec.relocated("ScanParameters2d", payload, known.current.said)
 
     def _lines_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
         """They lie where the frame is that they are taken in; the finished scan will be told to lie where it was."""
         region, mapping = getattr(told, "region", None), self._mapping_at(time_s)
         if region is None or mapping is None:
             return None
-        place = self.region.told(region)
-        said = self._codec.encode(ScanParameters(mapping.to_sample(region))) if place is None else place.said
+        known = self.region.published(region)
+        if known is None or known.current is None:
+            said = self._codec.encode(ScanParameters(mapping.to_sample(region)))
+        else:
+            self.region, said = known, known.current.said
         return self._codec.relocated("ScanLines", payload, said)
 
     def _probe_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
         if not isinstance(told, ProbePosition):
             return None
-        mapping, place = self._mapping_at(time_s), self.probe.told(told)
-        if place is None or mapping is None:
+        mapping, known = self._mapping_at(time_s), self.probe.published(told)
+        if known is None or mapping is None:
             sample = told if mapping is None else _position(mapping, told.xy_m)
-            place = PositionPair(sample, self._codec.encode(sample), told, bytes(payload))
-            self.probe.current = place
-        return None if mapping is None else self._codec.relocated("ProbePosition", payload, place.said)
+            known = self.probe.at(PositionPair(sample, self._codec.encode(sample), told, bytes(payload)))
+        self.probe = known
+        if mapping is None or known.current is None:
+            return None
+        return self._codec.relocated("ProbePosition", payload, known.current.said)
 
     def _spectrum_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
         """It lies where the sample was at its own time, which may not be that of the move to it."""
@@ -318,44 +389,14 @@ class DriftFrame:
             return None
         return self._codec.relocated("Spec1d", payload, self._codec.encode(_position(mapping, position_m)))
 
-    # --- over a kill ---
 
-    def snapshot(self) -> Plain:
-        return {
-            "region": self.region.current and self.region.current.to_list(),
-            "probe": self.probe.current and self.probe.current.to_list(),
-            "shape": self.shape,
-            "upwards": self.upwards,
-            "durations": self.durations.to_list(),
-            "remembered": [
-                [key, one.kind, *one.place.to_list(), base64.b64encode(one.payload).decode()]
-                for key, one in self._remembered.items()
-            ],
-            "beside": self.beside(),
-        }
-
-    def restore(self, state: Plain) -> None:
-        self.restored = state["beside"]
-        if state["region"] is not None:
-            self.region.current = self._place(_SET_SCAN, *state["region"])
-        if state["probe"] is not None:
-            self.probe.current = self._place(_SET_PROBE, *state["probe"])
-        self.shape = None if state["shape"] is None else (int(state["shape"][0]), int(state["shape"][1]))
-        self.upwards = state["upwards"]
-        self.durations.restore(state["durations"])
-        for key, kind, said, sent, payload in state["remembered"]:
-            place = self._place(int(kind), said, sent)
-            self._remembered[str(key)] = _Remembered(int(kind), place, base64.b64decode(payload))
-
-    def _place(self, kind: int, said: str, sent: str) -> PositionPair[Any]:
-        """Read what `PositionPair.to_list` wrote. Raises ValueError if it is no such place."""
-        parts = [base64.b64decode(part) for part in (said, sent)]
-        sample, tip = (self._codec.decode_packet(_MESSAGES[kind], part) for part in parts)
-        if isinstance(sample, ScanParameters) and isinstance(tip, ScanParameters):
-            sample, tip = sample.region, tip.region
-        if sample is None or tip is None:
-            raise ValueError("a place in force that can't be read")
-        return PositionPair(sample, parts[0], tip, parts[1])
+def _place(codec: PlaceCodec, kind: int, saved: SavedPlace) -> PositionPair[Any]:
+    sample, tip = (codec.decode_packet(_MESSAGES[kind], part) for part in (saved.said, saved.sent))
+    if isinstance(sample, ScanParameters) and isinstance(tip, ScanParameters):
+        sample, tip = sample.region, tip.region
+    if sample is None or tip is None:
+        raise ValueError("a place in force that can't be read")
+    return PositionPair(sample, saved.said, tip, saved.sent)
 
 
 def _place_of(request: Request) -> Region | RegionChange | ProbePosition | PositionChange | None:
