@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import python_api
+from afspm.microscopes.simulator.faults import Fault
+from afspm.microscopes.simulator.instrument import PanelEvent
 
 from afspm import components
 from afspm.dashboard import Dashboard
 from afspm.gateway import Gateway
 from afspm.logic import arbitration, diagram
 from afspm.microscopes.simulator import Simulator
-from afspm.microscopes.simulator.faults import Fault
-from afspm.microscopes.simulator.instrument import PanelEvent
 from afspm.simulation.drift import Relaxation
 from afspm.simulation.surfaces import KINDS
 from afspm.simulation.world import WorldSettings

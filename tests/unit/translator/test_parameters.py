@@ -111,7 +111,7 @@ def test_the_simulator_has_every_base_parameter_and_the_right_unit_for_its_mode(
         {"initial": {"scan-speed": "1 V"}},
         {"initial": {"scan-sped": 1}},
         {"faults": [{"kind": "explode"}]},
-        {"faults": [{"kind": "slow", "when": 3}]},
+        {"faults": [{"kind": "crash", "when": 3}]},
         {"panel": [{"at_s": 1.0, "set": {"scan-sped": 1}}]},
         {"panel": [{"at_s": 1.0, "action": "x-dance"}]},
     ],

@@ -10,8 +10,8 @@ import pytest
 from asylum_bench import Bench, Emulated
 from vendor_bench import SOON, Peer, scans, small, states
 
-from afspm.emulators.faults import Fault
 from afspm.model import ControlRequest, ControlResponse, ProbePosition, Scan, ScopeState, Spectrum, names
+from afspm.simulation.faults import Fault
 
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE

@@ -542,8 +542,8 @@ def test_a_force_curve_that_somebody_takes_is_published_with_the_place_of_its_fi
     made = bench(speed=2.0)
     peer = made.start()
     peer.until(FREE)
-    made.at_panel(lambda emulator: emulator.rig.move_probe((20e-9, 30e-9)))
-    made.at_panel(lambda emulator: emulator.rig.stop_move())
+    made.at_panel(lambda emulator: emulator.rig.move_probe((20e-9, 30e-9), emulator.clock.now_s()))
+    made.at_panel(lambda emulator: emulator.rig.stop_move(emulator.clock.now_s()))
     x, y = made.emulator.rig.probe_m
     made.at_panel(lambda emulator: emulator.controller.curve(made.clock.now_s()))
     peer.until(ScopeState.SPEC)

@@ -325,7 +325,7 @@ def test_a_scan_stopped_while_the_translator_is_down_is_not_published(bench: Mak
     peer.until(ScopeState.SCANNING)
     until_line(made, peer, 2)
     made.kill()
-    made.at_panel(lambda emulator: emulator.rig.stop_scan())
+    made.at_panel(lambda emulator: emulator.rig.stop_scan(emulator.clock.now_s()))
     peer = made.start()
     heard = peer.until(FREE)
     assert "INTERRUPTED" in states(heard)

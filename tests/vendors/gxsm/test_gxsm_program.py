@@ -22,10 +22,10 @@ from raw_clients import MemoryClient, SocketClient, client
 from vendor_bench import DEADLINE_S
 
 from afspm.emulators.emulator import Crashed
-from afspm.emulators.faults import Faults
 from afspm.emulators.gxsm.block import FAULT_KINDS, SharedMemoryBlock
 from afspm.emulators.gxsm.file_writer import GxsmFileWriter
 from afspm.files import read
+from afspm.simulation.faults import Faults
 
 Make = Callable[..., Bench]
 KINDS: list[dict[str, Any]] = [{"version": 3}, {"version": 4}, {"version": 4, "transport": "shm"}]

@@ -456,7 +456,7 @@ def test_a_spectrum_is_stopped_where_the_hardware_can(bench: Make, settings: dic
     ready(peer)
     assert peer.act(names.START_SPEC).ok
     peer.until(ScopeState.SPEC)
-    made.at_panel(lambda emulator: emulator.rig.stop_move())
+    made.at_panel(lambda emulator: emulator.rig.stop_move(emulator.clock.now_s()))
     until_s = made.clock.now_s() + 60.0
     while made.emulator.rig.spectrum is None and made.clock.now_s() < until_s:
         peer.get(names.SPEC_KIND)

@@ -12,12 +12,12 @@ import pytest
 import zmq
 from fake_clock import FakeClock
 
-from afspm.emulators.faults import Faults
 from afspm.emulators.park import ParkEmulator
 from afspm.emulators.park.engine import Script, Wait
 from afspm.emulators.park.smartscan import SmartScanProgram
-from afspm.emulators.rig import Rig, RigBusy
 from afspm.errors import InvalidValue
+from afspm.simulation.faults import Faults
+from afspm.simulation.instrument import Instrument, InstrumentBusy
 
 
 class SmartScan(SmartScanProgram):
@@ -25,11 +25,11 @@ class SmartScan(SmartScanProgram):
 
     def __init__(self, folder: Path) -> None:
         self.clock = FakeClock()
-        rig = Rig({"surface": "particles"}, seed=3, clock=self.clock, background=False)
+        rig = Instrument({"surface": "particles"}, seed=3, start_s=self.clock.t_s)
         rig.setup.shape = (8, 16)
         log = logging.getLogger("test")
         faults = Faults([], ParkEmulator.fault_kinds, 0.0)
-        super().__init__(rig, faults, folder, log, start_s=0.1, file_s=0.1)
+        super().__init__(rig, faults, self.clock, folder, log, start_s=0.1, file_s=0.1)
 
     def begin(self, path: str, *given: object) -> Any:
         return self.ask("call", path, list(given))
@@ -134,7 +134,7 @@ def test_value_out_of_range_is_refused_and_nothing_moves(smartscan: SmartScan, p
 def test_nothing_moves_from_the_start_of_a_scan_on(smartscan: SmartScan, path: str, given: tuple[float, ...]) -> None:
     smartscan.begin("scan.triggerImageScan")
     for _ in range(3):  # the ramp to the first line, and the first lines
-        with pytest.raises(RigBusy, match="busy with a scan"):
+        with pytest.raises(InstrumentBusy, match="busy with a scan"):
             smartscan.begin(path, *given)
         smartscan.clock.t_s += 0.4
         smartscan.advance(smartscan.clock.t_s)
@@ -208,7 +208,7 @@ def test_line_is_scanned_until_it_is_stopped_and_nothing_is_saved(smartscan: Sma
 
 def test_sweep_of_the_drive_frequency_keeps_the_instrument_busy(smartscan: SmartScan) -> None:
     sweep = smartscan.begin("ncm.sweepAutoFullRange")
-    with pytest.raises(RigBusy, match="busy with a sweep"):
+    with pytest.raises(InstrumentBusy, match="busy with a sweep"):
         smartscan.begin("scan.triggerImageScan")
     smartscan.clock.t_s += 3.1
     assert not sweep.waiting()

@@ -70,7 +70,7 @@ def test_whatever_smartscan_turns_out_to_say_the_tip_is_moved_scanned_with_and_w
 def test_what_smartscan_refuses_is_refused_with_its_own_words(bench: Make, variant: Settings) -> None:
     made = bench(**variant)
     peer = small(made)
-    made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4))
+    made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4, emulator.clock.now_s()))
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.ACTION_ERROR
     assert "busy with a calibration" in response.reason
@@ -235,7 +235,7 @@ def test_a_curve_that_is_stopped_on_the_way_to_it_is_not_taken(bench: Make) -> N
     peer = made.start()
     ready(peer)
     moved(peer, 120e-9, -40e-9)
-    made.at_panel(lambda emulator: emulator.rig.move_probe((1e-6, 0.0)))
+    made.at_panel(lambda emulator: emulator.rig.move_probe((1e-6, 0.0), emulator.clock.now_s()))
     made.at_panel(lambda emulator: setattr(emulator.rig.setup, "move_speed_m_s", 5e-9))
     assert peer.act(names.START_SPEC).ok
     peer.until(ScopeState.SPEC)
@@ -257,7 +257,7 @@ def test_withdrawing_ends_a_curve(bench: Make) -> None:
 def test_a_curve_that_smartscan_refuses_is_no_result(bench: Make) -> None:
     made = bench()
     peer = small(made)
-    made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4))
+    made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4, emulator.clock.now_s()))
     peer.act(names.START_SPEC)
     heard = peer.until(FREE)
     assert states(heard)[-2:] == ["INTERRUPTED", "FREE"]

@@ -11,7 +11,7 @@ from typing import Final, TypeVar
 import numpy as np
 
 from afspm.emulators.gxsm.program import ANGSTROM_M, GxsmProgram
-from afspm.emulators.rig import RigBusy
+from afspm.simulation.instrument import InstrumentBusy
 
 FAULT_KINDS: Final[Mapping[str, str]] = {
     "error": "a call raises an error",
@@ -107,7 +107,7 @@ class GxsmFunctions:
             raise WrongArguments(method)
         try:
             found = function(self, *arguments)
-        except RigBusy as busy:
+        except InstrumentBusy as busy:
             raise SystemError(str(busy)) from busy
         if self._faults.strikes("wrong-type", now_s):
             return "\x04"
@@ -166,22 +166,23 @@ class GxsmFunctions:
 
     def _do(self, name: str) -> None:
         program, rig = self._program, self._program.rig
+        now_s = program.clock.now_s()
         if name in self._feedback_actions:
             rig.setup.feedback = replace(rig.setup.feedback, on=name == self._feedback_actions[0])
         elif name.startswith("CHECK-") and name.removeprefix("CHECK-") in _MODES[program.card]:
             program.probe_auto_save = True
         elif name == "DSP_VP_ABORT_EXECUTE":
-            rig.stop_spectrum()
+            rig.stop_spectrum(now_s)
             program.curve = None
         elif name.startswith("DSP_VP_"):
             mode = name.split("_")[2]
             depth = -program.entries["dsp-Z-end"] * ANGSTROM_M if mode == "FZ" else 0.0
             if depth > 0.0:
-                rig.crash(depth, program.entries["dsp-Z-Slope"] * ANGSTROM_M)
+                rig.crash(depth, program.entries["dsp-Z-Slope"] * ANGSTROM_M, now_s)
                 return
             program.take_curve(_KINDS.get(mode, "IV"))
         elif name == "DSP_CMD_AUTOAPP":
-            rig.engage()
+            rig.engage(now_s)
         elif name == "DSP_CMD_STOPALL":
             program.stop_scan()
 

@@ -11,16 +11,16 @@ from typing import Final
 import numpy as np
 
 from afspm.clock import Clock
-from afspm.emulators.activities import ScanActivity, SpectrumActivity
-from afspm.emulators.faults import Faults
 from afspm.emulators.gxsm import files
 from afspm.emulators.gxsm.channels import CHANNELS, SIMULATED_3, GxsmChannel
 from afspm.emulators.gxsm.entries import GxsmEntries, GxsmEntry, lengths, simulated_3
 from afspm.emulators.gxsm.file_writer import GxsmFileWriter
-from afspm.emulators.rig import Rig
 from afspm.errors import InvalidValue
 from afspm.model import Region
 from afspm.plain_data import Plain
+from afspm.simulation.activities import ScanActivity, SpectrumActivity
+from afspm.simulation.faults import Faults
+from afspm.simulation.instrument import Instrument
 
 CARDS: Final = {"SRanger": "SRangerMK2:SPM", "RPSPMC": "RPSPMC:SPM", "simulator": "SPM-SIM:SPM"}
 FAULT_KINDS: Final[Mapping[str, str]] = {
@@ -75,7 +75,7 @@ class GxsmProgram:
         repeats: a scan that comes to its end is followed by the next.
     """
 
-    def __init__(self, rig: Rig, faults: Faults, clock: Clock, folder: Path, settings: GxsmSettings) -> None:
+    def __init__(self, rig: Instrument, faults: Faults, clock: Clock, folder: Path, settings: GxsmSettings) -> None:
         self.rig, self.faults, self.clock, self.folder = rig, faults, clock, folder
         self.version, self.card = version, card = settings.version, settings.card
         self.dialogs: list[str] = []
@@ -156,7 +156,7 @@ class GxsmProgram:
         """Another bias; one that was in force for a short while has been a pulse."""
         now_s = self.clock.now_s()
         if now_s - self._bias_since_s < _PULSE_S:
-            self.rig.pulsed(self.rig.setup.bias_v, now_s - self._bias_since_s)
+            self.rig.pulsed(self.rig.setup.bias_v, now_s - self._bias_since_s, now_s)
         self.rig.setup.bias_v, self._bias_since_s = value, now_s
 
     # --- what happens by itself ---
@@ -164,7 +164,7 @@ class GxsmProgram:
     def advance(self, now_s: float) -> float | None:
         """Up to now; returns when a file is to be written."""
         if self._scanning and self.faults.strikes("panel-stop", now_s):
-            self.rig.stop_scan()
+            self.rig.stop_scan(now_s)
         if self._scanning and self.last is not None and not self.last.running(now_s):
             self._scanning = False
             if self.auto_save:
@@ -188,7 +188,7 @@ class GxsmProgram:
     def stop_scan(self) -> None:
         """Break off the scan that runs, or is to begin."""
         self._next = False
-        self.rig.stop_scan()
+        self.rig.stop_scan(self.clock.now_s())
 
     # --- scans ---
 
@@ -199,7 +199,7 @@ class GxsmProgram:
         if self._next:
             return
         follows, self._follows = self._follows, False
-        self.rig.stop_move()
+        self.rig.stop_move(now_s)
         if self.rig.busy(now_s) or self.faults.strikes("no-start", now_s):
             return
         if not self.channels:
@@ -215,7 +215,7 @@ class GxsmProgram:
         else:
             self.rig.setup.line_s = 2.0 * entries["RangeX"] / entries["dsp-fbs-scan-speed-scan"]
         try:
-            started = self.rig.start_scan()
+            started = self.rig.start_scan(now_s)
         except InvalidValue as error:
             self.dialogs.append(str(error))
             return
@@ -319,7 +319,7 @@ class GxsmProgram:
 
     def _move(self) -> None:
         if self.rig.doing(self.clock.now_s()) in ("", "move"):
-            self.rig.move_probe(self.tip_m())
+            self.rig.move_probe(self.tip_m(), self.clock.now_s())
 
     def tip_m(self) -> tuple[float, float]:
         """The position that the tip was sent to."""
@@ -334,7 +334,7 @@ class GxsmProgram:
         if self.rig.busy(self.clock.now_s()):
             return
         try:
-            self.curve = self.rig.start_spectrum(kind)
+            self.curve = self.rig.start_spectrum(kind, self.clock.now_s())
         except InvalidValue as error:
             self.dialogs.append(str(error))
 

@@ -11,12 +11,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from afspm.emulators.activities import RETRACE, Channels, ScanActivity, SpectrumActivity
 from afspm.emulators.nanosurf import files
 from afspm.emulators.program import MakerProgram, NamedFile
 from afspm.errors import InvalidValue
 from afspm.model import Region
 from afspm.plain_data import Plain
+from afspm.simulation.activities import RETRACE, Channels, ScanActivity, SpectrumActivity
 
 _INTEGRAL_GAIN: Final = 0.5
 """What Studio's integral gain of 1 is to the simulated feedback, in 1/s."""
@@ -206,7 +206,7 @@ class StudioProgram(MakerProgram):
     def get(self, path: str) -> object:
         """Return a value of a panel, or where the tip is."""
         if path in ("scanner.offset_x", "scanner.offset_y"):
-            return self.rig.probe_at(self.rig.clock.now_s())[path.endswith("y")]
+            return self.rig.probe_at(self.now_s)[path.endswith("y")]
         value: object = self.values[path] * self.scale(path) if path == SETPOINT else self.values[path]
         return value
 
@@ -246,14 +246,14 @@ class StudioProgram(MakerProgram):
         return self.scanning or self.measuring_curve or self.engages or self.rig.busy(now_s)
 
     def start_curves(self, now_s: float) -> None:
-        """Take the curves of the grid. Raises RigBusy."""
+        """Take the curves of the grid. Raises InstrumentBusy."""
         x, y, width, height, columns, rows, rotation_deg = (self.values[path] for path in FRAMES["grid"])
         region = Region((x, y), (max(width, 1e-12), max(height, 1e-12)), math.radians(rotation_deg))
         points = np.stack([of.ravel() for of in region.pixels_m((rows, columns))], axis=1)
         self._start_grid(CurveGrid((rows, columns), [(px, py) for px, py in points.tolist()]), now_s)
 
     def measure_at(self, kind: str, name: str, place: Sequence[Any], now_s: float) -> None:
-        """Measure an item of the workspace: a frame, a grid, or a point. Raises RigBusy, InvalidValue."""
+        """Measure an item of the workspace: a frame, a grid, or a point. Raises InstrumentBusy, InvalidValue."""
         self._item_name = name
         for path, value in zip(FRAMES.get(kind, ()), place, strict=False):
             self.put(path, value)
@@ -270,8 +270,8 @@ class StudioProgram(MakerProgram):
         super().stop_curve()
         if self._grid is not None:
             self._grid = None
-            self.rig.stop_spectrum()
-            self.rig.stop_move()
+            self.rig.stop_spectrum(self.now_s)
+            self.rig.stop_move(self.now_s)
 
     def withdraw(self, now_s: float) -> None:
         self._grid = None
@@ -282,9 +282,9 @@ class StudioProgram(MakerProgram):
         self._grid = None
 
     def begin_procedure(self, path: str) -> None:
-        """Begin one of `PROCEDURES_S`. Raises RigBusy."""
+        """Begin one of `PROCEDURES_S`. Raises InstrumentBusy."""
         self._refuse_busy()
-        self.rig.occupy(path, PROCEDURES_S[path])
+        self.rig.occupy(path, PROCEDURES_S[path], self.now_s)
         if path == "probe.cantilever_calibration.run":
             self._calibrated = True
         elif path == "z_control.gain_finder.run":
@@ -298,7 +298,7 @@ class StudioProgram(MakerProgram):
         self.values |= self._cantilever
 
     def load_mode(self, name: str) -> None:
-        """Load a mode of measurement. Raises RigBusy: a measurement is running."""
+        """Load a mode of measurement. Raises InstrumentBusy: a measurement is running."""
         self._refuse_busy()
         self.values["mode.name"] = name
 
@@ -320,17 +320,19 @@ class StudioProgram(MakerProgram):
             self.rig.scan.resume(now_s)
 
     def move(self) -> None:
-        """Send the tip to the target. Raises RigBusy, InvalidValue."""
+        """Send the tip to the target. Raises InstrumentBusy, InvalidValue."""
         self.rig.setup.move_speed_m_s = self.values["scanner.move_speed_xy_on_surface"]
-        self.rig.move_probe((self.values["scanner.offset_x_target"], self.values["scanner.offset_y_target"]))
+        self.rig.move_probe(
+            (self.values["scanner.offset_x_target"], self.values["scanner.offset_y_target"]), self.now_s
+        )
 
     def lines(self, channel: int) -> tuple[str, str, list[float]]:
         """Return name, unit and the complete lines of the running scan, one after the other as they were scanned."""
         scan = self.rig.scan
         if scan is None:
             return "", "", []
-        name, (unit, values) = list(_named(scan.channels(self.rig.clock.now_s())).items())[channel]
-        done = scan.lines_done(self.rig.clock.now_s())
+        name, (unit, values) = list(_named(scan.channels(self.now_s)).items())[channel]
+        done = scan.lines_done(self.now_s)
         rows = values if scan.upwards else values[::-1]
         return name, unit, [float(one) for one in rows[:done].ravel()]
 
@@ -376,10 +378,10 @@ class StudioProgram(MakerProgram):
         while grid is not None and not self.rig.busy(now_s):
             if grid.at_point:
                 grid.at_point = False
-                grid.curves.append(self.rig.start_spectrum("force"))
+                grid.curves.append(self.rig.start_spectrum("force", self.now_s))
             elif grid.points_m:
                 self.rig.setup.move_speed_m_s = self.values["scanner.move_speed_xy_on_surface"]
-                self.rig.move_probe(grid.points_m.pop(0))
+                self.rig.move_probe(grid.points_m.pop(0), self.now_s)
                 grid.at_point = True
             else:
                 self._grid = None

@@ -264,7 +264,7 @@ class CommandTree:
 
     @property
     def _now_s(self) -> float:
-        return self._program.rig.clock.now_s()
+        return self._program.now_s
 
     def _blocking(
         self, call: Callable[..., None], waiting: Callable[[], bool], message: Callable[[], str] = lambda: ""

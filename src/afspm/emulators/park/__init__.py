@@ -59,7 +59,7 @@ class ParkEmulator(ScriptedEmulator):
     def make_program(self) -> MakerProgram:
         """Make SmartScan."""
         self._scripts: dict[Script, bool] = {}  # and whether its reply was sent already
-        self._smartscan = SmartScanProgram(self.rig, self.faults, self.folder, self.log, **self._times)
+        self._smartscan = SmartScanProgram(self.rig, self.faults, self.clock, self.folder, self.log, **self._times)
         self._smartscan.tells_gains = self._tells_gains
         return self._smartscan
 

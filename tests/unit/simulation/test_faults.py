@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from afspm.emulators.faults import EVERY_TIME, Fault, Faults
 from afspm.errors import ConfigError
+from afspm.simulation.faults import EVERY_TIME, Fault, Faults
 
 KNOWN = {"no-reply": "", "modal-dialog": "", "crash": ""}
 
