@@ -559,7 +559,7 @@ def test_a_pulse_is_a_bias_that_is_put_back(bench: Make, monkeypatch: pytest.Mon
     peer = made.start()
     ready(peer)
     pulses: list[tuple[float, float]] = []
-    monkeypatch.setattr(made.emulator.rig, "pulsed", lambda *pulse: pulses.append(pulse))
+    monkeypatch.setattr(made.emulator.rig, "pulsed", lambda *pulse: pulses.append(pulse[:2]))
     assert peer.set(names.TIP_BIAS_VOLTAGE, 0.5).ok
     assert peer.set(names.PULSE_VOLTAGE, -4.5).ok
     assert peer.set(names.PULSE_DURATION, "300", "ms").ok
@@ -587,7 +587,7 @@ def test_a_crash_is_an_indentation_that_is_not_saved(bench: Make, monkeypatch: p
     )
     ready(peer)
     crashes: list[tuple[float, float]] = []
-    monkeypatch.setattr(made.emulator.rig, "crash", lambda *crash: crashes.append(crash))
+    monkeypatch.setattr(made.emulator.rig, "crash", lambda *crash: crashes.append(crash[:2]))
     assert peer.set(names.CRASH_DEPTH, 2, "um").ok
     assert peer.set(names.CRASH_SPEED, 5, "um/s").ok
     assert peer.act(names.CRASH).ok

@@ -267,7 +267,7 @@ def test_a_pulse_is_a_bias_that_is_put_back(
     peer = made.start()
     ready(peer)
     pulses: list[tuple[float, float]] = []
-    monkeypatch.setattr(made.emulator.rig, "pulsed", lambda *pulse: pulses.append(pulse))
+    monkeypatch.setattr(made.emulator.rig, "pulsed", lambda *pulse: pulses.append(pulse[:2]))
     before = peer.get(names.TIP_BIAS_VOLTAGE)
     assert peer.set(names.PULSE_VOLTAGE, -4.5).ok
     assert peer.set(names.PULSE_DURATION, "300", "ms").ok
@@ -304,7 +304,7 @@ def test_a_crash_is_what_the_experiment_file_says(bench: Make, monkeypatch: pyte
     )
     ready(peer)
     crashes: list[tuple[float, float]] = []
-    monkeypatch.setattr(made.emulator.rig, "crash", lambda *crash: crashes.append(crash))
+    monkeypatch.setattr(made.emulator.rig, "crash", lambda *crash: crashes.append(crash[:2]))
     assert peer.set(names.CRASH_DEPTH, 2, "nm").ok
     assert peer.set(names.CRASH_SPEED, 50, "nm/s").ok
     assert peer.act(names.CRASH).ok

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.errors import ConfigError, Refused
-from afspm.microscopes.park.activity import STOP, STOP_CURVE, Activity
+from afspm.microscopes.park.activity import STOP, STOP_CURVE, SmartScanActivity
 from afspm.microscopes.park.link import Link, SmartScanError
 from afspm.microscopes.park.result_files import SETTLE_S, ParkFiles
 from afspm.microscopes.park.session import FALSE, TRUE, Session
@@ -68,7 +68,7 @@ class Park(Driver):
         if both:
             raise ConfigError(f"{', '.join(sorted(both))} would mean both", where="idle_words", hint="take one away")
         self._session: Session | None = None
-        self._activity: Activity | None = None
+        self._activity: SmartScanActivity | None = None
         self._place = TipPlace(self._smartscan, self._begun)
         self._kept = KeptSettings(_AT_FIRST)
         self._gains = Gains(self._smartscan)
@@ -94,7 +94,9 @@ class Park(Driver):
             told = f"SmartScan's folder of data {folder} does not exist on this computer"
             raise ConfigError(told, where="data_dir", hint='data_dir = "/where/it/is/mounted"')
         self._files = ParkFiles(self.memory, self.log, self.clock.monotonic_s)
-        self._activity = Activity(session, self._files, self._folder, self._frame_in_force, self.clock, self.log)
+        self._activity = SmartScanActivity(
+            session, self._files, self._folder, self._frame_in_force, self.clock, self.log
+        )
 
     def close(self) -> None:
         if self._activity is not None:
@@ -176,13 +178,13 @@ class Park(Driver):
         return self._session
 
     @property
-    def _doing(self) -> Activity:
+    def _doing(self) -> SmartScanActivity:
         if self._activity is None:
             raise ControllerLost("SmartScan is not connected", where=self.controller_at)
         return self._activity
 
     def _begun(self, call: LongCall) -> None:
-        self._doing.begun(call)
+        self._doing.watch(call)
 
     def _frame_in_force(self) -> Region:
         return frame(self.in_force(FRAME))[0]
