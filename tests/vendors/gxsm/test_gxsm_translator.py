@@ -140,7 +140,7 @@ def test_gxsm_may_be_left_to_save_by_itself(bench: Make) -> None:
     ready(peer)
     found = [scanned(peer)["ZS-Topo"] for _ in range(2)]
     assert [scan.filename[-19:-16] for scan in found] == ["001", "002"]
-    assert made.emulator.program.auto_save
+    assert made.emulator.program.panel.auto_save
     assert len(list(made.data.glob("*.nc"))) == 8
 
 
@@ -537,7 +537,7 @@ def test_scans_repeated_at_the_panel_are_published_one_by_one_and_a_stopped_one_
     ready(peer, shape=(24, 32))
 
     def begin(emulator: Any) -> None:
-        emulator.program.repeats = True
+        emulator.program.panel.repeats = True
         emulator.program.start_scan()
 
     made.at_panel(begin)
@@ -558,7 +558,7 @@ def test_scans_repeated_at_the_panel_are_published_one_by_one_and_a_stopped_one_
 
 def until_line(made: Bench, line: int) -> None:
     """Until so many lines of the running scan are complete."""
-    last, pace = made.emulator.program.last, Event()
+    last, pace = made.emulator.program.scan.activity, Event()
     assert last is not None
     while last.lines_done(made.clock.now_s()) < line:
         pace.wait(0.005)
@@ -581,7 +581,7 @@ def test_a_scan_that_a_person_begins_again_at_once_is_published_as_two(bench: Ma
         program.saving.advance(made.clock.now_s() + 1.0)
         program.saving.done_s = 0.0
         program.start_scan()
-        program.shows_s = 0.0
+        program.scan.shows_s = 0.0
 
     made.at_panel(again)
     heard = peer.until(FREE)
@@ -597,15 +597,15 @@ def test_autosave_is_off_only_while_a_scan_of_the_translator_runs(bench: Make) -
     made = bench(speed=10.0, auto_save=False)
     peer = made.start()
     ready(peer, shape=(24, 32))
-    assert made.emulator.program.auto_save, "GXSM saves what is begun at its panel"
+    assert made.emulator.program.panel.auto_save, "GXSM saves what is begun at its panel"
     assert peer.act(names.START_SCAN).ok
-    assert not made.emulator.program.auto_save, "one that is stopped is not to be saved"
+    assert not made.emulator.program.panel.auto_save, "one that is stopped is not to be saved"
     assert peer.act(names.STOP_SCAN).ok
     peer.until(FREE)
-    assert made.emulator.program.auto_save
+    assert made.emulator.program.panel.auto_save
     assert not list(made.data.glob("*.nc"))
     scanned(peer)
-    assert made.emulator.program.auto_save
+    assert made.emulator.program.panel.auto_save
     assert len(list(made.data.glob("*.nc"))) == 4, "saved once"
 
 
@@ -623,7 +623,7 @@ def test_the_clock_of_its_computer_may_be_another_and_be_set_meanwhile(bench: Ma
     peer = made.start()
     ready(peer)
     for behind_s in (0.0, 3600.0, 3600.0, 7200.0, 60.0):
-        made.at_panel(lambda emulator, behind_s=behind_s: setattr(emulator.program, "behind_s", behind_s))
+        made.at_panel(lambda emulator, behind_s=behind_s: setattr(emulator.program.panel, "behind_s", behind_s))
         assert len(scanned(peer)) == 4
 
 
@@ -633,10 +633,10 @@ def test_a_scan_that_begins_sooner_after_it_was_asked_for_than_the_one_before_is
     peer = made.start()
     ready(peer, shape=(64, 32))
     late_s = 30.0
-    made.at_panel(lambda emulator: setattr(emulator.program, "behind_s", -late_s))
+    made.at_panel(lambda emulator: setattr(emulator.program.panel, "behind_s", -late_s))
     assert len(scanned(peer)) == 4
-    made.at_panel(lambda emulator: setattr(emulator.program, "behind_s", 0.0))
-    last = made.emulator.program.last
+    made.at_panel(lambda emulator: setattr(emulator.program.panel, "behind_s", 0.0))
+    last = made.emulator.program.scan.activity
     assert last is not None
     assert made.clock.now_s() > last.start_s + late_s, "else the clock seems to have been set back"
     assert len(scanned(peer)) == 4
