@@ -207,7 +207,7 @@ def test_what_is_set_is_told_to_the_last_digit(bench: Make) -> None:
         names.MOVE_SPEED: 2.3456789e-7,
         names.ZCTRL_PGAIN: 0.123456789,
         names.ZCTRL_IGAIN: 123.456789,
-        names.ZCTRL_SETPOINT: 0.66666666666,
+        names.ZCTRL_SETPOINT: 0.66666666666e-9,
         names.SCAN_TOP_LEFT_X: 1.23456789012e-8,
         names.SCAN_SIZE_Y: 3.33333333333e-7,
         names.SCAN_ANGLE: -12.3456789012,
@@ -224,9 +224,9 @@ def test_feedback_is_set_and_its_switch_can_only_be_read(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
-    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(proportional_gain=0.25, setpoint=0.5)).ok
+    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(proportional_gain=0.25, setpoint=0.5e-9)).ok
     heard = peer.until(lambda one: isinstance(one, Feedback))
-    assert (heard[-1].on, heard[-1].proportional_gain, heard[-1].setpoint) == (True, 0.25, 0.5)
+    assert (heard[-1].on, heard[-1].proportional_gain, heard[-1].setpoint) == (True, 0.25, pytest.approx(0.5e-9))
     assert made.emulator.rig.setup.feedback.proportional_gain == 0.25
     assert made.emulator.rig.setup.feedback.integral_gain == pytest.approx(1500.0), "as it was"
     assert peer.get("x-feedback-on") == "true"

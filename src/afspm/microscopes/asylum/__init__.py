@@ -20,7 +20,7 @@ from afspm.translator.driver import ControllerLost, Driver, action
 from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.translator.result_files import SCAN
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
-from afspm.units import Duration
+from afspm.units import Duration, PollPeriod
 
 _AT_FIRST: Final[dict[str, Value]] = {
     names.SCAN_DIRECTION: names.UP,
@@ -65,7 +65,7 @@ class Asylum(Driver):
         spots: str = "image",
         move_s: Duration = 2.0,
         reply_timeout_s: Duration = 5.0,
-        poll_period_s: Duration = 0.25,
+        poll_period_s: PollPeriod = 0.25,
         **common: Any,
     ) -> None:
         super().__init__(poll_period_s=poll_period_s, **common)

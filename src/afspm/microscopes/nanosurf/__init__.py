@@ -17,7 +17,7 @@ from afspm.plain_data import PlainMapping
 from afspm.translator.driver import ControllerLost, Driver, action
 from afspm.translator.parameters import Value
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
-from afspm.units import Duration
+from afspm.units import Duration, PollPeriod
 
 _AT_FIRST: Final[dict[str, Value]] = {names.SCAN_DIRECTION: names.UP, names.SPEC_KIND: FORCE}
 _STORAGE: Final = "data.storage"
@@ -54,7 +54,7 @@ class Nanosurf(Driver):
         gallery_dir: str | None = None,
         image_buffer: int | None = None,
         reply_timeout_s: Duration = 5.0,
-        poll_period_s: Duration = 0.25,
+        poll_period_s: PollPeriod = 0.25,
         **common: Any,
     ) -> None:
         super().__init__(poll_period_s=poll_period_s, **common)

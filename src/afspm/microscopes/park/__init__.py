@@ -18,7 +18,7 @@ from afspm.translator.driver import ControllerLost, Driver, action
 from afspm.translator.long_call import LongCall
 from afspm.translator.parameters import Value
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
-from afspm.units import Duration, Length
+from afspm.units import Duration, Length, PollPeriod
 
 _SCANNING: Final = TRUE | {"scanning", "running"}
 _IDLE: Final = FALSE | {"idle", "ready", "done", "stopped"}
@@ -54,7 +54,7 @@ class Park(Driver):
         scanning_words: Sequence[str] = (),
         idle_words: Sequence[str] = (),
         reply_timeout_s: Duration = 5.0,
-        poll_period_s: Duration = 0.25,
+        poll_period_s: PollPeriod = 0.25,
         **common: Any,
     ) -> None:
         super().__init__(poll_period_s=poll_period_s, **common)
