@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from fake_clock import FakeClock
 from nanosurf_bench import Bench
 from vendor_bench import FLAT, TURNED, moved, ready, scanned, scans, small, states
 
-from afspm.emulators.nanosurf.studio import StudioProgram
+from afspm.emulators.nanosurf import NanosurfEmulator
+from afspm.emulators.nanosurf.studio import SETPOINT, StudioProgram
+from afspm.errors import InvalidValue
 from afspm.exit_codes import ExitCode
 from afspm.model import Region, Scan, ScanLines, ScopeState, Spectrum, names
+from afspm.simulation.faults import Faults
+from afspm.simulation.instrument import Instrument
 
 Make = Callable[..., Bench]
 Settings = dict[str, Any]
@@ -43,6 +50,17 @@ def test_a_scan_shows_the_sample_as_it_lies(bench: Make, release: int, direction
             assert likeness(mirrored) < likeness(scan.values) - 0.1
     assert made.emulator.rig.scan is not None
     assert made.emulator.rig.scan.upwards is (direction == "up")
+
+
+def test_the_setpoint_of_a_frequency_shift_is_in_hertz(tmp_path: Path) -> None:
+    rig = Instrument({"feedback": {"mode": "frequency-shift", "setpoint": -20.0}}, 3, 1000.0)
+    faults, log = Faults([], NanosurfEmulator.all_faults(), 0.0), logging.getLogger("test")
+    studio = StudioProgram(rig, faults, FakeClock(), tmp_path, log, start_s=0.1, file_s=0.1)
+    assert (studio.setpoint_unit, list(studio.setpoint_units), studio.get(SETPOINT)) == ("Hz", ["Hz"], -20.0)
+    studio.put(SETPOINT, -35.0)
+    assert studio.get(SETPOINT) == -35.0
+    with pytest.raises(InvalidValue, match="has no unit 'V'"):
+        studio.set_setpoint_unit("V")
 
 
 def test_one_scan_after_the_other_each_its_own(bench: Make) -> None:

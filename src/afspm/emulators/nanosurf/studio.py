@@ -29,6 +29,7 @@ _MOST_PIXELS: Final = 8192
 _MOST_GAIN: Final = 100000
 _MOST_CURVES: Final = 128
 SETPOINT: Final = "z_control.setpoint"
+_MOST_SHIFT_HZ: Final = 1e3
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,7 @@ class StudioProgram(MakerProgram):
         values: of the panels, by path.
         on_signal: called with "scanning_started" and "scanning_finished".
         when_advanced: called after each advance; returns whether it has begun to measure something.
-        setpoint_unit: in which `get` and `put` have the setpoint; `values` has it in V.
+        setpoint_unit: in which `get` and `put` have the setpoint; `values` has it in V, of a frequency shift in Hz.
     """
 
     def __init__(self, *given: Any, **settings: Any) -> None:
@@ -170,7 +171,7 @@ class StudioProgram(MakerProgram):
         self.values["data.storage.gallery_directory"] = str(self.folder)
         self.on_signal: Callable[[str], None] = lambda name: None
         self.when_advanced: Callable[[float], bool] = lambda now_s: False
-        self.setpoint_unit = "V"
+        self.setpoint_unit = "Hz" if self._holds_frequency else "V"
         self._item_name = "Image"
         self._grid: CurveGrid | None = None
         self._calibrated = False
@@ -189,13 +190,26 @@ class StudioProgram(MakerProgram):
         self.values |= {path: _NOMINAL * value for path, value in self._cantilever.items()}
 
     @property
+    def _holds_frequency(self) -> bool:
+        return self.rig.world.settings.feedback.mode == "frequency-shift"
+
+    @property
     def setpoint_units(self) -> Mapping[str, float]:
-        """Return the possible units of the setpoint, with the value of 1 V in each."""
+        """Return the possible units of the setpoint, with the value in each of 1 V, or of 1 Hz of a frequency shift."""
+        if self._holds_frequency:
+            return {"Hz": 1.0}
         return {"V": 1.0, "m": float(self.values["probe.current_deflection_sensitivity"])}
 
     def scale(self, path: str) -> float:
         """Return the factor from a value of `values` to the one that `get` returns."""
         return self.setpoint_units[self.setpoint_unit] if path == SETPOINT else 1.0
+
+    def bounds(self, path: str) -> tuple[float, float]:
+        """Return the bounds of a number as `get` returns it."""
+        row, scale = PANEL[path], self.scale(path)
+        if path == SETPOINT and self._holds_frequency:
+            return -_MOST_SHIFT_HZ, _MOST_SHIFT_HZ
+        return row.low * scale, row.high * scale
 
     def set_setpoint_unit(self, unit: str) -> None:
         """Change the unit of the setpoint for `get` and `put`. Raises InvalidValue."""
@@ -219,8 +233,7 @@ class StudioProgram(MakerProgram):
             if type(value) is not type(row.at_first):
                 raise InvalidValue(f"{path}: {value!r} is no {type(row.at_first).__name__}")
         else:
-            low, high = (0, max(number for _, number in row.enum)) if row.enum else (row.low, row.high)
-            low, high = low * self.scale(path), high * self.scale(path)
+            low, high = (0, max(number for _, number in row.enum)) if row.enum else self.bounds(path)
             if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
                 raise InvalidValue(f"{path}: {value!r} is not within {low:g} to {high:g}")
             value = type(row.at_first)(value / self.scale(path))
