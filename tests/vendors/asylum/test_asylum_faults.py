@@ -118,16 +118,6 @@ def test_the_procedures_of_an_older_afspm_are_enough_to_scan(bench: Make) -> Non
 # --- scans and curves ---
 
 
-def test_a_scan_that_does_not_begin_is_refused(bench: Make) -> None:
-    made = bench()
-    peer = small(made)
-    made.strike("scan-refused")
-    response = peer.act(names.START_SCAN)
-    assert response.code == ControlResponse.ACTION_ERROR
-    assert "did not begin the scan that it was asked for" in response.reason
-    scans_again(peer)
-
-
 def test_a_force_curve_that_is_refused(bench: Make) -> None:
     made = bench()
     peer = small(made)

@@ -91,14 +91,6 @@ def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, direction: 
     assert read(scans["HeightTrace"].filename).upwards is (direction == "up")
 
 
-def test_one_scan_after_the_other_each_its_own(bench: Make) -> None:
-    made = bench()
-    peer = made.start()
-    ready(peer)
-    files = [scanned(peer)["HeightTrace"].filename for _ in range(3)]
-    assert [Path(name).name for name in files] == ["Image0000.ibw", "Image0001.ibw", "Image0002.ibw"]
-
-
 def test_a_scan_that_is_stopped_gives_none_and_leaves_the_tip_withdrawn(bench: Make) -> None:
     made = bench(speed=10.0, saves_partial=True)
     peer = made.start()

@@ -99,16 +99,6 @@ def test_a_scan_that_is_stopped_gives_none(bench: Make, kind: dict[str, Any]) ->
     assert peer.act(names.STOP_SCAN).ok, "nothing to stop is no error"
 
 
-def test_one_scan_after_the_other_each_its_own(bench: Make) -> None:
-    made = bench()
-    peer = made.start()
-    ready(peer)
-    found = [scanned(peer)["ZS-Topo"] for _ in range(3)]
-    assert [scan.filename[-19:] for scan in found] == [f"00{n}-M-Xp-ZSmTopo.nc" for n in (1, 2, 3)]
-    assert not np.array_equal(found[0].values, found[1].values)
-    assert len(list(made.data.glob("*.nc"))) == 12, "none was saved twice"
-
-
 def test_numbers_that_are_taken_already_are_no_trap(bench: Make) -> None:
     """GXSM begins at 001 with each start: it names what is there already, and then counts each channel by itself."""
     made = bench()
@@ -514,16 +504,6 @@ def test_the_approach_is_a_coarse_motor(bench: Make) -> None:
 
 
 # --- at the panel ---
-
-
-def test_a_scan_started_at_the_panel_is_published(bench: Make) -> None:
-    made = bench(speed=20.0)
-    peer = made.start()
-    ready(peer, shape=(40, 32))
-    made.at_panel(lambda emulator: emulator.program.start_scan())
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    assert {scan.region for scan in scans(heard)} == {TURNED}
 
 
 @pytest.mark.parametrize("saving", ["afspm", "gxsm"])

@@ -63,37 +63,6 @@ def test_the_setpoint_of_a_frequency_shift_is_in_hertz(tmp_path: Path) -> None:
         studio.set_setpoint_unit("V")
 
 
-def test_one_scan_after_the_other_each_its_own(bench: Make) -> None:
-    made = bench()
-    peer = made.start()
-    ready(peer)
-    files = [scanned(peer)["Height Forward"].filename[-9:] for _ in range(3)]
-    assert files == ["00001.nhf", "00002.nhf", "00003.nhf"]
-
-
-def test_a_scan_that_is_stopped_gives_none(bench: Make) -> None:
-    made = bench(speed=10.0)
-    peer = made.start()
-    ready(peer, shape=(64, 32))
-    assert peer.act(names.START_SCAN).ok
-    assert states(peer.until(ScopeState.SCANNING)) == ["SCANNING"]
-    assert peer.act(names.STOP_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not any(isinstance(one, Scan) for one in heard)
-
-
-@pytest.mark.parametrize("release", [18, 19])
-def test_a_scan_that_begins_at_the_panel_is_published(bench: Make, release: int) -> None:
-    made = bench(speed=20.0, release=release)
-    peer = made.start(release=release)
-    ready(peer, shape=(32, 32))
-    made.at_panel(lambda emulator: emulator.program.start_scan(made.clock.now_s()))
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    assert {scan.region for scan in scans(heard)} == {TURNED}
-
-
 @pytest.mark.parametrize("direction", ["up", "down"])
 def test_lines_come_while_it_scans(bench: Make, direction: str) -> None:
     made = bench(speed=5.0)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 from park_bench import Bench
-from vendor_bench import FLAT, SOON, TURNED, left_in_danger, moved, ready, scanned, scans, small, states
+from vendor_bench import FLAT, SOON, left_in_danger, moved, ready, scanned, scans, small, states
 
-from afspm.model import ControlResponse, Region, Scan, ScopeState, Spectrum, names
+from afspm.model import ControlResponse, Region, ScopeState, Spectrum, names
 
 pytestmark = pytest.mark.slow
 
@@ -74,33 +74,6 @@ def test_what_smartscan_refuses_is_refused_with_its_own_words(bench: Make, varia
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.ACTION_ERROR
     assert "busy with a calibration" in response.reason
-
-
-def test_one_scan_after_the_other_each_its_own(bench: Make) -> None:
-    peer = small(bench())
-    files = [scanned(peer)["Height Forward"].filename.rpartition("SIMULATED")[2] for _ in range(3)]
-    assert files == [f"_{number:04d}_Height_Forward.tiff" for number in (1, 2, 3)]
-
-
-def test_a_scan_that_is_stopped_gives_none(bench: Make) -> None:
-    peer = bench(speed=10.0).start()
-    ready(peer, shape=(64, 32))
-    assert peer.act(names.START_SCAN).ok
-    assert states(peer.until(ScopeState.SCANNING)) == ["SCANNING"]
-    assert peer.act(names.STOP_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not any(isinstance(one, Scan) for one in heard)
-
-
-def test_a_scan_that_begins_at_the_panel_is_published(bench: Make) -> None:
-    made = bench(speed=20.0)
-    peer = made.start()
-    ready(peer, shape=(32, 32))
-    made.at_panel(lambda emulator: emulator.program.start_scan(made.clock.now_s()))
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    assert {scan.region for scan in scans(heard)} == {TURNED}
 
 
 def test_withdrawing_ends_a_scan_and_lifts_the_stage(bench: Make) -> None:
@@ -168,15 +141,6 @@ def test_a_file_that_is_late_is_waited_for(bench: Make, kind: str, state: str) -
     heard = peer.until(FREE)
     assert scans(heard)
     assert states(heard)[-1] == state
-
-
-def test_a_scan_that_does_not_begin_is_refused(bench: Make) -> None:
-    made = bench()
-    peer = small(made)
-    made.strike("scan-refused")
-    response = peer.act(names.START_SCAN)
-    assert response.code == ControlResponse.ACTION_ERROR
-    assert "did not begin the scan" in response.reason
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
