@@ -15,15 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import python_api
-from afspm.microscopes.simulator.faults import Fault
-from afspm.microscopes.simulator.instrument import PanelEvent
 
 from afspm import components
 from afspm.dashboard import Dashboard
 from afspm.gateway import Gateway
 from afspm.logic import arbitration, diagram
-from afspm.microscopes.simulator import Simulator
+from afspm.microscopes.simulator import FAULT_KINDS, Simulator
+from afspm.microscopes.simulator.controller import PanelEvent
 from afspm.simulation.drift import Relaxation
+from afspm.simulation.faults import Fault
 from afspm.simulation.surfaces import KINDS
 from afspm.simulation.world import WorldSettings
 from afspm.testing.commissioning.report import TRIED_ON, InstrumentReport
@@ -99,7 +99,13 @@ def simulator_page() -> str:
     hints = typing.get_type_hints(WorldSettings)
     parts += [_table_page(name, hints[name]) for name in WorldSettings.__dataclass_fields__]
     parts += [_table_page("relaxing, in drift", Relaxation)]
-    parts += [_table_page("each of faults", Fault), _table_page("each of panel", PanelEvent)]
+    kinds = [
+        "| kind | effect |",
+        "| --- | --- |",
+        *(f"| `{kind}` | {does} |" for kind, does in FAULT_KINDS.items()),
+        "",
+    ]
+    parts += [_table_page("each of faults", Fault), *kinds, _table_page("each of panel", PanelEvent)]
     return "\n".join(parts)
 
 
