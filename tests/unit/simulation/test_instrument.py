@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from typing import Any
@@ -339,3 +340,88 @@ def test_what_makes_no_sense_is_refused_before_anything_begins(rig: Instrument, 
             begin()
     assert not rig.busy(clock.t_s)
     assert rig.scan is None
+
+
+def _kept(rig: Instrument) -> Any:
+    return json.loads(json.dumps(rig.state()))
+
+
+def _killed(rig: Instrument) -> Instrument:
+    """Another instrument that goes on from what the first has on disk."""
+    again = Instrument({}, 3, 1000.0)
+    again.setup = rig.setup
+    again.restore(_kept(rig))
+    return again
+
+
+def test_killed_instrument_goes_on_with_its_scan_as_if_nothing_had_happened(rig: Instrument) -> None:
+    rig.pulse(8.0, 0.1, 1000.0)
+    rig.start_scan(1001.0)
+    again = _killed(rig)
+    assert (again.doing(1002.0), again.probe_at(1002.0)) == ("scan", rig.probe_at(1002.0))
+    for instrument in (rig, again):
+        ended = instrument.ended(1010.0)
+        assert ended is instrument.scan
+        assert instrument.ended(1010.0) is None
+    assert rig.scan is not None
+    assert again.scan is not None
+    assert np.array_equal(rig.scan.channels()["Height"][1], again.scan.channels()["Height"][1])
+    for instrument in (rig, again):
+        instrument.start_scan(1020.0)
+    assert (rig.scan.number, again.scan.number) == (2, 2)
+    assert np.array_equal(rig.scan.channels()["Height"][1], again.scan.channels()["Height"][1])
+    assert _kept(rig) == _kept(again)
+
+
+def test_killed_instrument_goes_on_with_whatever_it_did(rig: Instrument) -> None:
+    for now_s, begin, what in (
+        (1000.0, lambda at_s: rig.move_probe((3e-6, 0.0), at_s), "move"),
+        (1010.0, lambda at_s: rig.start_spectrum("force", at_s), "spectrum"),
+        (1020.0, rig.withdraw, "approach"),
+    ):
+        begin(now_s)
+        again = _killed(rig)
+        assert (again.doing(now_s), again.ends_s, again.engaged) == (what, rig.ends_s, rig.engaged)
+        assert again.probe_at(now_s) == rig.probe_at(now_s)
+        if what == "spectrum":
+            assert np.array_equal(rig.spectrum.values, again.spectrum.values)  # type: ignore[union-attr]
+
+
+def test_velocity_that_is_set_during_a_scan_moves_the_rest_of_it_and_outlives_a_kill(rig: Instrument) -> None:
+    rig.setup.upwards = True
+    before = rig.start_scan(1000.0).channels()["Height"][1]
+    rig.follow((1e-7, 0.0), 1002.0)  # after four of eight lines
+    again = _killed(rig)
+    for instrument in (rig, again):
+        assert instrument.scan is not None
+        after = instrument.scan.channels()["Height"][1]
+        change_m = np.abs(after - before)
+        assert change_m[:3].max() < 0.1 * change_m[5:].max()
+    assert rig.world.sample.compensation.at(1100.0)[0] == pytest.approx(again.world.sample.compensation.at(1100.0)[0])
+
+
+def test_feedback_that_is_set_during_a_scan_is_in_force_from_the_next_line_on(rig: Instrument) -> None:
+    before = rig.start_scan(1000.0).channels()["Amplitude"][1]
+    rig.setup.feedback = replace(rig.setup.feedback, setpoint=0.3)
+    rig.adjust(1002.0)
+    assert rig.scan is not None
+    after = rig.scan.channels()["Amplitude"][1]
+    assert np.array_equal(before[:4], after[:4])
+    assert np.median(after[4:]) == pytest.approx(0.3, abs=0.05)
+    assert np.median(before[4:]) == pytest.approx(0.7, abs=0.05)
+
+
+def test_events_are_noted_with_the_truth(clock: Any) -> None:
+    noted: list[tuple[float, str, bool]] = []
+    rig = Instrument(
+        {}, 3, clock.t_s, note=lambda time_s, event, facts: noted.append((time_s, event, "drift_m" in facts["truth"]))
+    )
+    rig.setup.shape, rig.setup.line_s = (4, 4), 0.5
+    rig.start_scan(1000.0)
+    rig.stop_scan(1001.0)
+    rig.start_spectrum("IV", 1002.0)
+    rig.stop_spectrum(1003.0)
+    rig.pulse(8.0, 0.1, 1004.0)
+    rig.crash(1e-9, 1e-8, 1005.0)
+    events = ("scan starts", "scan stopped", "spectrum starts", "spectrum stopped", "pulse", "crash")
+    assert noted == [(1000.0 + number, event, True) for number, event in enumerate(events)]
