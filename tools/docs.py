@@ -22,11 +22,11 @@ from afspm.logic.arbitration import RoleTable
 from afspm.logic.envelopes import CacheRule, CacheSettings
 from afspm.logic.limits import Limit
 from afspm.logic.settings import ControlSettings
-from afspm.microscopes.simulator import Simulator
-from afspm.microscopes.simulator.faults import Fault
-from afspm.microscopes.simulator.instrument import PanelEvent
+from afspm.microscopes.simulator import FAULT_KINDS, Simulator
+from afspm.microscopes.simulator.controller import PanelEvent
 from afspm.model import Role
 from afspm.simulation.drift import Relaxation
+from afspm.simulation.faults import Fault
 from afspm.simulation.surfaces import KINDS
 from afspm.simulation.world import WorldSettings
 from afspm.testing.commissioning.report import TRIED_ON, InstrumentReport
@@ -123,7 +123,13 @@ def simulator_page() -> str:
     hints = typing.get_type_hints(WorldSettings)
     parts += [_table_page(name, hints[name]) for name in WorldSettings.__dataclass_fields__]
     parts += [_table_page("relaxing, in drift", Relaxation)]
-    parts += [_table_page("each of faults", Fault), _table_page("each of panel", PanelEvent)]
+    kinds = [
+        "| kind | effect |",
+        "| --- | --- |",
+        *(f"| `{kind}` | {does} |" for kind, does in FAULT_KINDS.items()),
+        "",
+    ]
+    parts += [_table_page("each of faults", Fault), *kinds, _table_page("each of panel", PanelEvent)]
     return "\n".join(parts)
 
 

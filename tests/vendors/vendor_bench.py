@@ -21,7 +21,6 @@ from hosts import host
 from afspm import wire
 from afspm.clock import ExperimentClock
 from afspm.emulators.emulator import Emulator
-from afspm.emulators.faults import Fault
 from afspm.exit_codes import ExitCode
 from afspm.launch import Launch, Sockets
 from afspm.model import (
@@ -38,6 +37,7 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
+from afspm.simulation.faults import Fault
 from afspm.supervisor.ports import FreePorts
 
 DEADLINE_S = 30.0

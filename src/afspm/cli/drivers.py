@@ -188,7 +188,7 @@ def _emulate(emulator: Emulator, speed: float, folder: Path) -> None:
 
 
 def _described(name: str, class_: type[Emulator]) -> str:
-    faults = "".join(f"\n    {kind:20} {does}" for kind, does in class_.fault_kinds.items())
+    faults = "".join(f"\n    {kind:20} {does}" for kind, does in class_.all_faults().items())
     return f"{name}: {class_.vendor}{faults}"
 
 

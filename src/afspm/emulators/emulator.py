@@ -16,12 +16,14 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from afspm.addresses import Listens
 from afspm.clock import Clock, ExperimentClock
-from afspm.emulators.faults import Fault, Faults
-from afspm.emulators.rig import Rig
 from afspm.errors import AfspmError, ErrorCollector, TransportError
 from afspm.exit_codes import ExitCode
 from afspm.plain_data import PlainMapping
+from afspm.process.background import in_background
 from afspm.requirements import require
+from afspm.simulation.faults import Fault, Faults
+from afspm.simulation.instrument import Instrument
+from afspm.simulation.truth import Truth
 from afspm.translator.emulated_controller import AddressNotice, notice_file
 from afspm.transport.polling import WakeUp
 from afspm.transport.port import Killed
@@ -94,7 +96,7 @@ class Emulator(ABC):
     usual: ClassVar[PlainMapping] = {}
     """Settings by which it is found where the vendor's own controller is: for `afspm emulate` alone, and on request."""
     fault_kinds: ClassVar[Mapping[str, str]] = {}
-    """Every fault that can be had, with what it does."""
+    """The faults of the maker's program, with the effect of each; `all_faults` has those of all emulators, too."""
 
     modes: ClassVar[Sequence[str]] = ("amplitude", "current", "frequency-shift")
     """Of the simulated feedback: those that the controller has."""
@@ -107,7 +109,7 @@ class Emulator(ABC):
     clock: Clock
     log: logging.Logger
     folder: Path
-    rig: Rig
+    rig: Instrument
     faults: Faults
     woken: WakeUp[None]
     listening: Callable[[str], None]
@@ -144,8 +146,13 @@ class Emulator(ABC):
             world = World.from_settings(self._world_settings, self.seed, 0.0)
             one_of(world.settings.feedback.mode, self.modes, "feedback.mode")
         with errors:
-            Faults(self._faults, self.fault_kinds, 0.0)
+            Faults(self._faults, self.all_faults(), 0.0)
         errors.raise_all()
+
+    @classmethod
+    def all_faults(cls) -> dict[str, str]:
+        """Return every fault that there is, with its effect: those of the class, and those of all emulators."""
+        return {**cls.fault_kinds, "hang": "the whole program hangs for the duration (real time)"}
 
     # -- what one writes
 
@@ -180,7 +187,7 @@ class Emulator(ABC):
 
     def abandon(self) -> None:
         """Give up what goes on, after `tick` or `serve` has raised. Extend it where more than the rig is busy."""
-        self.rig.abandon()
+        self.rig.abandon(self.clock.now_s())
 
     # -- what is there for it
 
@@ -221,8 +228,9 @@ class Emulator(ABC):
             TransportError: another program listens at its port.
         """
         self.clock, self.folder, self.log, self.listening = clock, folder, log, listening
-        self.rig = Rig(self._world_settings, self.seed, clock)
-        self.faults = Faults(self._faults, self.fault_kinds, clock.now_s())
+        truth = Truth(folder / "truth.jsonl")
+        self.rig = Instrument(self._world_settings, self.seed, clock.now_s(), run=in_background, note=truth.note)
+        self.faults = Faults(self._faults, self.all_faults(), clock.now_s())
         folder.mkdir(parents=True, exist_ok=True)
         self.woken = WakeUp()
         self.rig.drawing.wake, self.rig.drawing.log = self.woken.post, log
@@ -350,6 +358,10 @@ class Emulator(ABC):
     def _wait_s(self) -> float:
         """Real seconds until something happens by itself."""
         self._look_for_button()
+        hang = self.faults.strikes("hang", self.clock.now_s())
+        if hang is not None:
+            self.log.warning("an emulated fault: %s", hang)
+            self._stop.wait(hang.duration_s)
         now_s = self.clock.now_s()
         times = (self._survive(self.tick, now_s), self.rig.next_change_s(now_s), self.faults.next_s(now_s))
         due_s = min((at_s for at_s in times if at_s is not None), default=math.inf)

@@ -7,23 +7,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
-from afspm.emulators.activities import ScanActivity, SpectrumActivity
-from afspm.emulators.faults import Faults
+from afspm.clock import Clock
 from afspm.emulators.pending_writes import PendingWrites
-from afspm.emulators.rig import Rig, RigBusy
 from afspm.errors import AfspmError
-
-PROGRAM_FAULTS: Final = {
-    "scan-refused": "a scan does not begin, without an error",
-    "spectrum-refused": "a curve does not begin, without an error",
-    "stopped": "a scan is stopped at the panel",
-    "withdrawn": "the tip is withdrawn at the panel during a scan, which ends",
-    "no-file": "a scan or curve is not saved",
-    "late-file": "a file appears only after the duration",
-    "half-file": "the second half of a file appears only after the duration",
-}
+from afspm.simulation.activities import ScanActivity, SpectrumActivity
+from afspm.simulation.faults import Faults
+from afspm.simulation.instrument import Instrument, InstrumentBusy
 
 NamedFile = tuple[str, bytes]
 """The name of a file and its content."""
@@ -44,10 +34,19 @@ class MakerProgram(ABC):
     """
 
     def __init__(
-        self, rig: Rig, faults: Faults, folder: Path, log: logging.Logger, *, start_s: float, file_s: float
+        self,
+        rig: Instrument,
+        faults: Faults,
+        clock: Clock,
+        folder: Path,
+        log: logging.Logger,
+        *,
+        start_s: float,
+        file_s: float,
     ) -> None:
         self.rig = rig
         self.faults = faults
+        self.clock = clock
         self.folder = folder
         self.repeats = self.saves_partial = False
         self._log = log
@@ -79,6 +78,11 @@ class MakerProgram(ABC):
     # -- what goes on
 
     @property
+    def now_s(self) -> float:
+        """Experiment time."""
+        return self.clock.now_s()
+
+    @property
     def scanning(self) -> bool:
         """True from the command to scan to the end of the scan."""
         return self._scan is not None or math.isfinite(self._starts_at_s)
@@ -102,10 +106,10 @@ class MakerProgram(ABC):
         """Advance to now; return when something else happens, besides what the rig knows of itself."""
         if self._engages and not self.rig.busy(now_s):
             self._engages = False
-            self.rig.engage()
+            self.rig.engage(now_s)
         if now_s >= self._starts_at_s and not self.rig.busy(now_s):
             self._starts_at_s = math.inf
-            self._begin_scan()
+            self._begin_scan(now_s)
         if self._scan is not None:
             self._watch_scan(self._scan, now_s)
         if self._curve is not None and not self._curve.running(now_s):
@@ -115,7 +119,7 @@ class MakerProgram(ABC):
         return min((at_s for at_s in (due_s, self._starts_at_s) if at_s is not None and at_s > now_s), default=None)
 
     def start_scan(self, now_s: float) -> None:
-        """Begin a scan. Raises RigBusy."""
+        """Begin a scan. Raises InstrumentBusy."""
         self._refuse_busy()
         if not self.faults.strikes("scan-refused", now_s):
             self._starts_at_s = now_s + self._start_s
@@ -125,41 +129,41 @@ class MakerProgram(ABC):
         self._starts_at_s = math.inf
         ended, self._scan = self._scan, None
         if ended is not None:
-            self.rig.stop_scan()
+            self.rig.stop_scan(now_s)
             if self.saves_partial:
                 self._save(self.scan_files(ended, now_s), now_s)
 
     def start_curve(self, kind: str, now_s: float) -> None:
-        """Take a curve where the tip is. Raises RigBusy, InvalidValue."""
+        """Take a curve where the tip is. Raises InstrumentBusy, InvalidValue."""
         self._refuse_busy()
         if not self.faults.strikes("spectrum-refused", now_s):
             self.prepare_curve()
-            self._curve = self.rig.start_spectrum(kind)
+            self._curve = self.rig.start_spectrum(kind, now_s)
 
     def stop_curve(self) -> None:
         """Break the curve off."""
         if self._curve is not None:
             self._curve = None
-            self.rig.stop_spectrum()
+            self.rig.stop_spectrum(self.now_s)
 
     def engage(self) -> None:
-        """Bring the tip to the sample, once it has finished going away. Raises RigBusy."""
+        """Bring the tip to the sample, once it has finished going away. Raises InstrumentBusy."""
         if self.scanning or self.measuring_curve:
-            raise RigBusy("a measurement is running")
+            raise InstrumentBusy("a measurement is running")
         self._engages = True
 
     def stop_engaging(self) -> None:
         """Leave the tip where it is on its way to the sample: away from it."""
-        if self._engages or self.rig.doing(self.rig.clock.now_s()) == "approach":
+        if self._engages or self.rig.doing(self.now_s) == "approach":
             self._engages = False
-            self.rig.stop("approach")
+            self.rig.stop("approach", self.now_s)
             self.rig.engaged = False
 
     def withdraw(self, now_s: float) -> None:
         """End what goes on, and take the tip away from the sample."""
         self.stop_scan(now_s)
         self._engages, self._curve = False, None
-        self.rig.withdraw()
+        self.rig.withdraw(now_s)
 
     def abandon(self) -> None:
         """Forget what goes on, as an error that nobody foresaw ended it."""
@@ -168,15 +172,15 @@ class MakerProgram(ABC):
     # -- inside
 
     def _refuse_busy(self) -> None:
-        doing = "scan" if self.scanning else self.rig.doing(self.rig.clock.now_s())
+        doing = "scan" if self.scanning else self.rig.doing(self.now_s)
         if doing or self._engages:
-            raise RigBusy(f"the instrument is busy with a {doing or 'approach'}")
+            raise InstrumentBusy(f"the instrument is busy with a {doing or 'approach'}")
 
-    def _begin_scan(self) -> None:
+    def _begin_scan(self, now_s: float) -> None:
         """Begin the scan; with values that no scan can be taken with, it ends as if stopped at the panel."""
         try:
             self.prepare_scan()
-            self._scan = self.rig.start_scan()
+            self._scan = self.rig.start_scan(now_s)
         except (AfspmError, ArithmeticError, ValueError) as error:
             self._log.warning("the scan was interrupted: %s", error)
 

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Protocol
 
 from afspm.emulators.emulator import Crashed, Emulator
-from afspm.emulators.program import PROGRAM_FAULTS, MakerProgram
+from afspm.emulators.program import MakerProgram
 from afspm.errors import AfspmError
+from afspm.simulation.faults import INSTRUMENT_FAULTS
 
 SCRIPT_FAULTS: Final = {
     "no-reply": "a script is run but not answered",
@@ -28,7 +29,7 @@ SCRIPT_FAULTS: Final = {
     "dialog": "a dialog waits on the screen: nothing is answered for the duration",
     "restart": "the program closes its socket, and opens it again after the duration",
     "crash": "the program vanishes",
-    **PROGRAM_FAULTS,
+    **INSTRUMENT_FAULTS,
 }
 
 Client = Hashable

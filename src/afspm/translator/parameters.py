@@ -66,11 +66,9 @@ class ParameterSpec:
 
     @property
     def si_unit(self) -> str:
-        """The unit of the value inside: SI, but where it depends on the operating mode (the setpoint), the row's."""
-        if self.name in names.BASE_PARAMETERS:
-            si = names.BASE_PARAMETERS[self.name]
-            return self.unit if si is None else si
-        return units.si_unit(self.unit)
+        """The SI unit of the value inside. Of the setpoint, whose kind the operating mode decides, the row has it."""
+        si = names.BASE_PARAMETERS.get(self.name)
+        return units.si_unit(self.unit) if si is None else si
 
     @property
     def wire_unit(self) -> str:

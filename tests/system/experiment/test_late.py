@@ -21,7 +21,7 @@ component = true
 class = "Simulator"
 surface = "flat"
 initial = {{ scan-speed = "40 um/s" }}
-faults = [{{ kind = "slow", count = 1000, duration_s = 0.9 }}]  # real seconds: nine minutes of the experiment
+faults = [{{ kind = "late-reply", count = 1000, duration_s = 0.9 }}]  # real seconds: nine minutes of the experiment
 
 [scheduler]
 component = true
@@ -50,7 +50,7 @@ def test_scans_are_missed_only_where_the_clock_does_not_wait(afspm_run: Run, tmp
 
 
 JUDGED = (
-    NIGHT.replace('faults = [{{ kind = "slow", count = 1000, duration_s = 0.9 }}]', "")
+    NIGHT.replace('faults = [{{ kind = "late-reply", count = 1000, duration_s = 0.9 }}]', "")
     + """
 [judge]
 component = true

@@ -41,7 +41,7 @@ def test_faults_on_demand_are_not_there_unless_wanted(run: Any) -> None:
 
 def test_slow_answers_come_late(faulty: Any) -> None:
     peer = faulty.peer().ready()
-    demand(peer, "slow", count=2, duration_s=1.0)
+    demand(peer, "late-reply", count=2, duration_s=1.0)
     for _ in range(2):
         began_s = time.monotonic()
         assert peer.ask_frames(get_speed(), 10)[0] == b"\0"
@@ -53,7 +53,7 @@ def test_slow_answers_come_late(faulty: Any) -> None:
 
 def test_a_lost_answer_was_carried_out_and_is_given_when_asked_again(faulty: Any) -> None:
     peer = faulty.peer().ready()
-    demand(peer, "lose")
+    demand(peer, "no-reply")
     scan = [b"\1", control_pb2.ActionMsg(action=START_SCAN).SerializeToString(), b"me/1/scan"]
     assert peer.ask_frames(scan, 0.5) is None
     assert peer.ask_frames(scan, 10)[0] == b"\0"
@@ -64,7 +64,7 @@ def test_a_lost_answer_was_carried_out_and_is_given_when_asked_again(faulty: Any
 
 def test_refusals_end_after_their_number(faulty: Any) -> None:
     peer = faulty.peer().ready()
-    demand(peer, "refuse", count=2)
+    demand(peer, "error", count=2)
     assert [peer.act(START_SCAN), peer.act(START_SCAN), peer.act(START_SCAN)] == [FAILURE, FAILURE, OK]
 
 

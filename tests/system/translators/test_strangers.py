@@ -53,9 +53,9 @@ def test_no_byte_reaches_who_has_the_vendors_usual_port(
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Gxsm4's shared memory is there on Linux alone")
 def test_no_call_reaches_the_shared_memory_of_a_gxsm_that_is_not_the_emulated_one(tmp_path: Path) -> None:
     from afspm.clock import ExperimentClock
-    from afspm.emulators.faults import Faults
     from afspm.emulators.gxsm import GxsmEmulator
     from afspm.emulators.gxsm.block import SharedMemoryBlock
+    from afspm.simulation.faults import Faults
 
     name = GxsmEmulator.usual["block"]
     if Path("/dev/shm", name).exists():

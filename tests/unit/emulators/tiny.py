@@ -45,7 +45,7 @@ class Tiny(Emulator):
             return
         if asked == "scan":
             self.rig.setup.shape, self.rig.setup.line_s = (2, 2), 10.0
-            self.rig.start_scan()
+            self.rig.start_scan(now_s)
         assert self._client is not None
         self._client.sendall(f"{self.release} {self.rig.doing(now_s)}\n".encode())
 

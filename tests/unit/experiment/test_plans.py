@@ -108,6 +108,14 @@ def test_a_duration_of_the_microscope_is_not_below_zero(write: Write, setting: s
     assert error.place.line == line_of(experiment, setting.split(" ")[0])
 
 
+@pytest.mark.parametrize("maker", ["Asylum", "Gxsm", "Nanonis", "Nanosurf", "Park"])
+def test_a_controller_is_not_looked_at_without_a_pause(write: Write, maker: str) -> None:
+    microscope = SIMULATED.replace("Simulator", maker)
+    assert maker in microscope
+    experiment = write("", frame=microscope + 'poll_period_s = "0 s"\n')
+    assert any(error.place.line == line_of(experiment, "poll_period_s") for error in errors(experiment))
+
+
 def test_a_tip_is_treated_within_the_limits(write: Write) -> None:
     corrector = '[repair]\ncomponent = true\nclass = "TipCorrector"\nworkshop_center = ["3 um", "0 um"]\n'
     error = only_error(write(corrector + REGION, frame=SIMULATED))

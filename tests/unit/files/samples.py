@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
 
-from afspm.emulators.activities import ScanActivity, SpectrumActivity
 from afspm.emulators.park import files as park
 from afspm.model import Feedback, Region, Spectrum
+from afspm.simulation.activities import ScanActivity, SpectrumActivity
 from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
@@ -217,9 +216,8 @@ def nid() -> bytes:
 
 
 def park_image() -> bytes:
-    drawn: Future[DrawnScan] = Future()
-    drawn.set_result(DrawnScan())
-    scan = ScanActivity(1, REGION, (NY, NX), 0.0, 0.5, True, Feedback(setpoint=0.7), 0.2, _drawn=drawn)
+    scan = ScanActivity(1, REGION, (NY, NX), 0.0, 0.5, True, Feedback(setpoint=0.7), 0.2)
+    scan.draw(DrawnScan())
     return next(content for _, content in park.images(scan, END_NS / 1e9, "NCM"))
 
 

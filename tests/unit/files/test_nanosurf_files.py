@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 import afspm
-from afspm.clock import ExperimentClock
-from afspm.emulators.activities import SpectrumActivity
 from afspm.emulators.nanosurf import files
-from afspm.emulators.rig import Rig
 from afspm.errors import FileError
 from afspm.model import Region
+from afspm.simulation.activities import SpectrumActivity
+from afspm.simulation.instrument import Instrument
 
 pytest.importorskip("h5py")
 NSFOPEN = importlib.util.find_spec("NSFopen")
@@ -28,13 +27,16 @@ def example(name: str) -> Path:
     return path
 
 
-def scanned(folder: Path, *, upwards: bool = True) -> tuple[Path, Rig]:
+START_S = 1.7e9
+
+
+def scanned(folder: Path, *, upwards: bool = True) -> tuple[Path, Instrument]:
     """A file of the emulator, and the instrument that it was scanned with."""
-    rig = Rig({"surface": "steps"}, 3, ExperimentClock.starting_now(speed=1e4), background=False)
+    rig = Instrument({"surface": "steps"}, 3, START_S)
     rig.setup.region, rig.setup.shape = Region((40e-9, -25e-9), (300e-9, 100e-9), np.deg2rad(30)), (6, 10)
     rig.setup.upwards = upwards
     path = folder / "scan.nhf"
-    path.write_bytes(files.image(rig.start_scan(), 1.7e9, "dynamic_mode"))
+    path.write_bytes(files.image(rig.start_scan(START_S), 1.7e9, "dynamic_mode"))
     return path, rig
 
 
@@ -62,7 +64,7 @@ def test_nsfopen_reads_the_same_heights_and_curves(tmp_path: Path) -> None:
     for way, suffix in (("Forward", ""), ("Backward", " Retrace")):
         heights = rig.scan.channels()[f"Height{suffix}"][1]
         np.testing.assert_allclose(np.asarray(data[way]["Height"], float), heights, atol=1e-9 * np.ptp(heights))
-    taken = Rig({"surface": "steps"}, 3, ExperimentClock.starting_now()).start_spectrum("force")
+    taken = Instrument({"surface": "steps"}, 3, START_S).start_spectrum("force", START_S)
     path = tmp_path / "curve.nhf"
     path.write_bytes(files.curves([taken], (1, 1), 1.7e9, "dynamic_mode"))
     data = reading.read(str(path)).data["Image"]
@@ -72,9 +74,9 @@ def test_nsfopen_reads_the_same_heights_and_curves(tmp_path: Path) -> None:
 
 
 def test_lines_that_were_not_scanned_are_missing(tmp_path: Path) -> None:
-    rig = Rig({"surface": "steps"}, 3, ExperimentClock.starting_now(), background=False)
+    rig = Instrument({"surface": "steps"}, 3, START_S)
     rig.setup.shape = (6, 10)
-    scan = rig.start_scan()
+    scan = rig.start_scan(START_S)
     scan.stopped_s = scan.start_s + 2.5 * scan.line_s
     path = tmp_path / "partial.nhf"
     path.write_bytes(files.image(scan, scan.stopped_s, "dynamic_mode"))
@@ -82,8 +84,8 @@ def test_lines_that_were_not_scanned_are_missing(tmp_path: Path) -> None:
 
 
 def test_a_curve_goes_there_and_back(tmp_path: Path) -> None:
-    rig = Rig({"surface": "steps"}, 3, ExperimentClock.starting_now())
-    taken: SpectrumActivity = rig.start_spectrum("force")
+    rig = Instrument({"surface": "steps"}, 3, START_S)
+    taken: SpectrumActivity = rig.start_spectrum("force", START_S)
     path = tmp_path / "curve.nhf"
     path.write_bytes(files.curves([taken], (1, 1), 1.7e9, "dynamic_mode"))
     (curve,) = afspm.read(path).spectra

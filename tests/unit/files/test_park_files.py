@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import shutil
 import subprocess
-from concurrent.futures import Future
 from pathlib import Path
 
 import gwyfile
@@ -14,10 +13,10 @@ import pytest
 from PIL import Image
 
 import afspm
-from afspm.emulators.activities import RETRACE, ScanActivity, SpectrumActivity
 from afspm.emulators.park import files
 from afspm.errors import FileError
 from afspm.model import Feedback, Region
+from afspm.simulation.activities import RETRACE, ScanActivity, SpectrumActivity
 
 REGION = Region((1e-6, -2e-6), (3e-6, 1.5e-6), math.radians(30))
 HEIGHTS = np.arange(240.0).reshape(12, 20) * 1e-9
@@ -32,9 +31,8 @@ class Drawn:
 @pytest.fixture
 def written(tmp_path: Path) -> dict[str, Path]:
     """The files of a scan, by channel and direction."""
-    drawn: Future[Drawn] = Future()
-    drawn.set_result(Drawn())
-    scan = ScanActivity(1, REGION, (12, 20), 0.0, 0.5, True, Feedback(setpoint=0.7), 0.2, _drawn=drawn)
+    scan = ScanActivity(1, REGION, (12, 20), 0.0, 0.5, True, Feedback(setpoint=0.7), 0.2)
+    scan.draw(Drawn())
     for name, content in files.images(scan, 1.7e9, "NCM"):
         (tmp_path / f"{name}.tiff").write_bytes(content)
     return {path.stem: path for path in tmp_path.glob("*.tiff")}

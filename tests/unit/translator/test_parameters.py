@@ -13,7 +13,7 @@ from afspm.errors import ConfigError, Refused
 from afspm.microscopes.asylum import Asylum
 from afspm.microscopes.gxsm import Gxsm
 from afspm.microscopes.nanonis import Nanonis
-from afspm.microscopes.simulator import Simulator
+from afspm.microscopes.simulator import FAULT_KINDS, Simulator
 from afspm.model import names
 from afspm.translator import Driver, ParameterSpec, ParameterTable, Value
 
@@ -103,6 +103,17 @@ def test_the_simulator_has_every_base_parameter_and_the_right_unit_for_its_mode(
     assert Simulator(surface="lattice").table[names.ZCTRL_SETPOINT].unit == "A"
 
 
+def test_the_setpoint_of_a_current_is_in_si_whatever_the_controller_has() -> None:
+    row = ParameterTable.from_toml(Gxsm.parameters_file)[names.ZCTRL_SETPOINT]
+    assert (row.unit, row.si_unit) == ("nA", "A")
+    assert row.parse("500", "pA") == pytest.approx(5e-10)
+    assert row.to_vendor(5e-10) == pytest.approx(0.5)
+
+
+def test_the_simulators_faults_are_those_that_can_be_demanded() -> None:
+    assert Simulator(fault_action=True).table["x-fault-kind"].choices == tuple(FAULT_KINDS)
+
+
 @pytest.mark.parametrize(
     "settings",
     [
@@ -111,7 +122,7 @@ def test_the_simulator_has_every_base_parameter_and_the_right_unit_for_its_mode(
         {"initial": {"scan-speed": "1 V"}},
         {"initial": {"scan-sped": 1}},
         {"faults": [{"kind": "explode"}]},
-        {"faults": [{"kind": "slow", "when": 3}]},
+        {"faults": [{"kind": "crash", "when": 3}]},
         {"panel": [{"at_s": 1.0, "set": {"scan-sped": 1}}]},
         {"panel": [{"at_s": 1.0, "action": "x-dance"}]},
     ],

@@ -91,14 +91,6 @@ def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, direction: 
     assert read(scans["HeightTrace"].filename).upwards is (direction == "up")
 
 
-def test_one_scan_after_the_other_each_its_own(bench: Make) -> None:
-    made = bench()
-    peer = made.start()
-    ready(peer)
-    files = [scanned(peer)["HeightTrace"].filename for _ in range(3)]
-    assert [Path(name).name for name in files] == ["Image0000.ibw", "Image0001.ibw", "Image0002.ibw"]
-
-
 def test_a_scan_that_is_stopped_gives_none_and_leaves_the_tip_withdrawn(bench: Make) -> None:
     made = bench(speed=10.0, saves_partial=True)
     peer = made.start()
@@ -542,8 +534,8 @@ def test_a_force_curve_that_somebody_takes_is_published_with_the_place_of_its_fi
     made = bench(speed=2.0)
     peer = made.start()
     peer.until(FREE)
-    made.at_panel(lambda emulator: emulator.rig.move_probe((20e-9, 30e-9)))
-    made.at_panel(lambda emulator: emulator.rig.stop_move())
+    made.at_panel(lambda emulator: emulator.rig.move_probe((20e-9, 30e-9), emulator.clock.now_s()))
+    made.at_panel(lambda emulator: emulator.rig.stop_move(emulator.clock.now_s()))
     x, y = made.emulator.rig.probe_m
     made.at_panel(lambda emulator: emulator.controller.curve(made.clock.now_s()))
     peer.until(ScopeState.SPEC)
@@ -559,7 +551,7 @@ def test_a_pulse_is_a_bias_that_is_put_back(bench: Make, monkeypatch: pytest.Mon
     peer = made.start()
     ready(peer)
     pulses: list[tuple[float, float]] = []
-    monkeypatch.setattr(made.emulator.rig, "pulsed", lambda *pulse: pulses.append(pulse))
+    monkeypatch.setattr(made.emulator.rig, "pulsed", lambda *pulse: pulses.append(pulse[:2]))
     assert peer.set(names.TIP_BIAS_VOLTAGE, 0.5).ok
     assert peer.set(names.PULSE_VOLTAGE, -4.5).ok
     assert peer.set(names.PULSE_DURATION, "300", "ms").ok
@@ -587,7 +579,7 @@ def test_a_crash_is_an_indentation_that_is_not_saved(bench: Make, monkeypatch: p
     )
     ready(peer)
     crashes: list[tuple[float, float]] = []
-    monkeypatch.setattr(made.emulator.rig, "crash", lambda *crash: crashes.append(crash))
+    monkeypatch.setattr(made.emulator.rig, "crash", lambda *crash: crashes.append(crash[:2]))
     assert peer.set(names.CRASH_DEPTH, 2, "um").ok
     assert peer.set(names.CRASH_SPEED, 5, "um/s").ok
     assert peer.act(names.CRASH).ok

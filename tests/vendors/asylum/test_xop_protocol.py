@@ -14,8 +14,8 @@ import zmq
 from igor_test_functions import WithTestFunctions
 
 from afspm.clock import ExperimentClock
-from afspm.emulators.faults import Fault
 from afspm.microscopes.asylum import xop
+from afspm.simulation.faults import Fault
 
 CALLS = json.loads(Path(__file__).with_name("xop_calls.json").read_text())
 PATIENCE_MS = 10_000

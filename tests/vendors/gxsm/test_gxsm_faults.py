@@ -235,7 +235,7 @@ def stopped_at_panel(made: Bench, peer: Peer) -> None:
 def until_line(made: Bench, peer: Peer, line: int) -> None:
     """Until so many lines of the running scan are complete."""
     until_s = made.clock.now_s() + 60.0
-    last = made.emulator.program.last
+    last = made.emulator.program.scan.activity
     assert last is not None
     while last.lines_done(made.clock.now_s()) < line and made.clock.now_s() < until_s:
         peer.get(names.SPEC_KIND)
@@ -325,7 +325,7 @@ def test_a_scan_stopped_while_the_translator_is_down_is_not_published(bench: Mak
     peer.until(ScopeState.SCANNING)
     until_line(made, peer, 2)
     made.kill()
-    made.at_panel(lambda emulator: emulator.rig.stop_scan())
+    made.at_panel(lambda emulator: emulator.rig.stop_scan(emulator.clock.now_s()))
     peer = made.start()
     heard = peer.until(FREE)
     assert "INTERRUPTED" in states(heard)
@@ -337,7 +337,7 @@ def test_slow_lines_of_gxsms_simulator_are_scanned_to_their_end(bench: Make) -> 
     peer = small(made)
     assert peer.set("x-pixel-rate", 50).ok
     assert scanned(peer)
-    last = made.emulator.program.last
+    last = made.emulator.program.scan.activity
     assert last is not None
     assert last.line_s > 0.2
 
@@ -405,10 +405,10 @@ def test_a_gxsm_that_names_its_channels_only_once_it_scans(bench: Make) -> None:
 
 
 def _named_late(program: GxsmProgram) -> Callable[[float], list[Path]]:
-    names, first = program.names, program.last
+    names, first = program.names, program.scan.activity
 
     def late(now_s: float) -> list[Path]:
-        return [] if program.last is first else names(now_s)
+        return [] if program.scan.activity is first else names(now_s)
 
     return late
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm.emulators.faults import Faults
 from afspm.emulators.gxsm import files
 from afspm.emulators.gxsm.channels import CHANNELS
 from afspm.emulators.gxsm.file_writer import FAULT_KINDS, GxsmFileWriter
 from afspm.files import netcdf, read
+from afspm.simulation.faults import Faults
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "gxsm"
 REAL = {

@@ -22,10 +22,10 @@ from raw_clients import MemoryClient, SocketClient, client
 from vendor_bench import DEADLINE_S
 
 from afspm.emulators.emulator import Crashed
-from afspm.emulators.faults import Faults
 from afspm.emulators.gxsm.block import FAULT_KINDS, SharedMemoryBlock
 from afspm.emulators.gxsm.file_writer import GxsmFileWriter
 from afspm.files import read
+from afspm.simulation.faults import Faults
 
 Make = Callable[..., Bench]
 KINDS: list[dict[str, Any]] = [{"version": 3}, {"version": 4}, {"version": 4, "transport": "shm"}]
@@ -81,7 +81,7 @@ def test_a_scan_from_first_to_last(bench: Make, kind: dict[str, Any]) -> None:
         gxsm.call("action", "UNCHECK-MainAutoSave")
         assert gxsm.call("startscan") == 0
         until(made, lambda: bool(bits(gxsm) & 2))
-        scanning = made.emulator.program.last
+        scanning = made.emulator.program.scan.activity
         assert scanning is not None
         assert made.clock.now_s() >= scanning.start_s + 0.15, "it takes a moment to be seen"
         gxsm.call("set", "RangeX", "2000")
@@ -165,7 +165,7 @@ def test_names_are_those_of_old_files_until_it_has_saved(bench: Make) -> None:
         until(made, lambda: len(list(made.data.glob("*.nc"))) == 6)
         gxsm.call("startscan")
         saved = name(0)
-        started = made.emulator.program.last
+        started = made.emulator.program.scan.activity
         assert started is not None
         assert saved == "scan003-M-Xp-ZSmTopo.nc" or made.clock.now_s() > started.start_s + 0.04
         until(made, lambda: name(0) == "scan004-M-Xp-ZSmTopo.nc")
@@ -320,7 +320,7 @@ def test_the_bridge_does_nothing_for_who_does_not_know_the_secret(bench: Make, s
             assert stranger.recv(1000) == b"", "no answer"
     with calling(made) as gxsm:
         assert gxsm.call("get", "RangeX") == 1e4
-    assert made.emulator.program.auto_save
+    assert made.emulator.program.panel.auto_save
 
 
 @pytest.mark.parametrize("line", [b"Host: x", b"{}", b"[]", b"[1]", b'["get", {}]', b"[" * 9000, b"\xff"])

@@ -26,7 +26,7 @@ class Emulated(AtPanel, NanonisEmulator):
     def tick(self, now_s: float) -> float | None:
         scanning = self.software.scans.running
         if self.ends_as_awaited and scanning is not None and self._waits_for("Scan.WaitEndOfScan"):
-            scanning.scan._paused_s = -1e6  # all of it is behind
+            scanning.scan.paused_s = -1e6  # all of it is behind
         next_s = super().tick(now_s)
         if self.software.scans.ends:
             self.scan_ended.set()

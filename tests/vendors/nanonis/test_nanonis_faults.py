@@ -83,7 +83,7 @@ def test_what_it_refuses_is_refused_with_its_own_words(bench: Make) -> None:
 def test_a_spectrum_that_is_refused_is_an_error_at_once(bench: Make) -> None:
     made = bench()
     peer = small(made)
-    made.at_panel(lambda emulator: emulator.rig.occupy("something else", 1e6))
+    made.at_panel(lambda emulator: emulator.rig.occupy("something else", 1e6, emulator.clock.now_s()))
     response = peer.act(names.START_SPEC)
     assert response.code == ControlResponse.ACTION_ERROR
     assert "something else" in response.reason

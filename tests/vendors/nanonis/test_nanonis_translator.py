@@ -76,27 +76,6 @@ def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, direction: 
         assert read(file).upwards is (direction == "up")
 
 
-def test_a_scan_that_is_stopped_gives_none(bench: Make) -> None:
-    made = bench(speed=10.0)
-    peer = made.start()
-    ready(peer, shape=(64, 32))
-    assert peer.act(names.START_SCAN).ok
-    assert states(peer.until(ScopeState.SCANNING)) == ["SCANNING"]
-    assert peer.act(names.STOP_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not any(isinstance(one, Scan) for one in heard)
-    assert peer.act(names.STOP_SCAN).ok, "nothing to stop is no error"
-
-
-def test_one_scan_after_the_other_each_its_own(bench: Make) -> None:
-    made = bench()
-    peer = made.start()
-    ready(peer)
-    files = [scanned(peer)["Z Forward"].filename for _ in range(3)]
-    assert [name[-7:] for name in files] == ["001.sxm", "002.sxm", "003.sxm"]
-
-
 def test_lines_come_while_it_scans(bench: Make) -> None:
     made = bench(speed=5.0)
     peer = made.start(live_lines_s=1.0)
@@ -361,16 +340,6 @@ def test_parameters_and_actions_of_the_experiment_file(bench: Make) -> None:
 
 
 # --- at the panel ---
-
-
-def test_a_scan_started_at_the_panel_is_published(bench: Make) -> None:
-    made = bench(speed=20.0)
-    peer = made.start()
-    ready(peer, shape=(40, 32))
-    made.at_panel(lambda emulator: emulator.software.scans.start(upwards=True))
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    assert any(isinstance(one, Scan) for one in heard)
 
 
 def test_the_panel_may_have_been_left_scanning_on_and_on_and_not_saving(bench: Make) -> None:

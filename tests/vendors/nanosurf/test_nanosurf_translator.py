@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from fake_clock import FakeClock
 from nanosurf_bench import Bench
 from vendor_bench import FLAT, TURNED, moved, ready, scanned, scans, small, states
 
-from afspm.emulators.nanosurf.studio import StudioProgram
+from afspm.emulators.nanosurf import NanosurfEmulator
+from afspm.emulators.nanosurf.studio import SETPOINT, StudioProgram
+from afspm.errors import InvalidValue
 from afspm.exit_codes import ExitCode
 from afspm.model import Region, Scan, ScanLines, ScopeState, Spectrum, names
+from afspm.simulation.faults import Faults
+from afspm.simulation.instrument import Instrument
 
 Make = Callable[..., Bench]
 Settings = dict[str, Any]
@@ -45,35 +52,15 @@ def test_a_scan_shows_the_sample_as_it_lies(bench: Make, release: int, direction
     assert made.emulator.rig.scan.upwards is (direction == "up")
 
 
-def test_one_scan_after_the_other_each_its_own(bench: Make) -> None:
-    made = bench()
-    peer = made.start()
-    ready(peer)
-    files = [scanned(peer)["Height Forward"].filename[-9:] for _ in range(3)]
-    assert files == ["00001.nhf", "00002.nhf", "00003.nhf"]
-
-
-def test_a_scan_that_is_stopped_gives_none(bench: Make) -> None:
-    made = bench(speed=10.0)
-    peer = made.start()
-    ready(peer, shape=(64, 32))
-    assert peer.act(names.START_SCAN).ok
-    assert states(peer.until(ScopeState.SCANNING)) == ["SCANNING"]
-    assert peer.act(names.STOP_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not any(isinstance(one, Scan) for one in heard)
-
-
-@pytest.mark.parametrize("release", [18, 19])
-def test_a_scan_that_begins_at_the_panel_is_published(bench: Make, release: int) -> None:
-    made = bench(speed=20.0, release=release)
-    peer = made.start(release=release)
-    ready(peer, shape=(32, 32))
-    made.at_panel(lambda emulator: emulator.program.start_scan(made.clock.now_s()))
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    assert {scan.region for scan in scans(heard)} == {TURNED}
+def test_the_setpoint_of_a_frequency_shift_is_in_hertz(tmp_path: Path) -> None:
+    rig = Instrument({"feedback": {"mode": "frequency-shift", "setpoint": -20.0}}, 3, 1000.0)
+    faults, log = Faults([], NanosurfEmulator.all_faults(), 0.0), logging.getLogger("test")
+    studio = StudioProgram(rig, faults, FakeClock(), tmp_path, log, start_s=0.1, file_s=0.1)
+    assert (studio.setpoint_unit, list(studio.setpoint_units), studio.get(SETPOINT)) == ("Hz", ["Hz"], -20.0)
+    studio.put(SETPOINT, -35.0)
+    assert studio.get(SETPOINT) == -35.0
+    with pytest.raises(InvalidValue, match="has no unit 'V'"):
+        studio.set_setpoint_unit("V")
 
 
 @pytest.mark.parametrize("direction", ["up", "down"])

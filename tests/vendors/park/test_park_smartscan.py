@@ -12,12 +12,13 @@ import pytest
 import zmq
 from fake_clock import FakeClock
 
-from afspm.emulators.faults import Faults
-from afspm.emulators.park import ParkEmulator
-from afspm.emulators.park.engine import Script, Wait
+from afspm.emulators.park import ParkEmulator, engine
+from afspm.emulators.park.engine import LONGEST_S, Script, Wait
 from afspm.emulators.park.smartscan import SmartScanProgram
-from afspm.emulators.rig import Rig, RigBusy
+from afspm.emulators.scripted import ScriptFailed
 from afspm.errors import InvalidValue
+from afspm.simulation.faults import Faults
+from afspm.simulation.instrument import Instrument, InstrumentBusy
 
 
 class SmartScan(SmartScanProgram):
@@ -25,11 +26,11 @@ class SmartScan(SmartScanProgram):
 
     def __init__(self, folder: Path) -> None:
         self.clock = FakeClock()
-        rig = Rig({"surface": "particles"}, seed=3, clock=self.clock, background=False)
+        rig = Instrument({"surface": "particles"}, seed=3, start_s=self.clock.t_s)
         rig.setup.shape = (8, 16)
         log = logging.getLogger("test")
         faults = Faults([], ParkEmulator.fault_kinds, 0.0)
-        super().__init__(rig, faults, folder, log, start_s=0.1, file_s=0.1)
+        super().__init__(rig, faults, self.clock, folder, log, start_s=0.1, file_s=0.1)
 
     def begin(self, path: str, *given: object) -> Any:
         return self.ask("call", path, list(given))
@@ -134,7 +135,7 @@ def test_value_out_of_range_is_refused_and_nothing_moves(smartscan: SmartScan, p
 def test_nothing_moves_from_the_start_of_a_scan_on(smartscan: SmartScan, path: str, given: tuple[float, ...]) -> None:
     smartscan.begin("scan.triggerImageScan")
     for _ in range(3):  # the ramp to the first line, and the first lines
-        with pytest.raises(RigBusy, match="busy with a scan"):
+        with pytest.raises(InstrumentBusy, match="busy with a scan"):
             smartscan.begin(path, *given)
         smartscan.clock.t_s += 0.4
         smartscan.advance(smartscan.clock.t_s)
@@ -208,17 +209,24 @@ def test_line_is_scanned_until_it_is_stopped_and_nothing_is_saved(smartscan: Sma
 
 def test_sweep_of_the_drive_frequency_keeps_the_instrument_busy(smartscan: SmartScan) -> None:
     sweep = smartscan.begin("ncm.sweepAutoFullRange")
-    with pytest.raises(RigBusy, match="busy with a sweep"):
+    with pytest.raises(InstrumentBusy, match="busy with a sweep"):
         smartscan.begin("scan.triggerImageScan")
     smartscan.clock.t_s += 3.1
     assert not sweep.waiting()
+
+
+def run_on(script: Script) -> tuple[object, str] | None:
+    """The value of a script; None once it waits for the instrument."""
+    while (found := script.step()) is None and not script.waits:
+        pass
+    return found
 
 
 def test_script_sleeps_in_the_experiments_time(smartscan: SmartScan) -> None:
     source = "var t0 = Date.now(); while (Date.now() - t0 < 90) { spm.sleep(20); } Date.now() - t0"
     script = Script(source, smartscan.names, smartscan.ask)
     naps = 0
-    while (found := script.step()) is None:
+    while (found := run_on(script)) is None:
         wakes_s = smartscan.next_waking_s(smartscan.clock.t_s)
         assert wakes_s is not None
         assert wakes_s - smartscan.clock.t_s == pytest.approx(0.02, abs=1e-6)
@@ -229,9 +237,25 @@ def test_script_sleeps_in_the_experiments_time(smartscan: SmartScan) -> None:
 
 def test_value_of_what_took_its_time_is_the_scripts(smartscan: SmartScan) -> None:
     script = Script("spm.readChannelAveraged('current', 2, 10).unit", smartscan.names, smartscan.ask)
-    assert script.step() is None
+    assert run_on(script) is None
     smartscan.clock.t_s += 1.0
-    assert script.step() == ("pA", "pA")
+    assert run_on(script) == ("pA", "pA")
+
+
+def test_script_that_computes_holds_nothing_up(smartscan: SmartScan, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine, "_AT_ONCE_S", 0.01)
+    script = Script("let sum = 0; for (let i = 0; i < 3e6; i++) { sum += i; } 5", smartscan.names, smartscan.ask)
+    assert script.step() is None
+    assert 0.0 < script.computes_for_s < LONGEST_S
+    assert run_on(script) == (5, "5")
+
+
+def test_script_without_an_end_is_given_up(smartscan: SmartScan, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine, "_AT_ONCE_S", 0.01)
+    monkeypatch.setattr(engine, "LONGEST_S", 0.0)
+    script = Script("for (let i = 0; i < 3e6; i++) {} 5", smartscan.names, smartscan.ask)
+    with pytest.raises(ScriptFailed, match="does not come to an end"):
+        run_on(script)
 
 
 # --- requests that are none ---

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 from park_bench import Bench
-from vendor_bench import FLAT, SOON, TURNED, left_in_danger, moved, ready, scanned, scans, small, states
+from vendor_bench import FLAT, SOON, left_in_danger, moved, ready, scanned, scans, small, states
 
-from afspm.model import ControlResponse, Region, Scan, ScopeState, Spectrum, names
+from afspm.model import ControlResponse, Region, ScopeState, Spectrum, names
 
 pytestmark = pytest.mark.slow
 
@@ -70,37 +70,10 @@ def test_whatever_smartscan_turns_out_to_say_the_tip_is_moved_scanned_with_and_w
 def test_what_smartscan_refuses_is_refused_with_its_own_words(bench: Make, variant: Settings) -> None:
     made = bench(**variant)
     peer = small(made)
-    made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4))
+    made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4, emulator.clock.now_s()))
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.ACTION_ERROR
     assert "busy with a calibration" in response.reason
-
-
-def test_one_scan_after_the_other_each_its_own(bench: Make) -> None:
-    peer = small(bench())
-    files = [scanned(peer)["Height Forward"].filename.rpartition("SIMULATED")[2] for _ in range(3)]
-    assert files == [f"_{number:04d}_Height_Forward.tiff" for number in (1, 2, 3)]
-
-
-def test_a_scan_that_is_stopped_gives_none(bench: Make) -> None:
-    peer = bench(speed=10.0).start()
-    ready(peer, shape=(64, 32))
-    assert peer.act(names.START_SCAN).ok
-    assert states(peer.until(ScopeState.SCANNING)) == ["SCANNING"]
-    assert peer.act(names.STOP_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not any(isinstance(one, Scan) for one in heard)
-
-
-def test_a_scan_that_begins_at_the_panel_is_published(bench: Make) -> None:
-    made = bench(speed=20.0)
-    peer = made.start()
-    ready(peer, shape=(32, 32))
-    made.at_panel(lambda emulator: emulator.program.start_scan(made.clock.now_s()))
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    assert {scan.region for scan in scans(heard)} == {TURNED}
 
 
 def test_withdrawing_ends_a_scan_and_lifts_the_stage(bench: Make) -> None:
@@ -170,15 +143,6 @@ def test_a_file_that_is_late_is_waited_for(bench: Make, kind: str, state: str) -
     assert states(heard)[-1] == state
 
 
-def test_a_scan_that_does_not_begin_is_refused(bench: Make) -> None:
-    made = bench()
-    peer = small(made)
-    made.strike("scan-refused")
-    response = peer.act(names.START_SCAN)
-    assert response.code == ControlResponse.ACTION_ERROR
-    assert "did not begin the scan" in response.reason
-
-
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize(("kind", "swept"), [("force", "Z"), ("IV", "Bias")])
 def test_a_curve_is_taken_where_the_tip_was_sent(bench: Make, kind: str, swept: str, variant: Settings) -> None:
@@ -235,7 +199,7 @@ def test_a_curve_that_is_stopped_on_the_way_to_it_is_not_taken(bench: Make) -> N
     peer = made.start()
     ready(peer)
     moved(peer, 120e-9, -40e-9)
-    made.at_panel(lambda emulator: emulator.rig.move_probe((1e-6, 0.0)))
+    made.at_panel(lambda emulator: emulator.rig.move_probe((1e-6, 0.0), emulator.clock.now_s()))
     made.at_panel(lambda emulator: setattr(emulator.rig.setup, "move_speed_m_s", 5e-9))
     assert peer.act(names.START_SPEC).ok
     peer.until(ScopeState.SPEC)
@@ -257,7 +221,7 @@ def test_withdrawing_ends_a_curve(bench: Make) -> None:
 def test_a_curve_that_smartscan_refuses_is_no_result(bench: Make) -> None:
     made = bench()
     peer = small(made)
-    made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4))
+    made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4, emulator.clock.now_s()))
     peer.act(names.START_SPEC)
     heard = peer.until(FREE)
     assert states(heard)[-2:] == ["INTERRUPTED", "FREE"]

@@ -11,11 +11,11 @@ from typing import Final
 
 from afspm.emulators.asylum import files
 from afspm.emulators.asylum.values import IgorValues
-from afspm.emulators.faults import Faults
 from afspm.emulators.pending_writes import PendingWrites
-from afspm.emulators.rig import Rig
 from afspm.errors import AfspmError, InvalidValue
 from afspm.model import Region
+from afspm.simulation.faults import Faults
+from afspm.simulation.instrument import Instrument
 
 FAULT_KINDS: Final = {
     "scan-refused": "DoScan does nothing",
@@ -66,7 +66,7 @@ class AsylumController:
 
     def __init__(
         self,
-        rig: Rig,
+        rig: Instrument,
         faults: Faults,
         values: IgorValues,
         folder: Path,
@@ -95,7 +95,7 @@ class AsylumController:
         if self.values.get("TipVoltage") == before_v:
             return
         if now_s - self._bias_since_s < _PULSE_S and math.isfinite(before_v):
-            self.rig.pulsed(before_v, now_s - self._bias_since_s)
+            self.rig.pulsed(before_v, now_s - self._bias_since_s, now_s)
         self._bias_since_s = now_s
 
     # --- what goes on ---
@@ -104,7 +104,7 @@ class AsylumController:
         """Advance to now; return the time of the next change."""
         if self._engages and not self.rig.busy(now_s):
             self._engages = False
-            self.rig.engage()
+            self.rig.engage(now_s)
         if now_s >= self._starts_at_s and not self.rig.busy(now_s):
             self._starts_at_s = math.inf
             self._start_or_interrupt(now_s)
@@ -144,7 +144,7 @@ class AsylumController:
             self.values.put("LastScan", 0)
         self.values.put("ScanStatus", 1)
         self.values.settle()
-        self.rig.stop_spectrum()
+        self.rig.stop_spectrum(now_s)
         self.rig.engaged = True
         self._starts_at_s = now_s + self._settings.start_s
 
@@ -154,7 +154,7 @@ class AsylumController:
             self._leave_image(now_s)
         self.values.put("ScanStatus;FMapStatus;DelayUpdate", 0)
         self._curve_running = self._engages = False
-        self.rig.withdraw()
+        self.rig.withdraw(now_s)
 
     def engage(self) -> None:
         """Bring the tip to the sample, once it has finished going away."""
@@ -176,7 +176,7 @@ class AsylumController:
         try:
             if not self._can_be_scanned():
                 raise InvalidValue("no scan is possible with these parameters")
-            self._start()
+            self._start(now_s)
         except (AfspmError, ArithmeticError, ValueError) as error:
             self._log.warning("the scan was interrupted: %s", error)
             self._leave_image(now_s)
@@ -195,7 +195,7 @@ class AsylumController:
             and all(2 <= values.get(name) <= _MOST_POINTS for name in ("ScanLines", "ScanPoints"))
         )
 
-    def _start(self) -> None:
+    def _start(self, now_s: float) -> None:
         values, rig = self.values, self.rig
         rig.setup.region = self._frame()
         rig.setup.shape = (round(values.get("ScanLines")), round(values.get("ScanPoints")))
@@ -208,7 +208,7 @@ class AsylumController:
             integral_gain=_INTEGRAL_GAIN * values.get("IntegralGain"),
             setpoint=values.get("AmplitudeSetpointVolts"),
         )
-        rig.start_scan()
+        rig.start_scan(now_s)
         self._image = rig.setup.region
 
     def _frame(self) -> Region:
@@ -228,7 +228,7 @@ class AsylumController:
 
     def _leave_image(self, now_s: float) -> None:
         running = self.rig.scan is not None and self.rig.scan.running(now_s)
-        self.rig.stop_scan()
+        self.rig.stop_scan(now_s)
         self._starts_at_s = math.inf
         self.values.put("ScanStatus", 0)
         scan = self.rig.scan
@@ -242,30 +242,30 @@ class AsylumController:
         if self.scanning or self.rig.busy(now_s) or self.faults.strikes("force-refused", now_s):
             return False
         try:
-            self._indent()
-            self.rig.start_spectrum("force")
+            self._indent(now_s)
+            self.rig.start_spectrum("force", now_s)
         except (AfspmError, ArithmeticError, ValueError) as error:
             self._log.warning("the force curve was refused: %s", error)
             return False
         self._curve_running = True
         return True
 
-    def _indent(self) -> None:
+    def _indent(self, now_s: float) -> None:
         depth_m, speed_m_s = self.values.get("ForceDist"), self.values.get("Velocity")
         if depth_m > _INDENTS_M:
-            self.rig.crash(min(depth_m, _REACH_M), speed_m_s)
-            self.rig.abandon()  # the curve itself takes the time
+            self.rig.crash(min(depth_m, _REACH_M), speed_m_s, now_s)
+            self.rig.abandon(now_s)  # the curve itself takes the time
 
-    def stop_curve(self) -> None:
+    def stop_curve(self, now_s: float) -> None:
         """Stop the force curve at once."""
         self._curve_running = False
-        self.rig.stop_spectrum()
+        self.rig.stop_spectrum(now_s)
 
     def go_to_spot(self, now_s: float) -> None:
         """Send the tip to the spot that ForceSpotNumber says, on the last image.
 
         Raises:
-            InvalidValue: there is no such spot, or it is nowhere. RigBusy.
+            InvalidValue: there is no such spot, or it is nowhere. InstrumentBusy.
         """
         number = self._whole("ForceSpotNumber")
         if not 0 <= number < len(self.spots_m) or not all(abs(along) < _REACH_M for along in self.spots_m[number]):
@@ -273,7 +273,7 @@ class AsylumController:
         image = self._image
         x, y = (along - size / 2 for along, size in zip(self.spots_m[number], image.size_m, strict=True))
         cos, sin = math.cos(image.angle_rad), math.sin(image.angle_rad)
-        self.rig.move_probe((image.center_m[0] + cos * x - sin * y, image.center_m[1] + sin * x + cos * y))
+        self.rig.move_probe((image.center_m[0] + cos * x - sin * y, image.center_m[1] + sin * x + cos * y), now_s)
 
     def _curve_done(self, now_s: float) -> None:
         self._curve_running = False

@@ -7,9 +7,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from afspm.emulators.activities import ScanActivity, SpectrumActivity
 from afspm.emulators.asylum import ibw
 from afspm.emulators.asylum.values import IgorValues
+from afspm.simulation.activities import ScanActivity, SpectrumActivity
 
 AMPLITUDE_M_PER_V = 1e-7
 

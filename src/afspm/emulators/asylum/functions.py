@@ -121,7 +121,7 @@ class AsylumFunctions:
             return self._go_to_spot()
         if name in ("Reset", "Stop"):
             if name == "Reset":
-                self._controller.stop_curve()
+                self._controller.stop_curve(self._now_s())
             return 0.0
         return 1.0
 

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Final
 
 from afspm.emulators.emulator import Crashed
-from afspm.emulators.faults import Faults
 from afspm.emulators.gxsm.console import ScriptCall
 from afspm.emulators.gxsm.signalled import CONTENT, SIZE
 from afspm.errors import ConfigError
 from afspm.microscopes.gxsm import pickles
 from afspm.microscopes.gxsm.errors import BadReply
+from afspm.simulation.faults import Faults
 
 FAULT_KINDS: Final[Mapping[str, str]] = {
     "bad-pickle": "shared memory: the result is not a pickle",

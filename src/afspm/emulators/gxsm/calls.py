@@ -11,7 +11,7 @@ from typing import Final, TypeVar
 import numpy as np
 
 from afspm.emulators.gxsm.program import ANGSTROM_M, GxsmProgram
-from afspm.emulators.rig import RigBusy
+from afspm.simulation.instrument import InstrumentBusy
 
 FAULT_KINDS: Final[Mapping[str, str]] = {
     "error": "a call raises an error",
@@ -107,7 +107,7 @@ class GxsmFunctions:
             raise WrongArguments(method)
         try:
             found = function(self, *arguments)
-        except RigBusy as busy:
+        except InstrumentBusy as busy:
             raise SystemError(str(busy)) from busy
         if self._faults.strikes("wrong-type", now_s):
             return "\x04"
@@ -155,33 +155,34 @@ class GxsmFunctions:
         program = self._program
         kind, _, switch = name.partition("-")
         if kind in ("CHECK", "UNCHECK") and switch == "MainAutoSave":
-            program.auto_save = kind == "CHECK"
+            program.panel.auto_save = kind == "CHECK"
         elif kind in ("CHECK", "UNCHECK") and switch == "SCAN-REPEAT":
-            program.repeats = kind == "CHECK"
+            program.panel.repeats = kind == "CHECK"
         elif name == "GETCHECK-MainAutoSave" and program.version == 4:
-            return "TRUE" if program.auto_save else "FALSE"
+            return "TRUE" if program.panel.auto_save else "FALSE"
         elif name in self._list_actions():
             self._do(name)
         return Uninitialised() if program.version == 3 else 0
 
     def _do(self, name: str) -> None:
         program, rig = self._program, self._program.rig
+        now_s = program.clock.now_s()
         if name in self._feedback_actions:
             rig.setup.feedback = replace(rig.setup.feedback, on=name == self._feedback_actions[0])
         elif name.startswith("CHECK-") and name.removeprefix("CHECK-") in _MODES[program.card]:
-            program.probe_auto_save = True
+            program.panel.probe_auto_save = True
         elif name == "DSP_VP_ABORT_EXECUTE":
-            rig.stop_spectrum()
+            rig.stop_spectrum(now_s)
             program.curve = None
         elif name.startswith("DSP_VP_"):
             mode = name.split("_")[2]
             depth = -program.entries["dsp-Z-end"] * ANGSTROM_M if mode == "FZ" else 0.0
             if depth > 0.0:
-                rig.crash(depth, program.entries["dsp-Z-Slope"] * ANGSTROM_M)
+                rig.crash(depth, program.entries["dsp-Z-Slope"] * ANGSTROM_M, now_s)
                 return
             program.take_curve(_KINDS.get(mode, "IV"))
         elif name == "DSP_CMD_AUTOAPP":
-            rig.engage()
+            rig.engage(now_s)
         elif name == "DSP_CMD_STOPALL":
             program.stop_scan()
 
@@ -212,14 +213,14 @@ class GxsmFunctions:
         return (_NEVER_WRITTEN, _NEVER_WRITTEN, _NEVER_WRITTEN)
 
     def _pixel(self, now_s: float, *, centred: bool) -> tuple[float, float, float]:
-        rows, columns = self._program.last.shape if self._program.last is not None else (0, 0)
+        rows, columns = self._program.scan.activity.shape if self._program.scan.activity is not None else (0, 0)
         x, y = columns // 2, self._program.y_current(now_s)
         return (float(x - columns // 2), float(rows // 2 - y), 0.0) if centred else (float(x), float(y), 0.0)
 
     def _bits(self, now_s: float) -> int:
         program = self._program
         doing, scan = program.rig.doing(now_s), program.rig.scan
-        scanning = doing == "scan" and scan is not None and now_s >= scan.start_s + program.shows_s
+        scanning = doing == "scan" and scan is not None and now_s >= scan.start_s + program.scan.shows_s
         scanning = scanning or (program.is_between_repeats and not doing)
         paused, probing = scanning and scan is not None and scan.paused, doing == "spectrum"
         feedback = bool(program.rig.setup.feedback.on)
@@ -274,19 +275,19 @@ class GxsmFunctions:
     def _get_geometry(self, channel: int) -> tuple[float, ...]:
         if not self._has(channel):
             return (0.0,) * 5
-        x, y, width, height, angle_deg = self._program.last_frame
+        x, y, width, height, angle_deg = self._program.scan.frame
         return (width, height, x, y, angle_deg)
 
     @_function
     def _get_dimensions(self, channel: int) -> tuple[int, ...]:
-        scan = self._program.last
+        scan = self._program.scan.activity
         return (_NOBODY,) * 4 if scan is None or not self._has(channel) else (scan.shape[1], scan.shape[0], 1, 1)
 
     @_function
     def _get_differentials(self, channel: int) -> tuple[float, ...]:
         if not self._has(channel):
             return (0.0,) * 4
-        _, _, width, height, _ = self._program.last_frame
+        _, _, width, height, _ = self._program.scan.frame
         columns, rows, _, _ = self._get_dimensions(channel)
         return (width / (columns - 1), height / (rows - 1), self._program.channels[channel].dz, 10.0)
 
@@ -296,7 +297,7 @@ class GxsmFunctions:
     @_function
     def _get_slice(self, channel: int, value: int, time: int, first: int, count: int) -> object:
         program = self._program
-        if program.last is None or not self._has(channel):
+        if program.scan.activity is None or not self._has(channel):
             return -1
         one = program.channels[channel]
         image = program.image(one)

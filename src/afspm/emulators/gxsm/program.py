@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from afspm.clock import Clock
-from afspm.emulators.activities import ScanActivity, SpectrumActivity
-from afspm.emulators.faults import Faults
 from afspm.emulators.gxsm import files
 from afspm.emulators.gxsm.channels import CHANNELS, SIMULATED_3, GxsmChannel
 from afspm.emulators.gxsm.entries import GxsmEntries, GxsmEntry, lengths, simulated_3
 from afspm.emulators.gxsm.file_writer import GxsmFileWriter
-from afspm.emulators.rig import Rig
 from afspm.errors import InvalidValue
 from afspm.model import Region
 from afspm.plain_data import Plain
+from afspm.simulation.activities import ScanActivity, SpectrumActivity
+from afspm.simulation.faults import Faults
+from afspm.simulation.instrument import Instrument
 
 CARDS: Final = {"SRanger": "SRangerMK2:SPM", "RPSPMC": "RPSPMC:SPM", "simulator": "SPM-SIM:SPM"}
 FAULT_KINDS: Final[Mapping[str, str]] = {
@@ -64,41 +64,76 @@ class GxsmSettings:
     reach_m: float
 
 
+@dataclass
+class GxsmPanel:
+    """The switches of GXSM's panel.
+
+    Attributes:
+        auto_save: of scans; probe_auto_save of spectra.
+        repeats: a scan that comes to its end is followed by the next.
+        behind_s: how much the clock of its computer, whose times are in files, is behind; it may be set at any time.
+    """
+
+    auto_save: bool
+    probe_auto_save: bool
+    repeats: bool = False
+    behind_s: float = 0.0
+
+
+@dataclass
+class GxsmScan:
+    """The last scan that was begun, and the memory that it is scanned into.
+
+    Attributes:
+        activity: None before the first.
+        frame: offset, range and rotation at its start.
+        runs: until GXSM has seen its end; `saved`: since then.
+        shows_s: how long after its begin it is seen running.
+        next_follows: another scan is to begin; `follows`: it does so at once.
+        number, own: the number in the names of its files; the names, once it is saved.
+        before: the names that are reported at first; None: its own at once.
+        y_before: the line that is reported until its first one is complete.
+        memory: rows of the scan before, by channel.
+    """
+
+    activity: ScanActivity | None = None
+    frame: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    runs: bool = False
+    saved: bool = False
+    shows_s: float = SHOWS_S
+    next_follows: bool = False
+    follows: bool = False
+    number: int = 0
+    before: list[Path] | None = None
+    y_before: int = 0
+    memory: dict[GxsmChannel, np.ndarray] = field(default_factory=dict)
+    own: list[Path] = field(default_factory=list)
+
+
 class GxsmProgram:
     """The program.
 
     Attributes:
-        auto_save: of scans; probe_auto_save of spectra.
+        panel: the switches of its panel.
         channels: that a scan records.
-        dialogs: what dialogs on the screen say.
-        behind_s: how much the clock of its computer, which files tell, is behind; it may be set at any time.
-        repeats: a scan that comes to its end is followed by the next.
+        dialogs: the texts of dialogs on the screen.
+        scan: the last scan that was begun.
     """
 
-    def __init__(self, rig: Rig, faults: Faults, clock: Clock, folder: Path, settings: GxsmSettings) -> None:
+    def __init__(self, rig: Instrument, faults: Faults, clock: Clock, folder: Path, settings: GxsmSettings) -> None:
         self.rig, self.faults, self.clock, self.folder = rig, faults, clock, folder
         self.version, self.card = version, card = settings.version, settings.card
         self.dialogs: list[str] = []
-        self.behind_s = 0.0
-        self.repeats = False
+        self.panel = GxsmPanel(settings.auto_save, settings.probe_auto_save)
         self.entries = GxsmEntries(
             version, settings.user_unit, decimal_comma=settings.decimal_comma, dialogs=self.dialogs.append
         )
-        self.auto_save, self.probe_auto_save = settings.auto_save, settings.probe_auto_save
         known = SIMULATED_3 if (version, card) == (3, "simulator") else CHANNELS[version]
         self.channels: list[GxsmChannel] = [one for one in known if one.source in rig.channels]
         self.saving = GxsmFileWriter(folder, faults)
-        self.last: ScanActivity | None = None
-        self.last_frame = (0.0, 0.0, 0.0, 0.0, 0.0)
+        self.scan = GxsmScan()
         self.curve: SpectrumActivity | None = None
-        self.shows_s = SHOWS_S
-        self._scanning = self._saved = self._next = self._follows = False
-        self._number = 0
-        self._before: list[Path] | None = None
-        self._y_before = 0
         self._bias_since_s = -math.inf
-        self._memory: dict[GxsmChannel, np.ndarray] = {}
-        self._own: list[Path] = []
         self._curves = 0
         for ref, entry in lengths(settings.reach_m / ANGSTROM_M, self._told).items():
             self.entries.add(ref, entry)
@@ -156,50 +191,50 @@ class GxsmProgram:
         """Another bias; one that was in force for a short while has been a pulse."""
         now_s = self.clock.now_s()
         if now_s - self._bias_since_s < _PULSE_S:
-            self.rig.pulsed(self.rig.setup.bias_v, now_s - self._bias_since_s)
+            self.rig.pulsed(self.rig.setup.bias_v, now_s - self._bias_since_s, now_s)
         self.rig.setup.bias_v, self._bias_since_s = value, now_s
 
     # --- what happens by itself ---
 
     def advance(self, now_s: float) -> float | None:
         """Up to now; returns when a file is to be written."""
-        if self._scanning and self.faults.strikes("panel-stop", now_s):
-            self.rig.stop_scan()
-        if self._scanning and self.last is not None and not self.last.running(now_s):
-            self._scanning = False
-            if self.auto_save:
+        if self.scan.runs and self.faults.strikes("panel-stop", now_s):
+            self.rig.stop_scan(now_s)
+        if self.scan.runs and self.scan.activity is not None and not self.scan.activity.running(now_s):
+            self.scan.runs = False
+            if self.panel.auto_save:
                 self.save(now_s, finished=True)
-            self._next = self._follows = self.repeats and self.last.stopped_s is None
+            self.scan.next_follows = self.scan.follows = self.panel.repeats and self.scan.activity.stopped_s is None
         if self.curve is not None and not self.curve.running(now_s):
             curve, self.curve = self.curve, None
-            if self.probe_auto_save:
+            if self.panel.probe_auto_save:
                 self._save_curve(curve, now_s)
         next_s = self.saving.advance(now_s)
-        if self._next and now_s >= self.saving.done_s:
+        if self.scan.next_follows and now_s >= self.saving.done_s:
             self.start_scan()
-        return min(next_s or math.inf, self.saving.done_s) if self._next else next_s
+        return min(next_s or math.inf, self.saving.done_s) if self.scan.next_follows else next_s
 
     @property
     def is_between_repeats(self) -> bool:
         """True after the end of a scan that the next one follows at once: GXSM does not tell of an end then."""
-        is_whole = self.last is not None and self.last.stopped_s is None
-        return self.repeats and is_whole and (self._scanning or self._next)
+        is_whole = self.scan.activity is not None and self.scan.activity.stopped_s is None
+        return self.panel.repeats and is_whole and (self.scan.runs or self.scan.next_follows)
 
     def stop_scan(self) -> None:
         """Break off the scan that runs, or is to begin."""
-        self._next = False
-        self.rig.stop_scan()
+        self.scan.next_follows = False
+        self.rig.stop_scan(self.clock.now_s())
 
     # --- scans ---
 
     def start_scan(self) -> None:
         """If it can; there is no answer. While files are written GXSM does nothing else."""
         now_s = self.clock.now_s()
-        self._next = now_s < self.saving.done_s
-        if self._next:
+        self.scan.next_follows = now_s < self.saving.done_s
+        if self.scan.next_follows:
             return
-        follows, self._follows = self._follows, False
-        self.rig.stop_move()
+        follows, self.scan.follows = self.scan.follows, False
+        self.rig.stop_move(now_s)
         if self.rig.busy(now_s) or self.faults.strikes("no-start", now_s):
             return
         if not self.channels:
@@ -215,29 +250,29 @@ class GxsmProgram:
         else:
             self.rig.setup.line_s = 2.0 * entries["RangeX"] / entries["dsp-fbs-scan-speed-scan"]
         try:
-            started = self.rig.start_scan()
+            started = self.rig.start_scan(now_s)
         except InvalidValue as error:
             self.dialogs.append(str(error))
             return
-        self._memory = {one: _resized(self.image(one), (rows, columns)) for one in self.channels}
-        is_first = self.last is None and self.card == "simulator" and self.version == 4
-        self._y_before = _NEVER_WRITTEN if is_first else self.y_current(now_s)
-        self._before, self._own = None if follows else self.names(now_s), []
-        self._number = self.saving.next_number()
-        self.shows_s = 0.0 if follows else SHOWS_S
-        self.last = started
-        self.last_frame = tuple(entries[ref] for ref in ("OffsetX", "OffsetY", "RangeX", "RangeY", "Rotation"))  # type: ignore[assignment]
-        self._scanning, self._saved = True, False
+        self.scan.memory = {one: _resized(self.image(one), (rows, columns)) for one in self.channels}
+        is_first = self.scan.activity is None and self.card == "simulator" and self.version == 4
+        self.scan.y_before = _NEVER_WRITTEN if is_first else self.y_current(now_s)
+        self.scan.before, self.scan.own = None if follows else self.names(now_s), []
+        self.scan.number = self.saving.next_number()
+        self.scan.shows_s = 0.0 if follows else SHOWS_S
+        self.scan.activity = started
+        self.scan.frame = tuple(entries[ref] for ref in ("OffsetX", "OffsetY", "RangeX", "RangeY", "Rotation"))  # type: ignore[assignment]
+        self.scan.runs, self.scan.saved = True, False
 
     def y_current(self, now_s: float) -> int:
         """The last line that is complete: that of the scan before until the first is; the very last after a stop."""
-        scan = self.last
+        scan = self.scan.activity
         if scan is None:
             return 0
         if not scan.running(now_s):
             return scan.shape[0] - 1
         done = scan.lines_done(now_s)
-        return done - 1 if done else self._y_before
+        return done - 1 if done else self.scan.y_before
 
     def frame(self) -> Region:
         """The frame of the next scan."""
@@ -246,13 +281,13 @@ class GxsmProgram:
 
     def names(self, now_s: float) -> list[Path]:
         """Return where each channel is to be saved, whatever is there already, or was; none before the first scan."""
-        if self.last is None:
+        if self.scan.activity is None:
             return []
-        if self._before is not None and now_s < self.last.start_s + NAMED_S:
-            return self._before
-        if self._own:
-            return self._own
-        return [self.saving.named(ending, self._number) for ending in self._endings()]
+        if self.scan.before is not None and now_s < self.scan.activity.start_s + NAMED_S:
+            return self.scan.before
+        if self.scan.own:
+            return self.scan.own
+        return [self.saving.named(ending, self.scan.number) for ending in self._endings()]
 
     def shown(self, path: Path) -> str:
         """Return a path as it is told: a GXSM whose user has chosen no folder saves to ".", wherever it was started."""
@@ -260,13 +295,13 @@ class GxsmProgram:
 
     def image(self, channel: GxsmChannel) -> np.ndarray:
         """Return what is in memory of a channel: rows that the last scan did not come to are as they were."""
-        if self.last is None or channel not in self._memory:
+        if self.scan.activity is None or channel not in self.scan.memory:
             return np.zeros((0, 0), np.float32)
         now_s = self.clock.now_s()
-        until_s = now_s if self._scanning else self.last.stopped_s
-        drawn = self.last.channels(until_s)
+        until_s = now_s if self.scan.runs else self.scan.activity.stopped_s
+        drawn = self.scan.activity.channels(until_s)
         scanned = channel.raw(drawn[channel.source][1])
-        return np.where(np.isnan(scanned), self._memory[channel], scanned)
+        return np.where(np.isnan(scanned), self.scan.memory[channel], scanned)
 
     def save(self, now_s: float, *, finished: bool = False) -> None:
         """Save the last scan, if there is one: again, if it was saved.
@@ -274,22 +309,22 @@ class GxsmProgram:
         Args:
             finished: GXSM is done with it, whatever the time.
         """
-        if self.last is None:
+        if self.scan.activity is None:
             return
-        if self._saved:
-            self._own = []
-        own = [self.saving.free(ending, self._number) for ending in self._endings()]
-        finished = finished or now_s >= self.last.end_s + UNFINISHED_S
+        if self.scan.saved:
+            self.scan.own = []
+        own = [self.saving.free(ending, self.scan.number) for ending in self._endings()]
+        finished = finished or now_s >= self.scan.activity.end_s + UNFINISHED_S
         pairs = zip(own, self.channels, strict=True)
         self.saving.write([(path, self._file(one, path, finished=finished)) for path, one in pairs], now_s)
         self.saving.counted(own)
-        self._own, self._saved = own, True
+        self.scan.own, self.scan.saved = own, True
 
     def _endings(self) -> list[str]:
         return [channel.ending(master=number == 0) for number, channel in enumerate(self.channels)]
 
     def _file(self, channel: GxsmChannel, path: Path, *, finished: bool) -> bytes:
-        scan = self.last
+        scan = self.scan.activity
         assert scan is not None
         saved = files.GxsmScanFile(
             str(path),
@@ -297,9 +332,9 @@ class GxsmProgram:
             self.image(channel),
             channel.dz,
             channel.unit,
-            self.last_frame,
-            scan.start_s - self.behind_s,
-            scan.end_s - self.behind_s if finished else 0.0,
+            self.scan.frame,
+            scan.start_s - self.panel.behind_s,
+            scan.end_s - self.panel.behind_s if finished else 0.0,
             CARDS[self.card],
             scan.bias_v,
         )
@@ -319,7 +354,7 @@ class GxsmProgram:
 
     def _move(self) -> None:
         if self.rig.doing(self.clock.now_s()) in ("", "move"):
-            self.rig.move_probe(self.tip_m())
+            self.rig.move_probe(self.tip_m(), self.clock.now_s())
 
     def tip_m(self) -> tuple[float, float]:
         """The position that the tip was sent to."""
@@ -334,7 +369,7 @@ class GxsmProgram:
         if self.rig.busy(self.clock.now_s()):
             return
         try:
-            self.curve = self.rig.start_spectrum(kind)
+            self.curve = self.rig.start_spectrum(kind, self.clock.now_s())
         except InvalidValue as error:
             self.dialogs.append(str(error))
 

@@ -14,10 +14,10 @@ from afspm.emulators.nanonis import logger, wire
 from afspm.emulators.nanonis.dispatch import DeferredResult, FunctionRefused, Results
 from afspm.emulators.nanonis.faults import FAULT_KINDS, senseless_value
 from afspm.emulators.nanonis.software import NanonisSoftware
-from afspm.emulators.rig import RigBusy
 from afspm.emulators.tcp_server import ClientConnection, TcpServer
 from afspm.errors import ConfigError, InvalidValue
 from afspm.plain_data import PlainMapping
+from afspm.simulation.instrument import InstrumentBusy
 from afspm.units import Length
 
 RELEASES: Final = {"2021": 10862, "2022": 11798, "2023": 13742, "2024": 14429, "2025": 14573}
@@ -218,7 +218,7 @@ class NanonisEmulator(Emulator):
         """Answer with an error where something can't be: all that a client asks passes through here."""
         try:
             yield
-        except (FunctionRefused, RigBusy, InvalidValue, wire.MalformedRequest) as error:
+        except (FunctionRefused, InstrumentBusy, InvalidValue, wire.MalformedRequest) as error:
             self._refuse(connection, asked, str(error))
         except Crashed:
             raise

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from afspm.clock import Clock
-from afspm.emulators.faults import Faults
 from afspm.emulators.nanonis.dispatch import Answer, DeferredResult
 from afspm.emulators.nanonis.registers import Registers
 from afspm.emulators.nanonis.session import SessionFolder
-from afspm.emulators.rig import Rig
 from afspm.plain_data import Plain
+from afspm.simulation.faults import Faults
+from afspm.simulation.instrument import Instrument
 
 _Z_CONTROLLERS: Final = {
     "current": ("log Current", "A"),
@@ -33,7 +33,7 @@ class NanonisCore:
         opened: the modules that clients have opened.
     """
 
-    rig: Rig
+    rig: Instrument
     faults: Faults
     clock: Clock
     session: SessionFolder

@@ -75,7 +75,7 @@ class Dispatcher:
         """Execute a function and return its results.
 
         Raises:
-            FunctionRefused, RigBusy, InvalidValue.
+            FunctionRefused, InstrumentBusy, InvalidValue.
         """
         handler = self._handlers.get(name)
         _refuse_nan(name, arguments, keeps_nan=handler is None or name in _KEEPS_NAN)

@@ -9,13 +9,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from afspm.emulators.activities import RETRACE, ScanActivity
 from afspm.emulators.nanonis import files
 from afspm.emulators.nanonis.core import NanonisCore
 from afspm.emulators.nanonis.dispatch import Answer, DeferredResult, FunctionRefused, Results, answers, chosen
 from afspm.emulators.nanonis.session import checked_name
 from afspm.emulators.nanonis.signals import CHANNELS, NAMES, Signals, name_and_unit
 from afspm.model import Region
+from afspm.simulation.activities import RETRACE, ScanActivity
 from afspm.simulation.scanning import MOST_PIXELS
 
 Image = tuple[str, str, np.ndarray, np.ndarray]
@@ -146,7 +146,7 @@ class ScanModule:
     def advance(self, now_s: float) -> float | None:
         """Start and end scans that are due; return when a delayed one starts."""
         if self.running is not None and self._core.faults.strikes("panel-stop", now_s):
-            self._core.rig.stop_scan()
+            self._core.rig.stop_scan(now_s)
         if self._delayed_start is not None and now_s >= self._delayed_start[0]:
             (_, upwards), self._delayed_start = self._delayed_start, None
             self.start(upwards)
@@ -155,7 +155,7 @@ class ScanModule:
         return None if self._delayed_start is None else self._delayed_start[0]
 
     def start(self, upwards: bool) -> None:
-        """Start a scan at once. Raises RigBusy."""
+        """Start a scan at once. Raises InstrumentBusy."""
         x, y, width, height, clockwise_deg = self.frame
         rig = self._core.rig
         size_m = (width * (self.pixels - 1) / self.pixels, height * max(self.lines - 1, 1) / self.lines)
@@ -163,7 +163,7 @@ class ScanModule:
         rig.setup.shape = (self.lines, self.pixels)
         forward_s, backward_s = self.speed[2:4]
         rig.setup.line_s, rig.setup.upwards = forward_s + backward_s, upwards
-        scan = rig.start_scan()
+        scan = rig.start_scan(self._core.now_s)
         self.running = self.last = StartedScan(scan, self.frame, (forward_s, backward_s), list(self.channels))
 
     @answers("Scan.Action")
@@ -171,18 +171,18 @@ class ScanModule:
         now_s, rig = self._core.now_s, self._core.rig
         if action == 0:
             if self.running is not None:  # it begins anew
-                rig.stop_scan()
+                rig.stop_scan(now_s)
                 self.advance(now_s)
             self._start_on_request(bool(direction), now_s)
             self._core.client[_WAITED] = self.ends, now_s
         elif action == 1:
-            rig.stop_scan()
+            rig.stop_scan(now_s)
         elif action == 2 and rig.scan is not None:
             rig.scan.pause(now_s)
         elif action == 3 and rig.scan is not None:
             rig.scan.resume(now_s)
         elif action == 6:
-            rig.move_probe(self.frame[:2])
+            rig.move_probe(self.frame[:2], now_s)
         elif action not in (2, 3, 4, 5):
             raise FunctionRefused(f"{action} is not an action")
         return ()

@@ -6,8 +6,8 @@ import logging
 from pathlib import Path, PureWindowsPath
 from typing import Final
 
-from afspm.emulators.faults import Faults
 from afspm.errors import InvalidValue
+from afspm.simulation.faults import Faults
 
 _NO_FILE_NAME: Final = frozenset('\\/:*?"<>|') | {chr(number) for number in range(32)}
 _LONGEST_NAME: Final = 200

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from afspm.emulators.activities import RETRACE, SpectrumActivity
 from afspm.emulators.nanonis.core import NanonisCore
 from afspm.emulators.nanonis.dispatch import Answer, FunctionRefused, answers
 from afspm.emulators.nanonis.logger import LARGEST_OVERSAMPLING, TcpLogger
+from afspm.simulation.activities import RETRACE, SpectrumActivity
 
 CHANNELS: Final = {"Current": 0, "Height": 14, "Phase": 16, "Amplitude": 17, "Frequency Shift": 18}
 """Simulated channel -> index of its signal."""

@@ -9,7 +9,6 @@ from typing import Final
 import numpy as np
 
 from afspm.clock import Clock
-from afspm.emulators.faults import Faults
 from afspm.emulators.nanonis.core import NanonisCore
 from afspm.emulators.nanonis.dispatch import Answer, Dispatcher, FunctionRefused, answers, chosen
 from afspm.emulators.nanonis.files import read_dat
@@ -18,7 +17,8 @@ from afspm.emulators.nanonis.session import SessionFolder, checked_name
 from afspm.emulators.nanonis.signals import Signals
 from afspm.emulators.nanonis.spectra import SpectroscopyModules
 from afspm.emulators.nanonis.tip import TipModules, ZController
-from afspm.emulators.rig import Rig
+from afspm.simulation.faults import Faults
+from afspm.simulation.instrument import Instrument
 
 _RANGE_Z_M: Final = 2e-6
 _EXPERIMENTS: Final = {"Bias Spectroscopy": "IV", "Z Spectroscopy": "force"}
@@ -37,7 +37,7 @@ class NanonisSoftware:
 
     def __init__(
         self,
-        rig: Rig,
+        rig: Instrument,
         faults: Faults,
         clock: Clock,
         folder: Path,
@@ -109,13 +109,13 @@ class PatternModule:
         if points < 1:
             raise FunctionRefused(f"a pattern of {points} points")
         kind = _EXPERIMENTS[registers.get("Pattern.Props")[0]]
-        rig.occupy(_BUSY, points * rig.world.spectrum_s(kind))
+        rig.occupy(_BUSY, points * rig.world.spectrum_s(kind), self._core.now_s)
         registers.put("Pattern.Active", active)
         return ()
 
     @answers("Pattern.ExpStop")
     def _stop(self) -> Answer:
-        self._core.rig.stop(_BUSY)
+        self._core.rig.stop(_BUSY, self._core.now_s)
         return ()
 
     @answers("Pattern.ExpStatusGet")

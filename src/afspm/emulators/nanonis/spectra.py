@@ -7,12 +7,12 @@ from typing import Final
 
 import numpy as np
 
-from afspm.emulators.activities import SpectrumActivity
 from afspm.emulators.nanonis import files
 from afspm.emulators.nanonis.core import NanonisCore
 from afspm.emulators.nanonis.dispatch import Answer, DeferredResult, FunctionRefused, Results, answers, chosen
 from afspm.emulators.nanonis.session import checked_name
 from afspm.emulators.nanonis.signals import Signals, name_and_unit, spectrum_columns, spectrum_signal
+from afspm.simulation.activities import SpectrumActivity
 
 _KINDS: Final = {"BiasSpectr": "IV", "ZSpectr": "force"}
 _CHANNELS: Final = {"BiasSpectr": (0, 22), "ZSpectr": (20, 21)}
@@ -92,10 +92,10 @@ class SpectroscopyModules:
             session.save(session.next_name(self._base_names[module], 5, ".dat"), content, now_s)
 
     def start(self, module: str, base_name: str) -> None:
-        """Start a spectrum. Raises RigBusy."""
+        """Start a spectrum. Raises InstrumentBusy."""
         self._base_names[module] = checked_name(base_name) or self._base_names[module]
         sweep = self.sweeps[module]
-        curve = sweep.resample(self._core.rig.start_spectrum(_KINDS[module], sweep.sweeps))
+        curve = sweep.resample(self._core.rig.start_spectrum(_KINDS[module], self._core.now_s, sweep.sweeps))
         self.running = curve if sweep.channels is None else self._recorded(curve, sweep.channels)
 
     def _recorded(self, curve: SpectrumActivity, channels: list[int]) -> SpectrumActivity:
@@ -163,7 +163,7 @@ class SpectroscopyModules:
     def _stop(self, name: str) -> Answer:
         self._module(name)
         if self.running is not None:
-            self._core.rig.stop_spectrum()
+            self._core.rig.stop_spectrum(self._core.now_s)
             self.running = None
             self.ended += 1
         return ()

@@ -38,7 +38,7 @@ class ZController:
         """Let the safe tip withdraw the tip, where a fault says so."""
         faults, rig = self._core.faults, self._core.rig
         if faults.strikes("safe-tip", now_s):
-            rig.withdraw()
+            rig.withdraw(now_s)
             self.state = "safe"
         if self._scans.running is not None and faults.strikes("safe-tip-unnoticed", now_s):
             rig.engaged = False
@@ -133,7 +133,7 @@ class ZController:
         """Withdraw the tip, which an auto-approach that goes on meanwhile brings back."""
         if not self._approaches():
             rig = self._core.rig
-            rig.withdraw()
+            rig.withdraw(self._core.now_s)
             self.state = "off"
             rig.setup.feedback = replace(rig.setup.feedback, on=False)
         return self._core.until_free(wait, timeout_ms)
@@ -145,10 +145,10 @@ class ZController:
     @answers("AutoApproach.OnOffSet")
     def _set_approach(self, on: int) -> Answer:
         if on:
-            self._core.rig.engage()
+            self._core.rig.engage(self._core.now_s)
             self.switch(self._core.now_s, on=True)
         elif self._approaches():
-            self._core.rig.withdraw()
+            self._core.rig.withdraw(self._core.now_s)
         return ()
 
     @answers("AutoApproach.OnOffGet")
@@ -176,7 +176,7 @@ class TipModules:
         rig = self._core.rig
         rig.setup.move_speed_m_s = self._own_speed_m_s if self._has_own_speed else self._scans.speed[0]
         reach_x, reach_y = self._core.range_m[0] / 2, self._core.range_m[1] / 2
-        rig.move_probe((float(np.clip(x, -reach_x, reach_x)), float(np.clip(y, -reach_y, reach_y))))
+        rig.move_probe((float(np.clip(x, -reach_x, reach_x)), float(np.clip(y, -reach_y, reach_y))), self._core.now_s)
         return self._core.until_free(wait)
 
     @answers("FolMe.XYPosGet")
@@ -196,7 +196,7 @@ class TipModules:
 
     @answers("FolMe.Stop")
     def _stop(self) -> Answer:
-        self._core.rig.stop_move()
+        self._core.rig.stop_move(self._core.now_s)
         return ()
 
     # --- bias and tip shaper ---
@@ -215,7 +215,9 @@ class TipModules:
     @answers("Bias.Pulse")
     def _pulse(self, wait: int, width_s: float, bias_v: float, hold: int, absolute: int) -> Answer:
         relative = 1
-        self._core.rig.pulse(bias_v + (self._core.rig.setup.bias_v if absolute == relative else 0.0), width_s)
+        self._core.rig.pulse(
+            bias_v + (self._core.rig.setup.bias_v if absolute == relative else 0.0), width_s, self._core.now_s
+        )
         if hold:
             self._z_controller.pulse_holds = hold == 1
         return self._core.until_free(wait)
@@ -225,9 +227,9 @@ class TipModules:
         props = self._core.registers.get("TipShaper.Props")
         lift_m, lift_s, restore = props[3], props[4], props[10]
         if lift_m < 0.0:
-            self._core.rig.crash(-lift_m, -lift_m / max(lift_s, 1e-6))
+            self._core.rig.crash(-lift_m, -lift_m / max(lift_s, 1e-6), self._core.now_s)
         else:
-            self._core.rig.occupy("shaper", lift_s)
+            self._core.rig.occupy("shaper", lift_s, self._core.now_s)
         if not restore:
             self._z_controller.switch(self._core.now_s, on=False)
         return self._core.until_free(wait, timeout_ms)
@@ -258,7 +260,7 @@ class TipModules:
         was_on, *_ = (*self._core.registers.get("Piezo.DriftComp"), 0)
         x, y, z, *limit = rest
         now_on = chosen(on, was_on, 1, 0)
-        self._core.rig.follow((x, y) if now_on else (0.0, 0.0))
+        self._core.rig.follow((x, y) if now_on else (0.0, 0.0), self._core.now_s)
         self._core.registers.put("Piezo.DriftComp", now_on, x, y, z, limit[0] if limit else 10.0)
         return ()
 
@@ -289,7 +291,7 @@ class TipModules:
             raise FunctionRefused(f"{direction} is not a direction")
         now_s = self._core.now_s
         at_m = self._motor_at_m(now_s)
-        self._core.rig.occupy("motor", abs(steps) * _STEP_S)
+        self._core.rig.occupy("motor", abs(steps) * _STEP_S, self._core.now_s)
         self._motor_m, self._motor_walk = at_m, (direction // 2, -steps if direction % 2 else steps, now_s)
         return self._core.until_free(wait)
 
@@ -297,7 +299,7 @@ class TipModules:
     def _stop_motor(self) -> Answer:
         now_s = self._core.now_s
         self._motor_m, self._motor_walk = self._motor_at_m(now_s), (0, 0, now_s)
-        self._core.rig.stop("motor")
+        self._core.rig.stop("motor", self._core.now_s)
         return ()
 
     @answers("Motor.PosGet")

@@ -50,7 +50,7 @@ class NanosurfEmulator(ScriptedEmulator):
         """Make Studio with its tree of commands."""
         self._levels: dict[Client, int | None] = {}
         self._client: Client = None
-        program = StudioProgram(self.rig, self.faults, self.folder, self.log, **self._times)
+        program = StudioProgram(self.rig, self.faults, self.clock, self.folder, self.log, **self._times)
         self._tree = CommandTree(program, self._release, self._image_buffer, self._select, self.log)
         return program
 

@@ -9,8 +9,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from afspm.emulators.activities import RETRACE, ScanActivity, SpectrumActivity
 from afspm.plain_data import PlainMapping
+from afspm.simulation.activities import RETRACE, ScanActivity, SpectrumActivity
 from afspm.simulation.fields import Array
 
 _MISSING: Final = -(2**31)

@@ -11,12 +11,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from afspm.emulators.activities import RETRACE, Channels, ScanActivity, SpectrumActivity
 from afspm.emulators.nanosurf import files
 from afspm.emulators.program import MakerProgram, NamedFile
 from afspm.errors import InvalidValue
 from afspm.model import Region
 from afspm.plain_data import Plain
+from afspm.simulation.activities import RETRACE, Channels, ScanActivity, SpectrumActivity
 
 _INTEGRAL_GAIN: Final = 0.5
 """What Studio's integral gain of 1 is to the simulated feedback, in 1/s."""
@@ -29,6 +29,7 @@ _MOST_PIXELS: Final = 8192
 _MOST_GAIN: Final = 100000
 _MOST_CURVES: Final = 128
 SETPOINT: Final = "z_control.setpoint"
+_MOST_SHIFT_HZ: Final = 1e3
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,7 @@ class StudioProgram(MakerProgram):
         values: of the panels, by path.
         on_signal: called with "scanning_started" and "scanning_finished".
         when_advanced: called after each advance; returns whether it has begun to measure something.
-        setpoint_unit: in which `get` and `put` have the setpoint; `values` has it in V.
+        setpoint_unit: in which `get` and `put` have the setpoint; `values` has it in V, of a frequency shift in Hz.
     """
 
     def __init__(self, *given: Any, **settings: Any) -> None:
@@ -170,7 +171,7 @@ class StudioProgram(MakerProgram):
         self.values["data.storage.gallery_directory"] = str(self.folder)
         self.on_signal: Callable[[str], None] = lambda name: None
         self.when_advanced: Callable[[float], bool] = lambda now_s: False
-        self.setpoint_unit = "V"
+        self.setpoint_unit = "Hz" if self._holds_frequency else "V"
         self._item_name = "Image"
         self._grid: CurveGrid | None = None
         self._calibrated = False
@@ -189,13 +190,26 @@ class StudioProgram(MakerProgram):
         self.values |= {path: _NOMINAL * value for path, value in self._cantilever.items()}
 
     @property
+    def _holds_frequency(self) -> bool:
+        return self.rig.world.settings.feedback.mode == "frequency-shift"
+
+    @property
     def setpoint_units(self) -> Mapping[str, float]:
-        """Return the possible units of the setpoint, with the value of 1 V in each."""
+        """Return the possible units of the setpoint, with the value in each of 1 V, or of 1 Hz of a frequency shift."""
+        if self._holds_frequency:
+            return {"Hz": 1.0}
         return {"V": 1.0, "m": float(self.values["probe.current_deflection_sensitivity"])}
 
     def scale(self, path: str) -> float:
         """Return the factor from a value of `values` to the one that `get` returns."""
         return self.setpoint_units[self.setpoint_unit] if path == SETPOINT else 1.0
+
+    def bounds(self, path: str) -> tuple[float, float]:
+        """Return the bounds of a number as `get` returns it."""
+        row, scale = PANEL[path], self.scale(path)
+        if path == SETPOINT and self._holds_frequency:
+            return -_MOST_SHIFT_HZ, _MOST_SHIFT_HZ
+        return row.low * scale, row.high * scale
 
     def set_setpoint_unit(self, unit: str) -> None:
         """Change the unit of the setpoint for `get` and `put`. Raises InvalidValue."""
@@ -206,7 +220,7 @@ class StudioProgram(MakerProgram):
     def get(self, path: str) -> object:
         """Return a value of a panel, or where the tip is."""
         if path in ("scanner.offset_x", "scanner.offset_y"):
-            return self.rig.probe_at(self.rig.clock.now_s())[path.endswith("y")]
+            return self.rig.probe_at(self.now_s)[path.endswith("y")]
         value: object = self.values[path] * self.scale(path) if path == SETPOINT else self.values[path]
         return value
 
@@ -219,8 +233,7 @@ class StudioProgram(MakerProgram):
             if type(value) is not type(row.at_first):
                 raise InvalidValue(f"{path}: {value!r} is no {type(row.at_first).__name__}")
         else:
-            low, high = (0, max(number for _, number in row.enum)) if row.enum else (row.low, row.high)
-            low, high = low * self.scale(path), high * self.scale(path)
+            low, high = (0, max(number for _, number in row.enum)) if row.enum else self.bounds(path)
             if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
                 raise InvalidValue(f"{path}: {value!r} is not within {low:g} to {high:g}")
             value = type(row.at_first)(value / self.scale(path))
@@ -246,14 +259,14 @@ class StudioProgram(MakerProgram):
         return self.scanning or self.measuring_curve or self.engages or self.rig.busy(now_s)
 
     def start_curves(self, now_s: float) -> None:
-        """Take the curves of the grid. Raises RigBusy."""
+        """Take the curves of the grid. Raises InstrumentBusy."""
         x, y, width, height, columns, rows, rotation_deg = (self.values[path] for path in FRAMES["grid"])
         region = Region((x, y), (max(width, 1e-12), max(height, 1e-12)), math.radians(rotation_deg))
         points = np.stack([of.ravel() for of in region.pixels_m((rows, columns))], axis=1)
         self._start_grid(CurveGrid((rows, columns), [(px, py) for px, py in points.tolist()]), now_s)
 
     def measure_at(self, kind: str, name: str, place: Sequence[Any], now_s: float) -> None:
-        """Measure an item of the workspace: a frame, a grid, or a point. Raises RigBusy, InvalidValue."""
+        """Measure an item of the workspace: a frame, a grid, or a point. Raises InstrumentBusy, InvalidValue."""
         self._item_name = name
         for path, value in zip(FRAMES.get(kind, ()), place, strict=False):
             self.put(path, value)
@@ -270,8 +283,8 @@ class StudioProgram(MakerProgram):
         super().stop_curve()
         if self._grid is not None:
             self._grid = None
-            self.rig.stop_spectrum()
-            self.rig.stop_move()
+            self.rig.stop_spectrum(self.now_s)
+            self.rig.stop_move(self.now_s)
 
     def withdraw(self, now_s: float) -> None:
         self._grid = None
@@ -282,9 +295,9 @@ class StudioProgram(MakerProgram):
         self._grid = None
 
     def begin_procedure(self, path: str) -> None:
-        """Begin one of `PROCEDURES_S`. Raises RigBusy."""
+        """Begin one of `PROCEDURES_S`. Raises InstrumentBusy."""
         self._refuse_busy()
-        self.rig.occupy(path, PROCEDURES_S[path])
+        self.rig.occupy(path, PROCEDURES_S[path], self.now_s)
         if path == "probe.cantilever_calibration.run":
             self._calibrated = True
         elif path == "z_control.gain_finder.run":
@@ -298,7 +311,7 @@ class StudioProgram(MakerProgram):
         self.values |= self._cantilever
 
     def load_mode(self, name: str) -> None:
-        """Load a mode of measurement. Raises RigBusy: a measurement is running."""
+        """Load a mode of measurement. Raises InstrumentBusy: a measurement is running."""
         self._refuse_busy()
         self.values["mode.name"] = name
 
@@ -320,17 +333,19 @@ class StudioProgram(MakerProgram):
             self.rig.scan.resume(now_s)
 
     def move(self) -> None:
-        """Send the tip to the target. Raises RigBusy, InvalidValue."""
+        """Send the tip to the target. Raises InstrumentBusy, InvalidValue."""
         self.rig.setup.move_speed_m_s = self.values["scanner.move_speed_xy_on_surface"]
-        self.rig.move_probe((self.values["scanner.offset_x_target"], self.values["scanner.offset_y_target"]))
+        self.rig.move_probe(
+            (self.values["scanner.offset_x_target"], self.values["scanner.offset_y_target"]), self.now_s
+        )
 
     def lines(self, channel: int) -> tuple[str, str, list[float]]:
         """Return name, unit and the complete lines of the running scan, one after the other as they were scanned."""
         scan = self.rig.scan
         if scan is None:
             return "", "", []
-        name, (unit, values) = list(_named(scan.channels(self.rig.clock.now_s())).items())[channel]
-        done = scan.lines_done(self.rig.clock.now_s())
+        name, (unit, values) = list(_named(scan.channels(self.now_s)).items())[channel]
+        done = scan.lines_done(self.now_s)
         rows = values if scan.upwards else values[::-1]
         return name, unit, [float(one) for one in rows[:done].ravel()]
 
@@ -376,10 +391,10 @@ class StudioProgram(MakerProgram):
         while grid is not None and not self.rig.busy(now_s):
             if grid.at_point:
                 grid.at_point = False
-                grid.curves.append(self.rig.start_spectrum("force"))
+                grid.curves.append(self.rig.start_spectrum("force", self.now_s))
             elif grid.points_m:
                 self.rig.setup.move_speed_m_s = self.values["scanner.move_speed_xy_on_surface"]
-                self.rig.move_probe(grid.points_m.pop(0))
+                self.rig.move_probe(grid.points_m.pop(0), self.now_s)
                 grid.at_point = True
             else:
                 self._grid = None

@@ -264,7 +264,7 @@ class CommandTree:
 
     @property
     def _now_s(self) -> float:
-        return self._program.rig.clock.now_s()
+        return self._program.now_s
 
     def _blocking(
         self, call: Callable[..., None], waiting: Callable[[], bool], message: Callable[[], str] = lambda: ""
@@ -281,8 +281,8 @@ class CommandTree:
         elif row.unit:
             fields["unit"] = {"get": lambda: row.unit}
         if row.unit and row.low > -1e300:
-            fields["min"] = {"get": lambda: row.low * program.scale(path)}
-            fields["max"] = {"get": lambda: row.high * program.scale(path)}
+            fields["min"] = {"get": lambda: program.bounds(path)[0]}
+            fields["max"] = {"get": lambda: program.bounds(path)[1]}
         table = {name: self._lua.table_from(access) for name, access in fields.items()}
         enum = self._lua.table_from(dict(row.enum)) if row.enum else None
         return self._prelude.property(self._lua.table_from(table), enum)

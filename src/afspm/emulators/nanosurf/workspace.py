@@ -11,8 +11,8 @@ from typing import Any, Final
 from xml.etree import ElementTree
 
 from afspm.emulators.nanosurf.studio import FRAMES, StudioProgram
-from afspm.emulators.rig import RigBusy
 from afspm.errors import AfspmError, InvalidValue
+from afspm.simulation.instrument import InstrumentBusy
 
 NO_ITEM: Final = str(uuid.UUID(int=0))
 _MOST_ITEMS: Final = 1000
@@ -164,14 +164,14 @@ class MeasurementQueue:
         self.entries = kept
 
     def process(self, entries: list[tuple[str, int]]) -> None:
-        """Measure items. Raises RigBusy: something is being measured; InvalidValue: there is no such item."""
+        """Measure items. Raises InstrumentBusy: something is being measured; InvalidValue: there is no such item."""
         for item_id, _ in entries:
             self._workspace[item_id]
-        if self.running or self._program.occupied(self._program.rig.clock.now_s()):
-            raise RigBusy("a measurement is running")
+        if self.running or self._program.occupied(self._program.now_s):
+            raise InstrumentBusy("a measurement is running")
         self.message = ""
         self._left = (item_id for item_id, times in entries for _ in range(times))
-        self.advance(self._program.rig.clock.now_s())
+        self.advance(self._program.now_s)
 
     def abort(self) -> None:
         """Measure no further item."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, Final, Literal, NoReturn
 
@@ -59,7 +60,7 @@ class ParkEmulator(ScriptedEmulator):
     def make_program(self) -> MakerProgram:
         """Make SmartScan."""
         self._scripts: dict[Script, bool] = {}  # and whether its reply was sent already
-        self._smartscan = SmartScanProgram(self.rig, self.faults, self.folder, self.log, **self._times)
+        self._smartscan = SmartScanProgram(self.rig, self.faults, self.clock, self.folder, self.log, **self._times)
         self._smartscan.tells_gains = self._tells_gains
         return self._smartscan
 
@@ -100,7 +101,10 @@ class ParkEmulator(ScriptedEmulator):
                 ended = True
             if ended:
                 del self._scripts[script]
-        times = super().tick(now_s), self._smartscan.next_waking_s(now_s)
+        times = [super().tick(now_s), self._smartscan.next_waking_s(now_s)]
+        for script in self._scripts:
+            if math.isfinite(left_s := script.computes_for_s):
+                times.append(now_s + max(left_s, 0.0) / self.clock.real_s(1.0))
         return min((at_s for at_s in times if at_s is not None), default=None)
 
     def abandon(self) -> None:
@@ -134,13 +138,9 @@ class ParkEmulator(ScriptedEmulator):
         raise ScriptFailed(f"there is no method {method!r}")
 
     def _run(self, request: bytes, source: str) -> bytes | Unfinished:
-        script = Script(source, self._smartscan.names, self._smartscan.ask)
+        script = Script(source, self._smartscan.names, self._smartscan.ask, self.woken.post)
         self._scripts[script] = False
-        reply = self._step(request, script)
-        if isinstance(reply, Unfinished) and self._replies == "at-once":
-            self._scripts[script] = True
-            return _reply(request, result=_DONE, value="")
-        return reply
+        return self._step(request, script)
 
     def _step(self, request: bytes, script: Script) -> bytes | Unfinished:
         try:
@@ -148,6 +148,9 @@ class ParkEmulator(ScriptedEmulator):
         except BaseException:
             self._scripts.pop(script, None)
             raise
+        if found is None and script.waits and self._replies == "at-once":
+            self._scripts[script] = True
+            return _reply(request, result=_DONE, value="")
         if found is None:
             return Unfinished(lambda: self._step(request, script))
         self._scripts.pop(script, None)

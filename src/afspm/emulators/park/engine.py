@@ -7,6 +7,8 @@ the emulator's own thread, which takes turns with it.
 from __future__ import annotations
 
 import json
+import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +20,9 @@ from afspm.emulators.scripted import ScriptFailed
 from afspm.errors import AfspmError
 
 LONGEST_S: Final = 5.0
-"""Real seconds of computing after which a script is given up."""
+"""Real seconds of computing after which a script is given up. Its thread computes on: the engine can't be left."""
+_AT_ONCE_S: Final = 0.25
+"""Real seconds that the emulator waits for a script before it serves others: as long as most need to the end."""
 _MEMORY: Final = 64 << 20
 _PRELUDE: Final = Path(__file__).with_name("prelude.js")
 _REFUSALS: Final = (AfspmError, ArithmeticError, TypeError, ValueError)
@@ -42,10 +46,12 @@ class Script:
 
     Args:
         names: the "values" and "methods" of `spm`.
+        wake: called from the script's thread when `step` has more to do.
     """
 
-    def __init__(self, source: str, names: str, ask: Ask) -> None:
-        self._ask = ask
+    def __init__(self, source: str, names: str, ask: Ask, wake: Callable[[], None] = lambda: None) -> None:
+        self._ask, self._wake = ask, wake
+        self._computes_since_s = time.monotonic()
         self._asks: SimpleQueue[tuple[str, str]] = SimpleQueue()
         self._answers: SimpleQueue[str] = SimpleQueue()
         self._wait: Wait | None = None
@@ -53,7 +59,7 @@ class Script:
         Thread(target=self._work, args=(source, names), name="emulated script", daemon=True).start()
 
     def step(self) -> tuple[object, str] | None:
-        """Run on; return its value as it is and as text, or None while it waits. Raises ScriptFailed."""
+        """Run on; return its value as it is and as text, or None while it waits or computes. Raises ScriptFailed."""
         if self._wait is not None:
             if self._wait.waiting():
                 return None
@@ -61,8 +67,10 @@ class Script:
             self._answer(ended)
         while True:
             try:
-                kind, content = self._asks.get(timeout=LONGEST_S)
+                kind, content = self._asks.get(timeout=_AT_ONCE_S)
             except Empty:
+                if self.computes_for_s > 0.0:
+                    return None
                 self.end()
                 raise ScriptFailed("the script does not come to an end") from None
             if kind == "failed":
@@ -73,6 +81,16 @@ class Script:
             if not self._answered(content):
                 return None
 
+    @property
+    def waits(self) -> bool:
+        """True while it waits for the instrument."""
+        return self._wait is not None
+
+    @property
+    def computes_for_s(self) -> float:
+        """Real seconds after which a script that computes is given up; infinite while it waits for the instrument."""
+        return math.inf if self.waits else self._computes_since_s + LONGEST_S - time.monotonic()
+
     def end(self) -> None:
         """Run it no further: whatever it asks for fails."""
         self._ended, self._wait = True, None
@@ -80,6 +98,7 @@ class Script:
 
     def _answered(self, content: str) -> bool:
         """Do what was asked for; return False if the script waits for it."""
+        self._computes_since_s = time.monotonic()
         try:
             found = self._ask(*json.loads(content))
         except _REFUSALS as error:
@@ -93,6 +112,7 @@ class Script:
         return True
 
     def _answer(self, wait: Wait) -> None:
+        self._computes_since_s = time.monotonic()
         try:
             self._answers.put(json.dumps({"value": wait.value()}))
         except _REFUSALS as error:
@@ -110,14 +130,18 @@ class Script:
             context.add_callable("__ask", self._asked)
             context.eval(_PRELUDE.read_text(encoding="utf-8"))
             context.set("__source", source)
-            self._asks.put(("done", context.eval("__run(__source)")))
+            self._hand_over("done", context.eval("__run(__source)"))
         # an engine that fails in any other way must end its script, too: the emulator waits for it
         except Exception as error:
-            self._asks.put(("failed", str(error).partition("\n")[0]))
+            self._hand_over("failed", str(error).partition("\n")[0])
 
     def _asked(self, content: str) -> str:
         """Never raises: the engine would not survive it."""
         if self._ended:
             return _END
-        self._asks.put(("ask", content))
+        self._hand_over("ask", content)
         return self._answers.get()
+
+    def _hand_over(self, kind: str, content: str) -> None:
+        self._asks.put((kind, content))
+        self._wake()

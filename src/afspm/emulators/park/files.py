@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from afspm.emulators.activities import RETRACE, ScanActivity, SpectrumActivity
 from afspm.files.park_header import (
     CURVE_KINDS,
     CURVES,
@@ -29,6 +28,7 @@ from afspm.files.park_header import (
     VERSION_TAG,
     VERSIONS,
 )
+from afspm.simulation.activities import RETRACE, ScanActivity, SpectrumActivity
 from afspm.simulation.fields import Array
 
 _VERSION = max(VERSIONS)

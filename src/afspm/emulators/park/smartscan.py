@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
-from afspm.emulators.activities import RETRACE, ScanActivity, SpectrumActivity
 from afspm.emulators.park import files
 from afspm.emulators.park.engine import Wait
 from afspm.emulators.program import MakerProgram, NamedFile
@@ -17,6 +16,7 @@ from afspm.errors import InvalidValue
 from afspm.files.park_header import MICROMETRE
 from afspm.model import Region
 from afspm.plain_data import Plain
+from afspm.simulation.activities import RETRACE, ScanActivity, SpectrumActivity
 
 GEOMETRY: Final[dict[str, tuple[type, float, float]]] = {
     "pixelHeight": (int, 1, 8192),
@@ -131,10 +131,6 @@ class SmartScanProgram(MakerProgram):
         self._apply()
 
     @property
-    def now_s(self) -> float:
-        return self.rig.clock.now_s()
-
-    @property
     def names(self) -> str:
         """What there is below `spm`, in JSON."""
         return json.dumps({"values": [*self._values, *self._told], "methods": list(self._methods)})
@@ -198,13 +194,13 @@ class SmartScanProgram(MakerProgram):
 
     def _scan_line(self) -> None:
         self._refuse_busy()
-        self.rig.occupy(_LINE_SCAN, _LINE_SCAN_S)
+        self.rig.occupy(_LINE_SCAN, _LINE_SCAN_S, self.now_s)
 
     def _sweep(self, *given: float) -> Wait:
         for number, value in enumerate(given, 1):
             _number(f"number {number} of a sweep", value, 0.0, 1e9)
         self._refuse_busy()
-        self.rig.occupy("sweep of the drive frequency", _SWEEP_S)
+        self.rig.occupy("sweep of the drive frequency", _SWEEP_S, self.now_s)
         return Wait(lambda: self.rig.busy(self.now_s))
 
     def _approach(self, mode: str = "q+s") -> Wait:
@@ -231,13 +227,13 @@ class SmartScanProgram(MakerProgram):
     def _move_along_z(self, scanner_um: float, stage_um: float, way_um: float, speed_um_s: float) -> Wait:
         """Move scanner or stage; below the height at which the tip touches, it is driven into the sample."""
         self._refuse_busy()
-        self.rig.occupy("move along z", way_um / speed_um_s)
+        self.rig.occupy("move along z", way_um / speed_um_s, self.now_s)
         self._z_um, self.stage_um[2] = scanner_um, stage_um
         height_um = scanner_um + stage_um
         self.rig.engaged = height_um <= 0.0
         if height_um < -_TOUCHES_UM:
-            self.rig.stop("move along z")
-            self.rig.crash(-height_um * MICROMETRE, speed_um_s * MICROMETRE)
+            self.rig.stop("move along z", self.now_s)
+            self.rig.crash(-height_um * MICROMETRE, speed_um_s * MICROMETRE, self.now_s)
         return Wait(lambda: self.rig.busy(self.now_s))
 
     def _move_xy_stage(self, x_um: float, y_um: float, x_speed: float = 1.0, y_speed: float = 1.0) -> Wait:
@@ -249,7 +245,7 @@ class SmartScanProgram(MakerProgram):
         self._refuse_busy()
         by_um = (x_um - self.stage_um[0], y_um - self.stage_um[1])
         lasts_s = max(abs(by_um[0]) / x_speed, abs(by_um[1]) / y_speed) / _STAGE_UM_S
-        self.rig.shift_sample((by_um[0] * MICROMETRE, by_um[1] * MICROMETRE), lasts_s)
+        self.rig.shift_sample((by_um[0] * MICROMETRE, by_um[1] * MICROMETRE), lasts_s, self.now_s)
         self.stage_um[:2] = [x_um, y_um]
         return Wait(lambda: self.rig.busy(self.now_s))
 
@@ -261,7 +257,7 @@ class SmartScanProgram(MakerProgram):
     def _move(self, x_um: float, y_um: float) -> Wait:
         for name, value in (("x", x_um), ("y", y_um)):
             _number(name, value, -50.0, 50.0)
-        self.rig.move_probe((x_um * MICROMETRE, y_um * MICROMETRE))
+        self.rig.move_probe((x_um * MICROMETRE, y_um * MICROMETRE), self.now_s)
         return Wait(lambda: self.rig.doing(self.now_s) == "move")
 
     def _sleep(self, lasts_ms: float) -> Wait:
@@ -314,7 +310,7 @@ class SmartScanProgram(MakerProgram):
 
     def stop_scan(self, now_s: float) -> None:
         super().stop_scan(now_s)
-        self.rig.stop(_LINE_SCAN)
+        self.rig.stop(_LINE_SCAN, self.now_s)
 
     def stop_engaging(self) -> None:
         super().stop_engaging()

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.errors import ConfigError, Refused
-from afspm.microscopes.asylum.activity import FORCE, Activity
+from afspm.microscopes.asylum.activity import FORCE, AsylumActivity
 from afspm.microscopes.asylum.link import Link
 from afspm.microscopes.asylum.result_files import AsylumFiles
 from afspm.microscopes.asylum.session import Session
@@ -20,7 +20,7 @@ from afspm.translator.driver import ControllerLost, Driver, action
 from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.translator.result_files import SCAN
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
-from afspm.units import Duration
+from afspm.units import Duration, PollPeriod
 
 _AT_FIRST: Final[dict[str, Value]] = {
     names.SCAN_DIRECTION: names.UP,
@@ -54,6 +54,7 @@ class Asylum(Driver):
     software: ClassVar[str] = "Asylum Research in Igor Pro"
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
+    _activity: AsylumActivity
 
     def __init__(
         self,
@@ -64,7 +65,7 @@ class Asylum(Driver):
         spots: str = "image",
         move_s: Duration = 2.0,
         reply_timeout_s: Duration = 5.0,
-        poll_period_s: Duration = 0.25,
+        poll_period_s: PollPeriod = 0.25,
         **common: Any,
     ) -> None:
         super().__init__(poll_period_s=poll_period_s, **common)
@@ -95,8 +96,16 @@ class Asylum(Driver):
         self.prove()
         self._kept.kept_in(self.memory)
         self._files = AsylumFiles(self.memory, self.log)
-        self._activity = Activity(
-            session, self._files, self.memory, self._folders, self._frame_in_force, self.clock, self.log
+        self._activity = AsylumActivity(
+            session,
+            self._files,
+            self.memory,
+            self._folders,
+            self._frame_in_force,
+            self.clock,
+            self.log,
+            spot_m=None if self._spots == "none" else self._place.xy_m,
+            take_curve=self._take_curve,
         )
         session.doing()
         if not session.at_once:
@@ -128,7 +137,7 @@ class Asylum(Driver):
         return self._activity.status()
 
     def next_change_s(self) -> float | None:
-        return self._activity.next_change_s()
+        return self._activity.way.next_s
 
     def get(self, vendor: str) -> Value:
         if vendor == names.ENGAGED:
@@ -168,7 +177,7 @@ class Asylum(Driver):
         self._igor().put("LastScan", 1)
         self._begin(SCAN, "DoScanFunc", "UpScan" if up else "DownScan")
         self._igor().put("LastScan", 1)  # also where beginning to scan puts it back
-        self._activity.settle(SCAN)
+        self._activity.await_begin(SCAN)
         if probe_m is not None:  # it stays where it is, on another image
             try:
                 self._place.put(probe_m)
@@ -200,14 +209,14 @@ class Asylum(Driver):
         self._activity.saves(FORCE)
         if self._activity.was_led_away:
             self._place.go()
-            self._activity.takes_on_arrival(self._take_curve)
+            self._activity.curve_awaited = FORCE
         else:
             self._take_curve()
 
     def _take_curve(self) -> None:
-        self._activity.begin(FORCE, None if self._spots == "none" else self._place.xy_m())
+        self._activity.begin_curve()
         self._begin(FORCE, "DoForceFunc", "Single")
-        self._activity.settle(FORCE)
+        self._activity.await_begin(FORCE)
 
     @action(names.STOP_SPEC)
     def stop_spec(self) -> None:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Final
 
 from afspm.errors import ConfigError, Refused
 from afspm.microscopes.gxsm import bridge
-from afspm.microscopes.gxsm.activity import SHOWS_S, Activity, Saving
+from afspm.microscopes.gxsm.activity import SHOWS_S, GxsmActivity, Saving
 from afspm.microscopes.gxsm.hardware import (
     ABORT,
     APPROACH,
@@ -137,7 +137,7 @@ class Gxsm(Driver):
             soon_s=self.patience_s(SOON_S),
             late_s=self.patience_s(LATE_S),
         )
-        self._activity = Activity(
+        self._activity = GxsmActivity(
             ask,
             hardware,
             scan_frame,

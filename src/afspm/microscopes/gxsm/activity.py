@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final
 
 from afspm.clock import Clock
 from afspm.microscopes.gxsm.errors import GxsmError
@@ -16,6 +16,7 @@ from afspm.microscopes.gxsm.result_files import GxsmFiles, endings
 from afspm.microscopes.gxsm.scan_memory import Rows, is_unfinished, looked_at, only
 from afspm.microscopes.gxsm.settings import ScanFrame
 from afspm.model import Region, ScopeState, ScopeStatus
+from afspm.translator.activity import Activity, TipWay
 from afspm.translator.result_files import SCAN, as_list
 from afspm.translator.state import Kept
 
@@ -89,7 +90,25 @@ class ScanProgress:
     follows: bool = False
 
 
-class Activity:
+class AutosaveSwitch:
+    """GXSM's Auto Save: on for scans of its panel, off while a scan of the translator's may be stopped.
+
+    Attributes:
+        on: as it was set by this translator; None: not known.
+    """
+
+    def __init__(self, ask: Asking, *, is_used: bool) -> None:
+        self._ask, self._is_used = ask, is_used
+        self.on: bool | None = None
+
+    def switch(self, *, on: bool) -> None:
+        """Switch it, unless it is so already."""
+        if self._is_used and self.on is not on:
+            self._ask.call("action", AUTOSAVE[on])
+            self.on = on
+
+
+class GxsmActivity(Activity):
     """See the module.
 
     Args:
@@ -99,6 +118,8 @@ class Activity:
         shows_s: how long what was begun may take to be seen running, in experiment time.
         switches_autosave: GXSM's Auto Save is off while a scan of the translator's runs.
     """
+
+    program: ClassVar[str] = "GXSM"
 
     def __init__(
         self,
@@ -115,20 +136,16 @@ class Activity:
         saving: Saving,
         switches_autosave: bool,
     ) -> None:
+        super().__init__(files, clock, log)
         self._ask = ask
         self._hardware = hardware
         self._frame = frame
         self._set_frame = set_frame
         self._files = files
-        self._clock = clock
-        self._log = log
         self._shows_s = shows_s
         self._saving = saving
-        self._switches_autosave = switches_autosave
-        self._autosave: bool | None = None  # as it was set by this translator
-        self._stopping = False
-        self._execute = ""
-        self._kept = kept
+        self._autosave = AutosaveSwitch(ask, is_used=switches_autosave)
+        self._way = TipWay(kept, clock)
         self._looked_ns = 0  # at the last look
         self._shows_until_s = 0.0
         self._scan = ScanProgress()
@@ -138,8 +155,8 @@ class Activity:
 
     def start_scan(self) -> None:
         """Scan the frame."""
-        self._autosave = None  # a person may have switched it at the panel
-        self._switch_autosave(on=False)
+        self._autosave.on = None  # a person may have switched it at the panel
+        self._autosave.switch(on=False)
         self._begin_scan(self._clock.now_ns(), own=True)
         self._scan.y_before = int(self._ask.number("y_current"))
         rows, columns = self._set_frame()[1]
@@ -159,33 +176,28 @@ class Activity:
         self._frame.move_tip(position_m)
         self.sets_out(way_s)
         self._begin_curve(kind, position_m)
-        self._execute = execute(kind)
+        self.curve_awaited = kind
 
     def stop_scan(self) -> None:
         """Break the scan off."""
         self._ask.call("stopscan")
-        self._stop()
+        self.stopped()
 
     def stop_curve(self) -> None:
         """Break the spectrum off."""
-        if not self._execute:
+        if not self.curve_awaited:
             self._ask.call("action", ABORT)
-        self._stop()
+        self.stopped()
 
     def sets_out(self, way_s: float) -> None:
         """The tip was sent on, and arrives so long, experiment time, after it would have been where it was sent before,
         at the latest."""
-        self._kept["arrives_s"] = max(self._clock.now_s(), self._arrives_s) + way_s
-
-    @property
-    def _arrives_s(self) -> float:
-        """Experiment time; it is remembered, as the tip goes on when the link is lost."""
-        return float(self._kept.get("arrives_s", 0.0))
+        self._way.sets_out(way_s, after_last_way=True)
 
     def next_change_s(self) -> float | None:
         """When the tip has arrived, what was begun must show, or files must be there."""
         now_s = self._clock.now_s()
-        times = (self._arrives_s, self._shows_until_s, self._scan.settles_until_s, self._files.next_s() or 0.0)
+        times = (self._way.arrives_s, self._shows_until_s, self._scan.settles_until_s, self._files.next_s() or 0.0)
         return min((at_s for at_s in times if at_s > now_s), default=None)
 
     # --- what goes on ---
@@ -215,19 +227,19 @@ class Activity:
         """Return what GXSM is doing now; what has ended is awaited from here on."""
         doing, now_s = self.doing(), self._clock.now_s()
         # a RedPitaya does not tell measuring from a program of its own that may lead the tip
-        led = self._hardware is Hardware.RPSPMC and now_s < self._arrives_s
-        if self._execute and doing.measuring and not led:
+        led = self._hardware is Hardware.RPSPMC and self._way.is_on
+        if self.curve_awaited and doing.measuring and not led:
             return self._forestalled()
-        if self._execute:
-            if not doing.moving and now_s >= self._arrives_s:
+        if self.curve_awaited:
+            if not doing.moving and not self._way.is_on:
                 self._take_curve(now_s)
             return ScopeStatus(ScopeState.SPEC)
         if doing.measuring and not (led and not self._files.what):
             return self._measuring(doing)
         self._looked_ns = self._clock.now_ns()
-        moving = doing.moving or now_s < self._arrives_s
+        moving = doing.moving or self._way.is_on
         # a stopped spectrum may still be at the tip's way to it
-        if self._stopping and (moving or (self._autosave is False and not self._is_settled(now_s))):
+        if self._stopping and (moving or (self._autosave.on is False and not self._is_settled(now_s))):
             return ScopeStatus(ScopeState.INTERRUPTED)
         self._stopping = False
         what = self._files.what
@@ -236,25 +248,18 @@ class Activity:
         if what == SCAN and not self._is_settled(now_s):
             return ScopeStatus(ScopeState.SCANNING)
         if what:
-            self._end(what)
-        self._switch_autosave(on=True)
+            self.end()
+        self._autosave.switch(on=True)
         if doing.approaching:
             return ScopeStatus(ScopeState.COARSE_MOTOR)
-        if moving:
-            return ScopeStatus(ScopeState.MOVING)
-        return ScopeStatus(ScopeState.INTERRUPTED if self._files.broken_off else ScopeState.FREE)
+        return ScopeStatus(ScopeState.MOVING) if moving else self.at_rest()
 
     def _measuring(self, doing: Doing) -> ScopeStatus:
         if self._files.what == SCAN and doing.scanning and self._is_another():
             self._follow()
         self._shows_until_s = self._scan.settles_until_s = 0.0
         if not self._files.what and not self._stopping:  # somebody began it at the panel
-            if doing.scanning:
-                self._begin_scan(self._looked_ns, own=False)
-                self._switch_autosave(on=True)
-                self._is_another()  # the first look, which later ones are compared with
-            else:
-                self._begin_curve("VP", self._frame.tip())
+            self.begin(SCAN if doing.scanning else "VP")
         if self._files.what == SCAN and self._files.before is None:
             self._look_at_memory()
         self._looked_ns = self._clock.now_ns()
@@ -288,7 +293,7 @@ class Activity:
         name, ended_ns, now_ns = self._scan.name, self._scan.ended_ns, self._clock.now_ns()
         self._files.end(ended_ns or now_ns, now_ns, channels, folder, is_whole=None, before=before)
         self._begin_scan(self._looked_ns, own=False)
-        self._switch_autosave(on=True)
+        self._autosave.switch(on=True)
         self._scan.name, self._scan.follows = name, True
         self._seen_last = (0, 0), None
 
@@ -315,12 +320,6 @@ class Activity:
         last = self._last_row()
         return only(rows, last) if abs(line - last) > 1 else None
 
-    def _switch_autosave(self, *, on: bool) -> None:
-        """Switch GXSM's Auto Save: on for scans of its panel, off while a scan of the translator's may be stopped."""
-        if self._switches_autosave and self._autosave is not on:
-            self._ask.call("action", AUTOSAVE[on])
-            self._autosave = on
-
     def _is_settled(self, now_s: float) -> bool:
         """Return whether GXSM is done with the scan that has just ended."""
         if not self._scan.settles_until_s:
@@ -329,15 +328,24 @@ class Activity:
 
     def _forestalled(self) -> ScopeStatus:
         """The tip was on its way to a spectrum: that must not be taken into what somebody measures."""
-        self._log.error("the spectrum was not taken: another measurement began while the tip moved")
-        self._execute, self._kept["arrives_s"] = "", 0.0
-        self._files.forget()
-        return ScopeStatus(ScopeState.INTERRUPTED)
+        self.curve_awaited = ""
+        self._way.give_up()
+        self.forget()
+        return self.fail("the spectrum was not taken: another measurement began while the tip moved")
 
     def _take_curve(self, now_s: float) -> None:
-        action, self._execute = self._execute, ""
+        action, self.curve_awaited = execute(self.curve_awaited), ""
         self._shows_until_s = now_s + self._shows_s
         self._ask.call("action", action)
+
+    def begin(self, what: str) -> None:
+        """Note a measurement that was begun at the panel, since the last look."""
+        if what != SCAN:
+            self._begin_curve(what, self._frame.tip())
+            return
+        self._begin_scan(self._looked_ns, own=False)
+        self._autosave.switch(on=True)
+        self._is_another()  # the first look, which later ones are compared with
 
     def _begin_scan(self, begun_ns: int, *, own: bool) -> None:
         self._stopping, self._scan = False, ScanProgress()
@@ -351,13 +359,12 @@ class Activity:
         folder = self._saving.probe_dir or self._folder()
         self._files.begin(kind, folder, 0, {"position": list(position_m)})
 
-    def _stop(self) -> None:
-        self._stopping = True
-        self._execute, self._shows_until_s = "", 0.0
-        self._files.forget()
+    def stopped(self) -> None:
+        self._shows_until_s = 0.0
+        super().stopped()
 
-    def _end(self, what: str) -> None:
-        if what != SCAN:
+    def end(self) -> None:
+        if self._files.what != SCAN:
             now_ns = self._clock.now_ns()
             self._files.end(now_ns, now_ns)
             return

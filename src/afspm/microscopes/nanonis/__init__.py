@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Final
 from afspm.errors import ConfigError, FileError, Refused
 from afspm.microscopes.nanonis import fetched, protocol
 from afspm.microscopes.nanonis import settings as own
-from afspm.microscopes.nanonis.activity import Activity
+from afspm.microscopes.nanonis.activity import NanonisActivity
 from afspm.microscopes.nanonis.result_files import NanonisFiles
 from afspm.microscopes.nanonis.session import MODULES, Session
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
@@ -93,7 +93,7 @@ class Nanonis(Driver):
             own_folder = (self.run_dir / "scans").resolve()
             patience_s = self.patience_s(self.result_timeout_s / 2)
             self._files = NanonisFiles(self.memory, self._session_dir, own_folder, patience_s, self.log)
-        self._activity = Activity(session, self._files, self._probe, self.memory, self.clock, self.log)
+        self._activity = NanonisActivity(session, self._files, self._probe, self.memory, self.clock, self.log)
         folder = self._session_dir or Path(session.ask("Util.SessionPathGet")[0])
         if not folder.is_dir():
             self.log.warning(

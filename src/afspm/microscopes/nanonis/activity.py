@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Final
+from typing import ClassVar, Final
 
 from afspm.clock import Clock
 from afspm.errors import Refused
@@ -14,21 +14,20 @@ from afspm.microscopes.nanonis.result_files import NanonisFiles
 from afspm.microscopes.nanonis.session import APPROACH, MODULES, CurveEnded, Heard, ScanEnded, Session
 from afspm.microscopes.nanonis.settings import Probe, ScanFrame
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
+from afspm.translator.activity import Activity
 from afspm.translator.driver import ControllerLost
 from afspm.translator.result_files import SCAN, as_list
 from afspm.translator.setting_groups import frame
 from afspm.translator.state import Kept
 
-_SETTLES_S: Final = 1.0
-"""Real time that a spectrum may take to be seen running."""
 _SHOWS_S: Final = 10.0
-"""The same of a scan, which may have to go to its first line."""
+"""Real time that a scan may take to be seen running, which may have to go to its first line."""
 _LATEST_S: Final = 10.0
 """Experiment time that the tip may arrive later than it should."""
 _SAFE_TIP, _WITHDRAWING = 5, 6
 
 
-class Activity:
+class NanonisActivity(Activity):
     """The measurements, moves and pauses of one controller.
 
     Args:
@@ -37,6 +36,9 @@ class Activity:
     Attributes:
         curve: the data of the last spectrum, once it has ended.
     """
+
+    program: ClassVar[str] = "Nanonis"
+    settles_s: ClassVar[float] = 1.0
 
     def __init__(
         self,
@@ -47,19 +49,17 @@ class Activity:
         clock: Clock,
         log: logging.Logger,
     ) -> None:
+        super().__init__(files, clock, log)
         self._ask = session.ask
         self._listener = session.listener
         self._opened = session.opened
         self._files = files
         self._probe = probe
         self._kept = kept
-        self._clock = clock
-        self._log = log
         self.curve: CurveEnded | None = None
-        self._stopping = False
         self._kind_asked = ""
         self._told: str | None = None
-        self._was_safe = self._cut_off = False
+        self._was_safe = False
         self._shows_until_s = 0.0
 
     # --- what is begun ---
@@ -77,19 +77,32 @@ class Activity:
         Raises:
             Refused: ACTION_ERROR: Nanonis would not.
         """
-        self._begin_curve(kind)
+        self._stopping = False
+        self.begin(kind)
         self._kind_asked = kind
         same_name = ""
         self._listener.curve(MODULES[kind], same_name)
-        self._settle(f"{MODULES[kind]}.StatusGet")
+        self._await_curve(f"{MODULES[kind]}.StatusGet")
 
-    def _begin_curve(self, kind: str) -> None:
-        self._stopping, self.curve = False, None
-        self._files.begin(kind, self._session_folder(), {"position": list(self._probe.xy_m())})
+    def begin(self, what: str) -> None:
+        """Note that a measurement begins; a scan with the frame that Nanonis has."""
+        if what == SCAN:
+            self.begin_scan(frame(ScanFrame(self._ask).read())[0])
+            return
+        self.curve = None
+        self._files.begin(what, self._session_folder(), {"position": list(self._probe.xy_m())})
 
-    def _settle(self, status: str) -> None:
+    def end(self, path: str | None = None) -> None:
+        """Note that the measurement has ended.
+
+        Args:
+            path: of its file, where Nanonis reported it; empty: it is not saved.
+        """
+        self._files.end(self._clock.now_ns(), self._clock.now_s(), path)
+
+    def _await_curve(self, status: str) -> None:
         """Return once what was begun is seen running, or has ended already. Raises Refused: Nanonis would not."""
-        until_s = self._clock.monotonic_s() + _SETTLES_S
+        until_s = self._clock.monotonic_s() + self.settles_s
         while not self._ask(status)[0] and self._clock.monotonic_s() < until_s:
             for heard in self._listener.heard():
                 if isinstance(heard, Exception) and not isinstance(heard, ControllerLost):
@@ -109,21 +122,18 @@ class Activity:
         """Break the scan off."""
         stop, no_direction = 1, 0
         self._ask("Scan.Action", stop, no_direction)
-        self._stopping = True
-        self._files.forget()
+        self.stopped()
 
     def stop_curve(self) -> None:
         """Break the spectrum off."""
         for module in self._opened.intersection(MODULES.values()):
             if self._ask(f"{module}.StatusGet")[0]:
                 self._ask(f"{module}.Stop")
-        self._stopping = True
-        self._files.forget()
+        self.stopped()
 
     def forget(self) -> None:
-        """Nothing comes of what was begun."""
         self._kind_asked = ""
-        self._files.forget()
+        super().forget()
 
     @contextmanager
     def occupied(self, state: ScopeState, lasts_s: float) -> Iterator[None]:
@@ -170,9 +180,8 @@ class Activity:
                 return ScopeStatus(ScopeState.SCANNING)
             told = None
         if self._files.what == SCAN or told is not None:
-            self._end(told)
-        state, cut_off, self._cut_off = self._besides_scans(), self._cut_off, False
-        return ScopeStatus(ScopeState.INTERRUPTED if cut_off or self._files.broken_off else state)
+            self.end(told)
+        return self.at_rest(self._besides_scans())
 
     def refuse_safe_tip(self) -> None:
         """Raise Refused where the tip was withdrawn in an emergency: nothing is to be measured then."""
@@ -182,26 +191,21 @@ class Activity:
 
     def _scanning(self, told: str | None) -> ScopeStatus:
         if told:  # it scans again and again
-            self._end(told)
+            self.end(told)
+        self.follow(SCAN)
         if not self._stopping:
-            if self._files.what != SCAN:
-                self.begin_scan(frame(ScanFrame(self._ask).read())[0])
             self._files.seen()
             self._listener.scan()
             if self._watch_safe_tip(self._ask("ZCtrl.StatusGet")[0]):
                 self.stop_scan()  # it may go on in the air, and look well
-                self._cut_off = True
+                self._failed = True
         return ScopeStatus(ScopeState.SCANNING)
 
     def _besides_scans(self) -> ScopeState:
         kind = self._kind_running()
+        self.follow(kind)
         if kind:
-            if not self._stopping and self._files.what != kind:
-                self._begin_curve(kind)
             return ScopeState.SPEC
-        self._stopping = False
-        if self._files.what:
-            self._end(None)
         state, until_s = self._occupied
         if self._clock.now_s() < until_s:
             return state
@@ -258,10 +262,7 @@ class Activity:
             if self._kind_asked:
                 self._kind_asked = ""
                 not_saved = ""
-                self._end(not_saved)
-
-    def _end(self, told: str | None) -> None:
-        self._files.end(self._clock.now_ns(), self._clock.now_s(), told)
+                self.end(not_saved)
 
     def _session_folder(self) -> str:
         return str(self._ask("Util.SessionPathGet")[0])

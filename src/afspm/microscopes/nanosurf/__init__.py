@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Final
 
 from afspm.errors import ConfigError, Refused
 from afspm.microscopes.nanosurf import commands, lines
-from afspm.microscopes.nanosurf.activity import FORCE, Activity, NanosurfFiles
+from afspm.microscopes.nanosurf.activity import FORCE, NanosurfFiles, StudioActivity
 from afspm.microscopes.nanosurf.link import Link, StudioError
 from afspm.microscopes.nanosurf.session import Session
 from afspm.microscopes.nanosurf.settings import DIRECTION, UNITS, FrameSettings, Slopes, TipPlace, direction
@@ -17,7 +17,7 @@ from afspm.plain_data import PlainMapping
 from afspm.translator.driver import ControllerLost, Driver, action
 from afspm.translator.parameters import Value
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
-from afspm.units import Duration
+from afspm.units import Duration, PollPeriod
 
 _AT_FIRST: Final[dict[str, Value]] = {names.SCAN_DIRECTION: names.UP, names.SPEC_KIND: FORCE}
 _STORAGE: Final = "data.storage"
@@ -54,7 +54,7 @@ class Nanosurf(Driver):
         gallery_dir: str | None = None,
         image_buffer: int | None = None,
         reply_timeout_s: Duration = 5.0,
-        poll_period_s: Duration = 0.25,
+        poll_period_s: PollPeriod = 0.25,
         **common: Any,
     ) -> None:
         super().__init__(poll_period_s=poll_period_s, **common)
@@ -64,7 +64,7 @@ class Nanosurf(Driver):
         self._gallery_dir, self._image_buffer = gallery_dir, image_buffer
         self._reply_timeout_s = reply_timeout_s
         self._session: Session | None = None
-        self._activity: Activity | None = None
+        self._activity: StudioActivity | None = None
         self._kept = KeptSettings(_AT_FIRST)
         self._place = TipPlace(self._studio)
         self.groups = (self._kept, FrameSettings(self._studio), Slopes(self._studio), self._place)
@@ -80,7 +80,7 @@ class Nanosurf(Driver):
         self._check_table(session)
         self._kept.kept_in(self.memory)
         self._files = NanosurfFiles(self.memory, self.log)
-        self._activity = Activity(
+        self._activity = StudioActivity(
             session, self._files, self._place, self._folder, self._frame_in_force, self.clock, self.log
         )
         self._save_files(session)
@@ -175,7 +175,7 @@ class Nanosurf(Driver):
         return self._session
 
     @property
-    def _doing(self) -> Activity:
+    def _doing(self) -> StudioActivity:
         if self._activity is None:
             raise ControllerLost("Studio is not connected", where=self.controller_at)
         return self._activity

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.errors import ConfigError, Refused
-from afspm.microscopes.park.activity import STOP, STOP_CURVE, Activity
+from afspm.microscopes.park.activity import STOP, STOP_CURVE, SmartScanActivity
 from afspm.microscopes.park.link import Link, SmartScanError
 from afspm.microscopes.park.result_files import SETTLE_S, ParkFiles
 from afspm.microscopes.park.session import FALSE, TRUE, Session
@@ -18,7 +18,7 @@ from afspm.translator.driver import ControllerLost, Driver, action
 from afspm.translator.long_call import LongCall
 from afspm.translator.parameters import Value
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
-from afspm.units import Duration, Length
+from afspm.units import Duration, Length, PollPeriod
 
 _SCANNING: Final = TRUE | {"scanning", "running"}
 _IDLE: Final = FALSE | {"idle", "ready", "done", "stopped"}
@@ -54,7 +54,7 @@ class Park(Driver):
         scanning_words: Sequence[str] = (),
         idle_words: Sequence[str] = (),
         reply_timeout_s: Duration = 5.0,
-        poll_period_s: Duration = 0.25,
+        poll_period_s: PollPeriod = 0.25,
         **common: Any,
     ) -> None:
         super().__init__(poll_period_s=poll_period_s, **common)
@@ -68,7 +68,7 @@ class Park(Driver):
         if both:
             raise ConfigError(f"{', '.join(sorted(both))} would mean both", where="idle_words", hint="take one away")
         self._session: Session | None = None
-        self._activity: Activity | None = None
+        self._activity: SmartScanActivity | None = None
         self._place = TipPlace(self._smartscan, self._begun)
         self._kept = KeptSettings(_AT_FIRST)
         self._gains = Gains(self._smartscan)
@@ -94,7 +94,9 @@ class Park(Driver):
             told = f"SmartScan's folder of data {folder} does not exist on this computer"
             raise ConfigError(told, where="data_dir", hint='data_dir = "/where/it/is/mounted"')
         self._files = ParkFiles(self.memory, self.log, self.clock.monotonic_s)
-        self._activity = Activity(session, self._files, self._folder, self._frame_in_force, self.clock, self.log)
+        self._activity = SmartScanActivity(
+            session, self._files, self._folder, self._frame_in_force, self.clock, self.log
+        )
 
     def close(self) -> None:
         if self._activity is not None:
@@ -176,13 +178,13 @@ class Park(Driver):
         return self._session
 
     @property
-    def _doing(self) -> Activity:
+    def _doing(self) -> SmartScanActivity:
         if self._activity is None:
             raise ControllerLost("SmartScan is not connected", where=self.controller_at)
         return self._activity
 
     def _begun(self, call: LongCall) -> None:
-        self._doing.begun(call)
+        self._doing.watch(call)
 
     def _frame_in_force(self) -> Region:
         return frame(self.in_force(FRAME))[0]

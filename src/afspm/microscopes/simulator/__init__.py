@@ -14,16 +14,18 @@ from typing import TYPE_CHECKING, ClassVar, Final, TypeVar
 
 from afspm.errors import AfspmError, ConfigError, ErrorCollector, Refused
 from afspm.files import read
-from afspm.microscopes.simulator.faults import Fault, Faults
-from afspm.microscopes.simulator.instrument import Instrument, PanelEvent
-from afspm.microscopes.simulator.truth import Truth
+from afspm.microscopes.simulator.controller import PanelEvent, SimulatedController
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.plain_data import PlainMapping
+from afspm.process.background import in_background
 from afspm.simulation import World
+from afspm.simulation.faults import INSTRUMENT_FAULTS, Fault, Faults
 from afspm.simulation.feedback import FeedbackSettings
+from afspm.simulation.instrument import Instrument
 from afspm.simulation.settings import build
+from afspm.simulation.truth import Truth
 from afspm.simulation.world import read_settings
-from afspm.translator.driver import Action, Driver, action
+from afspm.translator.driver import Action, ControllerLost, Driver, action
 from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.units import Duration, PollPeriod
 
@@ -36,6 +38,15 @@ Table = dict[str, object]
 """Settings as the experiment file has them."""
 Rows = dict[str, Table]
 
+FAULT_KINDS: Final[Mapping[str, str]] = {
+    **INSTRUMENT_FAULTS,
+    "late-reply": "an answer is delayed by the duration (real time)",
+    "no-reply": "a request is carried out but not answered",
+    "error": "the controller refuses a request",
+    "restart": "the controller can't be reached for the duration",
+    "hang": "the process hangs for the duration (real time)",
+    "crash": "the process ends at once",
+}
 _FAULT = "x-fault"
 _FAULT_PARAMETERS = ("x-fault-kind", "x-fault-count", "x-fault-duration")
 _AT_FIRST: Table = {
@@ -62,22 +73,24 @@ _AT_FIRST: Table = {
     names.CRASH_SPEED: "50 nm/s",
     names.CRASH_DEPTH: "5 nm",
     names.ENGAGED: True,
-    "x-fault-kind": "slow",
+    "x-fault-kind": "late-reply",
     "x-fault-count": 1,
     "x-fault-duration": 1.0,
 }
 
 
 def _told(
-    name: str, do: Callable[[Instrument, float], None], *, state: ScopeState | None = None, refuses: bool = True
+    name: str,
+    do: Callable[[SimulatedController, float], None],
+    *,
+    state: ScopeState | None = None,
+    refuses: bool = True,
 ) -> Callable[[Simulator], None]:
-    """Return the action that has the instrument do something now, unless a simulated fault refuses."""
+    """Return the action that has the controller do something now, unless a simulated fault refuses."""
 
     @action(name, state=state)
     def act(self: Simulator) -> None:
-        if refuses:
-            self.faults.maybe_refuse()
-        do(self._instrument, self.clock.now_s())
+        do(self._reached(refuses=refuses), self.clock.now_s())
 
     return act
 
@@ -152,10 +165,15 @@ class Simulator(Driver):
         with errors:
             World.from_settings(self._world_settings, seed, 0.0)
         self._faults_settings = _made(Fault, faults or [], "faults", errors)
+        with errors:
+            Faults(self._faults_settings, FAULT_KINDS, 0.0)
         self._panel = _made(PanelEvent, panel or [], "panel", errors)
         self._fault_action, self._approach_s = fault_action, approach_s
         self.initial: Mapping[str, Value] = {}
         self.scan_speed_m_s: float | None = None
+        self.faults: Faults | None = None
+        self.demanded: Fault | None = None
+        self._controller: SimulatedController | None = None
         loop = _loop_of(self._world_settings)
         with errors:
             super().__init__(
@@ -203,41 +221,49 @@ class Simulator(Driver):
 
     def connect(self) -> None:
         """Switch the instrument on, or find it as it was."""
+        if self._controller is None:
+            self._controller = self._switch_on()
+        self._reached(refuses=False)
+
+    def _switch_on(self) -> SimulatedController:
         import_module("scipy.io")  # which saves files: the first is not to be later than others
         kept = self.memory
         if "start_s" not in kept:
             values = {name: self.table[name].to_vendor(value) for name, value in self._initial.items()}
-            kept.update(start_s=self.clock.now_s(), values=values, doing=None, results=[], scans=0, spectra=0, panel=0)
+            kept.update(start_s=self.clock.now_s(), values=values, results=[], panel=0)
             kept["faults"] = {}
-        world = World.from_settings(self._world_settings, self._seed, kept["start_s"])
-        self.faults = Faults(self._faults_settings, kept["faults"], kept["start_s"])
+        start_s = kept["start_s"]
+        self.faults = Faults(self._faults_settings, FAULT_KINDS, start_s, kept["faults"])
         truth = Truth(self.run_dir / "truth.jsonl", kept)
-        self._instrument = Instrument(
-            world,
-            self.table,
-            kept,
-            (self.run_dir / "scans").resolve(),
-            faults=self.faults,
-            truth=truth,
-            log=self.log,
-            panel=self._panel,
-            approach_s=self._approach_s,
-            wake=self.wake,
+        instrument = Instrument(self._world_settings, self._seed, start_s, run=in_background, note=truth.note)
+        instrument.setup.approach_s = self._approach_s
+        instrument.drawing.wake, instrument.drawing.log = self.wake, self.log
+        if "instrument" not in kept:
+            instrument.note(start_s, "start", {"settings": self._world_settings, "seed": self._seed})
+        folder = (self.run_dir / "scans").resolve()
+        return SimulatedController(
+            instrument, self.table, kept, folder, faults=self.faults, log=self.log, panel=self._panel
         )
-        if "world" not in kept:
-            kept["world"] = world.state()
-            facts = {"settings": self._world_settings, "seed": self._seed, "truth": world.truth(kept["start_s"])}
-            truth.note(kept["start_s"], "start", facts)
+
+    def _reached(self, *, refuses: bool) -> SimulatedController:
+        """Return the controller, unless a fault is in the way."""
+        now_s, faults, controller = self.clock.now_s(), self.faults, self._controller
+        if controller is None or faults is None or faults.lasts("restart", now_s):
+            raise ControllerLost("the simulated controller can't be reached")
+        if refuses and faults.strikes("error", now_s):
+            raise Refused(ControlResponse.FAILURE, "the controller refused (a simulated fault)")
+        return controller
 
     def status(self) -> ScopeStatus:
-        return ScopeStatus(self._instrument.state(self.clock.now_s()))
+        return ScopeStatus(self._reached(refuses=False).state(self.clock.now_s()))
 
     def next_change_s(self) -> float | None:
-        return self._instrument.next_change_s()
+        return None if self._controller is None else self._controller.next_change_s()
 
     def get(self, vendor: str) -> Value:
         if vendor == names.CONTROLLER:
             return f"simulated microscope of afspm {version('afspm')}"
+        self._reached(refuses=False)
         if vendor not in self.memory["values"]:
             raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, f"the simulated controller has no {vendor!r}")
         value: Value = self.memory["values"][vendor]
@@ -247,33 +273,32 @@ class Simulator(Driver):
         """Set values; the frame and the probe are moved at the move speed."""
         for vendor in values:
             self.get(vendor)
-        if not set(values) <= set(_FAULT_PARAMETERS):
-            self.faults.maybe_refuse()
-        self._instrument.set(dict(values), self.clock.now_s())
+        controller = self._reached(refuses=not set(values) <= set(_FAULT_PARAMETERS))
+        controller.set(dict(values), self.clock.now_s())
 
     def results(self) -> Sequence[str]:
-        return self._instrument.results()
+        return self._reached(refuses=False).results()
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         return list(read(result))
 
     def lines(self, start: int) -> Sequence[ScanLines]:
-        return self._instrument.lines(start, self.clock.now_s())
+        return self._reached(refuses=False).lines(start, self.clock.now_s())
 
-    start_scan = _told(names.START_SCAN, Instrument.start_scan)
-    stop_scan = _told(names.STOP_SCAN, Instrument.stop)
-    start_spec = _told(names.START_SPEC, Instrument.start_spectrum)
-    stop_spec = _told(names.STOP_SPEC, Instrument.stop)
-    pulse = _told(names.PULSE, Instrument.pulse, state=ScopeState.BUSY_PARAM)
-    crash = _told(names.CRASH, Instrument.crash, state=ScopeState.MOVING)
-    engage = _told(names.ENGAGE, Instrument.engage, state=ScopeState.COARSE_MOTOR)
-    retract = _told(names.RETRACT, Instrument.retract, state=ScopeState.COARSE_MOTOR, refuses=False)
+    start_scan = _told(names.START_SCAN, SimulatedController.start_scan)
+    stop_scan = _told(names.STOP_SCAN, SimulatedController.stop)
+    start_spec = _told(names.START_SPEC, SimulatedController.start_spectrum)
+    stop_spec = _told(names.STOP_SPEC, SimulatedController.stop)
+    pulse = _told(names.PULSE, SimulatedController.pulse, state=ScopeState.BUSY_PARAM)
+    crash = _told(names.CRASH, SimulatedController.crash, state=ScopeState.MOVING)
+    engage = _told(names.ENGAGE, SimulatedController.engage, state=ScopeState.COARSE_MOTOR)
+    retract = _told(names.RETRACT, SimulatedController.retract, state=ScopeState.COARSE_MOTOR, refuses=False)
 
     @action(_FAULT, while_busy=True)
     def fault(self) -> None:
         """Make the fault that the parameters "x-fault-…" describe."""
         kind, count, duration_s = (self.memory["values"][name] for name in _FAULT_PARAMETERS)
-        self.faults.demand(Fault(str(kind), 0.0, int(count), float(duration_s)))
+        self.demanded = Fault(str(kind), 0.0, int(count), float(duration_s))
 
     def own_actions(self) -> dict[str, Action]:
         found = super().own_actions()

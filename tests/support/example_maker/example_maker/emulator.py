@@ -6,12 +6,12 @@ import json
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from afspm.emulators.activities import ScanActivity, SpectrumActivity
 from afspm.emulators.emulator import LOOPBACK, Emulator
 from afspm.emulators.program import PROGRAM_FAULTS, MakerProgram, NamedFile
 from afspm.emulators.tcp_server import ClientConnection, TcpServer
 from afspm.errors import AfspmError
 from afspm.model import Region, Scan
+from afspm.simulation.activities import ScanActivity, SpectrumActivity
 from example_maker.files import packed
 
 

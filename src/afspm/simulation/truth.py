@@ -19,13 +19,13 @@ class Truth:
     A disk that hangs gets the lines later: the microscope does not wait for it.
 
     Args:
-        kept: where the number of the last line is kept. After a kill the last event may be written again, under
-            the same `n`.
+        kept: where the number of the last line is kept, if it is to outlive a kill. The last event may then be written
+            again, under the same `n`.
     """
 
-    def __init__(self, path: Path, kept: Plain) -> None:
+    def __init__(self, path: Path, kept: Plain | None = None) -> None:
         self._path = path
-        self._kept = kept
+        self._kept: Plain = {} if kept is None else kept
         self._disk = DiskThread()
 
     def note(self, time_s: float, event: str, facts: Mapping[str, object]) -> None:

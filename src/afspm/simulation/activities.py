@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -11,7 +11,8 @@ import numpy as np
 
 from afspm.model import Feedback, Region
 from afspm.simulation.fields import Array
-from afspm.simulation.scanning import Course
+from afspm.simulation.measuring import Adjustment
+from afspm.simulation.scanning import Course, SimulatedScan
 
 Channels = dict[str, tuple[str, Array]]
 """Channel -> (unit, values [y, x], both ascending)."""
@@ -54,14 +55,15 @@ class Move(Occupied):
 
 @dataclass
 class ScanActivity:
-    """A scan that was started: with the values that were in force then, whatever is changed later.
+    """A scan that was started: with the values that were in force then, and those of `adjusted`.
 
     Attributes:
         number: from 1 on.
         region, shape: of the frame; (rows, columns).
         line_s: of trace and retrace together.
         upwards: whether its first line is the one with the smallest y.
-        feedback, bias_v: in force at its start.
+        feedback, bias_v, slope: in force at its start.
+        adjusted: changes during the scan, each in force from the next line on.
         stopped_s: when it was broken off; None unless it was.
     """
 
@@ -73,24 +75,43 @@ class ScanActivity:
     upwards: bool
     feedback: Feedback
     bias_v: float
+    slope: tuple[float, float] = (0.0, 0.0)
+    adjusted: tuple[Adjustment, ...] = ()
     stopped_s: float | None = None
-    _drawn: Future[ScanValues] = field(default_factory=Future, repr=False)
-    _whole: Channels | None = field(default=None, repr=False)
-    _paused_since_s: float | None = None
-    _paused_s: float = 0.0
+    paused_since_s: float | None = None
+    paused_s: float = 0.0
+    _drawn: Future[ScanValues] = field(default_factory=Future, init=False, repr=False, compare=False)
+    _whole: Channels | None = field(default=None, init=False, repr=False, compare=False)
 
     what = "scan"
+
+    @property
+    def course(self) -> Course:
+        """Place and time of the scan. Raises InvalidValue: it cannot be taken."""
+        return Course(self.region, self.shape, self.line_s, self.start_s, "up" if self.upwards else "down")
+
+    def draw(self, values: ScanValues) -> None:
+        """Take the values, for which `channels` waits."""
+        self._drawn.set_result(values)
+
+    def wait(self) -> None:
+        """Wait until the values are there."""
+        wait([self._drawn])
+
+    def redrawn(self, adjusted: tuple[Adjustment, ...]) -> None:
+        """Forget the values, which are computed again with these adjustments."""
+        self.adjusted, self._whole, self._drawn = adjusted, None, Future()
 
     @property
     def end_s(self) -> float:
         """End of the last line as far as known: later after a pause, earlier if stopped."""
         if self.stopped_s is not None:
             return self.stopped_s
-        return self.start_s + self.shape[0] * self.line_s + self._paused_s
+        return self.start_s + self.shape[0] * self.line_s + self.paused_s
 
     @property
     def paused(self) -> bool:
-        return self._paused_since_s is not None
+        return self.paused_since_s is not None
 
     @property
     def drawing(self) -> bool:
@@ -132,6 +153,12 @@ class ScanActivity:
         drawn = self._drawn.result()
         return drawn.channels(None if until_s is None else self._scanned_until_s(until_s))
 
+    @property
+    def truth(self) -> Mapping[str, object]:
+        """The ground truth of the values, JSON-able; empty in air. Waits as `channels` does."""
+        drawn = self._drawn.result()
+        return drawn.truth if isinstance(drawn, SimulatedScan) else {}
+
     def signals(self, now_s: float) -> dict[str, float]:
         """Return the present value of each channel; on the way back, the retrace where it is recorded."""
         if self._whole is None:
@@ -151,13 +178,13 @@ class ScanActivity:
     def pause(self, now_s: float) -> None:
         """Stay on the line until `resume`."""
         if not self.paused and self.running(now_s):
-            self._paused_since_s = now_s
+            self.paused_since_s = now_s
 
     def resume(self, now_s: float) -> None:
         """Go on."""
-        if self._paused_since_s is not None:
-            self._paused_s += now_s - self._paused_since_s
-            self._paused_since_s = None
+        if self.paused_since_s is not None:
+            self.paused_s += now_s - self.paused_since_s
+            self.paused_since_s = None
 
     def stop(self, now_s: float) -> None:
         """Break it off."""
@@ -168,9 +195,9 @@ class ScanActivity:
     def _scanned_until_s(self, now_s: float) -> float:
         """The time at which an undisturbed scan would have got as far."""
         until_s = now_s if self.stopped_s is None else min(now_s, self.stopped_s)
-        if self._paused_since_s is not None:
-            until_s = min(until_s, self._paused_since_s)
-        return until_s - self._paused_s
+        if self.paused_since_s is not None:
+            until_s = min(until_s, self.paused_since_s)
+        return until_s - self.paused_s
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
-from afspm.emulators.faults import EVERY_TIME, Fault, Faults
 from afspm.errors import ConfigError
+from afspm.simulation.faults import EVERY_TIME, Fault, Faults
 
 KNOWN = {"no-reply": "", "modal-dialog": "", "crash": ""}
 
@@ -63,3 +65,13 @@ def test_a_fault_on_demand_counts_from_now() -> None:
     faults.demand(Fault("crash", 1.0), 150.0)
     assert faults.strikes("crash", 150.5) is None
     assert faults.strikes("crash", 151.0) is not None
+
+
+def test_faults_that_have_struck_do_not_strike_again_after_a_restart() -> None:
+    given, kept = [Fault("crash", 1.0), Fault("no-reply", 0.0, count=3)], {}
+    faults = Faults(given, KNOWN, 100.0, kept)
+    assert faults.strikes("crash", 101.0)
+    assert faults.strikes("no-reply", 101.0)
+    again = Faults(given, KNOWN, 100.0, json.loads(json.dumps(kept)))
+    assert again.strikes("crash", 200.0) is None
+    assert [bool(again.strikes("no-reply", 200.0)) for _ in range(3)] == [True, True, False]

@@ -1,15 +1,26 @@
-"""Fault injection: which faults strike an emulated controller, and when."""
+"""Fault injection: which faults strike a simulated microscope or an emulated controller, and when."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Final
 
 from afspm.errors import ConfigError
-from afspm.plain_data import PlainMapping
+from afspm.plain_data import Plain, PlainMapping
 
 EVERY_TIME = 1_000_000_000
+INSTRUMENT_FAULTS: Final[Mapping[str, str]] = {
+    "scan-refused": "a scan does not begin, without an error",
+    "spectrum-refused": "a curve does not begin, without an error",
+    "stopped": "a scan is stopped at the panel",
+    "withdrawn": "the tip is withdrawn at the panel during a scan, which ends",
+    "no-file": "a scan or curve is not saved",
+    "late-file": "a file appears only after the duration",
+    "half-file": "the second half of a file appears only after the duration",
+}
+"""What goes wrong with any microscope, whatever the way to it."""
 
 
 @dataclass(frozen=True)
@@ -17,8 +28,8 @@ class Fault:
     """One fault.
 
     Attributes:
-        kind: one that the emulator knows.
-        at_s: experiment seconds after the emulator was started, from which on it strikes.
+        kind: one that the microscope or the emulator has.
+        at_s: experiment seconds after the start, from which on it strikes.
         count: how many times.
         duration_s: how long it lasts, for kinds that last (experiment seconds).
     """
@@ -71,30 +82,36 @@ class Fault:
 
 
 class Faults:
-    """The faults of one emulator.
+    """The faults of one simulated microscope or emulator.
 
     Args:
         faults: in any order.
-        known: the kinds that it has, with what each does.
+        known: the kinds that there are, with the effect of each.
         start_s: experiment time that `Fault.at_s` counts from.
+        kept: JSON-able, and lasts: the faults that are left, where they outlive a restart (a crash comes once).
 
     Raises:
-        ConfigError: a kind that it does not have.
+        ConfigError: an unknown kind.
     """
 
-    def __init__(self, faults: Iterable[Fault], known: Mapping[str, str], start_s: float) -> None:
+    def __init__(
+        self, faults: Iterable[Fault], known: Mapping[str, str], start_s: float, kept: Plain | None = None
+    ) -> None:
         self._known = known
         self._start_s = start_s
-        self._left: list[Fault] = []
-        for fault in faults:
+        self._kept: Plain = {} if kept is None else kept
+        given = list(faults)
+        for fault in given:
             self._check(fault.kind)
-            self._left.append(fault)
-        self._left.sort(key=lambda fault: fault.at_s)
+        left = [Fault(**one) for one in self._kept["left"]] if "left" in self._kept else given
+        self._left = sorted(left, key=lambda fault: fault.at_s)
+        self._keep()
 
     def demand(self, fault: Fault, now_s: float) -> None:
         """One more, its time counted from now."""
         self._check(fault.kind)
         self._left.append(replace(fault, at_s=now_s - self._start_s + fault.at_s))
+        self._keep()
 
     def strikes(self, kind: str, now_s: float) -> Fault | None:
         """Return the fault if one of this kind strikes now, and count it.
@@ -108,6 +125,7 @@ class Faults:
                     self._left[i] = replace(fault, count=fault.count - 1)
                 else:
                     del self._left[i]
+                self._keep()
                 return fault
         return None
 
@@ -121,6 +139,9 @@ class Faults:
         """Return the time at which the next fault begins or ends; None if there is none."""
         times = (self._start_s + fault.at_s + after_s for fault in self._left for after_s in (0.0, fault.duration_s))
         return min((at_s for at_s in times if at_s > now_s), default=None)
+
+    def _keep(self) -> None:
+        self._kept["left"] = [asdict(fault) for fault in self._left]
 
     def _check(self, kind: str) -> None:
         if kind not in self._known:

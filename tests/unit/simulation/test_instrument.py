@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from typing import Any
@@ -9,14 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm.emulators.rig import Rig, RigBusy
 from afspm.errors import InvalidValue
 from afspm.model import Region
+from afspm.process.background import in_background
 from afspm.simulation import World
+from afspm.simulation.instrument import Instrument, InstrumentBusy
+from afspm.simulation.scan_drawing import run_at_once
 
 
-def test_a_scan_takes_its_time_and_its_lines_come_one_by_one(rig: Rig, clock: Any) -> None:
-    scan = rig.start_scan()
+def test_a_scan_takes_its_time_and_its_lines_come_one_by_one(rig: Instrument, clock: Any) -> None:
+    scan = rig.start_scan(clock.t_s)
     assert scan.end_s == 1004.0
     told = []
     for t_s in (1000.0, 1000.49, 1000.5, 1002.0, 1003.99, 1004.0):
@@ -26,9 +29,9 @@ def test_a_scan_takes_its_time_and_its_lines_come_one_by_one(rig: Rig, clock: An
     assert rig.scan is scan
 
 
-def test_lines_not_taken_yet_are_missing_on_the_side_it_has_not_reached(rig: Rig) -> None:
+def test_lines_not_taken_yet_are_missing_on_the_side_it_has_not_reached(rig: Instrument) -> None:
     rig.setup.upwards = False
-    scan = rig.start_scan()
+    scan = rig.start_scan(1000.0)
     unit, height = scan.channels(1001.0)["Height"]
     assert unit == "m"
     assert np.isnan(height[:6]).all()
@@ -36,37 +39,37 @@ def test_lines_not_taken_yet_are_missing_on_the_side_it_has_not_reached(rig: Rig
     assert np.array_equal(scan.channels()["Height"][1][6:], height[6:])
 
 
-def test_it_is_the_same_world_as_the_simulators(rig: Rig) -> None:
+def test_it_is_the_same_world_as_the_simulators(rig: Instrument) -> None:
     theirs = World.from_settings({}, 3, 1000.0).scan(rig.setup.region, (8, 16), 0.5, 1000.0, rig.setup.feedback, 0.1)
-    ours = rig.start_scan()
+    ours = rig.start_scan(1000.0)
     assert np.array_equal(ours.channels()["Height"][1], theirs.channels()["Height"][1])
 
 
-def test_what_is_changed_during_a_scan_is_for_the_next(rig: Rig) -> None:
-    scan = rig.start_scan()
+def test_what_is_changed_during_a_scan_is_for_the_next(rig: Instrument) -> None:
+    scan = rig.start_scan(1000.0)
     rig.setup.region, rig.setup.shape = Region((1e-6, 0.0), (2e-6, 1e-6)), (4, 4)
     assert scan.region == Region((0.0, 0.0), (1e-6, 1e-6))
     assert scan.channels()["Height"][1].shape == (8, 16)
 
 
-def test_a_stopped_scan_keeps_the_lines_that_it_had(rig: Rig, clock: Any) -> None:
-    scan = rig.start_scan()
+def test_a_stopped_scan_keeps_the_lines_that_it_had(rig: Instrument, clock: Any) -> None:
+    scan = rig.start_scan(clock.t_s)
     clock.t_s = 1001.2
-    rig.stop_scan()
+    rig.stop_scan(clock.t_s)
     clock.t_s = 1100.0
     assert (scan.stopped_s, scan.lines_done(1100.0), rig.busy(1100.0)) == (1001.2, 2, False)
     assert np.isnan(scan.channels(1100.0)["Height"][1]).all(axis=1).tolist() == [False] * 2 + [True] * 6
 
 
-def test_stopping_a_scan_that_is_over_changes_nothing(rig: Rig, clock: Any) -> None:
-    scan = rig.start_scan()
+def test_stopping_a_scan_that_is_over_changes_nothing(rig: Instrument, clock: Any) -> None:
+    scan = rig.start_scan(clock.t_s)
     clock.t_s = 1010.0
-    rig.stop_scan()
+    rig.stop_scan(clock.t_s)
     assert (scan.stopped_s, scan.end_s, scan.lines_done(1010.0)) == (None, 1004.0, 8)
 
 
-def test_a_pause_puts_the_end_off(rig: Rig) -> None:
-    scan = rig.start_scan()
+def test_a_pause_puts_the_end_off(rig: Instrument) -> None:
+    scan = rig.start_scan(1000.0)
     scan.pause(1001.0)
     assert scan.running(1500.0)
     assert scan.lines_done(1500.0) == 2
@@ -76,44 +79,50 @@ def test_a_pause_puts_the_end_off(rig: Rig) -> None:
     assert np.isfinite(scan.channels(1501.5)["Height"][1]).all(axis=1).sum() == 3
 
 
-def test_what_can_not_be_scanned_is_refused_at_once(rig: Rig) -> None:
+def test_what_can_not_be_scanned_is_refused_at_once(rig: Instrument) -> None:
     rig.setup.line_s = 0.0
     with pytest.raises(InvalidValue, match="line"):
-        rig.start_scan()
+        rig.start_scan(1000.0)
     assert not rig.busy(1000.0)
 
 
-def test_one_thing_at_a_time(rig: Rig) -> None:
-    rig.start_scan()
-    for other in (rig.start_scan, rig.engage, lambda: rig.start_spectrum("IV"), lambda: rig.move_probe((0, 0))):
-        with pytest.raises(RigBusy, match="scan"):
+def test_one_thing_at_a_time(rig: Instrument) -> None:
+    rig.start_scan(1000.0)
+    now_s = 1000.0
+    for other in (
+        lambda: rig.start_scan(now_s),
+        lambda: rig.engage(now_s),
+        lambda: rig.start_spectrum("IV", now_s),
+        lambda: rig.move_probe((0, 0), now_s),
+    ):
+        with pytest.raises(InstrumentBusy, match="scan"):
             other()
 
 
-def test_a_move_takes_as_long_as_the_way_is(rig: Rig, clock: Any) -> None:
+def test_a_move_takes_as_long_as_the_way_is(rig: Instrument, clock: Any) -> None:
     rig.setup.move_speed_m_s = 1e-6
-    rig.move_probe((3e-6, 4e-6))
+    rig.move_probe((3e-6, 4e-6), clock.t_s)
     clock.t_s = 1002.5
     assert rig.probe_at(1002.5) == pytest.approx((1.5e-6, 2e-6))
-    rig.move_probe((1.5e-6, 0.0))  # on its way it is sent elsewhere
+    rig.move_probe((1.5e-6, 0.0), clock.t_s)  # on its way it is sent elsewhere
     assert rig.next_change_s(1002.5) == pytest.approx(1004.5)
     assert rig.probe_at(1005.0) == (1.5e-6, 0.0)
     assert not rig.busy(1005.0)
 
 
-def test_a_move_can_be_stopped_on_the_way(rig: Rig, clock: Any) -> None:
+def test_a_move_can_be_stopped_on_the_way(rig: Instrument, clock: Any) -> None:
     rig.setup.move_speed_m_s = 1e-6
-    rig.move_probe((4e-6, 0.0))
+    rig.move_probe((4e-6, 0.0), clock.t_s)
     clock.t_s = 1001.0
-    rig.stop_move()
+    rig.stop_move(clock.t_s)
     assert rig.probe_m == pytest.approx((1e-6, 0.0))
     assert not rig.busy(1001.0)
 
 
-def test_a_spectrum_is_taken_where_the_probe_is(rig: Rig, clock: Any) -> None:
-    rig.move_probe((1e-7, 0.0))
+def test_a_spectrum_is_taken_where_the_probe_is(rig: Instrument, clock: Any) -> None:
+    rig.move_probe((1e-7, 0.0), clock.t_s)
     clock.t_s += 1.0
-    spectrum = rig.start_spectrum("IV")
+    spectrum = rig.start_spectrum("IV", clock.t_s)
     assert spectrum.position_m == (1e-7, 0.0)
     assert spectrum.values.shape == (256, len(spectrum.names))
     assert rig.doing(1002.9) == "spectrum"
@@ -121,49 +130,49 @@ def test_a_spectrum_is_taken_where_the_probe_is(rig: Rig, clock: Any) -> None:
     assert spectrum.end_s == 1003.0
 
 
-def test_in_air_everything_can_be_done_and_all_is_noise(rig: Rig, clock: Any) -> None:
-    rig.withdraw()
+def test_in_air_everything_can_be_done_and_all_is_noise(rig: Instrument, clock: Any) -> None:
+    rig.withdraw(clock.t_s)
     assert rig.doing(1000.5) == "approach"
     clock.t_s = 1001.0
-    in_air = rig.start_scan()
+    in_air = rig.start_scan(clock.t_s)
     assert in_air.channels().keys() == rig.channels.keys()
     assert np.abs(in_air.channels()["Height"][1]).max() < 1e-10
     assert np.isnan(in_air.channels(1003.0)["Height"][1]).all(axis=1).tolist() == [False] * 4 + [True] * 4
     clock.t_s = 1100.0
-    curve = rig.start_spectrum("IV")
+    curve = rig.start_spectrum("IV", clock.t_s)
     assert np.ptp(curve.values[:, 0]) == pytest.approx(3.0)  # the sweep goes on
     assert np.abs(curve.values[:, 1]).max() < 1e-13
     clock.t_s = 1200.0
-    rig.engage()
+    rig.engage(clock.t_s)
     clock.t_s = 1300.0
-    assert np.ptp(rig.start_scan().channels()["Height"][1]) > 1e-10
+    assert np.ptp(rig.start_scan(clock.t_s).channels()["Height"][1]) > 1e-10
 
 
-def test_withdrawing_ends_whatever_is_going_on(rig: Rig, clock: Any) -> None:
-    scan = rig.start_scan()
+def test_withdrawing_ends_whatever_is_going_on(rig: Instrument, clock: Any) -> None:
+    scan = rig.start_scan(clock.t_s)
     clock.t_s = 1001.0
-    rig.withdraw()
+    rig.withdraw(clock.t_s)
     assert scan.stopped_s == 1001.0
     assert rig.doing(1001.5) == "approach"
 
 
-def test_the_tip_goes_to_and_fro_along_a_turned_line(rig: Rig) -> None:
+def test_the_tip_goes_to_and_fro_along_a_turned_line(rig: Instrument) -> None:
     rig.setup.region = Region((1e-6, 2e-6), (2e-6, 1e-6), math.pi / 2)
-    rig.start_scan()
+    rig.start_scan(1000.0)
     # turned by 90 degrees the fast axis runs along +y, the slow one along -x
     assert rig.probe_at(1000.0) == pytest.approx((1.5e-6, 1e-6))
     assert rig.probe_at(1000.25) == pytest.approx((1.5e-6, 3e-6))
     assert rig.probe_at(1003.75) == pytest.approx((0.5e-6, 3e-6))
 
 
-def test_pulses_and_crashes_happen_to_the_world(rig: Rig, clock: Any) -> None:
-    assert rig.pulse(8.0, 0.1) in ("cured", "worsened", "unchanged")
+def test_pulses_and_crashes_happen_to_the_world(rig: Instrument, clock: Any) -> None:
+    assert rig.pulse(8.0, 0.1, clock.t_s) in ("cured", "worsened", "unchanged")
     clock.t_s = 1001.0
-    rig.crash(depth_m=1e-7, speed_m_s=1e-6)
+    rig.crash(depth_m=1e-7, speed_m_s=1e-6, now_s=clock.t_s)
     assert rig.next_change_s(1001.0) == pytest.approx(1001.2)
     clock.t_s = 1002.0
     deep = rig.world.truth(1002.0)["marks"][-1]
-    rig.crash(depth_m=1e-9, speed_m_s=1e-6)
+    rig.crash(depth_m=1e-9, speed_m_s=1e-6, now_s=clock.t_s)
     shallow = rig.world.truth(1003.0)["marks"][-1]
     assert [mark["kind"] for mark in (deep, shallow)] == ["crash", "crash"]
     assert shallow["depth_m"] < 1e-9 < deep["depth_m"]
@@ -171,23 +180,23 @@ def test_pulses_and_crashes_happen_to_the_world(rig: Rig, clock: Any) -> None:
 
 def test_a_picture_drawn_in_the_background_is_the_same_and_wakes_the_emulator(clock: Any) -> None:
     woken = []
-    at_once, meanwhile = (Rig({}, 3, clock, background=background) for background in (False, True))
+    at_once, meanwhile = (Instrument({}, 3, clock.t_s, run=run) for run in (run_at_once, in_background))
     meanwhile.drawing.wake = lambda: woken.append(True)
     heights = []
     for rig in (at_once, meanwhile):
         rig.setup.shape = (8, 16)
-        heights.append(rig.start_scan().channels()["Height"][1])
+        heights.append(rig.start_scan(clock.t_s).channels()["Height"][1])
     assert np.array_equal(*heights)
-    meanwhile.stop_scan()
-    meanwhile.start_scan().channels()
+    meanwhile.stop_scan(clock.t_s)
+    meanwhile.start_scan(clock.t_s).channels()
     assert woken
 
 
-def test_it_follows_the_sample_with_the_velocity_that_it_is_told(rig: Rig, clock: Any) -> None:
-    rig.start_scan()
-    rig.follow((2e-9, -1e-9))
+def test_it_follows_the_sample_with_the_velocity_that_it_is_told(rig: Instrument, clock: Any) -> None:
+    rig.start_scan(clock.t_s)
+    rig.follow((2e-9, -1e-9), clock.t_s)
     clock.t_s = 1100.0
-    ours = rig.start_scan().channels()["Height"][1]
+    ours = rig.start_scan(clock.t_s).channels()["Height"][1]
     world = World.from_settings({}, 3, 1000.0)
     world.scan(rig.setup.region, (8, 16), 0.5, 1000.0, rig.setup.feedback, 0.1)
     world.compensate((2e-9, -1e-9), 1000.0)
@@ -198,12 +207,12 @@ def test_it_follows_the_sample_with_the_velocity_that_it_is_told(rig: Rig, clock
     assert np.corrcoef(ours.ravel(), elsewhere.ravel())[0, 1] < 0.999
 
 
-def test_a_tip_at_rest_shows_what_a_scan_shows_there_and_looking_changes_nothing(rig: Rig, clock: Any) -> None:
+def test_a_tip_at_rest_shows_what_a_scan_shows_there_and_looking_changes_nothing(rig: Instrument, clock: Any) -> None:
     rig.setup.region, rig.setup.shape = Region((30e-9, -20e-9), (10e-9, 10e-9)), (9, 9)
-    rig.move_probe((30e-9, -20e-9))
+    rig.move_probe((30e-9, -20e-9), clock.t_s)
     clock.t_s += 10.0
     shown = [rig.signals(clock.t_s) for _ in range(20)]
-    scanned = rig.start_scan().channels()
+    scanned = rig.start_scan(clock.t_s).channels()
     looked_at = {name: np.array([signals[name] for signals in shown]) for name in shown[0]}
     assert set(looked_at) == {name for name in scanned if not name.endswith("Retrace")}
     for name, values in looked_at.items():
@@ -215,8 +224,8 @@ def test_a_tip_at_rest_shows_what_a_scan_shows_there_and_looking_changes_nothing
     assert rig.world.state() == unseen.state()
 
 
-def test_signals_follow_the_lines_of_a_scan_and_are_noise_without_a_sample(rig: Rig, clock: Any) -> None:
-    scan = rig.start_scan()
+def test_signals_follow_the_lines_of_a_scan_and_are_noise_without_a_sample(rig: Instrument, clock: Any) -> None:
+    scan = rig.start_scan(clock.t_s)
     picture = scan.channels()
     clock.t_s = scan.start_s + 2 * rig.setup.line_s + rig.setup.line_s * 0.25 * 1.01
     assert rig.signals(clock.t_s)["Height"] == picture["Height"][1][2, 8]
@@ -225,12 +234,12 @@ def test_signals_follow_the_lines_of_a_scan_and_are_noise_without_a_sample(rig: 
     rig.setup.feedback = replace(rig.setup.feedback, setpoint=-1.0)
     clock.t_s = scan.end_s + 1.0
     assert abs(rig.signals(clock.t_s)["Current"]) < 1e-13, "no feedback, no contact"
-    rig.withdraw()
+    rig.withdraw(clock.t_s)
     assert abs(rig.signals(clock.t_s)["Current"]) < 1e-13
 
 
 def test_with_the_feedback_off_the_current_follows_where_z_is_held(clock: Any) -> None:
-    rig = Rig({"feedback": {"mode": "current", "setpoint": 1e-10}}, 3, clock)
+    rig = Instrument({"feedback": {"mode": "current", "setpoint": 1e-10}}, 3, clock.t_s)
     z_m = np.mean([rig.signals(clock.t_s)["Height"] for _ in range(50)])
     rig.setup.feedback = replace(rig.setup.feedback, on=False)
     rig.hold(float(z_m))
@@ -242,31 +251,33 @@ def test_with_the_feedback_off_the_current_follows_where_z_is_held(clock: Any) -
 
 
 @pytest.fixture
-def sensor(clock: Any) -> Rig:
+def sensor(clock: Any) -> Instrument:
     """An instrument with an oscillating sensor, on flat ground."""
     settings = {"feedback": {"mode": "frequency-shift", "setpoint": -20.0}, "noise": {"scar_probability": 0.0}}
-    rig = Rig(settings, 3, clock, background=False)
+    rig = Instrument(settings, 3, clock.t_s)
     rig.setup.region, rig.setup.shape = Region((30e-9, -20e-9), (10e-9, 10e-9)), (9, 9)
-    rig.move_probe((30e-9, -20e-9))
+    rig.move_probe((30e-9, -20e-9), clock.t_s)
     clock.t_s += 10.0
     return rig
 
 
-def _shift_hz(rig: Rig, clock: Any) -> float:
+def _shift_hz(rig: Instrument, clock: Any) -> float:
     return float(np.mean([rig.signals(clock.t_s)["Frequency Shift"] for _ in range(100)]))
 
 
-def test_a_sensor_at_rest_shows_the_frequency_shift_of_the_picture_and_of_the_setpoint(sensor: Rig, clock: Any) -> None:
+def test_a_sensor_at_rest_shows_the_frequency_shift_of_the_picture_and_of_the_setpoint(
+    sensor: Instrument, clock: Any
+) -> None:
     for setpoint_hz in (-20.0, -5.0):
         sensor.setup.feedback = replace(sensor.setup.feedback, setpoint=setpoint_hz)
-        unit, picture_hz = sensor.start_scan().channels()["Frequency Shift"]
+        unit, picture_hz = sensor.start_scan(clock.t_s).channels()["Frequency Shift"]
         clock.t_s += 100.0
         assert unit == "Hz"
         assert _shift_hz(sensor, clock) == pytest.approx(setpoint_hz, abs=0.05)
         assert np.median(picture_hz) == pytest.approx(setpoint_hz, abs=0.2)
 
 
-def test_a_sensor_that_is_lifted_shows_what_is_left_of_the_attraction(sensor: Rig, clock: Any) -> None:
+def test_a_sensor_that_is_lifted_shows_what_is_left_of_the_attraction(sensor: Instrument, clock: Any) -> None:
     z_m = float(np.mean([sensor.signals(clock.t_s)["Height"] for _ in range(400)]))
     sensor.setup.feedback = replace(sensor.setup.feedback, on=False)
     shifts_hz = []
@@ -276,21 +287,21 @@ def test_a_sensor_that_is_lifted_shows_what_is_left_of_the_attraction(sensor: Ri
     physics = sensor.world.settings.feedback.sensor
     lifted_hz = float(physics.shift_hz(np.array(physics.distance_m(-20.0) + 1e-9)))
     assert shifts_hz == [pytest.approx(-20.0, abs=0.5), pytest.approx(lifted_hz, abs=0.3), pytest.approx(0.0, abs=0.05)]
-    sensor.withdraw()
+    sensor.withdraw(clock.t_s)
     assert _shift_hz(sensor, clock) == pytest.approx(0.0, abs=0.05)
 
 
 def test_a_scan_that_can_not_be_simulated_is_one_broken_off(
-    rig: Rig, clock: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    rig: Instrument, clock: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    rig = Rig({}, 3, clock)
+    rig = Instrument({}, 3, clock.t_s)
     rig.setup.shape = (16, 16)
 
     def fails(*_: Any, **__: Any) -> None:
         raise MemoryError
 
     monkeypatch.setattr(rig.world, "scan", fails)
-    scan = rig.start_scan()
+    scan = rig.start_scan(clock.t_s)
     picture = scan.channels()
     assert (scan.stopped_s, scan.running(clock.t_s), rig.busy(clock.t_s)) == (scan.start_s, False, False)
     assert set(picture) == set(rig.channels)
@@ -298,7 +309,7 @@ def test_a_scan_that_can_not_be_simulated_is_one_broken_off(
     assert "was stopped" in caplog.text
 
 
-def test_what_makes_no_sense_is_refused_before_anything_begins(rig: Rig, clock: Any) -> None:
+def test_what_makes_no_sense_is_refused_before_anything_begins(rig: Instrument, clock: Any) -> None:
     for change in (
         {"feedback": replace(rig.setup.feedback, setpoint=-1.0)},
         {"feedback": replace(rig.setup.feedback, integral_gain=-1.0)},
@@ -314,18 +325,103 @@ def test_what_makes_no_sense_is_refused_before_anything_begins(rig: Rig, clock: 
         for name, value in change.items():
             setattr(rig.setup, name, value)
         with pytest.raises(InvalidValue):
-            rig.start_scan()
+            rig.start_scan(clock.t_s)
         for name, value in before.items():
             setattr(rig.setup, name, value)
     rig.engaged = False
     for begin in (
-        lambda: rig.move_probe((math.nan, 0.0)),
-        lambda: rig.pulse(1.0, math.nan),
-        lambda: rig.crash(1e-9, 0.0),
-        lambda: rig.follow((1.0, 0.0)),
+        lambda: rig.move_probe((math.nan, 0.0), clock.t_s),
+        lambda: rig.pulse(1.0, math.nan, clock.t_s),
+        lambda: rig.crash(1e-9, 0.0, clock.t_s),
+        lambda: rig.follow((1.0, 0.0), clock.t_s),
         lambda: rig.hold(math.inf),
     ):
         with pytest.raises(InvalidValue):
             begin()
     assert not rig.busy(clock.t_s)
     assert rig.scan is None
+
+
+def _kept(rig: Instrument) -> Any:
+    return json.loads(json.dumps(rig.state()))
+
+
+def _killed(rig: Instrument) -> Instrument:
+    """Another instrument that goes on from what the first has on disk."""
+    again = Instrument({}, 3, 1000.0)
+    again.setup = rig.setup
+    again.restore(_kept(rig))
+    return again
+
+
+def test_killed_instrument_goes_on_with_its_scan_as_if_nothing_had_happened(rig: Instrument) -> None:
+    rig.pulse(8.0, 0.1, 1000.0)
+    rig.start_scan(1001.0)
+    again = _killed(rig)
+    assert (again.doing(1002.0), again.probe_at(1002.0)) == ("scan", rig.probe_at(1002.0))
+    for instrument in (rig, again):
+        ended = instrument.ended(1010.0)
+        assert ended is instrument.scan
+        assert instrument.ended(1010.0) is None
+    assert rig.scan is not None
+    assert again.scan is not None
+    assert np.array_equal(rig.scan.channels()["Height"][1], again.scan.channels()["Height"][1])
+    for instrument in (rig, again):
+        instrument.start_scan(1020.0)
+    assert (rig.scan.number, again.scan.number) == (2, 2)
+    assert np.array_equal(rig.scan.channels()["Height"][1], again.scan.channels()["Height"][1])
+    assert _kept(rig) == _kept(again)
+
+
+def test_killed_instrument_goes_on_with_whatever_it_did(rig: Instrument) -> None:
+    for now_s, begin, what in (
+        (1000.0, lambda at_s: rig.move_probe((3e-6, 0.0), at_s), "move"),
+        (1010.0, lambda at_s: rig.start_spectrum("force", at_s), "spectrum"),
+        (1020.0, rig.withdraw, "approach"),
+    ):
+        begin(now_s)
+        again = _killed(rig)
+        assert (again.doing(now_s), again.ends_s, again.engaged) == (what, rig.ends_s, rig.engaged)
+        assert again.probe_at(now_s) == rig.probe_at(now_s)
+        if what == "spectrum":
+            assert np.array_equal(rig.spectrum.values, again.spectrum.values)  # type: ignore[union-attr]
+
+
+def test_velocity_that_is_set_during_a_scan_moves_the_rest_of_it_and_outlives_a_kill(rig: Instrument) -> None:
+    rig.setup.upwards = True
+    before = rig.start_scan(1000.0).channels()["Height"][1]
+    rig.follow((1e-7, 0.0), 1002.0)  # after four of eight lines
+    again = _killed(rig)
+    for instrument in (rig, again):
+        assert instrument.scan is not None
+        after = instrument.scan.channels()["Height"][1]
+        change_m = np.abs(after - before)
+        assert change_m[:3].max() < 0.1 * change_m[5:].max()
+    assert rig.world.sample.compensation.at(1100.0)[0] == pytest.approx(again.world.sample.compensation.at(1100.0)[0])
+
+
+def test_feedback_that_is_set_during_a_scan_is_in_force_from_the_next_line_on(rig: Instrument) -> None:
+    before = rig.start_scan(1000.0).channels()["Amplitude"][1]
+    rig.setup.feedback = replace(rig.setup.feedback, setpoint=0.3)
+    rig.adjust(1002.0)
+    assert rig.scan is not None
+    after = rig.scan.channels()["Amplitude"][1]
+    assert np.array_equal(before[:4], after[:4])
+    assert np.median(after[4:]) == pytest.approx(0.3, abs=0.05)
+    assert np.median(before[4:]) == pytest.approx(0.7, abs=0.05)
+
+
+def test_events_are_noted_with_the_truth(clock: Any) -> None:
+    noted: list[tuple[float, str, bool]] = []
+    rig = Instrument(
+        {}, 3, clock.t_s, note=lambda time_s, event, facts: noted.append((time_s, event, "drift_m" in facts["truth"]))
+    )
+    rig.setup.shape, rig.setup.line_s = (4, 4), 0.5
+    rig.start_scan(1000.0)
+    rig.stop_scan(1001.0)
+    rig.start_spectrum("IV", 1002.0)
+    rig.stop_spectrum(1003.0)
+    rig.pulse(8.0, 0.1, 1004.0)
+    rig.crash(1e-9, 1e-8, 1005.0)
+    events = ("scan starts", "scan stopped", "spectrum starts", "spectrum stopped", "pulse", "crash")
+    assert noted == [(1000.0 + number, event, True) for number, event in enumerate(events)]

@@ -1,0 +1,465 @@
+"""`Instrument`: the one simulated instrument, behind the Simulator's driver and behind every emulated controller.
+
+Theory of operation. A driver or a maker's protocol puts values in force (`setup`), begins one activity after the other,
+and asks how far it is. The instrument has no clock and no threads: every call gets the time (experiment seconds), and
+the work of drawing a scan is handed to `run`, which may do it in a thread.
+
+| | |
+| --- | --- |
+| comes in | `setup`, commands with their time |
+| state | the world (tip, sample, drift), one activity, the probe's position |
+| goes out | activities with their values, a `note` of each event |
+
+What always holds: one activity at a time; the world is touched by the drawing of a scan or by the caller, never by both
+(`ScanDrawing.wait`); the same seed and the same commands at the same times give the same values; `state` at any moment
+is enough to go on after a kill: a running scan is drawn anew from the world as it was at its start.
+
+Lengths in m in tip coordinates, angles in rad counter-clockwise, times in experiment seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from afspm.errors import AfspmError, InvalidValue
+from afspm.model import Feedback, Region
+from afspm.model.snapshot import restored, snapshot
+from afspm.plain_data import Plain, PlainMapping
+from afspm.simulation.activities import RETRACE, Move, Occupied, ScanActivity, SpectrumActivity, noise_in_air
+from afspm.simulation.feedback import FeedbackSettings
+from afspm.simulation.measuring import Adjustment
+from afspm.simulation.scan_drawing import RunWork, ScanDrawing, run_at_once
+from afspm.simulation.world import World
+
+Doing = ScanActivity | SpectrumActivity | Occupied
+Note = Callable[[float, str, Mapping[str, object]], None]
+"""Takes the time of an event, its name, and facts of it."""
+_MOST_AVERAGED = 32  # of more sweeps the noise is no less
+_FASTEST_DRIFT_M_S = 1e-6
+_FEW = (2, 2)  # pixels: enough to see which channels there are
+_STATE_VERSION = 1
+
+
+class InstrumentBusy(AfspmError):
+    """The instrument does something else, which is to be stopped or waited for first."""
+
+    code = "instrument-busy"
+
+
+class InstrumentSetup:
+    """The settings in force.
+
+    Attributes:
+        region, shape, line_s, upwards: of the next scan: the frame, (rows, columns), seconds of a line there and back,
+            and whether it begins with the smallest y.
+        slope: compensation of tilt, (x, y).
+        move_speed_m_s: of the probe outside of scans.
+        approach_s: duration of an approach or a withdrawal.
+    """
+
+    def __init__(self, feedback: FeedbackSettings) -> None:
+        self.region = Region((0.0, 0.0), (1e-6, 1e-6))
+        self.shape = (128, 128)
+        self.line_s = 1.0
+        self.upwards = True
+        self.feedback = Feedback(feedback.on, feedback.proportional_gain, feedback.integral_gain, feedback.setpoint)
+        self.bias_v = 0.1
+        self.slope = (0.0, 0.0)
+        self.move_speed_m_s = 5e-6
+        self.approach_s = 1.0
+
+
+@dataclass(frozen=True)
+class InstrumentState:
+    """All of an instrument that outlives a kill, besides its world and its `setup`; at most one activity is there."""
+
+    engaged: bool
+    probe_m: tuple[float, float]
+    spectra: int
+    last_scan: int
+    scan: ScanActivity | None
+    spectrum: SpectrumActivity | None
+    move: Move | None
+    occupied: Occupied | None
+
+
+class Instrument:
+    """A simulated instrument, which does one thing at a time. For one thread at a time.
+
+    Args:
+        world_settings: `surface`, `tip`, `drift` … of the simulated world, as of the Simulator.
+        seed: everything that is left to chance follows from it.
+        start_s: the first time that the instrument is called with.
+        run: runs the drawing of scans; by default at once.
+        note: gets each event, for the ground truth.
+
+    Attributes:
+        setup: the settings in force.
+        drawing: of scans.
+        engaged: whether the tip is at the sample; if not, all that is measured is noise.
+        scan, spectrum: the last one that was started, also when it is over; None before the first.
+        world: the physics, with its ground truth (`world.truth`).
+    """
+
+    def __init__(
+        self,
+        world_settings: PlainMapping,
+        seed: int,
+        start_s: float,
+        *,
+        run: RunWork = run_at_once,
+        note: Note | None = None,
+    ) -> None:
+        self.seed = seed
+        self._world_settings = world_settings
+        self.world = World.from_settings(world_settings, seed, start_s)
+        self.setup = InstrumentSetup(self.world.settings.feedback)
+        self.drawing = ScanDrawing(self.world, lambda: self.channels, seed, run)
+        self.engaged = True
+        self.scan: ScanActivity | None = None
+        self.spectrum: SpectrumActivity | None = None
+        self._doing: Doing | None = None
+        self._probe_m = (0.0, 0.0)
+        self._counts = {"scan": 0, "spectrum": 0}
+        self._before: Plain = {}  # the world before the running scan
+        self._noise = np.random.default_rng((seed, 3))
+        self._signals: Mapping[str, float] = {}
+        self._note = note
+
+    # -- what goes on
+
+    @cached_property
+    def channels(self) -> Mapping[str, str]:
+        """The channels of every scan, with their units: of a few pixels of a world that nothing happens to."""
+        few = World.from_settings(self._world_settings, self.seed, 0.0)
+        scan = few.scan(Region((0.0, 0.0), (1e-9, 1e-9)), _FEW, 1.0, 0.0)
+        return {name: unit for name, (unit, _) in scan.channels().items()}
+
+    def doing(self, now_s: float) -> str:
+        """Return "scan", "spectrum", "move", "pulse", "crash", "approach", the activity of `occupy`, or "" if free."""
+        return self._doing.what if self._doing is not None and self._doing.running(now_s) else ""
+
+    def busy(self, now_s: float) -> bool:
+        """True while something is going on."""
+        return bool(self.doing(now_s))
+
+    @property
+    def ends_s(self) -> float | None:
+        """The end of the last activity until `ended` has returned it; None if free, paused or still being drawn."""
+        doing = self._doing
+        if doing is None or (isinstance(doing, ScanActivity) and (doing.paused or doing.drawing)):
+            return None
+        return doing.end_s
+
+    def next_change_s(self, now_s: float) -> float | None:
+        """Return when it will be free; None if it is free or paused, or if `drawing.wake` will be called."""
+        ends_s = self.ends_s
+        return None if ends_s is None or ends_s <= now_s else ends_s
+
+    def ended(self, now_s: float) -> Doing | None:
+        """Return the activity that has ended since the last call; None if none has."""
+        doing = self._doing
+        if doing is None or doing.running(now_s):
+            return None
+        self._doing = None
+        return doing
+
+    def probe_at(self, now_s: float) -> tuple[float, float]:
+        """Return the position of the tip, also during a move or a scan."""
+        doing = self._doing
+        if isinstance(doing, ScanActivity) and doing.running(now_s):
+            return doing.tip_m(now_s)
+        if isinstance(doing, Move) and doing.running(now_s):
+            return doing.probe_at(now_s)
+        return self._probe_m
+
+    def signals(self, now_s: float) -> Mapping[str, float]:
+        """Return the present value of each channel with its noise: along the line during a scan, else at rest."""
+        scan, place = self.scan, self.probe_at(now_s)
+        if not self.engaged:
+            return self._noise_alone()
+        if scan is not None and scan.drawing and self._signals:
+            return self._signals  # the world is one thread's at a time
+        self.drawing.wait()
+        if scan is not None and scan is self._doing and scan.running(now_s):
+            self._signals = scan.signals(now_s)
+        else:
+            try:
+                self._signals = self.world.at_rest(
+                    place, now_s, self.setup.feedback, self.setup.bias_v, slope=self.setup.slope, random=self._noise
+                )
+            except InvalidValue:  # nothing is met with such a feedback
+                self._signals = self._noise_alone()
+        return self._signals
+
+    def _noise_alone(self) -> dict[str, float]:
+        kinds = {name: unit for name, unit in self.channels.items() if not name.endswith(RETRACE)}
+        return {name: float(noise_in_air(self._noise, (), unit)) for name, unit in kinds.items()}
+
+    @property
+    def probe_m(self) -> tuple[float, float]:
+        """The target of the last move, (x, y), at which spectra, pulses and crashes happen."""
+        return self._probe_m
+
+    # -- scans
+
+    def start_scan(self, now_s: float) -> ScanActivity:
+        """Scan the frame.
+
+        Raises:
+            InstrumentBusy. InvalidValue: what is in force can't be scanned.
+        """
+        self._check_free(now_s)
+        setup = self.setup
+        number = self._counts["scan"] + 1
+        scan = ScanActivity(
+            number,
+            setup.region,
+            setup.shape,
+            now_s,
+            setup.line_s,
+            setup.upwards,
+            setup.feedback,
+            setup.bias_v,
+            setup.slope,
+        )
+        draw = self.drawing.prepared(scan, engaged=self.engaged)
+        self._before, self._counts["scan"] = self.world.state(), number
+        self.note(now_s, "scan starts", {"number": number})
+        self.scan = self._doing = scan
+        self.drawing.start(scan, draw)
+        return scan
+
+    def stop_scan(self, now_s: float) -> None:
+        """Break the scan off, if one is running. What it has of lines stays to be had from `scan`."""
+        if self.scan is not None and self.scan is self._doing and self.scan.running(now_s):
+            self.scan.stop(now_s)
+            self.note(now_s, "scan stopped", {})
+
+    def adjust(self, now_s: float) -> None:
+        """Take the rest of a running scan with the feedback and the bias that are in force now."""
+        if self._scans and self.scan is not None and self.scan.running(now_s):
+            self.drawing.wait()
+            self.world.restore(self._before)
+            self._redraw((*self.scan.adjusted, Adjustment(now_s, self.setup.feedback, self.setup.bias_v)))
+
+    @property
+    def _scans(self) -> bool:
+        return self.scan is not None and self.scan is self._doing and self.scan.stopped_s is None
+
+    def _redraw(self, adjusted: tuple[Adjustment, ...]) -> None:
+        assert self.scan is not None
+        self._before = self.world.state()
+        self.scan.redrawn(adjusted)
+        self.drawing.start(self.scan, self.drawing.prepared(self.scan, engaged=self.engaged))
+
+    # -- spectra
+
+    def start_spectrum(self, kind: str, now_s: float, sweeps: int = 1) -> SpectrumActivity:
+        """Take a curve of a kind ("IV", "force") where the probe is, the mean of so many.
+
+        Raises:
+            InstrumentBusy. InvalidValue: there is no such kind.
+        """
+        self._check_free(now_s)
+        taken = [
+            self.world.spectrum(kind, self._probe_m, now_s, self.setup.feedback, self.setup.bias_v)
+            for _ in range(max(1, min(sweeps, _MOST_AVERAGED)))
+        ]
+        names, units, _ = taken[0]
+        values = np.mean([values for _, _, values in taken], axis=0)
+        self._counts["spectrum"] = number = self._counts["spectrum"] + 1
+        if not self.engaged:
+            random = np.random.default_rng((self.seed, 2, number))
+            for column, unit in list(enumerate(units))[1:]:  # the first is what is swept
+                values[:, column] = noise_in_air(random, values.shape[:1], unit)
+        end_s = now_s + sweeps * self.world.spectrum_s(kind)
+        self.spectrum = SpectrumActivity(number, kind, self._probe_m, now_s, end_s, names, units, values)
+        self._doing = self.spectrum
+        self.note(now_s, "spectrum starts", {"number": number, "kind": kind})
+        return self.spectrum
+
+    def stop_spectrum(self, now_s: float) -> None:
+        """Break the spectrum off, if one is running: it is gone."""
+        if isinstance(self._doing, SpectrumActivity) and self._doing.running(now_s):
+            self._doing = self.spectrum = None
+            self.note(now_s, "spectrum stopped", {})
+
+    # -- moves
+
+    def move_probe(self, xy_m: tuple[float, float], now_s: float, *, way_m: float = 0.0) -> None:
+        """Move the tip; the way takes its time. A move under way is turned to the new place.
+
+        Args:
+            way_m: way of the frame, where that is moved at the same time.
+
+        Raises:
+            InstrumentBusy: with something else than a move. InvalidValue: no place.
+        """
+        _finite("the position of the probe", *xy_m)
+        if self.doing(now_s) != "move":
+            self._check_free(now_s)
+        from_m, self._probe_m = self.probe_at(now_s), (float(xy_m[0]), float(xy_m[1]))
+        end_s = now_s + max(math.dist(from_m, self._probe_m), way_m) / self.setup.move_speed_m_s
+        self._doing = Move("move", now_s, end_s, from_m, self._probe_m)
+
+    def stop_move(self, now_s: float) -> None:
+        """Stay where the tip is on its way."""
+        if self.doing(now_s) == "move":
+            self._probe_m, self._doing = self.probe_at(now_s), None
+
+    def shift_sample(self, by_m: tuple[float, float], lasts_s: float, now_s: float) -> None:
+        """Move the sample with a coarse stage, so that the tip is over another place of it, (x, y) further.
+
+        Raises:
+            InstrumentBusy. InvalidValue: no distance or duration.
+        """
+        _finite("the way of the stage", *by_m)
+        self.occupy("stage", lasts_s, now_s)
+        if lasts_s > 0.0:
+            self.world.compensate((by_m[0] / lasts_s, by_m[1] / lasts_s), now_s)
+            self.world.compensate((0.0, 0.0), now_s + lasts_s)
+
+    def follow(self, velocity_m_per_s: tuple[float, float], now_s: float) -> None:
+        """Move the scanner with this velocity (x, y) from now on, to follow the sample; a running scan, too.
+
+        Raises:
+            InvalidValue: faster than any drift.
+        """
+        if not max(map(abs, velocity_m_per_s)) <= _FASTEST_DRIFT_M_S:
+            raise InvalidValue(f"a drift of {velocity_m_per_s} m/s", hint=f"at most {_FASTEST_DRIFT_M_S} m/s")
+        self.drawing.wait()
+        if self._scans and self.scan is not None and self.scan.running(now_s):
+            self.world.restore(self._before)
+            self.world.compensate(velocity_m_per_s, now_s)
+            self._redraw(self.scan.adjusted)
+        else:
+            self.world.compensate(velocity_m_per_s, now_s)
+
+    def hold(self, z_m: float) -> None:
+        """Leave z there while the feedback is off. Raises InvalidValue."""
+        self.drawing.wait()
+        self.world.hold(z_m)
+
+    # -- the tip
+
+    def pulse(self, voltage_v: float, duration_s: float, now_s: float) -> str:
+        """A bias pulse where the probe is: "cured", "worsened" or "unchanged"."""
+        self._check_free(now_s)
+        outcome = self.pulsed(voltage_v, duration_s, now_s)
+        self.occupy("pulse", duration_s, now_s)
+        return outcome
+
+    def pulsed(self, voltage_v: float, duration_s: float, now_s: float) -> str:
+        """As `pulse`, of one that is over: the bias was set, and put back."""
+        self.drawing.wait()
+        if not self.engaged or duration_s <= 0.0:
+            return "unchanged"
+        position_m = self._probe_m
+        outcome = self.world.pulse(voltage_v, duration_s, now_s, position_m)
+        facts = {"voltage_v": voltage_v, "duration_s": duration_s, "position_m": position_m, "outcome": outcome}
+        self.note(now_s, "pulse", facts)
+        return outcome
+
+    def crash(self, depth_m: float, speed_m_s: float, now_s: float) -> str:
+        """Drive the tip into the sample where the probe is, and out again: as `pulse`."""
+        if not min(depth_m, speed_m_s) > 0.0:
+            raise InvalidValue(f"a crash {depth_m} m deep with {speed_m_s} m/s", hint="depth and speed must be above 0")
+        self._check_free(now_s)
+        outcome, position_m = "unchanged", self._probe_m
+        if self.engaged:
+            outcome = self.world.crash(position_m, depth_m, speed_m_s, now_s)
+            facts = {"position_m": position_m, "speed_m_per_s": speed_m_s, "depth_m": depth_m, "outcome": outcome}
+            self.note(now_s, "crash", facts)
+        self.occupy("crash", 2.0 * depth_m / speed_m_s, now_s)
+        return outcome
+
+    def engage(self, now_s: float) -> None:
+        """Bring the tip to the sample."""
+        self._check_free(now_s)
+        self.engaged = True
+        self.occupy("approach", self.setup.approach_s, now_s)
+
+    def withdraw(self, now_s: float) -> None:
+        """Take the tip away from the sample, whatever is going on."""
+        self.stop_scan(now_s)
+        self.stop_spectrum(now_s)
+        self._doing, self.engaged = None, False
+        self.occupy("approach", self.setup.approach_s, now_s)
+
+    # -- anything else
+
+    def occupy(self, what: str, lasts_s: float, now_s: float) -> None:
+        """Be busy with anything else for so long. Raises InstrumentBusy, InvalidValue."""
+        _finite("the duration", lasts_s)
+        self._check_free(now_s)
+        self._doing = Occupied(what, now_s, now_s + lasts_s)
+
+    def stop(self, what: str, now_s: float) -> None:
+        """Be free, if it is busy with the activity that `occupy` was called with."""
+        if self.doing(now_s) == what:
+            self._doing = None
+
+    def abandon(self, now_s: float) -> None:
+        """Give up whatever goes on; what it has of a scan's lines stays."""
+        self.stop_scan(now_s)
+        self._doing = None
+
+    # -- after a kill
+
+    def state(self) -> Plain:
+        """Return all that `restore` needs, JSON-able; during a scan with the world of its start."""
+        doing = self._doing
+        world = self._before if self._scans or self.drawing.goes_on else self.world.state()
+        state = InstrumentState(
+            engaged=self.engaged,
+            probe_m=self._probe_m,
+            spectra=self._counts["spectrum"],
+            last_scan=self._counts["scan"],
+            scan=self.scan if self._scans else None,
+            spectrum=doing if isinstance(doing, SpectrumActivity) else None,
+            move=doing if isinstance(doing, Move) else None,
+            occupied=doing if isinstance(doing, Occupied) and not isinstance(doing, Move) else None,
+        )
+        return {"world": world, "instrument": snapshot(state, "instrument", _STATE_VERSION, lists=True)}
+
+    def restore(self, kept: PlainMapping) -> None:
+        """Become the instrument that `state` was taken from, whose settings are put in force by the caller.
+
+        Raises:
+            InvalidValue: a state of another world or version, or a damaged one.
+        """
+        found = restored(InstrumentState, kept["instrument"], "instrument", _STATE_VERSION)
+        self.world.restore(kept["world"])
+        self.engaged, self._probe_m = found.engaged, found.probe_m
+        self._counts = {"scan": found.last_scan, "spectrum": found.spectra}
+        self.scan, self.spectrum = found.scan, found.spectrum
+        self._doing = found.scan or found.spectrum or found.move or found.occupied
+        if self.scan is not None:
+            self._redraw(self.scan.adjusted)
+
+    # -- inside
+
+    def note(self, time_s: float, event: str, facts: Mapping[str, object]) -> None:
+        """Note an event with the ground truth, unless the world belongs to the drawing of a scan."""
+        if self._note is not None:
+            truth = {} if self.drawing.goes_on else {"truth": self.world.truth(time_s)}
+            self._note(time_s, event, {**facts, **truth})
+
+    def _check_free(self, now_s: float) -> None:
+        """Raises InstrumentBusy; waits for what is left of a scan that was stopped."""
+        doing = self.doing(now_s)
+        if doing:
+            raise InstrumentBusy(f"the instrument is busy with a {doing}")
+        self.drawing.wait()
+
+
+def _finite(what: str, *values: float) -> None:
+    """Raises InvalidValue unless all are."""
+    if not all(map(math.isfinite, values)):
+        raise InvalidValue(f"{what}: {', '.join(map(str, values))}", hint="must be finite")

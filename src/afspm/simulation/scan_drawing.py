@@ -1,0 +1,102 @@
+"""Computing the values of a scan: at its start, or beside everything else while the scan lasts."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping
+
+from afspm.errors import InvalidValue
+from afspm.simulation.activities import NoValues, ScanActivity, ScanValues, ValuesInAir
+from afspm.simulation.feedback import Loop
+from afspm.simulation.world import World
+
+_SMALLEST_M, _LARGEST_M, _LONGEST_PIXEL = 1e-12, 200e-6, 1e4
+
+RunWork = Callable[[Callable[[], None]], None]
+"""Runs a function: at once, or in another thread."""
+Draw = Callable[[], ScanValues]
+
+
+def run_at_once(work: Callable[[], None]) -> None:
+    """Run a function before anything else."""
+    work()
+
+
+class ScanDrawing:
+    """Draws one scan at a time; the world belongs to that work meanwhile.
+
+    Args:
+        units: gives the unit of each channel.
+        run: runs the work.
+
+    Attributes:
+        wake: called from the thread of the work when a scan is drawn.
+        log: for errors that no check foresaw.
+    """
+
+    def __init__(self, world: World, units: Callable[[], Mapping[str, str]], seed: int, run: RunWork) -> None:
+        self._world, self._units, self._seed, self._run = world, units, seed, run
+        self._newest: ScanActivity | None = None
+        self.wake: Callable[[], None] = lambda: None
+        self.log = logging.getLogger(__name__)
+
+    def start(self, scan: ScanActivity, draw: Draw) -> None:
+        """Begin to draw a scan that was `prepared`."""
+
+        def work() -> None:
+            try:
+                drawn = draw()
+            except Exception:  # whatever the world made of a scan, the instrument goes on without it
+                self.log.exception("scan %d can't be simulated and was stopped", scan.number)
+                drawn, scan.stopped_s = NoValues(self._units(), scan.shape), scan.start_s
+            scan.draw(drawn)
+            self.wake()
+
+        self._newest = scan
+        self._run(work)
+
+    @property
+    def goes_on(self) -> bool:
+        """True while a scan is being drawn, also one that was stopped."""
+        return self._newest is not None and self._newest.drawing
+
+    def wait(self) -> None:
+        """Wait until the newest scan is drawn, since the world is one thread's at a time."""
+        if self._newest is not None:
+            self._newest.wait()
+
+    def prepared(self, scan: ScanActivity, *, engaged: bool) -> Draw:
+        """Return the work of drawing a scan. Raises InvalidValue: it can't be simulated."""
+        _check_scannable(scan)
+        if not all(map(math.isfinite, (scan.bias_v, *scan.slope))):
+            raise InvalidValue(f"bias and slope: {scan.bias_v}, {scan.slope}", hint="finite")
+        course = scan.course
+        Loop.of(self._world.settings.feedback, scan.feedback)
+        if not engaged:
+            air = ValuesInAir(self._units(), course, (self._seed, 1, scan.number))
+            return lambda: air
+        return lambda: self._world.scan(
+            scan.region,
+            scan.shape,
+            scan.line_s,
+            scan.start_s,
+            scan.feedback,
+            scan.bias_v,
+            direction=course.direction,
+            slope=scan.slope,
+            adjusted=scan.adjusted,
+        )
+
+
+def _check_scannable(scan: ScanActivity) -> None:
+    """Raises InvalidValue: no scanner has such a frame; simulating it takes minutes, or more memory than there is."""
+    pixels = [size_m / count for size_m, count in zip(scan.region.size_m, scan.shape[::-1], strict=True)]
+    reach = all(_SMALLEST_M <= size_m <= _LARGEST_M for size_m in scan.region.size_m)
+    if not (reach and max(pixels) <= _LONGEST_PIXEL * min(pixels)):
+        raise InvalidValue(
+            f"a frame of {scan.region.size_m} m with {scan.shape[1]} x {scan.shape[0]} pixels can't be simulated",
+            hint=f"{_SMALLEST_M} to {_LARGEST_M} m, pixels at most {_LONGEST_PIXEL:g} times as long as wide",
+        )
+    if scan.start_s + scan.shape[0] * scan.line_s <= scan.start_s:
+        raise InvalidValue(f"a line of {scan.line_s} s can't be simulated", hint="its time must be above 0")

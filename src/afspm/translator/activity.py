@@ -1,0 +1,196 @@
+"""`Activity`: the measurement that runs at a maker's program, from its begin to its file.
+
+Theory of operation. A program is looked at again and again (`status`), and most do not report that anything began or
+ended. The life of a measurement is the same with all of them:
+
+| step | by |
+| --- | --- |
+| it begins: on request, or at the panel, where only the next look shows it | `begin`, `follow` |
+| it settles: a request is answered once the measurement is seen running, or its file is there | `settle` |
+| it ends: nothing is seen running any more, and its file is awaited from then on | `follow`, `end` |
+| it is stopped on request: whatever still runs is not taken for another measurement, and has no result | `stopped` |
+| what was broken off or has failed is reported once as INTERRUPTED | `at_rest` |
+
+A curve may have to wait until the tip is where the curve is to be taken (`curve_awaited`), and a command may last as
+long as the measurement itself (`call`). A maker's driver says how its program shows what runs, and how a measurement is
+noted with its files.
+"""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import ClassVar
+
+from afspm.clock import Clock
+from afspm.errors import AfspmError, Refused
+from afspm.model import ControlResponse, ScopeState, ScopeStatus
+from afspm.plain_data import Plain
+from afspm.translator.long_call import LongCall
+from afspm.translator.result_files import SCAN, ResultFiles
+
+
+class Activity(ABC):
+    """The measurement that runs, begun by a request or at the program's panel.
+
+    Args:
+        files: the results that are awaited.
+
+    Attributes:
+        call: the command that lasts as long as what it began; None: there is none.
+        curve_awaited: the kind of the curve that is taken once the tip is there; empty: none.
+    """
+
+    program: ClassVar[str]
+    """The name of the program, for messages."""
+    settles_s: ClassVar[float] = 0.0
+    """Real time that a measurement may take to be seen running."""
+    call_failures: ClassVar[tuple[type[AfspmError], ...]] = ()
+    """The errors by which a `call` reports that it failed."""
+
+    def __init__(self, files: ResultFiles, clock: Clock, log: logging.Logger) -> None:
+        self._results = files
+        self._clock = clock
+        self._log = log
+        self._stopping = self._failed = False
+        self.call: LongCall | None = None
+        self.curve_awaited = ""
+
+    # --- what a maker's driver adds ---
+
+    @abstractmethod
+    def begin(self, what: str) -> None:
+        """Note with the files that a measurement begins, with the values in force: `SCAN`, or the kind of a curve."""
+
+    @abstractmethod
+    def end(self) -> None:
+        """Note with the files that the measurement has ended: its result is awaited from now on."""
+
+    @abstractmethod
+    def status(self) -> ScopeStatus:
+        """Look at the program, and return what it is doing now. Raises ControllerLost."""
+
+    # --- the life of a measurement ---
+
+    def follow(self, what: str) -> None:
+        """Take in what was seen running: end what does not run any more, and begin what was begun at the panel.
+
+        Args:
+            what: `SCAN`, the kind of a curve, or empty.
+        """
+        if not what:
+            self._stopping = False
+        if self._results.what not in ("", what):
+            self.end()
+        if what and not self._stopping and self._results.what != what:
+            self.begin(what)
+
+    def settle(self, what: str, is_seen: Callable[[], bool]) -> None:
+        """Wait until what was begun is seen running, or has ended already: its file is there.
+
+        Raises:
+            Refused: ACTION_ERROR: the program does not do it, and reported no error.
+        """
+        until_s = self._clock.monotonic_s() + self.settles_s
+        while self._clock.monotonic_s() < until_s:
+            if is_seen():
+                return
+        self.forget()
+        named = what if what == SCAN else f"{what} curve"
+        reason = f"{self.program} did not begin the {named} that it was asked for"
+        raise Refused(ControlResponse.ACTION_ERROR, reason)
+
+    def started(self, what: str, do: Callable[[], object], is_seen: Callable[[], bool]) -> None:
+        """Begin a measurement on request. Raises what `do` raises, and Refused: nothing comes of it then."""
+        self._stopping = False
+        self.begin(what)
+        try:
+            do()
+        except Refused:
+            self.forget()
+            raise
+        self.settle(what, is_seen)
+
+    def stopped(self) -> None:
+        """Note that a request has stopped what is running: nothing comes of it."""
+        self._stopping, self.curve_awaited = True, ""
+        self._results.forget()
+
+    def forget(self) -> None:
+        """Expect no result of what was begun."""
+        self._results.forget()
+
+    def at_rest(self, state: ScopeState = ScopeState.FREE) -> ScopeStatus:
+        """Return the state while nothing is measured: INTERRUPTED once after a failure or a broken off scan."""
+        failed, self._failed = self._failed, False
+        return ScopeStatus(ScopeState.INTERRUPTED if failed or self._results.broken_off else state)
+
+    def fail(self, reason: str, *values: object) -> ScopeStatus:
+        """Log why nothing comes of what was asked for, and return the state that reports it."""
+        self._log.error(reason, *values)
+        return ScopeStatus(ScopeState.INTERRUPTED)
+
+    # --- commands that take as long as what they do ---
+
+    def watched_call(self) -> LongCall | None:
+        """Return the call as long as it goes on; one that has failed is logged. Raises ControllerLost."""
+        call = self.call
+        if call is None:
+            return None
+        try:
+            if call.running():
+                return call
+        except self.call_failures as error:
+            self._log.error("the %s failed: %s", call.what, error)
+            self._failed, self.curve_awaited = True, ""
+            if call.what == self._results.what:
+                self.forget()
+        self.close()
+        return None
+
+    def watch(self, call: LongCall) -> None:
+        """Watch a call instead of the one before."""
+        self.close()
+        self.call = call
+
+    def close(self) -> None:
+        """Wait no longer for what takes long."""
+        if self.call is not None:
+            self.call.close()
+            self.call = None
+
+
+class TipWay:
+    """The time that the tip needs to where it was sent, for programs that do not report its arrival.
+
+    Args:
+        kept: JSON-able, and lasts: the tip goes on when the connection is lost.
+    """
+
+    def __init__(self, kept: Plain, clock: Clock) -> None:
+        self._kept, self._clock = kept, clock
+
+    @property
+    def arrives_s(self) -> float:
+        """Experiment time of the arrival, at the latest."""
+        return float(self._kept.get("arrives_s", 0.0))
+
+    def sets_out(self, lasts_s: float, *, after_last_way: bool = False) -> None:
+        """Note that the tip was sent somewhere: now, or after the way that it is on."""
+        now_s = self._clock.now_s()
+        self._kept["arrives_s"] = (max(now_s, self.arrives_s) if after_last_way else now_s) + lasts_s
+
+    def give_up(self) -> None:
+        """Note that the tip does not go on."""
+        self._kept["arrives_s"] = 0.0
+
+    @property
+    def is_on(self) -> bool:
+        """True while the tip may be on its way."""
+        return self._clock.now_s() < self.arrives_s
+
+    @property
+    def next_s(self) -> float | None:
+        """The time of the arrival while the tip may be on its way."""
+        return self.arrives_s if self.is_on else None

@@ -1,0 +1,97 @@
+"""Faults of the simulated microscope that its driver has, without a process."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from afspm.errors import Refused
+from afspm.microscopes.simulator import Simulator
+from afspm.model import ScopeState
+from afspm.translator.driver import ControllerLost
+
+FREE, SCANNING, COARSE = ScopeState.FREE, ScopeState.SCANNING, ScopeState.COARSE_MOTOR
+
+
+@pytest.fixture
+def scope(request: Any, tmp_path: Path, fake_clock: Any) -> Simulator:
+    """A microscope with one fault, whose scans take 4 s."""
+    initial = {"scan-resolution-x": 8, "scan-resolution-y": 4}
+    made = Simulator(faults=[request.param], initial=initial)
+    made.clock, made.log, made.run_dir = fake_clock, logging.getLogger("test"), tmp_path
+    made.memory, made.wake = {}, lambda: None
+    made.connect()
+    return made
+
+
+def scanned(scope: Simulator, fake_clock: Any) -> ScopeState:
+    """The state after the time of a scan."""
+    scope.start_scan()
+    assert scope._controller is not None
+    scope._controller._instrument.drawing.wait()
+    fake_clock.t_s += 5.0
+    return scope.status().state
+
+
+@pytest.mark.parametrize("scope", [{"kind": "scan-refused"}], indirect=True)
+def test_scan_does_not_begin_without_an_error(scope: Simulator, fake_clock: Any) -> None:
+    scope.start_scan()
+    assert scope.status().state is FREE
+    assert scanned(scope, fake_clock) is FREE
+    assert len(scope.results()) == 1, "the next one does"
+
+
+@pytest.mark.parametrize(
+    ("scope", "state"), [({"kind": "stopped"}, FREE), ({"kind": "withdrawn"}, COARSE)], indirect=["scope"]
+)
+def test_scan_is_ended_at_the_panel(scope: Simulator, state: ScopeState, fake_clock: Any) -> None:
+    scope.start_scan()
+    assert scope.status().state is state
+    fake_clock.t_s += 100.0
+    assert scope.status().state is FREE
+    assert scope.results() == []
+
+
+@pytest.mark.parametrize("scope", [{"kind": "no-file"}], indirect=True)
+def test_scan_is_not_saved(scope: Simulator, fake_clock: Any, tmp_path: Path) -> None:
+    assert scanned(scope, fake_clock) is FREE
+    assert (scope.results(), list(tmp_path.rglob("*.nc"))) == ([], [])
+
+
+@pytest.mark.parametrize("scope", [{"kind": "late-file", "duration_s": 60.0}], indirect=True)
+def test_file_appears_late(scope: Simulator, fake_clock: Any) -> None:
+    assert scanned(scope, fake_clock) is FREE
+    (result,) = scope.results()
+    assert not Path(result).exists()
+    assert scope.next_change_s() == 1064.0
+    fake_clock.t_s += 60.0
+    assert scope.status().state is FREE
+    assert Path(result).exists()
+
+
+@pytest.mark.parametrize("scope", [{"kind": "restart", "at_s": 2.0, "duration_s": 10.0}], indirect=True)
+def test_controller_is_lost_for_a_while_and_its_scan_goes_on(scope: Simulator, fake_clock: Any) -> None:
+    scope.start_scan()
+    fake_clock.t_s += 3.0
+    for ask in (scope.status, scope.connect, scope.results, scope.stop_scan, lambda: scope.get("scan-speed")):
+        with pytest.raises(ControllerLost):
+            ask()
+    fake_clock.t_s += 10.0
+    scope.connect()
+    assert scope._controller is not None
+    scope._controller._instrument.drawing.wait()
+    assert scope.status().state is FREE
+    assert len(scope.results()) == 1
+
+
+@pytest.mark.parametrize("scope", [{"kind": "error", "count": 2}], indirect=True)
+def test_requests_are_refused_but_withdrawing_is_not(scope: Simulator) -> None:
+    with pytest.raises(Refused, match="simulated fault"):
+        scope.start_scan()
+    scope.retract()
+    with pytest.raises(Refused, match="simulated fault"):
+        scope.set({"scan-speed": 1e-6})
+    scope.set({"scan-speed": 1e-6})

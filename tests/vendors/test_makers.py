@@ -1,0 +1,124 @@
+"""The contract of every maker's translator, against its emulated controller: one test for all of them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from vendor_bench import TURNED, VendorBench, benches, ready, scanned, scans, small, states
+
+from afspm.model import ControlResponse, ScopeState, names
+
+FREE = ScopeState.FREE
+Make = Callable[..., VendorBench[Any]]
+
+
+@dataclass(frozen=True)
+class Maker:
+    """A maker.
+
+    Attributes:
+        name: of its folder.
+        height: the channel of the heights, forward.
+        number: of a scan, in the name of its file: a pattern with one group.
+        start: a scan at the panel, with the emulator and the time.
+    """
+
+    name: str
+    height: str
+    number: str
+    start: Callable[[Any, float], None]
+
+
+def start_program(emulator: Any, now_s: float) -> None:
+    emulator.program.start_scan(now_s)
+
+
+def start_asylum(emulator: Any, now_s: float) -> None:
+    emulator.controller.values.put("LastScan", 1)  # else one scan follows the other
+    emulator.controller.scan(now_s, None)
+
+
+MAKERS = {
+    maker.name: maker
+    for maker in (
+        Maker("asylum", "HeightTrace", r"Image(\d+)\.ibw$", start_asylum),
+        Maker("gxsm", "ZS-Topo", r"(\d+)-M-Xp-ZSmTopo\.nc$", lambda emulator, now_s: emulator.program.start_scan()),
+        Maker(
+            "nanonis",
+            "Z Forward",
+            r"(\d{3})\.sxm$",
+            lambda emulator, now_s: emulator.software.scans.start(upwards=True),
+        ),
+        Maker("nanosurf", "Height Forward", r"(\d+)\.nhf$", start_program),
+        Maker("park", "Height Forward", r"_(\d+)_Height_Forward\.tiff$", start_program),
+    )
+}
+each = pytest.mark.parametrize("maker", MAKERS.values(), ids=MAKERS)
+
+
+@pytest.fixture
+def bench(maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
+    monkeypatch.syspath_prepend(str(Path(__file__).parent / maker.name))
+    monkeypatch.setenv("HOME", str(tmp_path))  # GXSM's bridge has its secret there
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    yield from benches(import_module(f"{maker.name}_bench").Bench, tmp_path)
+
+
+@each
+def test_scans_follow_each_other_each_in_a_file_of_its_own(maker: Maker, bench: Make) -> None:
+    peer = bench().start()
+    ready(peer)
+    found = [scanned(peer)[maker.height] for _ in range(3)]
+    matches = [re.search(maker.number, scan.filename) for scan in found]
+    assert all(matches), [scan.filename for scan in found]
+    first, *others = [int(match[1]) for match in matches if match]
+    assert first in (0, 1)
+    assert others == [first + 1, first + 2]
+    assert not np.array_equal(found[0].values, found[1].values)
+
+
+@pytest.mark.parametrize("maker", [MAKERS[name] for name in ("nanonis", "nanosurf", "park")], ids=lambda one: one.name)
+def test_stopped_scan_is_not_published(maker: Maker, bench: Make) -> None:
+    """Of GXSM, and of Asylum, which withdraws the tip, their own tests have more to say."""
+    peer = bench(speed=10.0).start()
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    assert states(peer.until(ScopeState.SCANNING)) == ["SCANNING"]
+    assert peer.act(names.STOP_SCAN).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"]
+    assert not scans(heard)
+    assert peer.act(names.STOP_SCAN).ok, "nothing to stop is no error"
+
+
+@each
+def test_scan_begun_at_the_panel_is_published(maker: Maker, bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = made.start()
+    ready(peer, shape=(40, 32))
+    made.at_panel(lambda emulator: maker.start(emulator, made.clock.now_s()))
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "FREE"]
+    assert scans(heard)
+    for region in {scan.region for scan in scans(heard)}:  # Nanonis has a float32 of each length
+        assert (*region.center_m, *region.size_m) == pytest.approx((*TURNED.center_m, *TURNED.size_m), rel=1e-6)
+        assert region.angle_rad == pytest.approx(TURNED.angle_rad)
+
+
+@pytest.mark.parametrize("maker", [MAKERS[name] for name in ("asylum", "nanosurf", "park")], ids=lambda one: one.name)
+def test_scan_that_does_not_begin_is_refused(maker: Maker, bench: Make) -> None:
+    """GXSM and Nanonis, whose scans may begin late, are not waited for."""
+    made = bench()
+    peer = small(made)
+    made.strike("scan-refused")
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "did not begin the scan that it was asked for" in response.reason
+    assert scanned(peer), "the next one is taken"
