@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from afspm.emulators.emulator import LOOPBACK, Emulator
-from afspm.emulators.program import PROGRAM_FAULTS, MakerProgram, NamedFile
+from afspm.emulators.program import MakerProgram, NamedFile
 from afspm.emulators.tcp_server import ClientConnection, TcpServer
 from afspm.errors import AfspmError
 from afspm.model import Region, Scan
 from afspm.simulation.activities import ScanActivity, SpectrumActivity
+from afspm.simulation.faults import INSTRUMENT_FAULTS
 from example_maker.files import packed
 
 
@@ -47,10 +48,10 @@ class AcmeEmulator(Emulator):
 
     vendor = "Acme"
     usual: ClassVar = {"port": 7654}
-    fault_kinds: ClassVar = PROGRAM_FAULTS
+    fault_kinds: ClassVar = INSTRUMENT_FAULTS
 
     def open(self) -> str:
-        self._program = AcmeProgram(self.rig, self.faults, self.folder, self.log, start_s=0.2, file_s=0.1)
+        self._program = AcmeProgram(self.rig, self.faults, self.clock, self.folder, self.log, start_s=0.2, file_s=0.1)
         self._server = TcpServer(LOOPBACK, [self.port], one_each=False, wakes=self.woken, on_bytes=self._received)
         return f"{LOOPBACK}:{self._server.ports[0]}"
 
