@@ -111,7 +111,7 @@ def test_a_users_own_is_named_by_its_class_and_gets_its_settings() -> None:
     [
         ("breif", "did you mean 'brief'"),
         ("Least-Squares", "did you mean 'least-squares'"),
-        ("zzz", "least-squares, brief, orb, sift, correlation"),
+        ("zzz", "brief, correlation, least-squares, orb, sift"),
         ({"class": 3}, "text"),
         ({"class": f"{__name__}.Tolt"}, "did you mean 'Told'"),
         ({"class": "no_such_module.Thing"}, "is it installed"),
