@@ -35,6 +35,17 @@ class Hangs:
         raise AssertionError
 
 
+class Forks(Brightest):
+    """Leaves a process behind that holds all pipes of the worker, and hangs."""
+
+    def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
+        if os.fork() == 0:
+            threading.Event().wait(15.0)
+            os._exit(0)
+        threading.Event().wait()
+        raise AssertionError
+
+
 class Talks(Brightest):
     """Prints, as people do."""
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import textwrap
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -321,3 +322,18 @@ def test_simulated_time_passes_again_when_a_hanging_worker_is_restarted(work: Ca
     heard.registrar.take(job(0, 30, 30))
     heard.registrar.take(StartWorker())
     assert held == ["held", "passes"]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="a process can't be forked here")
+def test_restart_does_not_wait_for_processes_that_an_estimator_has_forked(work: Callable[..., Heard]) -> None:
+    heard = work("Forks")
+    heard.registrar.take(job(0, 30, 30))
+    heard.next(Registered)
+    former = psutil.Process(heard.registrar._process.pid)  # type: ignore[union-attr]
+    heard.registrar.take(job(1, 33, 28))
+    while not former.children():
+        time.sleep(0.01)
+    (left,) = former.children()
+    heard.registrar.take(StartWorker())
+    assert left.is_running(), "the restart has waited for it"
+    left.kill()

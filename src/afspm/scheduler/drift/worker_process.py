@@ -46,7 +46,6 @@ class DriftWorkerProcess:
         self._reports: deque[tuple[int, WorkerReport]] = deque()
         self._life = 0
         self._process: BaseProcess | None = None
-        self._reader = threading.Thread()
         self._jobs: queue.SimpleQueue[object] = queue.SimpleQueue()
 
     def take(self, job: object) -> None:
@@ -97,8 +96,7 @@ class DriftWorkerProcess:
         self._process, self._jobs = process, queue.SimpleQueue()
         threading.Thread(target=_write_all, args=(jobs, self._jobs), name="drift jobs", daemon=True).start()
         arguments = (process, reports, self._life)
-        self._reader = threading.Thread(target=self._read_all, args=arguments, name="drift reports", daemon=True)
-        self._reader.start()
+        threading.Thread(target=self._read_all, args=arguments, name="drift reports", daemon=True).start()
 
     def _end(self, *, within_s: float) -> None:
         self._late.close()
@@ -106,9 +104,10 @@ class DriftWorkerProcess:
         if process is None:
             return
         self._jobs.put(None)
-        self._reader.join(within_s)
+        process.join(within_s)
         process.kill()
-        self._reader.join()  # it alone waits for the process: of two waits, one would miss the exit code
+        # not for the thread that reads: a process that an estimator has forked holds the pipe open
+        process.join()
 
     def _read_all(self, process: BaseProcess, reports: Connection, life: int) -> None:
         """In a thread: from the worker's first report to its end."""
