@@ -12,7 +12,7 @@ the work of drawing a scan is handed to `run`, which may do it in a thread.
 
 What always holds: one activity at a time; the world is touched by the drawing of a scan or by the caller, never by both
 (`ScanDrawing.wait`); the same seed and the same commands at the same times give the same values; `state` at any moment
-is enough to go on after a kill: a running scan is drawn anew from the world as it was at its start.
+is enough to go on after a kill: a running scan is drawn again from the world as it was at its start.
 
 Lengths in m in tip coordinates, angles in rad counter-clockwise, times in experiment seconds.
 """
@@ -46,7 +46,7 @@ _STATE_VERSION = 1
 
 
 class InstrumentBusy(AfspmError):
-    """The instrument does something else, which is to be stopped or waited for first."""
+    """The instrument does something else, which must end or be stopped first."""
 
     code = "instrument-busy"
 
@@ -212,7 +212,7 @@ class Instrument:
         """Scan the frame.
 
         Raises:
-            InstrumentBusy. InvalidValue: what is in force can't be scanned.
+            InstrumentBusy. InvalidValue: no scan is possible with the setup.
         """
         self._check_free(now_s)
         setup = self.setup
@@ -261,7 +261,7 @@ class Instrument:
     # -- spectra
 
     def start_spectrum(self, kind: str, now_s: float, sweeps: int = 1) -> SpectrumActivity:
-        """Take a curve of a kind ("IV", "force") where the probe is, the mean of so many.
+        """Take a curve of a kind ("IV", "force") where the probe is, the mean of `sweeps`.
 
         Raises:
             InstrumentBusy. InvalidValue: there is no such kind.
@@ -386,7 +386,7 @@ class Instrument:
         self.occupy("approach", self.setup.approach_s, now_s)
 
     def withdraw(self, now_s: float) -> None:
-        """Take the tip away from the sample, whatever is going on."""
+        """End the activity, and take the tip away from the sample."""
         self.stop_scan(now_s)
         self.stop_spectrum(now_s)
         self._doing, self.engaged = None, False
@@ -406,7 +406,7 @@ class Instrument:
             self._doing = None
 
     def abandon(self, now_s: float) -> None:
-        """Give up whatever goes on; what it has of a scan's lines stays."""
+        """Give the activity up; the lines that a scan has stay."""
         self.stop_scan(now_s)
         self._doing = None
 
@@ -452,7 +452,7 @@ class Instrument:
             self._note(time_s, event, {**facts, **truth})
 
     def _check_free(self, now_s: float) -> None:
-        """Raises InstrumentBusy; waits for what is left of a scan that was stopped."""
+        """Raises InstrumentBusy; waits for the drawing of a scan that was stopped."""
         doing = self.doing(now_s)
         if doing:
             raise InstrumentBusy(f"the instrument is busy with a {doing}")

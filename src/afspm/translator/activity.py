@@ -8,7 +8,7 @@ ended. The life of a measurement is the same with all of them:
 | it begins: on request, or at the panel, where only the next look shows it | `begin`, `follow` |
 | it settles: a request is answered once the measurement is seen running, or its file is there | `settle` |
 | it ends: nothing is seen running any more, and its file is awaited from then on | `follow`, `end` |
-| it is stopped on request: whatever still runs is not taken for another measurement, and has no result | `stopped` |
+| it is stopped on request: a rest that still runs is not taken for another measurement, and has no result | `stopped` |
 | what was broken off or has failed is reported once as INTERRUPTED | `at_rest` |
 
 A curve may have to wait until the tip is where the curve is to be taken (`curve_awaited`), and a command may last as
@@ -113,7 +113,7 @@ class Activity(ABC):
         self.settle(what, is_seen)
 
     def stopped(self) -> None:
-        """Note that a request has stopped what is running: nothing comes of it."""
+        """Note that a request has stopped the measurement, which has no result."""
         self._stopping, self.curve_awaited = True, ""
         self._results.forget()
 

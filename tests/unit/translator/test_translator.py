@@ -381,8 +381,8 @@ def test_feedback_goes_on_after_all_else_and_off_before(bench: Any, monkeypatch:
         plain(given)
 
     monkeypatch.setattr(bench.microscope, "set", noted)
-    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False, setpoint=0.5)).code == OK
-    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True, setpoint=0.75)).code == OK
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False, setpoint=0.5e-9)).code == OK
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True, setpoint=0.75e-9)).code == OK
     assert order == [{"Loop"}, {"Setpoint"}, {"Setpoint"}, {"Loop"}]
 
 
@@ -771,7 +771,7 @@ def test_an_unchanged_value_that_can_not_be_set_is_no_change(bench: Any, name: s
 
 def test_a_whole_message_may_be_sent_back_with_one_field_changed(make_bench: Any) -> None:
     bench = make_bench({"parameters": {"x-feedback-on": {"read_only": True}}})
-    wanted = Feedback(on=True, proportional_gain=7.0, setpoint=1.0)
+    wanted = Feedback(on=True, proportional_gain=7.0, setpoint=1e-9)
     bench.microscope.values |= {"Loop": True, "Setpoint": 1.0}
     assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, wanted).code == OK
     assert bench.microscope.values["P"] == 7.0

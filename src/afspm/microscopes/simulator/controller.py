@@ -1,7 +1,7 @@
 """The simulated controller: values in force, a panel, and the files of what the simulated instrument measures.
 
-All that lasts is kept as "this, with these values, since then": whatever reads it later, a restarted process too, finds
-a measurement still running or finished, as with a controller that has a life of its own.
+All that lasts is kept as "this, with these values, since then": a process that is restarted finds a measurement still
+running or finished, as with a controller that has a life of its own.
 """
 
 from __future__ import annotations
@@ -214,7 +214,7 @@ class SimulatedController:
             self._measures()
 
     def stop(self, now_s: float) -> None:
-        """Break off what is being measured. What would have come of it is lost."""
+        """Break the measurement off; it has no result."""
         self._instrument.stop_scan(now_s)
         self._instrument.stop_spectrum(now_s)
         self._keep()
@@ -236,7 +236,7 @@ class SimulatedController:
         self._keep()
 
     def retract(self, now_s: float) -> None:
-        """Take the tip away from the sample, whatever is going on."""
+        """End the activity, and take the tip away from the sample."""
         self._kept["values"][names.ENGAGED] = False
         self._instrument.withdraw(now_s)
         self._keep()
