@@ -33,7 +33,7 @@ def shown(name: str) -> list[str]:
 def test_a_notebook_shows_the_error_and_the_lines_of_the_cell_alone(name: str) -> None:
     first, *rest = shown(name)
     assert "InvalidValue" in first
-    assert "a region of 1e-06 m x 0 m is empty (both sizes are above zero)" in first
+    assert "a region of 1 x 0 µm is empty (both sizes are above zero)" in first
     assert rest[-2:] == [
         "  line 4 of the cell: frame(0)",
         "  line 2 of the cell: return Region((0, 0), (1e-6, height))",
