@@ -163,8 +163,10 @@ class Survey(Component):
             self.log.warning("no survey was taken: there is no table and no picture")
             return
         self._keep(self._record)
+        from afspm.survey.figure import draw_survey  # matplotlib: needed at the end alone
+
         path = Path(self.run_dir) / f"{self.file}.png"
-        self._record.draw(path, title=self.name, simulated=self.simulated)
+        draw_survey(self._record, path, title=self.name, simulated=self.simulated)
         self.log.info("the survey is drawn: %s", path)
 
     def _set(self, parameters: Mapping[str, str | float]) -> None:
