@@ -182,7 +182,39 @@ def one_dimension() -> str:
     return sheet.document(740, 375, "Drift correction in one dimension")
 
 
+def house() -> str:
+    """The rooms by floors: the core, what stands on it, and the guests at the door."""
+    sheet = Sheet()
+    sheet.frame((10, 30), (470, 375), "the core: a night on the simulated microscope")
+    sheet.frame((510, 30), (220, 375), "guests: plugins/")
+    floors = (
+        ("component", ("cli", "testing")),
+        ("component", ("supervisor",)),
+        ("component", ("experiment", "components", "simulation")),
+        ("scheduler", ("client", "scheduler", "translator")),
+        ("translator", ("transport", "record")),
+        ("translator", ("storage", "wire")),
+        ("controller", ("model", "basics")),
+    )
+    for number, (kind, rooms) in enumerate(floors):
+        width = 440 / len(rooms)
+        for column, room in enumerate(rooms):
+            sheet.box((25 + width * (column + 0.5), 78 + number * 50), (width - 10, 34), kind, f"{room}/")
+    guests = ("nanonis", "asylum", "gxsm", "nanosurf", "park", "image", "drift", "web", "bluesky", "published")
+    for number, guest in enumerate(guests):
+        x, y = 567 + number % 2 * 106, 78 + number // 2 * 50
+        sheet.box((x, y), (96, 34), "decision", f"{guest}/")
+    sheet.note((620, 345), "… and packages of strangers", fill="#555555")
+    sheet.arrow((508, 200), (482, 200), stroke=CONTROL, both=True)
+    sheet.note((495, 190), "door", fill=CONTROL)
+    sheet.note(
+        (370, 428), "A room imports those below it. Guests import the core; the core finds them by entry points."
+    )
+    return sheet.document(740, 440, "The rooms of the core and the guests")
+
+
 DRAWINGS: dict[str, Callable[[], str]] = {
+    "house": house,
     "one-and-two-computers": computers,
     "reuse": reuse,
     "drift-workflow": workflow,

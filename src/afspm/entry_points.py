@@ -33,13 +33,14 @@ EXPORTERS = "afspm.exporters"  # afspm export --to NAME: a module, see afspm.rec
 ESTIMATORS = "afspm.estimators"  # of drift, by name
 TRACKERS = "afspm.trackers"  # of drift, by name
 FIGURES = "afspm.figures"  # of the report: (run, title), draws into the folder of the run
+DISPLAYS = "afspm.displays"  # of scans and spectra: what their `plot`, `to_sidpy` and notebook pictures call
 COMMANDS = "afspm.commands"  # afspm NAME: a function, or a typer.Typer
 PAGES = "afspm.pages"  # `afspm run --dashboard`: a module with the functions of afspm.cli.run.RunPage
 
 CLASSES = (COMPONENTS, SCHEDULERS, DRIVERS, EMULATORS)
 """The groups of the classes that an experiment file names without a module."""
 _FILE = "entry_points.txt"
-GROUPS = (*CLASSES, READERS, EXPORTERS, ESTIMATORS, TRACKERS, FIGURES, COMMANDS, PAGES)
+GROUPS = (*CLASSES, READERS, EXPORTERS, ESTIMATORS, TRACKERS, FIGURES, DISPLAYS, COMMANDS, PAGES)
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,18 @@ def load(group: str, name: str) -> Any:
     """
     point = find(name, group)
     return None if point is None else _loaded(point)
+
+
+def required(group: str, name: str) -> Any:
+    """Import what a name stands for.
+
+    Raises:
+        ConfigError: no package declares the name, its module can't be imported, or two packages declare it.
+    """
+    found = load(group, name)
+    if found is None:
+        raise ConfigError(f"no installed package declares {name!r}", where=group, hint="install afspm again")
+    return found
 
 
 def folder(group: str, name: str) -> Path | None:

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from afspm.client.component import Component
 from afspm.client.events import Events
 from afspm.client.keyed_results import check_key
+from afspm.client.targets import xy_of
 from afspm.components.planned_scans import FRAME, Pixels, checked_parameters, pair, shape_of
-from afspm.components.scan_plan import XY, ScanPlan
-from afspm.components.target_finder import TargetFinder
+from afspm.components.scan_plan import ScanPlan
 from afspm.errors import ConfigError, Refused
 from afspm.formatting import area_text, counted, lengths_text, position_text
 from afspm.model import Region, RegistrationOutcome, Scan, ScanSet, names, registration_summary
 from afspm.model.drift_mapping import drift_knowledge
+from afspm.model.geometry import XY
+from afspm.process.loading import find_object
 from afspm.storage.atomic import OutageLog
 from afspm.survey.record import Outcome, SurveyRecord, Visit
-from afspm.survey.targets import Target, lowest_beside
+from afspm.survey.targets import Target, find_particles, lowest_beside, nearest
 from afspm.units import Angle, Length
 
 MAPPING = "DriftMapping"
@@ -163,8 +165,10 @@ class Survey(Component):
             self.log.warning("no survey was taken: there is no table and no picture")
             return
         self._keep(self._record)
+        from afspm.survey.figure import draw_survey  # matplotlib: needed at the end alone
+
         path = Path(self.run_dir) / f"{self.file}.png"
-        self._record.draw(path, title=self.name, simulated=self.simulated)
+        draw_survey(self._record, path, title=self.name, simulated=self.simulated)
         self.log.info("the survey is drawn: %s", path)
 
     def _set(self, parameters: Mapping[str, str | float]) -> None:
@@ -321,3 +325,62 @@ def _place(name: str, place: float | Sequence[float], half_zoom_m: float) -> _Cu
 
 def _both(length: float | Sequence[float]) -> XY:
     return (float(length), float(length)) if isinstance(length, int | float) else pair(length)
+
+
+Finder = Callable[[Scan], Iterable[object]]
+
+
+@dataclass(frozen=True)
+class TargetFinder:
+    """Finds targets in a survey, and each of them again in its zoom.
+
+    Attributes:
+        function: of the user, "module.name"; None: particles.
+        count: at most so many.
+        min_height: of a particle, in the unit of the scan; None: what stands out of the noise.
+        separation_m: of two particles that are nearer, only the higher counts.
+        widest_m: of the survey: a particle in a zoom may fill it, and is not ground.
+        refines: whether they are found again in their zooms.
+    """
+
+    function: str | None
+    count: int
+    min_height: float | None
+    separation_m: float
+    widest_m: float
+    refines: bool
+
+    def check(self) -> None:
+        """Raise ConfigError: the function is not there."""
+        if self.function is not None:
+            self._function(self.function)
+
+    def targets(self, survey: Scan) -> list[Target]:
+        """Return the targets in a survey, in the order in which they are to be visited."""
+        if self.function is None:
+            return find_particles(survey, self.count, min_height=self.min_height, separation_m=self.separation_m)
+        return self._of_function(self.function, survey)[: self.count]
+
+    def again(self, zoom: Scan, target: Target) -> XY:
+        """Return where a target lies in its zoom, or where the survey showed it if it is not found there."""
+        if not self.refines:
+            return target.position_m
+        if self.function is None:
+            least = None if target.height is None else target.height / 2
+            found = find_particles(zoom, min_height=least, separation_m=self.separation_m, widest_m=self.widest_m)
+        else:
+            found = self._of_function(self.function, zoom)
+        near = nearest(found, target.position_m, min(zoom.region.size_m) / 2)
+        return target.position_m if near is None else near.position_m
+
+    def _of_function(self, path: str, scan: Scan) -> list[Target]:
+        places = self._function(path)(scan)
+        return [Target(xy) for place in places if all(map(math.isfinite, xy := xy_of(place)))]
+
+    @staticmethod
+    def _function(path: str) -> Finder:
+        function: object = find_object(path, "targets")
+        if not callable(function):
+            raise ConfigError(f"{path} is not a function", where="targets", hint="it is given a Scan")
+        found: Finder = function
+        return found

@@ -20,7 +20,6 @@ from afspm.model import Role
 
 if TYPE_CHECKING:
     from afspm.experiment.resolution import ResolvedExperiment
-    from afspm.logic.supervision.child import ChildPolicy
 
 
 @dataclass(frozen=True)
@@ -197,18 +196,6 @@ class Experiment:
         from afspm.experiment import process_starts
 
         return process_starts.asking(self.resolved, names)
-
-    def policy(self) -> ChildPolicy:
-        """Return how processes are watched and started again, from [restart]."""
-        from afspm.logic.supervision.child import ChildPolicy
-        from afspm.logic.supervision.liveness import LivenessPolicy
-        from afspm.logic.supervision.restart import RestartPolicy
-
-        r = self.resolved.sections.restart
-        return ChildPolicy(
-            LivenessPolicy(r.beat_period, r.missed_beats, r.start, r.longest_step, r.closing),
-            RestartPolicy(r.budget, r.window, r.first_delay, longest_delay_s=r.longest_delay, healthy_s=r.healthy),
-        )
 
     def clock(self) -> ExperimentClock:
         """Return the clock of a run that begins now, from [clock]."""

@@ -41,8 +41,7 @@ from afspm.model.requests import (
     ResponseDetail,
     request_name,
 )
-from afspm.model.scan import Scan, ScanParameters, ScanSet, ShapeChange
-from afspm.model.scan_lines import ScanLines
+from afspm.model.scan import Scan, ScanLines, ScanParameters, ScanSet, ShapeChange
 from afspm.model.spectrum import Spectrum
 from afspm.model.state import (
     ControlMode,

@@ -9,6 +9,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING
 
 from afspm.clock import utc_time
+from afspm.entry_points import DISPLAYS, required
 from afspm.errors import InvalidValue, NoSuchItem
 from afspm.model.geometry import XY, Region, RegionChange
 
@@ -217,9 +218,8 @@ class Scan:
         Raises:
             InvalidValue: there is no such kind, or nothing was measured.
         """
-        from afspm.model.plotting import draw
-
-        return draw(self, kind, axes, colorbar=colorbar, vmin=vmin, vmax=vmax)
+        drawn: Axes = required(DISPLAYS, "plot")(self, kind, axes, colorbar=colorbar, vmin=vmin, vmax=vmax)
+        return drawn
 
     def to_sidpy(self) -> sidpy.Dataset:
         """Return the scan as a `sidpy.Dataset`, for programs of the pycroscopy ecosystem (needs sidpy).
@@ -227,9 +227,7 @@ class Scan:
         Its axes are x and y in m, those of the unrotated rectangle; angle, frame, time and file are in
         `original_metadata["afspm"]`.
         """
-        from afspm.model.sidpy_dataset import to_sidpy
-
-        return to_sidpy(self)
+        return required(DISPLAYS, "to_sidpy")(self)
 
     @staticmethod
     def from_sidpy(dataset: sidpy.Dataset) -> Scan:
@@ -238,9 +236,8 @@ class Scan:
         Raises:
             InvalidValue: it is not an image, or its axes are not lengths.
         """
-        from afspm.model.sidpy_dataset import from_sidpy
-
-        return from_sidpy(dataset)
+        scan: Scan = required(DISPLAYS, "from_sidpy")(dataset)
+        return scan
 
     def to_xarray(self) -> xarray.DataArray:
         """Return an xarray DataArray with coordinates in m (needs the extra `xarray`).
@@ -271,9 +268,7 @@ class Scan:
         )
 
     def _repr_html_(self) -> str:
-        from afspm.model.notebook import scan_html
-
-        return scan_html(self)
+        return str(required(DISPLAYS, "scan_html")(self))
 
 
 class ScanSet(Mapping[str, Scan]):
@@ -332,6 +327,46 @@ class ScanSet(Mapping[str, Scan]):
         return xarray.Dataset({channel: scan.to_xarray() for channel, scan in self.items()})
 
     def _repr_html_(self) -> str:
-        from afspm.model.notebook import scans_html
+        return str(required(DISPLAYS, "scans_html")(self.values()))
 
-        return scans_html(self.values())
+
+@dataclass(frozen=True, eq=False)
+class ScanLines:
+    """Some neighbouring rows of one channel, published while the scan goes on.
+
+    Attributes:
+        region: of the whole scan.
+        shape: of the whole scan, (rows, columns).
+        channel, unit: of the values.
+        first_row: index in the whole scan of the first of these rows.
+        values: [rows, columns], y and x ascending, whatever the order in which they are scanned.
+        began_ns: when the scan began, ns since the Unix epoch: the same for all lines of a scan.
+    """
+
+    region: Region
+    shape: tuple[int, int]
+    channel: str
+    unit: str
+    first_row: int
+    values: NDArray[np.float64]
+    began_ns: int | None = None
+
+    def __post_init__(self) -> None:
+        rows, columns = self.shape
+        fits = self.values.ndim == 2 and self.values.shape[1] == columns
+        if not fits or not 0 <= self.first_row <= rows - self.values.shape[0]:
+            raise InvalidValue(
+                f"lines of shape {self.values.shape} from row {self.first_row} on are none of a scan of {self.shape}"
+            )
+
+    def into(self, picture: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+        """Return a picture of the whole scan with these lines in it; rows that are not there yet are NaN.
+
+        Args:
+            picture: [y, x] with the lines before, which is changed; None: these are the first.
+        """
+        import numpy as np
+
+        picture = np.full(self.shape, np.nan) if picture is None else picture
+        picture[self.first_row : self.first_row + len(self.values)] = self.values
+        return picture

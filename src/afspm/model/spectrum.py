@@ -7,6 +7,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING
 
 from afspm.clock import utc_time
+from afspm.entry_points import DISPLAYS, required
 from afspm.errors import InvalidValue, NoSuchItem
 from afspm.model.geometry import XY, Frame
 from afspm.plain_data import Plain
@@ -80,6 +81,4 @@ class Spectrum:
         return xarray.Dataset(columns, {swept: (swept, self[swept], {"units": self.units[0]})}, attributes)
 
     def _repr_html_(self) -> str:
-        from afspm.model.notebook import spectrum_html
-
-        return spectrum_html(self)
+        return str(required(DISPLAYS, "spectrum_html")(self))

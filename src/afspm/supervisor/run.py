@@ -18,6 +18,9 @@ from afspm.errors import ConfigError
 from afspm.experiment import Experiment, ProcessStart, Role, run_metadata
 from afspm.formatting import counted
 from afspm.launch import Launch, Sockets
+from afspm.logic.supervision.child import ChildPolicy
+from afspm.logic.supervision.liveness import LivenessPolicy
+from afspm.logic.supervision.restart import RestartPolicy
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.record.run_json import COMPUTER, ENDED, METADATA, REAL_S, STATE_DIR, run_json_or_empty
 from afspm.record.run_lock import lock_run
@@ -127,7 +130,7 @@ def go(
         reporter = reporter_of(experiment, starts, clock, common.run, handed.supervisor)
         tasks = [from_start(start) for start in handed.starts]
         ends_idle = experiment.ends_idle([task.name for task in tasks])
-        supervisor = Supervisor(tasks, log, clock, experiment.policy(), reporter, ends_idle=ends_idle)
+        supervisor = Supervisor(tasks, log, clock, _child_policy(experiment), reporter, ends_idle=ends_idle)
         with handed.laid_down(folder):
             outcome = supervisor.run()
         try:
@@ -286,3 +289,11 @@ def _require_real_time(clock: ExperimentClock, experiment: Experiment) -> None:
 def now() -> datetime:
     """Return real time, with the zone of this computer."""
     return datetime.fromtimestamp(ExperimentClock.real().now_s()).astimezone()
+
+
+def _child_policy(experiment: Experiment) -> ChildPolicy:
+    r = experiment.resolved.sections.restart
+    return ChildPolicy(
+        LivenessPolicy(r.beat_period, r.missed_beats, r.start, r.longest_step, r.closing),
+        RestartPolicy(r.budget, r.window, r.first_delay, longest_delay_s=r.longest_delay, healthy_s=r.healthy),
+    )

@@ -17,6 +17,7 @@ from pathlib import Path
 from afspm.clock import ExperimentClock
 from afspm.errors import AfspmError
 from afspm.exit_codes import ExitCode
+from afspm.formatting import duration_text
 from afspm.logic.supervision.child import ChildPolicy
 from afspm.logic.supervision.process_status import ProcessStatus
 from afspm.logic.supervision.run_end import EndReason
@@ -49,7 +50,6 @@ from afspm.process import signals
 from afspm.process.fault_file import take_fault
 from afspm.supervisor.activity_monitor import ActivityMonitor
 from afspm.supervisor.child_output import OutputDropped, OutputLine
-from afspm.supervisor.clock_check import ClockCheck
 from afspm.supervisor.log import LineReader, RunLog
 from afspm.supervisor.process import ChildEvent, ChildProcess, Task
 from afspm.supervisor.reaper import Reaper
@@ -255,3 +255,25 @@ class Supervisor:
 
     def _may_begin_of(self, task: Task) -> threading.Event | None:
         return self._may_begin if task.role is Role.COMPONENT else None
+
+
+TOLERANCE_S = 5.0
+
+
+class ClockCheck:
+    """Warns once if the two differ; simulated time that passes faster never agrees with the wall."""
+
+    def __init__(self, clock: ExperimentClock) -> None:
+        self._clock = clock
+        self._is_done = clock.speed != 1.0
+
+    def warning(self) -> str:
+        """Compare them now; returns what to warn of, mostly nothing."""
+        if self._is_done or abs(ahead_s := self._clock.wall_ahead_s()) < TOLERANCE_S:
+            return ""
+        self._is_done = True
+        way = "ahead of" if ahead_s > 0.0 else "behind"
+        return (
+            f"the computer's clock is {duration_text(abs(ahead_s))} {way} that of the run: it was set, or the "
+            "computer slept; the record keeps the run's own time"
+        )

@@ -42,9 +42,14 @@ _OUTLINE: Final = [withStroke(linewidth=2.0, foreground="black")]
 _SAYS: Final = {Outcome.REFUSED: "refused", Outcome.NOT_REACHED: "not reached", Outcome.INCOMPLETE: "incomplete"}
 
 
-def draw(record: SurveyRecord, path: Path, *, title: str = "", simulated: bool = False) -> None:
-    """Write the picture; see `SurveyRecord.draw`. Of many targets the first fifteen are shown closer."""
-    _Picture(record).save(path, title, simulated=simulated)
+def draw_survey(record: SurveyRecord, path: str | Path, *, title: str = "", simulated: bool = False) -> None:
+    """Draw a survey with its numbered targets, the zooms of the first fifteen and their curves.
+
+    Args:
+        path: of the picture; its ending names the format.
+        simulated: written on it, so that the picture is not taken for a measurement.
+    """
+    _Picture(record).save(Path(path), title, simulated=simulated)
 
 
 class _Picture:

@@ -90,17 +90,6 @@ class SurveyRecord:
         csv.writer(text, lineterminator="\n").writerows(self._rows(Path(path).absolute().parent))
         write_atomic(Path(path), [text.getvalue().encode()])
 
-    def draw(self, path: str | Path, *, title: str = "", simulated: bool = False) -> None:
-        """Draw the survey with its numbered targets, their zooms and their curves.
-
-        Args:
-            path: of the picture; its ending names the format.
-            simulated: written on it, so that the picture is not taken for a measurement.
-        """
-        from afspm.survey.figure import draw
-
-        draw(self, Path(path), title=title, simulated=simulated)
-
     def _rows(self, folder: Path) -> Iterator[list[str]]:
         yield [
             "number", "x", "y", "position_sd", "length_units", "registration", "height", "height_units", "outcome",

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from afspm.clock import ExperimentClock
-from afspm.supervisor.clock_check import TOLERANCE_S, ClockCheck
+from afspm.supervisor.supervisor import TOLERANCE_S, ClockCheck
 
 
 @pytest.mark.parametrize(

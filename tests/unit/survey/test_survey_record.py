@@ -12,6 +12,7 @@ from surfaces import scanned
 
 from afspm.model import Region, Spectrum
 from afspm.survey import Outcome, SurveyRecord, Target, Visit
+from afspm.survey.figure import draw_survey
 
 PLACES = np.array([(-1e-6, 0.0), (1e-6, 1e-6), (0.0, -1e-6), (1e-6, -1e-6)])
 RADII = np.array([60e-9, 90e-9, 75e-9, 50e-9])
@@ -65,7 +66,7 @@ def test_the_picture_is_drawn_with_as_many_targets_as_there_are(tmp_path: Path, 
     record = SurveyRecord(scanned(PLACES, RADII), [Target((0.0, 1e-8 * i)) for i in range(targets)], ("top",))
     for visit in record.visits[:-1]:
         measured(visit, "top")
-    record.draw(tmp_path / "survey.png", title="particles", simulated=True)
+    draw_survey(record, tmp_path / "survey.png", title="particles", simulated=True)
     with image.open(tmp_path / "survey.png") as drawn:
         width, height = drawn.size
     assert width >= 1000
@@ -74,6 +75,6 @@ def test_the_picture_is_drawn_with_as_many_targets_as_there_are(tmp_path: Path, 
 
 def test_one_of_each_outcome_is_drawn(record: SurveyRecord, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    record.draw(tmp_path / "survey.svg")
+    draw_survey(record, tmp_path / "survey.svg")
     drawn = (tmp_path / "survey.svg").read_text(encoding="utf-8")
     assert drawn.startswith("<?xml")

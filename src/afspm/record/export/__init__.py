@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 
 from afspm import entry_points
 from afspm.errors import FileError, InvalidValue
-from afspm.record.export.grids import grids
+from afspm.model import Spectrum
+from afspm.model.spectrum_stack import SpectrumStack, stacked
 from afspm.record.measured_files import write_synced
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
@@ -101,3 +104,21 @@ def chosen(rows: list[ScanRow], numbers: str) -> list[ScanRow]:
     if missing := [number for number in wanted if number not in by_number]:
         raise InvalidValue(f"there is no scan {missing[0]}", hint=f"there are 1 to {last}")
     return [by_number[number] for number in dict.fromkeys(wanted)]
+
+
+def grids(run: Run, rows: Sequence[SpectrumRow]) -> Iterator[tuple[str, SpectrumStack]]:
+    """Yield each grid of at least two by two spectra that were measured alike, with the name of its file.
+
+    A spectrum whose file is damaged is left out, as one that was not measured.
+    """
+    spectra: dict[tuple[str, tuple[str, ...]], list[Spectrum]] = {}
+    for row in rows:
+        with suppress(FileError):
+            spectrum = run.spectrum(row)
+            spectra.setdefault((spectrum.kind, spectrum.names), []).append(spectrum)
+    for number, ((kind, _), alike) in enumerate(spectra.items(), 1):
+        with suppress(InvalidValue):  # not on a grid
+            stack = stacked(alike, interpolate=True)
+            if min(len(stack.points.x_m), len(stack.points.y_m)) > 1:
+                name = re.sub(r"[^\w-]+", "-", kind).strip("-") or "spectra"
+                yield f"grid-{number:02}-{name}", stack
