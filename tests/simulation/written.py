@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from afspm.logic.arbitration import ArbitrationState
 from afspm.logic.event_log import CONTROL, PERIOD_S, SCHEDULER
 from afspm.logic.events import Effect, Input, Publish, Reply
-from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.model import (
     ControlEvent,
     ControlMode,
@@ -23,6 +22,7 @@ from afspm.model import (
     component_of,
     names,
 )
+from afspm.model.events import SUPERVISOR
 from afspm.wire.messages import JOURNAL
 from tests.simulation.codec import TableCodec
 from tests.simulation.scheduler import SchedulerHost

@@ -124,7 +124,7 @@ def keys(
     what runs there.
     """
     from afspm.experiment import load
-    from afspm.logic.supervisor_registry import SUPERVISOR
+    from afspm.model.events import SUPERVISOR
     from afspm.transport.keys import generate
 
     experiment = load(*files)

@@ -20,8 +20,8 @@ from afspm.components.notifications import (
 )
 from afspm.errors import ConfigError
 from afspm.formatting import duration_text
-from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import ControlState, LogLines, ProcessCondition, ProcessStates
+from afspm.model.events import LOGGED_AS
 from afspm.plain_data import Plain
 from afspm.record.run_json import experiment_name
 from afspm.units import Duration

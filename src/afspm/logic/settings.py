@@ -21,9 +21,9 @@ from afspm.logic.arbitration import Cause, RoleTable, Rules
 from afspm.logic.envelopes import Envelopes
 from afspm.logic.frozen import replace
 from afspm.logic.limits import ExperimentLimits
-from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import ProblemNames
+from afspm.model.events import SUPERVISOR
 from afspm.plain_data import SECTION, Switch, WholeNumber
 from afspm.units import Duration, PositiveDuration
 

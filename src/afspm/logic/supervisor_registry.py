@@ -21,14 +21,8 @@ from afspm.model import (
     component_of,
     is_process_name,
 )
-from afspm.model.events import LONGEST_PROCESS_NAME, PERSON
+from afspm.model.events import LONGEST_ANNOUNCEMENT, LONGEST_PROCESS_NAME, PERSON, SUPERVISOR
 
-SUPERVISOR = "supervisor"
-"""Whose key it takes, where there are keys, to speak of processes; each supervisor adds ":" and what tells it apart."""
-LOGGED_AS = "afspm"
-"""The name that its own lines have in the log."""
-LONGEST = 256 * 1024
-"""Bytes that may be told at a time."""
 SILENT_S = 10.0
 """A supervisor that has not been heard of for so long, real time, is given no more orders."""
 _MOST = 64  # supervisors
@@ -156,8 +150,8 @@ def announcement(event: RequestIn, codec: Codec) -> Announcement:
     told = event.request.subject
     if not isinstance(told, RelayedMessage):
         return Announcement("", "an empty announcement")
-    if len(told.payload) > LONGEST:
-        return Announcement("", f"{len(told.payload)} bytes in one announcement, at most {LONGEST} are allowed")
+    if len(told.payload) > LONGEST_ANNOUNCEMENT:
+        return Announcement("", f"an announcement of {len(told.payload)} bytes: at most {LONGEST_ANNOUNCEMENT}")
     thing = codec.decode_packet(told.message, told.payload)
     if isinstance(thing, Progress) and told.message == "Progress":
         mine = thing.name in (event.name, component_of(event.name))

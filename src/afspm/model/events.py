@@ -12,6 +12,12 @@ from afspm.errors import InvalidValue
 from afspm.model.requests import WAIT_FOR_CONTROL, ControlRequest, ControlResponse
 from afspm.model.state import ControlMode
 
+SUPERVISOR = "supervisor"
+"""The name of the key that allows to report on processes; each supervisor adds ":" and a suffix of its own."""
+LOGGED_AS = "afspm"
+"""The name of the supervisor's own lines in the log."""
+LONGEST_ANNOUNCEMENT = 256 * 1024
+"""Bytes that a supervisor may send at a time."""
 PERSON = ":"
 """Between a component and the person that it acts for: "dashboard:Ada"."""
 LONGEST_PROCESS_NAME = 100

@@ -22,8 +22,8 @@ from afspm.experiment import Experiment, Role
 from afspm.launch import Launch, Sockets
 from afspm.logic import diagnosis
 from afspm.logic.diagnosis import Diagnosis, Handshake, Heard, Reach, Severity, Versions
-from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.model import CLOCK_REQUEST, ProcessCondition, ProcessStates, Request
+from afspm.model.events import SUPERVISOR
 from afspm.plain_data import Plain
 from afspm.process.message_types import register_all
 from afspm.record.run_lock import goes_on

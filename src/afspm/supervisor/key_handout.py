@@ -12,7 +12,7 @@ from pathlib import Path
 from afspm.addresses import connectable, reaches
 from afspm.client.connect import GUEST_KEYS
 from afspm.experiment import Experiment, ProcessStart, Role
-from afspm.logic.supervisor_registry import SUPERVISOR
+from afspm.model.events import SUPERVISOR
 from afspm.record.run_json import STATE_DIR
 from afspm.storage.atomic import replace_file
 from afspm.storage.disk import run_bounded

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal, TextIO
 
 from afspm.clock import NS_PER_S, Clock, ExperimentClock
 from afspm.formatting import day_and_time, time_of_day
-from afspm.logic.supervisor_registry import LOGGED_AS
+from afspm.model.events import LOGGED_AS
 from afspm.storage.atomic import SLOW_S
 from afspm.storage.disk import SYNCER
 

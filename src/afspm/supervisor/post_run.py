@@ -20,7 +20,7 @@ from afspm.experiment import Role, implied_parts
 from afspm.formatting import duration_text
 from afspm.interpreter import python_command, python_environment
 from afspm.logic.supervision.run_end import EndReason
-from afspm.logic.supervisor_registry import LOGGED_AS
+from afspm.model.events import LOGGED_AS
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.run import open_run
 from afspm.record.run_lock import resume_command

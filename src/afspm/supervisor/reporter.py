@@ -30,7 +30,6 @@ from afspm.logic.supervision.supervisor_events import (
     SchedulerAnswered,
     UseReported,
 )
-from afspm.logic.supervisor_registry import LONGEST, SUPERVISOR
 from afspm.model import (
     CLOCK_REQUEST,
     OTHER_RUN_RESPONSE,
@@ -45,6 +44,7 @@ from afspm.model import (
     Request,
     Response,
 )
+from afspm.model.events import LONGEST_ANNOUNCEMENT, SUPERVISOR
 from afspm.process.context import new_session
 from afspm.transport.port import ControlConnected, ControlDisconnected, Incoming, ReplyReceived
 from afspm.transport.zmq_port import ZmqPort, open_port
@@ -59,7 +59,7 @@ MOST_LINES = 5000
 """Lines that wait for a scheduler that is not there; of more the oldest are dropped."""
 LONGEST_LINE = 2000
 """Characters."""
-_BATCH_BYTES = LONGEST // 4
+_BATCH_BYTES = LONGEST_ANNOUNCEMENT // 4
 _CLOSE_WITHIN_S = 1.0
 _MOST_FAILURES = 100
 

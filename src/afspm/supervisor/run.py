@@ -21,7 +21,7 @@ from afspm.launch import Launch, Sockets
 from afspm.logic.supervision.child import ChildPolicy
 from afspm.logic.supervision.liveness import LivenessPolicy
 from afspm.logic.supervision.restart import RestartPolicy
-from afspm.logic.supervisor_registry import LOGGED_AS
+from afspm.model.events import LOGGED_AS
 from afspm.record.run_json import COMPUTER, ENDED, METADATA, REAL_S, STATE_DIR, run_json_or_empty
 from afspm.record.run_lock import lock_run
 from afspm.storage.disk import run_bounded

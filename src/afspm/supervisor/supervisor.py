@@ -44,8 +44,8 @@ from afspm.logic.supervision.supervisor_events import (
     UseReported,
     WriteLog,
 )
-from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import Role
+from afspm.model.events import LOGGED_AS
 from afspm.process import signals
 from afspm.process.fault_file import take_fault
 from afspm.supervisor.activity_monitor import ActivityMonitor

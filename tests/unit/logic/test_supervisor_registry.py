@@ -11,7 +11,7 @@ from afspm import wire
 from afspm.logic.arbitration import RoleTable, Rules
 from afspm.logic.events import SaveState
 from afspm.logic.settings import SchedulerSettings
-from afspm.logic.supervisor_registry import LONGEST, SILENT_S
+from afspm.logic.supervisor_registry import SILENT_S
 from afspm.model import (
     RELAY_REQUEST,
     RESTART_REQUEST,
@@ -103,7 +103,7 @@ def test_nothing_else_is_published_for_others(lab: Lab, thing: Any) -> None:
 
 
 def test_what_is_too_long_or_nobodys_is_refused(lab: Lab) -> None:
-    told = RelayedMessage("LogLines", b"0" * (LONGEST + 1))
+    told = RelayedMessage("LogLines", b"0" * (LONGEST_ANNOUNCEMENT + 1))
     assert "at most" in replies(lab.ask(HOST, RELAY_REQUEST, told))[-1].response.reason
     assert "owner" in tell(lab, states("a", supervisor="")).reason
 

@@ -15,8 +15,8 @@ from afspm.logic.arbitration import Cause, RoleTable
 from afspm.logic.envelopes import CacheRule, CacheSettings
 from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.logic.settings import ControlSettings
-from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.model import Parameter, ProblemNames, Region
+from afspm.model.events import SUPERVISOR
 from afspm.model.snapshot import from_plain, to_plain
 from afspm.scheduler.scheduler import Scheduler
 

@@ -9,8 +9,8 @@ import pytest
 from afspm.clock import ExperimentClock
 from afspm.launch import Launch
 from afspm.logic.supervision.supervisor_events import EndRefused, UseReported
-from afspm.logic.supervisor_registry import LONGEST
 from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlRequest, ControlResponse, LogLines, Response
+from afspm.model.events import LONGEST_ANNOUNCEMENT
 from afspm.supervisor import reporter as reporting
 from afspm.supervisor.reporter import Reporter
 from afspm.wire import encode
@@ -37,7 +37,7 @@ def test_a_batch_is_no_longer_than_the_scheduler_takes(reporter: Reporter) -> No
         reporter.line("one", logging.INFO, "µ" * 10_000)
     lines = reporter._queue.take_lines()
     assert len(lines[0].text) == reporting.LONGEST_LINE
-    assert len(encode(LogLines(lines))[1]) <= LONGEST
+    assert len(encode(LogLines(lines))[1]) <= LONGEST_ANNOUNCEMENT
 
 
 def test_what_is_for_developers_is_left_out(reporter: Reporter) -> None:

@@ -43,8 +43,8 @@ from afspm.logic.supervision.supervisor_events import (
     WriteLog,
     describe_exit,
 )
-from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import Role
+from afspm.model.events import LOGGED_AS
 
 SCHEDULER_ANSWERS_WITHIN_S = 15.0
 """Time after which components no longer wait for the scheduler to answer."""

@@ -10,8 +10,8 @@ from afspm.clock import NS_PER_S
 from afspm.drawing import timeline
 from afspm.drawing.image_html import data_url
 from afspm.formatting import counted, day, duration_text, quantity
-from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.model import component_of
+from afspm.model.events import SUPERVISOR
 from afspm.record.overview import ROUTINE
 from afspm.record.report import curves, markup, sample
 from afspm.record.report.curves import SpectrumGroup

@@ -19,8 +19,8 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, ProcessStart, Role, load
 from afspm.launch import Launch, Sockets
-from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import Frame
+from afspm.model.events import LOGGED_AS
 from afspm.process.context import new_session
 from afspm.record.run_json import STATE_DIR
 from afspm.supervisor import run_folder, run_identity
