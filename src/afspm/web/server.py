@@ -10,7 +10,7 @@ import socket
 import threading
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from afspm.errors import ConfigError
 
@@ -89,7 +89,7 @@ class _TlsListener(socket.socket):
         self._within_s = within_s
         self._unfinished: dict[int, socket.socket] = {}
 
-    def accept(self) -> tuple[socket.socket, Any]:
+    def accept(self) -> tuple[socket.socket, object]:
         """Accept the next connection. Called by the event loop."""
         connection, address = super().accept()
         descriptor = connection.fileno()
