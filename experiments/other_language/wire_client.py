@@ -261,6 +261,8 @@ class Client:
         address, token = self.launch["sockets"]["heartbeat"], self.launch["beat_token"].encode()
         context = zmq.Context()
         socket = context.socket(zmq.PUB)
+        if address in (self.launch.get("keys") or {}).get("servers", {}):
+            self.secured(socket, address)
         socket.linger = 500
         if address:
             socket.connect(address)

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use crate::error::Result;
 use crate::launch::Launch;
+use crate::sockets;
 use crate::zmq::{self, Context, Socket};
 
 /// The age of the current step, which tells a busy process from a frozen one.
@@ -71,9 +72,9 @@ impl Heartbeat {
     /// Begin, if the launch line names a listener.
     pub fn start(launch: &Launch, activity: &Arc<Activity>) -> Result<Option<Heartbeat>> {
         let Some(address) = &launch.sockets.heartbeat else { return Ok(None) };
-        let socket = Context::new()?.socket(zmq::XPUB)?; // beats stay on this computer, and need no keys
+        let socket = Context::new()?.socket(zmq::XPUB)?;
         socket.set(zmq::LINGER, 200)?;
-        socket.connect(address)?;
+        sockets::connect_here(&socket, launch, address)?;
         let stop = Stop::default();
         let beats = Beats {
             socket,

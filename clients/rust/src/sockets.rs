@@ -67,6 +67,14 @@ fn connect(socket: &Socket, launch: &Launch, address: &str) -> Result<()> {
     socket.connect(address)
 }
 
+/// Connect to this computer: with keys where the launch line has the server's.
+pub fn connect_here(socket: &Socket, launch: &Launch, address: &str) -> Result<()> {
+    match &launch.keys {
+        Some(keys) if keys.servers.contains_key(address) => connect(socket, launch, address),
+        _ => socket.connect(address),
+    }
+}
+
 fn is_local(address: &str) -> bool {
     let Some((scheme, rest)) = address.split_once("://") else { return false };
     let host = rest.rsplit_once(':').map_or(rest, |(host, _)| host).trim_matches(['[', ']']);

@@ -1,7 +1,7 @@
 /** Heartbeats: a thread of its own says that this process is alive, and for how long its event loop has been busy. */
 
 import { Worker } from "node:worker_threads";
-import type { Launch } from "./launch.js";
+import { curveOptions, type Launch } from "./launch.js";
 
 const TURN_MS = 100;
 const CLOSED_WITHIN_MS = 1000;
@@ -9,6 +9,7 @@ const CLOSED_WITHIN_MS = 1000;
 /** What the thread is told when it starts. */
 export interface HeartbeatData {
   readonly address: string;
+  readonly curve: ReturnType<typeof curveOptions>;
   readonly token: string;
   readonly periodMs: number;
   readonly longestStepS: number;
@@ -27,7 +28,9 @@ export class Heartbeat {
     const turn = () => Atomics.store(turned, 0, process.hrtime.bigint());
     turn();
     this.timer = setInterval(turn, TURN_MS).unref();
-    const workerData: HeartbeatData = { address, token: launch.beat_token, periodMs: launch.beat_period_s * 1000, longestStepS, turned };
+    // beats stay on this computer: they are encrypted where the launch line has a key for them
+    const curve = launch.keys && address in launch.keys.servers ? curveOptions(launch.keys, address) : {};
+    const workerData: HeartbeatData = { address, curve, token: launch.beat_token, periodMs: launch.beat_period_s * 1000, longestStepS, turned };
     this.worker = new Worker(new URL("./heartbeat_thread.js", import.meta.url), { workerData });
     this.worker.unref();
   }

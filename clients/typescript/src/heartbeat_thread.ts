@@ -6,8 +6,8 @@ const ALIVE = 0;
 const CLOSING = 1;
 const IDLE_S = 0.5; // the event loop turns more often than that
 
-const { address, token, periodMs, longestStepS, turned } = workerData as HeartbeatData;
-const socket = new XPublisher({ linger: 200 });
+const { address, curve, token, periodMs, longestStepS, turned } = workerData as HeartbeatData;
+const socket = new XPublisher({ linger: 200, ...curve });
 let sending: Promise<void> = Promise.resolve();
 
 function beat(kind: number): void {

@@ -41,6 +41,13 @@ class SecuritySection(Section):
     plain: StrictBool = False
     """No keys are made for the run either: programs of this computer that know nothing of keys can join."""
     insecure: StrictBool = False
+    tcp: StrictBool = False
+    """Unix sockets are not used: for programs whose library has none. Every socket has keys then."""
+
+    @property
+    def are_sockets_private(self) -> bool:
+        """Whether sockets without an address in the file are unix sockets, where the system has them."""
+        return not (self.keys or self.plain or self.insecure or self.tcp)
 
 
 class RestartSection(Section):

@@ -33,6 +33,7 @@ from afspm.process.parent import (
     take_standard_input,
 )
 from afspm.transport.heartbeat import HeartbeatSender
+from afspm.transport.network import Network
 from afspm.transport.port import ParentGone, Port
 from afspm.transport.zmq_port import open_port
 
@@ -104,6 +105,7 @@ def _beating(launch: Launch, activity: ProcessActivity, logger: logging.Logger) 
         _watched_age_s(activity, logger),
         lambda: activity.longest_step_s,
         launch.beat_token,
+        Network.connecting(launch.name, launch.keys),
     )
     yield
     sender.close()

@@ -51,7 +51,7 @@ class Replayer:
         self._wake_up: WakeUp[None] = WakeUp()
         try:
             self._publisher = Publisher(self._network, publish, self._published)
-            self._router = Router(self._network, serve, log)
+            self._router = Router(self._network, serve, log, clock)
         except TransportError:
             self.close()
             raise

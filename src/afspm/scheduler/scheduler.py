@@ -83,7 +83,7 @@ class Scheduler:
         _restore(core, state, log_folder(folder) if folder else None)
         write_ahead = WriteAhead(state, PacketLog(log_folder(folder)) if folder else None, core.cached, log)
         warnings = RateLimitedLog(log, clock)
-        sockets = SchedulerSockets(launch, warnings, since_ns=core.newest_source_ns, epoch=_epoch(context))
+        sockets = SchedulerSockets(launch, warnings, clock, since_ns=core.newest_source_ns, epoch=_epoch(context))
         stopping = threading.Event()
 
         def stop() -> None:

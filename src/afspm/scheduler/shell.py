@@ -103,7 +103,8 @@ class SchedulerShell:
 
     def wait(self) -> list[Source]:
         """Wait for whatever comes first, a message or a deadline."""
-        timeout_s = (self._core.leave_at_s if self.ended else self._look_at_s) - self._clock.monotonic_s()
+        next_s = min(self._core.leave_at_s if self.ended else self._look_at_s, self._sockets.router.due_s)
+        timeout_s = next_s - self._clock.monotonic_s()
         return self._sockets.wait(None if timeout_s == math.inf else milliseconds(timeout_s))
 
     @property
@@ -138,6 +139,8 @@ class SchedulerShell:
                 for _ in sockets.link.follow():
                     self._take(events.TranslatorDown())
         now_s = self._clock.monotonic_s()
+        if now_s >= sockets.router.due_s:
+            self._requests()
         if now_s >= self._look_at_s:
             self._deadlines(now_s)
         elif now_s + _LATE_S < self._look_at_s:
@@ -161,6 +164,8 @@ class SchedulerShell:
                 sockets.subscriber.receive()
             else:
                 sockets.subscriber.follow()
+        if self._clock.monotonic_s() >= sockets.router.due_s:
+            self._requests()
 
     def _let_translator_go(self, stop: str = "") -> None:
         """It subscribes to nobody. One of version 1 goes on until it is stopped, but not with its scan.

@@ -12,6 +12,7 @@ from pathlib import Path
 from afspm.addresses import connectable, reaches
 from afspm.client.connect import GUEST_KEYS
 from afspm.experiment import Experiment, ProcessStart, Role
+from afspm.launch import Sockets
 from afspm.model.events import SUPERVISOR
 from afspm.record.run_json import STATE_DIR
 from afspm.storage.atomic import replace_file
@@ -59,8 +60,8 @@ def hand_over(experiment: Experiment, starts: Sequence[ProcessStart]) -> KeyHand
     if experiment.keys_folder is not None:
         return KeyHandout([_with(start, _of_file(experiment, start), _scheduler(experiment)) for start in starts])
     security = experiment.resolved.sections.security
-    guarded = {} if security.plain or security.insecure else _guarded(experiment, starts)
-    return _made(starts, guarded, _scheduler(experiment)) if guarded else KeyHandout(starts)
+    encrypted = {} if security.plain or security.insecure else _encrypted(experiment, starts)
+    return _made(starts, encrypted, _scheduler(experiment)) if encrypted else KeyHandout(starts)
 
 
 def _scheduler(experiment: Experiment) -> str:
@@ -84,8 +85,11 @@ def _of_file(experiment: Experiment, start: ProcessStart) -> Keys | None:
     return replace(own, peers=known, folder=None)
 
 
-def _guarded(experiment: Experiment, starts: Sequence[ProcessStart]) -> dict[str, str]:
-    """Return the servers that demand proof, by address: all who may ask them are started here."""
+def _encrypted(experiment: Experiment, starts: Sequence[ProcessStart]) -> dict[str, str]:
+    """Return the encrypted addresses and who binds them: all who may connect to them are started here.
+
+    They are those by which requests come, and all that other users of this computer can reach.
+    """
     slots = experiment.resolved.net.slots
     here = {start.launch.name for start in starts}
     complete = here >= set(experiment.component_names)
@@ -99,27 +103,47 @@ def _guarded(experiment: Experiment, starts: Sequence[ProcessStart]) -> dict[str
     for start in starts:
         if start.role is Role.TRANSLATOR and not start.command and schedulers and start.launch.sockets.serve:
             found[connectable(start.launch.sockets.serve)] = start.launch.name
+    guarding = set(found.values())
+    if not guarding.issuperset(start.launch.name for start in schedulers):
+        return found  # the scheduler's subscribers are started elsewhere, and know nothing of these keys
+    bound = [start.launch.sockets.publish for start in starts] + [start.launch.sockets.serve for start in starts]
+    all_ports = not any(keys.is_private(address) for address in bound if address is not None)
+    for start in starts:
+        publish, name = start.launch.sockets.publish, start.launch.name
+        # a program in another language knows all or nothing; its translators know nothing, unless the file has keys
+        can_encrypt = name in guarding or (start.role is Role.COMPONENT and (all_ports or not start.command))
+        if publish is not None and not keys.is_private(publish) and can_encrypt:
+            found[connectable(publish)] = name
     return found
 
 
-def _made(starts: Sequence[ProcessStart], guarded: Mapping[str, str], scheduler: str) -> KeyHandout:
+def _made(starts: Sequence[ProcessStart], encrypted: Mapping[str, str], scheduler: str) -> KeyHandout:
     """New pairs for all that is started, for those who join, and for who reports."""
     pairs = {name: keys.pair() for name in [*(start.launch.name for start in starts), SUPERVISOR, GUEST]}
     public = {name: pair[0] for name, pair in pairs.items()}
 
-    def of(name: str, control: str | None, role: Role = Role.COMPONENT) -> Keys | None:
-        owner = next((owner for address, owner in guarded.items() if control and reaches(control, address)), None)
-        servers = {str(control): owner} if owner is not None else {}
-        guards = name in guarded.values()
+    def of(name: str, sockets: Sockets, role: Role = Role.COMPONENT, *, foreign: bool = False) -> Keys | None:
+        connected = [address for address in (sockets.control, *sockets.subscribe) if address is not None]
+        servers = {
+            address: owner for address in connected for bound, owner in encrypted.items() if reaches(address, bound)
+        }
+        guards = name in encrypted.values()
         if not servers and not guards:
             return None
-        asking = {Role.SCHEDULER: [*pairs], Role.TRANSLATOR: [scheduler]}.get(role, []) if guards else []
+        asking = [] if not guards else subscribing(sockets) if role is Role.TRANSLATOR else [*pairs]
         peers = {public[one]: one for one in [*asking, *servers.values()]}
-        return Keys(name, *pairs[name], peers, servers, everywhere=False, guards=guards)
+        return Keys(name, *pairs[name], peers, servers, everywhere=foreign and guards, guards=guards)
+
+    def subscribing(sockets: Sockets) -> list[str]:
+        bound = sockets.publish or ""
+        found = [start.launch for start in starts if any(reaches(one, bound) for one in start.launch.sockets.subscribe)]
+        return [scheduler, *(launch.name for launch in found)]
 
     handed = [
-        _with(start, of(start.launch.name, start.launch.sockets.control, start.role), scheduler) for start in starts
+        _with(start, of(start.launch.name, start.launch.sockets, start.role, foreign=bool(start.command)), scheduler)
+        for start in starts
     ]
-    asked = next((address for address, owner in guarded.items() if owner == scheduler), None)
-    outside = [None if (one := of(name, asked)) is None else one.as_launch() for name in (GUEST, SUPERVISOR)]
+    asked = tuple(address for address, owner in encrypted.items() if owner == scheduler)
+    guest = Sockets(subscribe=asked)  # connects to all of them
+    outside = [None if (one := of(name, guest)) is None else one.as_launch() for name in (GUEST, SUPERVISOR)]
     return KeyHandout(handed, *outside)

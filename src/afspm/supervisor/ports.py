@@ -1,4 +1,9 @@
-"""Free ports for the addresses that an experiment file leaves open."""
+"""Addresses for the sockets to which the experiment file gives none: unix sockets of one folder, or free ports.
+
+Only the user who runs the experiment gets to the folder (mode 0700), whatever the user's umask is. The folder is not
+that of the run: a path of a unix socket has 107 bytes at most, and folders of runs are deep, and at times on a
+network's disk.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +11,19 @@ import errno
 import os
 import random
 import re
+import shutil
 import socket
 import sys
+import tempfile
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
 
 from afspm.addresses import LOOPBACK
 from afspm.errors import ConfigError
+from afspm.transport.network import HAS_PRIVATE_SOCKETS
 
 # Below the range from which systems take the ports of outgoing connections (Linux from 32768, Windows and macOS from
 # 49152). From within it a port would be no choice: while its process is being restarted, a peer that tries again and
@@ -21,6 +32,8 @@ LOWEST, HIGHEST = 20_000, 32_000
 TRIES = 200
 CAN_HOLD = sys.platform == "linux"
 """Elsewhere a port that one process has bound, without listening, can't be bound by another."""
+LONGEST_FOLDER = 90
+"""Bytes of the path of a folder of sockets. macOS allows the least for a socket: 103."""
 _MOST_HELD = 256
 _TCP = re.compile(r"tcp://(\*|[^:/\s]+|\[[0-9A-Fa-f:.]+\]):([1-9]\d*)")
 
@@ -57,6 +70,63 @@ class FreePorts:
     def address(self) -> str:
         """Return a free address for a socket, as ZeroMQ writes it."""
         return f"tcp://{self._host}:{self.take()}"
+
+
+class SocketFolder:
+    """Unix sockets in a new folder that its owner alone can enter. Raises OSError if there is no place for one."""
+
+    def __init__(self) -> None:
+        self.path = _private_folder()
+        self._count = 0
+
+    def address(self) -> str:
+        """Return an address that nothing is bound to."""
+        self._count += 1
+        return f"ipc://{self.path}/{self._count}"
+
+    def close(self) -> None:
+        """Remove the folder, and what a process that was killed has left in it."""
+        shutil.rmtree(self.path, ignore_errors=True)
+
+
+def _private_folder() -> Path:
+    """Make it where the system has a place for the sockets of a login session, else among temporary files."""
+    tried = [os.environ.get("XDG_RUNTIME_DIR"), tempfile.gettempdir(), "/tmp"]
+    for parent in filter(None, tried):
+        if len(os.fsencode(parent)) < LONGEST_FOLDER and os.access(parent, os.W_OK | os.X_OK):
+            return Path(tempfile.mkdtemp(prefix="afspm-", dir=parent))
+    raise OSError(f"no folder for sockets can be made in {', '.join(filter(None, tried))}")
+
+
+class NewAddresses(NamedTuple):
+    """Functions that return a new address at each call: of a socket without one in the file, or for heartbeats."""
+
+    of_socket: Callable[[], str]
+    of_heartbeat: Callable[[], str]
+
+
+@contextmanager
+def new_addresses(*, private: bool, tcp: bool) -> Iterator[NewAddresses]:
+    """Give the addresses of a run, which lead nowhere after the block. Raises ConfigError: they have no place.
+
+    Args:
+        private: sockets are unix sockets, where the system has them. Heartbeats, which stay on this computer, are as
+            soon as `tcp` is false.
+        tcp: all are ports.
+    """
+    ports = FreePorts()
+    if tcp or not HAS_PRIVATE_SOCKETS:
+        yield NewAddresses(ports.address, ports.address)
+        return
+    try:
+        folder = SocketFolder()
+    except OSError as error:
+        what = f"the run's sockets have no place: {error}"
+        raise ConfigError(what, hint="set XDG_RUNTIME_DIR to a folder of yours with a short path") from error
+    try:
+        yield NewAddresses(folder.address if private else ports.address, folder.address)
+    finally:
+        folder.close()
 
 
 def require_free(bound: Mapping[str, str]) -> None:

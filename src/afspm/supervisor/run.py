@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import platform
-from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -28,12 +28,13 @@ from afspm.storage.disk import run_bounded
 from afspm.storage.packet_log import discard_if_recorded, expect_recorder, log_folder
 from afspm.supervisor import key_handout, post_run, run_folder, run_identity
 from afspm.supervisor.log import RunLog
-from afspm.supervisor.ports import FreePorts, require_free
+from afspm.supervisor.ports import FreePorts, new_addresses, require_free
 from afspm.supervisor.post_run import EndedRun
 from afspm.supervisor.process import from_start
 from afspm.supervisor.reporter import reporter_of
 from afspm.supervisor.run_identity import RunIdentity
 from afspm.supervisor.supervisor import RunOutcome, Supervisor
+from afspm.transport.heartbeat import HeartbeatListener
 
 TAKES_WHO_COMES = ""
 """The identity of a run of a real microscope's translator alone, which obeys the scheduler that comes."""
@@ -85,7 +86,7 @@ def run(experiment: Experiment, options: RunOptions = RunOptions(), terminal: Te
     experiment.require_valid(options.only, options.without)
     own = _own(experiment, options)
     # whatever is wrong is told before a folder is made
-    first = _starts(experiment, options, own, FreePorts())
+    first = _starts(experiment, options, own, FreePorts().address)
     key_handout.hand_over(experiment, first)
     names = [start.launch.name for start in first]
     require_free(addresses_of(first))
@@ -113,9 +114,11 @@ def go(
     if experiment.resolved.sections.clock.waits:
         common = replace(common, clock=common.clock.waiting_in(folder / STATE_DIR / CLOCK_FILE))
     clock = common.clock
-    log = RunLog(folder / run_folder.LOG_FILE, clock, terminal=terminal, level=options.log_level, names=names)
-    try:
-        starts = _starts(experiment, options, common, FreePorts(), folder)
+    run_log = RunLog(folder / run_folder.LOG_FILE, clock, terminal=terminal, level=options.log_level, names=names)
+    security = experiment.resolved.sections.security
+    new = new_addresses(private=security.are_sockets_private, tcp=security.tcp)
+    with closing(run_log) as log, new as addresses:
+        starts = _starts(experiment, options, common, addresses.of_socket, folder)
         before = run_json_or_empty(folder)  # empty unless the run is resumed
         files = before.get(FILES) or list(map(str, experiment.files))
         facts = {**run_facts(name, starts, common), **facts_to_resume(experiment, starts, options), FILES: files}
@@ -130,7 +133,9 @@ def go(
         reporter = reporter_of(experiment, starts, clock, common.run, handed.supervisor)
         tasks = [from_start(start) for start in handed.starts]
         ends_idle = experiment.ends_idle([task.name for task in tasks])
-        supervisor = Supervisor(tasks, log, clock, _child_policy(experiment), reporter, ends_idle=ends_idle)
+        encrypts = not (security.plain or security.insecure)
+        beats = HeartbeatListener(take_address=addresses.of_heartbeat, encrypts=encrypts)
+        supervisor = Supervisor(tasks, log, clock, _child_policy(experiment), reporter, beats, ends_idle=ends_idle)
         with handed.laid_down(folder):
             outcome = supervisor.run()
         try:
@@ -146,8 +151,6 @@ def go(
                 run_bounded(lambda: discard_if_recorded(log_folder(folder / STATE_DIR)), WRITTEN_WITHIN_S)
         ended = EndedRun(name, folder, outcome, common.simulated)
         post_run.follow(experiment, ended, starts, clock, log, with_report=options.report)
-    finally:
-        log.close()
     return FinishedRun(folder, outcome)
 
 
@@ -178,7 +181,7 @@ def facts_to_resume(experiment: Experiment, starts: Sequence[ProcessStart], opti
 def dry_run(experiment: Experiment, options: RunOptions = RunOptions()) -> list[ProcessStart]:
     """Return what `run` would start, and nothing else. Raises as `run` does."""
     experiment.require_valid(options.only, options.without)
-    return _starts(experiment, options, _own(experiment, options), FreePorts())
+    return _starts(experiment, options, _own(experiment, options), FreePorts().address)
 
 
 def run_facts(name: str, starts: Sequence[ProcessStart], common: RunIdentity) -> dict[str, object]:
@@ -217,10 +220,14 @@ def _example_of_a_guest(starts: Sequence[ProcessStart]) -> Launch | None:
 
 
 def _starts(
-    experiment: Experiment, options: RunOptions, common: RunIdentity, ports: FreePorts, folder: Path | None = None
+    experiment: Experiment,
+    options: RunOptions,
+    common: RunIdentity,
+    take_address: Callable[[], str],
+    folder: Path | None = None,
 ) -> list[ProcessStart]:
     starts = experiment.launches(
-        take_address=ports.address,
+        take_address=take_address,
         only=options.only,
         without=options.without,
         clock=common.clock.as_dict(),

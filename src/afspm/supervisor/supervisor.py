@@ -54,6 +54,7 @@ from afspm.supervisor.log import LineReader, RunLog
 from afspm.supervisor.process import ChildEvent, ChildProcess, Task
 from afspm.supervisor.reaper import Reaper
 from afspm.supervisor.reporter import Reporter, ReporterEvent, ReportFailed
+from afspm.transport import keys
 from afspm.transport.heartbeat import HeartbeatListener
 from afspm.transport.polling import WakeUp
 
@@ -86,6 +87,7 @@ class Supervisor:
         clock: ExperimentClock,
         policy: ChildPolicy,
         reporter: Reporter | None = None,
+        beats: HeartbeatListener | None = None,
         *,
         ends_idle: bool = False,
     ) -> None:
@@ -96,7 +98,8 @@ class Supervisor:
         self._status = ProcessStatus(policy.liveness)
         self._reported_s = -math.inf
         self._wakeup: WakeUp[ChildEvent | EndSignal | ReporterEvent] = WakeUp()
-        self._beats = HeartbeatListener(self._wakeup)
+        self._beats = beats or HeartbeatListener()
+        self._beats.end_polls_by(self._wakeup.fileno())
         self._reaper = Reaper()
         self._tasks = {task.name: self._with_heartbeat(task) for task in tasks}
         self._processes: dict[str, ChildProcess] = {}
@@ -111,10 +114,11 @@ class Supervisor:
         self._core = SupervisorCore(specs, policy, awaits_scheduler=awaits_scheduler, ends_idle=ends_idle)
 
     def _with_heartbeat(self, task: Task) -> Task:
-        token = secrets.token_hex(16)
-        address = self._beats.listen(task.name, token=token, needs_token=bool(task.launch.class_))
-        launch = replace(task.launch, beat_token=token, sockets=replace(task.launch.sockets, heartbeat=address))
-        return replace(task, launch=launch)
+        token, launch = secrets.token_hex(16), task.launch
+        address, key = self._beats.listen(task.name, token=token, needs_token=bool(launch.class_))
+        own = launch.keys if key is None else keys.with_server(launch.name, launch.keys, address, key)
+        sockets = replace(launch.sockets, heartbeat=address)
+        return replace(task, launch=replace(launch, beat_token=token, sockets=sockets, keys=own))
 
     def run(self) -> RunOutcome:
         """Start everything; returns when nothing of it runs any more."""

@@ -11,6 +11,7 @@ from afspm.errors import WireError
 from afspm.logic.sessions import token_of
 from afspm.model import CLOCK_REQUEST, Request, Response
 from afspm.transport.frames import receive_frames, send_frames
+from afspm.transport.keys import routing_id
 from afspm.transport.network import CONNECTED, DISCONNECTED, Monitor, Network
 from afspm.transport.port import ControlConnected, ControlDisconnected, Incoming, ReplyReceived
 from afspm.transport.rate_limited_log import RateLimitedLog
@@ -38,8 +39,11 @@ class ControlClient:
         self._connected = False
         self._unanswered = b""
         self._name, self._token = name, ""
+        # a scheduler of version 1, which has no keys, takes the whole identity for the name
+        self._is_bare = network.keys is None
+        self._moving: list[Sequence[bytes]] | None = None  # what waits for the connection by another identity
         self.socket = network.socket(zmq.DEALER)
-        self.socket.setsockopt(zmq.ROUTING_ID, name.encode() if network.keys is None else network.keys.routing_id(name))
+        self.socket.setsockopt(zmq.ROUTING_ID, name.encode() if self._is_bare else routing_id(name))
         self.monitor = Monitor(network, self.socket, CONNECTED | DISCONNECTED)
         network.connect(self.socket, address)
 
@@ -47,8 +51,11 @@ class ControlClient:
         """Ask; dropped while there is no scheduler. Return the answer to what is not sent to one of version 1.
 
         A request repeated without an answer in between makes the connection anew: a connection that stands but leads
-        nowhere (cut off, or its name was taken by another process) would never lead anywhere again.
+        nowhere (cut off, or its identity was taken by another process) would never lead anywhere again.
         """
+        if self._moving is not None:
+            self._moving.append(frames)
+            return None
         if not self._connected:
             return None
         asked = frames[2] if len(frames) > 2 else b""
@@ -81,6 +88,12 @@ class ControlClient:
     def _known(self, version: Version) -> list[Incoming]:
         """The scheduler's version is known: send what has waited for that."""
         self.version = version
+        if version is Version.OURS and self._is_bare:
+            self._is_bare = False
+            self._moving = self._until_known or []
+            self.socket.setsockopt(zmq.ROUTING_ID, routing_id(self._name))
+            self._reconnect()
+            return []
         waiting, self._until_known, self._unanswered = self._until_known or [], None, b""
         answers = [self.send(frames) for frames in waiting]
         return [ReplyReceived(answer) for answer in answers if answer is not None]
@@ -107,6 +120,9 @@ class ControlClient:
         """Return the scheduler's coming and going."""
         found: list[Incoming] = []
         for event in self.monitor.drain():
+            if self._moving is not None:
+                self._moved(event.kind)
+                continue
             self._connected, self._unanswered, self._until_known = event.kind == CONNECTED, b"", None
             if self.version is Version.ONE:
                 self.version = Version.UNKNOWN  # what comes next may be one of ours
@@ -114,6 +130,13 @@ class ControlClient:
                 self._greet()
             found.append(ControlConnected() if self._connected else ControlDisconnected())
         return found
+
+    def _moved(self, kind: int) -> None:
+        """Take in the connection by the new identity, which nobody else needs to know of."""
+        if kind == CONNECTED:
+            waiting, self._moving, self._connected = self._moving or [], None, True
+            for frames in waiting:
+                self._send(frames)
 
     def _interpret(self, frames: list[bytes]) -> list[Incoming]:
         if len(frames) < 2 or frames[0]:

@@ -28,11 +28,6 @@ def receive_frames(socket: Socket) -> list[zmq.Frame]:
     return frames
 
 
-def is_readable(socket: Socket) -> bool:
-    """Return whether a message can be received at once."""
-    return bool(zmq.zmq_poll([(socket, zmq.POLLIN)], 0))
-
-
 def contents(frames: Sequence[zmq.Frame]) -> list[Buffer]:
     """Return what frames hold: what is large as a view of the received buffer, which the view keeps alive."""
     return [frame.bytes if len(frame) < _LARGE_BYTES else memoryview(frame.buffer).toreadonly() for frame in frames]
@@ -74,7 +69,10 @@ def send_packet(socket: Socket, packet: Packet, stamp: bytes | None, *, topic: b
 
 
 def descriptor_of(frame: zmq.Frame) -> int:
-    """Return the number of the connection that a message came by; -1 for peers older than ZMTP 3."""
+    """Return the number of the connection that a message came by; -1 for peers older than ZMTP 3.
+
+    For REQ sockets and plain subscribers alone, see `router` and `publisher`: the library calls it obsolete.
+    """
     try:
         return int(frame.get(zmq.SRCFD))
     except zmq.ZMQError:

@@ -7,10 +7,11 @@ import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import zmq
 
+from afspm.transport import keys as curve
 from afspm.transport.frames import receive_frames
 from afspm.transport.network import Network
 from afspm.transport.polling import WakeUp, milliseconds
@@ -44,6 +45,7 @@ class HeartbeatSender:
         step_age_s: for how long the current step has been running; called in the thread.
         longest_step_s: how long a step may take; called in the thread.
         token: of the launch line, by which the listener knows that the beat is ours.
+        network: for this socket alone, and closed with it.
 
     Attributes:
         heard: set as soon as there is a listener: beats from then on arrive.
@@ -56,9 +58,9 @@ class HeartbeatSender:
         step_age_s: Callable[[], float],
         longest_step_s: Callable[[], float],
         token: str = "",
+        network: Network | None = None,
     ) -> None:
-        # a network of its own: beats stay on this computer, and need no keys
-        self._network = Network()
+        self._network = network or Network()
         self._period_ms = max(1, round(period_s * 1000.0))
         self._step_age_s = step_age_s
         self._longest_step_s = longest_step_s
@@ -110,24 +112,29 @@ class _Expected:
 class HeartbeatListener:
     """Listens to the heartbeats of several processes, each at an address of its own, by a token of its own.
 
-    Any program of this computer can send to such an address: a beat of a process that knows its token counts with it
-    alone. A program of version 1, which sends none, is believed as it is.
+    Other users of this computer get to no such address: it is a unix socket, or encrypted, by a key that the process
+    alone gets. Other processes of this user may: a beat of a process that knows its token counts with it alone. A
+    program of version 1, which sends none, is believed as it is.
 
     Args:
-        wake_up: ends a `poll` under way; taking what was posted is left to its owner.
+        take_address: returns a new address.
+        encrypts: whether sockets are encrypted that other users can reach.
     """
 
-    def __init__(self, wake_up: WakeUp[Any] | None = None, *, network: Network | None = None) -> None:
-        self._network = network or Network()
+    def __init__(
+        self, *, take_address: Callable[[], str] = lambda: "tcp://127.0.0.1:0", encrypts: bool = False
+    ) -> None:
+        self._take_address, self._encrypts = take_address, encrypts
+        self._network = Network()
         self._expected: dict[zmq.Socket[bytes], _Expected] = {}
         self._poller = zmq.Poller()
-        if wake_up is not None:
-            self._poller.register(wake_up.fileno(), zmq.POLLIN)
 
-    def listen(
-        self, name: str, address: str = "tcp://127.0.0.1:0", *, token: str = "", needs_token: bool = False
-    ) -> str:
-        """Begin to listen to the process `name`, and return the address to give to it.
+    def end_polls_by(self, descriptor: int) -> None:
+        """Have a readable descriptor end a `poll` under way; to read from it is left to its owner."""
+        self._poller.register(descriptor, zmq.POLLIN)
+
+    def listen(self, name: str, *, token: str = "", needs_token: bool = False) -> tuple[str, bytes | None]:
+        """Begin to listen to the process `name`; return the address and the key to give to it, None if it is plain.
 
         Args:
             token: to be given to it, too.
@@ -135,10 +142,16 @@ class HeartbeatListener:
         """
         socket = self._network.socket(zmq.SUB)
         socket.setsockopt(zmq.SUBSCRIBE, b"")
+        address, key = self._take_address(), None
+        if self._encrypts and not curve.is_private(address):
+            # its clients need no keys that are known: nobody else has the server's
+            key, secret = curve.pair()
+            socket.setsockopt(zmq.CURVE_SERVER, 1)
+            socket.setsockopt(zmq.CURVE_SECRETKEY, secret)
         bound = self._network.bind(socket, address)
         self._expected[socket] = _Expected(name, token.encode(), needs_token)
         self._poller.register(socket, zmq.POLLIN)
-        return bound
+        return bound, key
 
     def poll(self, timeout_s: float | None) -> list[Heartbeat]:
         """Return the beats that have come; waits up to `timeout_s` real seconds (None: as long as it takes)."""

@@ -8,13 +8,13 @@ The files are those of ZeroMQ's own tools (ZPL), so that peers of other makes ca
 
 from __future__ import annotations
 
-import hmac
 import os
 import re
+import secrets
 import stat
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import zmq
@@ -26,7 +26,7 @@ from afspm.plain_data import Plain, PlainMapping
 GUEST = "guest"
 """The owner of the key that notebooks and terminal commands use where keys are made for a run; good for other names."""
 MARK = b"\0"
-"""Between a name and what nobody else knows of its owner's identity."""
+"""Between a name and the random rest of a socket's identity."""
 _NAME = re.compile(r"[A-Za-z0-9_. +-]{1,100}")
 _ENTRY = re.compile(r'^\s*(public-key|secret-key)\s*=\s*"([^"]{40})"\s*$', re.MULTILINE)
 
@@ -41,9 +41,9 @@ class Keys:
         peers: the public keys that are let in, and the names of their owners.
         servers: the names of those who bind the addresses that we connect to, by address.
         folder: where public keys are that are made later; None: these are all.
-        everywhere: whether every socket is encrypted. Else, on one computer, those by which requests come are, if we
-            guard them, and connections to `servers`; what is published is plain.
-        guards: whether requests to us are encrypted, where not everything is.
+        everywhere: whether every socket is encrypted. Else, on one computer, connections to `servers` are, and of our
+            own sockets those of `guards`.
+        guards: whether our sockets for requests are encrypted, and all that are not unix sockets.
     """
 
     name: str
@@ -72,17 +72,12 @@ class Keys:
             f"there is no public key of {name!r}", where=address, hint=f"afspm keys can make one: {name}.key"
         )
 
-    def binds_encrypted(self, *, requests: bool) -> bool:
-        """Return whether a socket that we bind is encrypted; `requests`: one by which requests come."""
-        return self.everywhere or (requests and self.guards)
+    def binds_encrypted(self, address: str, *, requests: bool) -> bool:
+        """Return whether a socket bound at `address` is encrypted; `requests`: the socket receives requests.
 
-    def routing_id(self, name: str) -> bytes:
-        """Return the identity of a socket that asks in a name: the same in every life, and secret.
-
-        By a bare name every peer that is let in could take the answers of another.
+        Only the owner of their folder gets to unix sockets. Names of senders need proof all the same.
         """
-        mark = hmac.digest(self.secret, name.encode(), "sha256").hex()[:16]
-        return name.encode() + MARK + mark.encode()
+        return self.everywhere or (self.guards and (requests or not is_private(address)))
 
     def user_as(self, user: str | None, name: str) -> str | None:
         """Return for whom a key is good: the guests' for every name that is not that of a process with its own key."""
@@ -101,6 +96,20 @@ class Keys:
             "everywhere": self.everywhere,
             "guards": self.guards,
         }
+
+
+def is_private(address: str) -> bool:
+    """Return whether the operating system keeps other users from an address."""
+    return address.startswith(("ipc://", "inproc://"))
+
+
+def routing_id(name: str) -> bytes:
+    """Return a new identity for a socket that sends requests in a name: unique, and known to the scheduler alone.
+
+    A ROUTER socket sends answers to the newest connection of an identity. By a bare name a second process would cut off
+    the first.
+    """
+    return name.encode() + MARK + secrets.token_hex(8).encode()
 
 
 def load(folder: str | Path, name: str, servers: Mapping[str, str] | None = None) -> Keys:
@@ -169,6 +178,20 @@ def from_launch(name: str, entries: PlainMapping | None) -> Keys | None:
         return None
     servers = {address: owner for address, owner in entries.items() if "://" in address}
     return load(entries["folder"], component_of(name), servers)
+
+
+def with_server(name: str, entries: PlainMapping | None, address: str, key: bytes) -> Plain:
+    """Return the keys of a launch line with that of one more server, the supervisor's heartbeat socket.
+
+    Args:
+        name: of the process; it gets a pair of its own if it has no keys yet.
+    """
+    own = from_launch(name, entries) or Keys(name, *pair(), {}, everywhere=False, guards=False)
+    owner = f"heartbeat of {name}"
+    return {
+        **(entries or {}),
+        **replace(own, peers={**own.peers, key: owner}, servers={**own.servers, address: owner}).as_launch(),
+    }
 
 
 def pair() -> tuple[bytes, bytes]:

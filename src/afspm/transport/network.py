@@ -9,6 +9,7 @@ import socket
 import struct
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,7 +17,6 @@ import zmq
 
 from afspm.errors import ConfigError, TransportError
 from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
-from afspm.transport.tcp_guard import TcpGuard
 
 if TYPE_CHECKING:
     from afspm.transport.keys import Keys
@@ -25,6 +25,8 @@ MAX_PACKET_BYTES = 256 * 1024 * 1024
 """Longest frame of a published packet: a scan of 4096² in one channel is half of that."""
 MAX_REQUEST_BYTES = 1024 * 1024
 """Longest frame of a request, response or subscription."""
+HAS_PRIVATE_SOCKETS = sys.platform != "win32" and zmq.has("ipc")
+"""Whether there are unix sockets, in folders with modes."""
 QUEUE_LENGTH = 4000
 """Messages that may wait for one peer; a publisher drops what is more."""
 
@@ -33,13 +35,15 @@ _LINGER_MS = 200
 _ALIVE_CHECK_MS = 2_000
 _ALIVE_TIMEOUT_MS = round(CUT_OFF_SHOWS_WITHIN_S * 1e3) - _ALIVE_CHECK_MS
 # libzmq 4.3.5 aborts the process (`Assertion failed: !_io_error`) if it sends or answers a heartbeat of ZMTP on a
-# connection that was lost while its receive queue was full. So the queues of sockets with heartbeats have no length in
-# messages: `tcp_guard` bounds them in bytes. All others rely on the heartbeats of TCP.
-_WITH_HEARTBEATS = frozenset({zmq.ROUTER, zmq.DEALER})
+# connection that was lost while its receive queue was full. So the receive queues of sockets with heartbeats, and of
+# their peers, have no length.
+# A subscriber's heartbeats have its publisher drop what waits for it once it stands still (`HEARTBEAT_TTL`), on unix
+# sockets too, where no option of TCP helps. A publisher sends none: behind unsent packets they would never go out.
+_WITH_HEARTBEATS = frozenset({zmq.ROUTER, zmq.DEALER, zmq.XSUB})
 _UNLIMITED = frozenset({*_WITH_HEARTBEATS, zmq.XPUB, zmq.SUB})
 _KEEPALIVE_S, _KEEPALIVE_TRIES = 2, 3
-# A peer that takes nothing is disconnected after this time, and what waited for it is dropped. Connected again it asks
-# for what it missed. (Linux and Windows; `tcp_guard` bounds how much may wait until then.)
+# A peer of TCP that takes nothing is disconnected after this time, and the packets that waited for it are dropped.
+# Connected again it asks for them. (Linux and Windows.)
 _STALLED_MS = 5_000
 _WINDOWS_MAXRT = 5  # of ws2ipdef.h; Python's socket module has no name for it
 _RECONNECT_MS, _RECONNECT_MAX_MS = 20, 200
@@ -84,7 +88,7 @@ class Network:
 
     Args:
         keys: of this process. With keys connections are encrypted and their owners known: all of them, or those by
-            which requests come (`Keys.everywhere`).
+            which requests come, and all that are not unix sockets (`Keys.binds_encrypted`).
         insecure: bind and connect to other computers without keys. Anyone there can then move the tip.
     """
 
@@ -93,9 +97,8 @@ class Network:
         self._insecure = insecure
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._sockets: list[zmq.Socket[bytes]] = []
-        self._guards: list[TcpGuard] = []
         self._authenticator = None
-        if keys is not None and keys.binds_encrypted(requests=True):
+        if keys is not None and (keys.everywhere or keys.guards):
             from afspm.transport.authenticator import Authenticator
 
             self._authenticator = Authenticator(self._context, keys)
@@ -112,6 +115,14 @@ class Network:
         from afspm.transport.keys import from_launch
 
         return cls(from_launch(name, entries), insecure=str(entries.get("insecure", "")).lower() == "true")
+
+    @classmethod
+    def connecting(cls, name: str, entries: Mapping[str, object] | None) -> Network:
+        """As `from_launch`, for sockets that only connect to this computer: plain where no key of a server is known."""
+        from afspm.transport.keys import from_launch
+
+        own = from_launch(name, entries)
+        return cls(None if own is None else replace(own, everywhere=False, guards=False))
 
     def socket(self, kind: int, *, max_bytes: int = MAX_REQUEST_BYTES) -> zmq.Socket[bytes]:
         """Return a socket with our limits; a frame over `max_bytes` ends the connection that it comes by."""
@@ -139,7 +150,7 @@ class Network:
             ConfigError: it would be open to others, and there are no keys.
         """
         self._guard(address)
-        if self.keys is not None and self.keys.binds_encrypted(requests=requests):
+        if self.keys is not None and self.keys.binds_encrypted(address, requests=requests):
             socket.setsockopt(zmq.CURVE_SERVER, 1)
             socket.setsockopt(zmq.CURVE_SECRETKEY, self.keys.secret)
             socket.setsockopt(zmq.ZAP_DOMAIN, b"afspm")
@@ -168,18 +179,10 @@ class Network:
         except zmq.ZMQError as error:
             raise TransportError(f"can't connect: {error}", where=address) from error
 
-    def watch(self, address: str, guard: TcpGuard) -> TcpGuard:
-        """Have `guard` watch those who connect to a bound address, until we close."""
-        guard.start(address)
-        self._guards.append(guard)
-        return guard
-
     def close(self) -> None:
         """Close all sockets, once what was sent has gone out or a fraction of a second has passed."""
         if self._context.closed:
             return
-        for guard in self._guards:
-            guard.close()
         if self._authenticator is not None:
             self._authenticator.close()
         self._context.destroy(linger=_LINGER_MS)
@@ -274,7 +277,7 @@ _numbers = itertools.count()
 
 
 class ConnectionEvent(NamedTuple):
-    """`kind` is one of the constants above; `value` the connection's descriptor if it was ACCEPTED or DISCONNECTED."""
+    """`kind` is one of the constants above; `value` the connection's descriptor if it was DISCONNECTED."""
 
     kind: int
     value: int

@@ -8,13 +8,11 @@ from afspm import wire
 from afspm.model import Packet
 from afspm.transport.frames import descriptor_of, property_of, receive_frames, send_packet
 from afspm.transport.late_joiners import LONGEST, History, Marker, is_reserved, spelled_out
-from afspm.transport.network import ACCEPTED, DISCONNECTED, Monitor, Network
-from afspm.transport.tcp_guard import MOST_SUBSCRIBED_BYTES, MOST_UNSENT_BYTES, TcpGuard
+from afspm.transport.network import DISCONNECTED, Monitor, Network
 from afspm.wire.protocol import prefixes_of_version_1
 
 _BATCH, _MOST_REPLAYS = 100, 5
 """Messages taken in, and replays made, before everything else is looked at again."""
-_OVERHEAD_BYTES = 24
 
 
 class Publisher:
@@ -25,30 +23,25 @@ class Publisher:
     was kept as ordinary packets, which all of that version see; and of all envelopes, which it asks for by the empty
     prefix, those of version 1, since it would end over any other.
 
-    Nobody is waited for. A slow subscriber is disconnected when too much waits for it: once it takes something again,
-    it connects anew and gets what it missed.
+    The publisher waits for no subscriber. One that stands still is disconnected: once it takes something again, it
+    connects anew and gets what it missed.
 
     Args:
         history: what was published before; asked when somebody subscribes.
-        most_unsent: bytes that may wait for a subscriber.
     """
 
-    def __init__(
-        self, network: Network, address: str, history: History, *, most_unsent: int = MOST_UNSENT_BYTES
-    ) -> None:
+    def __init__(self, network: Network, address: str, history: History) -> None:
         self.history = history
         self._plain: dict[int, set[bytes]] = {}  # subscriptions of version 1, by connection
         self.socket = network.socket(zmq.XPUB, max_bytes=LONGEST + 1)
         self.socket.setsockopt(zmq.XPUB_MANUAL, 1)
         self.socket.setsockopt(zmq.XPUB_VERBOSER, 1)
-        self.monitor = Monitor(network, self.socket, ACCEPTED | DISCONNECTED)
+        self.monitor = Monitor(network, self.socket, DISCONNECTED)
         self.address = network.bind(self.socket, address)
-        self._guard = network.watch(self.address, TcpGuard(MOST_SUBSCRIBED_BYTES, most_unsent))
 
     def publish(self, packet: Packet) -> None:
         """Send to all who subscribed to the packet's envelope. Never blocks."""
         send_packet(self.socket, packet, None if packet.time_ns is None else wire.encode_time(packet.time_ns))
-        self._guard.published(_size(packet))
 
     def kill(self) -> None:
         """Tell everyone that the experiment has ended."""
@@ -61,12 +54,8 @@ class Publisher:
 
     def follow(self) -> None:
         """Take in which connections came and went."""
-        for kind, descriptor in self.monitor.drain():
-            if kind == ACCEPTED:
-                self._guard.opened(descriptor)
-            else:
-                self._guard.closed(descriptor)
-                self._plain.pop(descriptor, None)
+        for _, descriptor in self.monitor.drain():
+            self._plain.pop(descriptor, None)
 
     def serve(self) -> int:
         """Take in who subscribed and who left; return how many joined."""
@@ -89,14 +78,14 @@ class Publisher:
         return joined + len(new)
 
     def _subscribed(self, subscription: bytes, frame: zmq.Frame, new: dict[int, list[bytes]]) -> int:
-        descriptor, marker = descriptor_of(frame), Marker.decode(subscription)
-        if marker is not None:
-            self._replay(marker, descriptor)
+        if (marker := Marker.decode(subscription)) is not None:
+            self._replay(marker)
             return 1
         # our own subscribers repeat their prefixes by themselves when a connection is made again, before they can say
         # what they have: they are subscribed by the marker, and only by it, so that they miss nothing
         if not is_reserved(subscription) and property_of(frame, "Socket-Type") != "XSUB":
             self.follow()  # what an earlier connection of this number wanted is forgotten
+            descriptor = descriptor_of(frame)
             self._plain.setdefault(descriptor, set()).add(subscription)
             for prefix in _meant(subscription):
                 self.socket.setsockopt(zmq.SUBSCRIBE, prefix)
@@ -111,7 +100,7 @@ class Publisher:
             if prefix not in still:
                 self.socket.setsockopt(zmq.UNSUBSCRIBE, prefix)
 
-    def _replay(self, marker: Marker, descriptor: int) -> None:
+    def _replay(self, marker: Marker) -> None:
         socket, topic = self.socket, marker.topic
         # in this mode a subscription is for the one peer whose message was received last
         socket.setsockopt(zmq.SUBSCRIBE, topic)
@@ -120,7 +109,6 @@ class Publisher:
         for packet in self.history(topic, marker.prefixes, marker.since_ns):
             stamp = b"" if packet.time_ns is None else wire.encode_time(packet.time_ns)
             send_packet(socket, packet, stamp, topic=topic)
-            self._guard.replayed(descriptor, len(topic) + _size(packet))
         socket.send(topic)
         socket.setsockopt(zmq.UNSUBSCRIBE, topic)
 
@@ -131,8 +119,3 @@ def _meant(prefix: bytes) -> list[bytes]:
         return [one.encode() for one in prefixes_of_version_1([prefix.decode()])]
     except UnicodeDecodeError:
         return []
-
-
-def _size(packet: Packet) -> int:
-    """About as many bytes as a packet takes on its way."""
-    return len(packet.envelope) + len(packet.payload) + _OVERHEAD_BYTES

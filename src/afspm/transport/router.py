@@ -1,22 +1,36 @@
-"""The scheduler's control socket: who asks, by which connection, and which connections there are."""
+"""The scheduler's control socket: requests, each with its sender, and the end of senders.
+
+A sender is known by the identity that it gives its socket: its name, a zero byte, and a random text
+(`keys.routing_id`). So two processes that use one name are two senders, and the answers to one never go to the other. A
+sender whose identity is its bare name, such as a REQ socket of a program without a client, is one sender with all that
+use the same.
+
+ZeroMQ says that some connection has ended, and not whose. Each sender that is known is then looked for by an empty
+message, which every client ignores: ROUTER refuses to send it to a peer that is gone (ROUTER_MANDATORY). A REQ socket
+would take it for the answer to a request that is on its way: its end is known by its connection's descriptor.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import zmq
 
-from afspm.transport.frames import descriptor_of, is_readable, property_of, receive_frames, send_frames, user_of
+from afspm.clock import Clock
+from afspm.transport.frames import descriptor_of, property_of, receive_frames, send_frames, user_of
 from afspm.transport.keys import MARK
-from afspm.transport.network import ACCEPTED, DISCONNECTED, REFUSED, Monitor, Network
+from afspm.transport.network import DISCONNECTED, REFUSED, Monitor, Network
 from afspm.transport.rate_limited_log import RateLimitedLog
-from afspm.transport.tcp_guard import TcpGuard
 from afspm.wire.protocol import ANSWER, QUESTION
 
 _LAST_WORDS = 200
-"""Messages looked through for the last words of who has gone."""
+"""Messages received before the end of a sender is passed on."""
+_LOOKS_S = (0.0, 0.02, 0.5)
+"""Real times, after a connection has ended, at which its sender is looked for: the library tells of the end a moment
+before it lets go of the peer."""
 
 
 class PeerConnected(NamedTuple):
@@ -45,153 +59,148 @@ RouterEvent = PeerConnected | PeerDisconnected | PeerAsked
 
 
 @dataclass(slots=True)
-class _Connection:
+class _Sender:
     number: int
-    descriptor: int
-    identity: bytes | None = None
-    name: str = ""
-    user: str | None = None
+    identity: bytes
+    owner: str | None
+    name: str
+    user: str | None
+    is_req: bool
+    descriptor: int = -1  # of a REQ socket
+    is_gone: bool = False
 
 
 class Router:
-    """REQ and DEALER peers, ours and of version 1, each known by its connection.
+    """REQ and DEALER peers, each known by its identity."""
 
-    A name belongs to the newest connection that uses it, so that a restarted component is the same client.
-    """
-
-    def __init__(self, network: Network, address: str, log: RateLimitedLog) -> None:
-        self._log = log
+    def __init__(self, network: Network, address: str, log: RateLimitedLog, clock: Clock) -> None:
+        self._log, self._clock = log, clock
         keys = network.keys
-        self._keys = keys if keys is not None and keys.binds_encrypted(requests=True) else None
+        self._keys = keys if keys is not None and keys.binds_encrypted(address, requests=True) else None
         self._has_refused = False
         self._numbers = 0
-        self._open: dict[int, _Connection] = {}  # by descriptor
-        self._formers: dict[int, _Connection] = {}  # the last to have had a descriptor that is closed, or given anew
+        self._senders: dict[bytes, _Sender] = {}
         self._identities: dict[int, bytes] = {}  # by number
+        self._looks_s: list[float] = []
         self.socket = network.socket(zmq.ROUTER)
+        # an identity belongs to its newest connection: its owner may connect anew before the old connection is found
+        # dead
         self.socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
-        self.monitor = Monitor(network, self.socket, ACCEPTED | DISCONNECTED | REFUSED)
+        self.socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
+        self.monitor = Monitor(network, self.socket, DISCONNECTED | REFUSED)
         self.address = network.bind(self.socket, address, requests=True)
-        self._guard = network.watch(self.address, TcpGuard())
+
+    @property
+    def due_s(self) -> float:
+        """When to call `receive` if nothing comes, in real monotonic time."""
+        return self._looks_s[0] if self._looks_s else math.inf
 
     def receive(self) -> list[RouterEvent]:
-        """Return the next request, and the changes of connections that came before it, in order.
+        """Return the next request, and the ends of senders, each after the sender's last request.
 
         The socket gives one message of each client in turn.
         """
-        messages = self._messages(1)
-        # drained after the messages were received: so every connection that they came by is known
-        changes = self._changes()
-        gone = [connection for connection, came in changes if not came]
-        if gone:  # what they said last comes before their end
-            messages += self._messages(_LAST_WORDS)
-        events: list[tuple[_Connection, RouterEvent]] = []
-        for frames in messages:
-            events += self._interpret(frames, gone, changes)
-        told: list[RouterEvent] = []
-        for connection, came in changes:
-            if came:
-                told.append(PeerConnected(connection.number))
-            else:
-                told += [event for sender, event in events if sender is connection]
-                told.append(PeerDisconnected(connection.number))
-                self._identities.pop(connection.number, None)
-        return told + [event for sender, event in events if all(sender is not one for one in gone)]
+        self._follow()
+        events: list[RouterEvent] = [*self._messages(1)]
+        now_s = self._clock.monotonic_s()
+        gone = self._gone() if now_s >= self.due_s else self._former_lives(events)
+        self._looks_s = [look_s for look_s in self._looks_s if look_s > now_s]
+        if not gone:
+            return events
+        events += self._messages(_LAST_WORDS)
+        for number in gone:
+            self._forget(number)
+        ended = [*(event for event in events if event.connection in gone), *map(PeerDisconnected, gone)]
+        return [*ended, *(event for event in events if event.connection not in gone)]
 
     def reply(self, connection: int, frames: Sequence[bytes]) -> None:
-        """Answer by `connection`, if it is still there. Never blocks."""
-        identity = self._identities.get(connection)
-        if identity is not None:
-            send_frames(self.socket, [identity, b"", *frames])
+        """Answer a sender, if it is still there. Never blocks."""
+        sender = self._senders.get(self._identities.get(connection, b""))
+        if sender is not None and not self._send([sender.identity, b"", *frames]):
+            sender.is_gone = True
+            self._look_soon()
 
-    def _messages(self, most: int) -> list[list[zmq.Frame]]:
-        """The next messages, at most so many."""
-        messages: list[list[zmq.Frame]] = []
-        while len(messages) < most and (frames := receive_frames(self.socket)):
-            messages.append(frames)
-            self._guard.heard(descriptor_of(frames[0]))
-        if not is_readable(self.socket):
-            self._guard.settle()
-        return messages
+    def _send(self, frames: Sequence[bytes]) -> bool:
+        """False if the peer is gone."""
+        try:
+            send_frames(self.socket, frames)
+        except zmq.ZMQError as error:
+            if error.errno != zmq.EHOSTUNREACH:
+                raise
+            return False
+        return True
 
-    def _changes(self) -> list[tuple[_Connection, bool]]:
-        """Connections in the order in which they came (True) and went."""
-        changes: list[tuple[_Connection, bool]] = []
-        for kind, descriptor in self.monitor.drain():
-            if kind not in (ACCEPTED, DISCONNECTED):
-                self._warn_refused()
-                continue
-            if (gone := self._open.pop(descriptor, None)) is not None:
-                self._guard.closed(descriptor)
-                self._formers[descriptor] = gone
-                changes.append((gone, False))
-            if kind == ACCEPTED:
-                self._guard.opened(descriptor)
-                changes.append((self._new(descriptor), True))
-        return changes
+    def _messages(self, most: int) -> list[PeerConnected | PeerAsked]:
+        """Return what the next messages say, at most so many."""
+        events: list[PeerConnected | PeerAsked] = []
+        for _ in range(most):
+            if not (frames := receive_frames(self.socket)):
+                break
+            events += self._interpret(frames)
+        return events
 
-    def _interpret(
-        self, frames: list[zmq.Frame], gone: list[_Connection], changes: list[tuple[_Connection, bool]]
-    ) -> list[tuple[_Connection, RouterEvent]]:
-        sender = self._sender(frames[0], gone, changes)
-        if sender is None:
-            return []
+    def _interpret(self, frames: list[zmq.Frame]) -> list[PeerConnected | PeerAsked]:
+        kind = property_of(frames[0], "Socket-Type")
+        if kind is None:
+            return []  # a peer older than ZMTP 3, or another protocol that looks like it
+        sender, is_new = self._sender(frames[0], kind)
+        events: list[PeerConnected | PeerAsked] = [PeerConnected(sender.number)] if is_new else []
         content = [frame.bytes for frame in frames]
         if len(content) < 2 or content[1]:
             self._log.warning(f"dropped a request of {sender.name or 'a nameless peer'}: no empty frame before it")
-            return []
-        if content[2:] == [*QUESTION]:  # whether we are one of ours; whose name it is does not matter for that
-            self.reply(sender.number, ANSWER)
-            return []
-        return [(sender, PeerAsked(sender.number, sender.name, sender.user, content[2:]))]
+        elif content[2:] == [*QUESTION]:  # whose name it is does not matter for that
+            self._send([sender.identity, b"", *ANSWER])
+        else:
+            events.append(PeerAsked(sender.number, sender.name, sender.user, content[2:]))
+        return events
 
-    def _sender(
-        self, first: zmq.Frame, gone: list[_Connection], changes: list[tuple[_Connection, bool]]
-    ) -> _Connection | None:
-        """The connection that a message came by; its descriptor may have been given to several, one after the other."""
-        identity, descriptor = first.bytes, descriptor_of(first)
-        current = self._open.get(descriptor)
-        if current is not None and current.identity == identity:
-            return current
-        former = self._formers.get(descriptor)
-        if former is not None and former.identity == identity and not (current and self._is_there(first)):
-            return former if former in gone else None  # its last words; None: its end was told before they came
-        for connection in (former if former in gone else None, current):
-            if connection is not None and connection.identity is None:
-                return self._introduced(connection, first)
-        if current is None:
-            return None
-        # it was taken for another, whose last words had been left on this descriptor
-        gone.append(current)
-        changes += [(current, False), (new := self._new(descriptor), True)]
-        return self._introduced(new, first)
-
-    def _is_there(self, first: zmq.Frame) -> bool:
-        """Return whether the peer that said this is connected; a REQ peer is taken to be.
-
-        A DEALER peer of ours ignores the empty frame that is sent to find out. A REQ peer would hang up.
-        """
-        if property_of(first, "Socket-Type") != "DEALER":
-            return True
-        self.socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
-        try:
-            return send_frames(self.socket, [first.bytes, b""]) or True  # False: it is there, and takes nothing
-        except zmq.ZMQError as error:
-            return error.errno != zmq.EHOSTUNREACH
-        finally:
-            self.socket.setsockopt(zmq.ROUTER_MANDATORY, 0)
-
-    def _new(self, descriptor: int) -> _Connection:
+    def _sender(self, first: zmq.Frame, kind: str) -> tuple[_Sender, bool]:
+        """Return who sent a message, and whether it is new."""
+        identity, owner = first.bytes, None if self._keys is None else user_of(first)
+        sender = self._senders.get(identity)
+        descriptor = descriptor_of(first) if kind == "REQ" else -1
+        if sender is not None and sender.owner == owner and not sender.is_gone:
+            sender.descriptor = descriptor
+            return sender, False
         self._numbers += 1
-        connection = self._open[descriptor] = _Connection(self._numbers, descriptor)
-        return connection
+        name = _name(identity)
+        user = None if self._keys is None else self._keys.user_as(owner, name)
+        sender = self._senders[identity] = _Sender(
+            self._numbers, identity, owner, name, user, kind == "REQ", descriptor
+        )
+        self._identities[sender.number] = identity
+        return sender, True
 
-    def _introduced(self, connection: _Connection, first: zmq.Frame) -> _Connection:
-        if connection.identity is None:
-            connection.identity = self._identities[connection.number] = first.bytes
-            connection.name = _name(first.bytes)
-            connection.user = None if self._keys is None else self._keys.user_as(user_of(first), connection.name)
-        return connection
+    def _former_lives(self, events: Sequence[RouterEvent]) -> list[int]:
+        """Return the senders that are gone, if one has come that may be such a process started again."""
+        names = {event.name for event in events if isinstance(event, PeerAsked) and len(events) > 1}
+        return self._gone() if sum(sender.name in names for sender in self._senders.values()) > 1 else []
+
+    def _gone(self) -> list[int]:
+        """Return the numbers of senders that are not there any more."""
+        there = set()
+        for sender in self._senders.values():
+            if not sender.is_gone and (sender.is_req or self._send([sender.identity, b""])):
+                there.add(sender.number)
+        return [number for number in self._identities if number not in there]
+
+    def _forget(self, number: int) -> None:
+        identity = self._identities.pop(number)
+        if (sender := self._senders.get(identity)) is not None and sender.number == number:
+            del self._senders[identity]
+
+    def _follow(self) -> None:
+        for kind, descriptor in self.monitor.drain():
+            if kind == DISCONNECTED:
+                for sender in self._senders.values():
+                    sender.is_gone |= sender.is_req and sender.descriptor == descriptor
+                self._look_soon()
+            else:
+                self._warn_refused()
+
+    def _look_soon(self) -> None:
+        now_s = self._clock.monotonic_s()
+        self._looks_s = [now_s + after_s for after_s in _LOOKS_S]
 
     def _warn_refused(self) -> None:
         """Once: a peer that is refused tries again without end."""

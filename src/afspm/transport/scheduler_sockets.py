@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 
+from afspm.clock import Clock
 from afspm.errors import ConfigError
 from afspm.launch import Launch
 from afspm.model import Packet
@@ -30,7 +31,7 @@ class SchedulerSockets:
         ConfigError: one is missing.
     """
 
-    def __init__(self, launch: Launch, log: RateLimitedLog, *, since_ns: int, epoch: bytes = b"") -> None:
+    def __init__(self, launch: Launch, log: RateLimitedLog, clock: Clock, *, since_ns: int, epoch: bytes = b"") -> None:
         sockets = launch.sockets
         if sockets.publish is None or sockets.serve is None or sockets.control is None or not sockets.subscribe:
             raise ConfigError(
@@ -40,7 +41,7 @@ class SchedulerSockets:
         self._network = Network.from_launch(launch.name, launch.keys)
         self._wake_up: WakeUp[None] = WakeUp()
         self.publisher = Publisher(self._network, sockets.publish, _nothing)
-        self.router = Router(self._network, sockets.serve, log)
+        self.router = Router(self._network, sockets.serve, log, clock)
         self.link = TranslatorLink(self._network, sockets.control, log, epoch)
         self.subscriber = Subscriber(
             self._network, launch.name, sockets.subscribe[0], None, log, since_ns=since_ns, filtered=False

@@ -9,10 +9,9 @@ import zmq
 from afspm.clock import Clock
 from afspm.errors import ConfigError
 from afspm.launch import Launch
-from afspm.transport.frames import descriptor_of, is_readable, property_of, receive_frames, send_frames, user_of
-from afspm.transport.network import ACCEPTED, DISCONNECTED, Monitor, Network
+from afspm.transport.frames import property_of, receive_frames, send_frames, user_of
+from afspm.transport.network import Network
 from afspm.transport.port import RequestReceived, Served, SubscriberJoined
-from afspm.transport.tcp_guard import TcpGuard
 from afspm.transport.zmq_port import BasePort
 from afspm.wire.protocol import ANSWER, QUESTION, answer_as_version_1
 
@@ -40,7 +39,7 @@ class ZmqServerPort(BasePort[Served]):
     ) -> None:
         super().__init__(network, clock, publish)
         self._allowed = allowed
-        self._has_keys = network.keys is not None and network.keys.binds_encrypted(requests=True)
+        self._has_keys = network.keys is not None and network.keys.binds_encrypted(serve, requests=True)
         self._asker: list[bytes] | None = None
         self._asked_by_version_1: int | None = None
         self._socket = network.socket(zmq.ROUTER)
@@ -48,11 +47,8 @@ class ZmqServerPort(BasePort[Served]):
         # found dead is never heard. And what it says is never freed: the library keeps the queues that nobody reads.
         self._socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
         self._socket.setsockopt(zmq.ROUTER_MANDATORY, 1)  # so that it can be seen who is there
-        self._monitor = Monitor(network, self._socket, ACCEPTED | DISCONNECTED)
         self.serve_address = network.bind(self._socket, serve, requests=True)
-        self._guard = network.watch(self.serve_address, TcpGuard())
         self._poller.register(self._socket, self._request)
-        self._poller.register(self._monitor.socket, self._follow)
 
     def poll(self, timeout_s: float | None) -> list[Served]:
         if is_busy := self._asker is not None:
@@ -66,17 +62,9 @@ class ZmqServerPort(BasePort[Served]):
     def _serve(self) -> list[Served]:
         return [SubscriberJoined()] if self._publisher is not None and self._publisher.serve() else []
 
-    def _follow(self) -> list[Served]:
-        for kind, descriptor in self._monitor.drain():
-            (self._guard.opened if kind == ACCEPTED else self._guard.closed)(descriptor)
-        return []
-
     def _request(self) -> list[Served]:
         """The next request, if the last one was answered."""
         while self._asker is None and (frames := receive_frames(self._socket)):
-            self._guard.heard(descriptor_of(frames[0]))
-            if not is_readable(self._socket):
-                self._guard.settle()
             request = self._accepted(frames)
             if request is not None:
                 return [request]

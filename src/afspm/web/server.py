@@ -25,7 +25,7 @@ HEAD_S = 10.0
 """Real time that a client has for the head of a request: before that is there, no password can be asked for."""
 MOST_HEAD_BYTES = 64 << 10
 MOST_UNFINISHED = 200
-"""Connections whose request has not come yet; with one more, the oldest is closed."""
+"""Connections without a finished TLS handshake, or without a request; with one more, the oldest is closed."""
 
 
 def listening(
@@ -76,7 +76,42 @@ def url_of(host: str, port: int, *, encrypted: bool) -> str:
     return f"{'https' if encrypted else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"
 
 
-def _impatient(stalled_s: float, head_s: float) -> type[asyncio.Protocol]:
+class _TlsListener(socket.socket):
+    """A listening socket that ends connections whose TLS handshake takes too long, or is the oldest of too many.
+
+    The server learns of a connection only when its handshake is done, and asyncio waits a minute for that: a client
+    that never begins would use up the files that the process may open. (On Windows, whose event loop accepts
+    connections by itself, asyncio's minute remains.)
+    """
+
+    def __init__(self, bound: socket.socket, within_s: float) -> None:
+        super().__init__(bound.family, bound.type, bound.proto, fileno=bound.dup().detach())
+        self._within_s = within_s
+        self._unfinished: dict[int, socket.socket] = {}
+
+    def accept(self) -> tuple[socket.socket, object]:
+        """Accept the next connection. Called by the event loop."""
+        connection, address = super().accept()
+        descriptor = connection.fileno()
+        self._unfinished.pop(descriptor, None)  # of a connection that is closed
+        self._unfinished[descriptor] = connection
+        asyncio.get_running_loop().call_later(self._within_s, self._end, descriptor, connection)
+        if len(self._unfinished) > MOST_UNFINISHED:
+            self._end(*next(iter(self._unfinished.items())))  # handshakes of honest clients last for milliseconds
+        return connection, address
+
+    def finished(self, descriptor: int) -> None:
+        """Note that a connection has finished its handshake."""
+        self._unfinished.pop(descriptor, None)
+
+    def _end(self, descriptor: int, connection: socket.socket) -> None:
+        if self._unfinished.get(descriptor) is connection:
+            del self._unfinished[descriptor]
+            with contextlib.suppress(OSError):  # closed already
+                connection.shutdown(socket.SHUT_RDWR)
+
+
+def _impatient(stalled_s: float, head_s: float, listener: _TlsListener | None) -> type[asyncio.Protocol]:
     """Return uvicorn's protocol, which disconnects clients that stall: they would keep their connections for ever."""
     import h11
 
@@ -92,6 +127,8 @@ def _impatient(stalled_s: float, head_s: float) -> type[asyncio.Protocol]:
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
+            if listener is not None:
+                listener.finished(transport.get_extra_info("socket").fileno())
             self._await(h11.IDLE)
 
         def data_received(self, data: bytes) -> None:
@@ -184,14 +221,18 @@ class WebServer:
         import uvicorn
 
         logging.getLogger("uvicorn").setLevel(logging.ERROR)  # what clients do wrong is theirs
+        self._bound = bound
+        listener = None if certificate is None else _TlsListener(bound, head_s)
+        self._listener = listener or bound
         config = uvicorn.Config(
             app if most_requests is None else _limited(app, most_requests),
+            loop="auto" if listener is None else "asyncio",  # uvloop accepts connections past the listener
             log_config=None,
             access_log=False,
             lifespan="on",
             proxy_headers=False,  # what a request says of its origin is anybody's word, and passwords are tried by it
             timeout_graceful_shutdown=1,
-            http=_impatient(stalled_s, head_s),
+            http=_impatient(stalled_s, head_s, listener),
             h11_max_incomplete_event_size=MOST_HEAD_BYTES,
             ssl_certfile=certificate,
             ssl_keyfile=key,
@@ -199,10 +240,10 @@ class WebServer:
         try:
             config.load()
         except (OSError, ValueError) as error:
+            self._listener.close()
             raise ConfigError(
                 f"certificate or certificate_key can't be loaded: {error}", hint="both must be PEM files"
             ) from error
-        self._socket = bound
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._run, name="web", daemon=True)
 
@@ -214,11 +255,12 @@ class WebServer:
         """Stop, within seconds; whoever is connected is cut off."""
         self._server.should_exit = True
         self._thread.join(_STOPPED_S)
-        with contextlib.suppress(OSError):
-            self._socket.close()
+        for one in (self._listener, self._bound):
+            with contextlib.suppress(OSError):
+                one.close()
 
     def _run(self) -> None:
         try:
-            self._server.run(sockets=[self._socket])
+            self._server.run(sockets=[self._listener])
         except SystemExit:  # that is how it tells that it couldn't start
             logging.getLogger("afspm.web").error("nothing can be served")

@@ -140,7 +140,7 @@ def beats_until(listener: HeartbeatListener, enough: Callable[[Heartbeat], bool]
 
 
 def test_beats_tell_busy_from_idle_and_the_end(host: Host, listener: HeartbeatListener) -> None:
-    address = listener.listen("diary")
+    address = listener.listen("diary")[0]
     child = host(part("Diary", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
     child.expect("start")
     beats_until(listener, lambda beat: beat.step_age_s == 0.0)
@@ -151,20 +151,20 @@ def test_beats_tell_busy_from_idle_and_the_end(host: Host, listener: HeartbeatLi
 def test_a_busy_component_beats_with_the_age_of_its_step_and_how_long_it_may_take(
     host: Host, listener: HeartbeatListener
 ) -> None:
-    address = listener.listen("stuck")
+    address = listener.listen("stuck")[0]
     host(part("Stuck", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
     beats_until(listener, lambda beat: (beat.step_age_s or 0.0) > 0.3 and beat.longest_step_s == 12.5)
 
 
 def test_what_takes_long_to_be_made_is_not_frozen(host: Host, listener: HeartbeatListener) -> None:
     """The class is not known yet: it can't say how long it takes to import it."""
-    address = listener.listen("slow")
+    address = listener.listen("slow")[0]
     host(part("SlowToMake", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
     beats_until(listener, lambda beat: (beat.step_age_s or 0.0) > 0.1 and beat.longest_step_s == 300.0)
 
 
 def test_a_step_that_takes_too_long_is_told_with_the_line_it_is_at(host: Host, listener: HeartbeatListener) -> None:
-    address = listener.listen("hanging")
+    address = listener.listen("hanging")[0]
     child = host(part("Hanging", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
     # not while it is loaded, which may take longer
     beats_until(listener, lambda beat: beat.longest_step_s == 0.2 and (beat.step_age_s or 0.0) > 0.2)
@@ -176,7 +176,7 @@ def test_a_step_that_takes_too_long_is_told_with_the_line_it_is_at(host: Host, l
 
 
 def test_a_crash_is_not_announced_as_an_end_on_purpose(host: Host, listener: HeartbeatListener) -> None:
-    address = listener.listen("broken")
+    address = listener.listen("broken")[0]
     child = host(part("Broken", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
     assert child.exit_code() == ExitCode.CRASHED
     assert not any(beat.closing for beat in listener.poll(0.3))

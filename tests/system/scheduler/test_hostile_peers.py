@@ -1,30 +1,34 @@
-"""Peers that flood, never finish or hang up in the middle: the scheduler lives, stays small, and serves all others."""
+"""Programs of another user, and programs without a key: they are kept out, and the scheduler serves all others."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
 import struct
+import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
 
 from afspm.model import ControlRequest
+from afspm.supervisor.ports import SocketFolder
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="bounds in bytes are those of Linux")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory and open files are read from /proc")
 GREETING = b"\xff" + bytes(8) + b"\x7f\3\1NULL".ljust(55, b"\0")
 PING = b"\4\7\4PING\0\0"
 MB = 1 << 20
-MOST_GROWTH_MB = 200
-SECONDS = 3.0
+MOST_GROWTH_MB = 100
+SECONDS = 2.0
+HALF_OPEN = 400
 
 
 class Raw:
-    """A connection that speaks ZMTP byte by byte."""
+    """A connection that speaks ZMTP byte by byte, without a key."""
 
     made: ClassVar[list[Raw]] = []
 
@@ -34,9 +38,6 @@ class Raw:
         self.made.append(self)
         ready = b"\5READY\x0bSocket-Type" + struct.pack(">I", len(kind)) + kind
         self.socket.sendall(GREETING + bytes([4, len(ready)]) + ready)
-        heard = b""
-        while b"READY" not in heard:
-            heard += self.socket.recv(1000)
         self.socket.setblocking(False)
 
     def say(self, data: bytes, within_s: float = SECONDS) -> bool:
@@ -50,11 +51,6 @@ class Raw:
                 except (BrokenPipeError, ConnectionResetError):
                     return False
         return True
-
-    def hang_up(self) -> None:
-        """At once, whatever is on its way (RST)."""
-        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        self.socket.close()
 
 
 def frame(payload: bytes, *, more: bool = False) -> bytes:
@@ -73,21 +69,21 @@ def closed() -> Iterator[None]:
 
 
 @pytest.fixture
-def friend(rig: Any) -> Any:
-    rig.start()
-    found = rig.component("Friend")
-    rig.linked(found)
+def friend(locked_rig: Any) -> Any:
+    locked_rig.start()
+    found = locked_rig.component("Experiment")
+    locked_rig.linked(found)
     return found
 
 
 @pytest.fixture
-def serves_as_before(rig: Any, friend: Any) -> Iterator[None]:
+def serves_as_before(locked_rig: Any, friend: Any) -> Iterator[None]:
     """Afterwards another client is answered, and the process has not grown."""
-    before = memory_mb(rig.process.pid, "VmRSS")
+    before = memory_mb(locked_rig.process.pid, "VmRSS")
     yield
     assert friend.ask(ControlRequest.ACTION_SUPPORT, "start-scan").ok
-    assert rig.process.poll() is None
-    assert memory_mb(rig.process.pid, "VmHWM") - before < MOST_GROWTH_MB
+    assert locked_rig.process.poll() is None
+    assert memory_mb(locked_rig.process.pid, "VmHWM") - before < MOST_GROWTH_MB
 
 
 def memory_mb(pid: int, field: str) -> float:
@@ -95,50 +91,76 @@ def memory_mb(pid: int, field: str) -> float:
     return next(int(line.split()[1]) for line in lines if line.startswith(field)) / 1024
 
 
+def address_of(rig: Any, kind: bytes) -> str:
+    return str(rig.serve if kind == b"DEALER" else rig.publish)
+
+
+ATTACKS: dict[str, tuple[bytes, Callable[[int], bytes]]] = {
+    "endless parts to the control socket": (b"DEALER", lambda _: frame(bytes(4000), more=True) * 100),
+    "endless parts to the publisher": (b"SUB", lambda _: frame(bytes(4000), more=True) * 100),
+    "requests and heartbeats": (
+        b"DEALER",
+        lambda _: (frame(b"", more=True) + frame(b"\5", more=True) + frame(b"start-scan") + PING) * 3000,
+    ),
+    "short subscriptions": (
+        b"SUB",
+        lambda n: b"".join(frame(b"\1%d" % (3000 * n + one)) for one in range(3000)),
+    ),
+    "replays": (b"XSUB", lambda _: b"".join(frame(b"\1\0replay/a/%d\0-1\0" % one) for one in range(500))),
+}
+
+
 @pytest.mark.usefixtures("serves_as_before")
-def test_peers_that_hang_up_while_their_requests_and_heartbeats_wait(rig: Any) -> None:
-    for _ in range(4):
-        peer = Raw(rig.serve, b"DEALER")
-        peer.say((frame(b"", more=True) + frame(b"\5", more=True) + frame(b"start-scan") + PING) * 300_000, 0.5)
-        peer.hang_up()
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_program_without_a_key_is_disconnected_whatever_it_sends(locked_rig: Any, attack: str) -> None:
+    kind, data = ATTACKS[attack]
+    peer = Raw(address_of(locked_rig, kind), kind)
+    assert not all(peer.say(data(n)) for n in range(2000))
 
 
 @pytest.mark.usefixtures("serves_as_before")
 @pytest.mark.parametrize("kind", [b"DEALER", b"SUB"])
-def test_a_message_whose_parts_never_end(rig: Any, kind: bytes) -> None:
-    peer = Raw(rig.serve if kind == b"DEALER" else rig.publish, kind)
-    part = frame(bytes(4000), more=True) * 100
-    assert not all(peer.say(part) for _ in range(2000))  # 800 MB
+def test_connections_that_never_finish_the_exchange_of_keys_are_ended(locked_rig: Any, kind: bytes) -> None:
+    host, port = address_of(locked_rig, kind).removeprefix("tcp://").split(":")
+    files = Path(f"/proc/{locked_rig.process.pid}/fd")
+    before = len(list(files.iterdir()))
+    silent = [socket.create_connection((host, int(port))) for _ in range(HALF_OPEN)]
+    locked_rig.until(lambda: len(list(files.iterdir())) > before + HALF_OPEN // 2)
+    late = locked_rig.component("Visitor")  # joins meanwhile
+    assert late.ask(ControlRequest.ACTION_SUPPORT, "start-scan").ok
+    locked_rig.until(lambda: len(list(files.iterdir())) < before + HALF_OPEN // 10)
+    for one in silent:
+        one.close()
 
 
-def ended(peer: Raw) -> bool:
-    peer.socket.settimeout(0.05)
-    with contextlib.suppress(TimeoutError):
-        try:
-            while peer.socket.recv(1000):
-                pass
-        except ConnectionResetError:
-            pass
-        return True
-    return False
+STRANGER = """
+import os, socket, sys
+os.setgroups([]); os.setgid(65534); os.setuid(65534)
+for path in sys.argv[1:]:
+    try:
+        socket.socket(socket.AF_UNIX).connect(path)
+        print("connected")
+    except OSError as error:
+        print(type(error).__name__)
+"""
 
 
-@pytest.mark.usefixtures("serves_as_before")
-@pytest.mark.parametrize(
-    "prefixes",
-    [[bytes([65 + n]) * (MB - 1000) for n in range(20)], [b"%d" % n + bytes(7000) for n in range(100)]],
-    ids=["one of 1 MB", "many of 7 kB"],
-)
-def test_subscriptions_to_more_than_any_peer_needs(rig: Any, prefixes: list[bytes]) -> None:
-    peer = Raw(rig.publish, b"SUB")
-    peer.say(b"".join(frame(b"\1" + prefix) for prefix in prefixes))
-    assert rig.until(lambda: ended(peer))
-
-
-@pytest.mark.usefixtures("serves_as_before")
-def test_a_peer_that_asks_for_replays_again_and_again(rig: Any, friend: Any) -> None:
-    for _ in range(20):
-        rig.publish_packet("Scan2d", b"")
-    peer = Raw(rig.publish, b"XSUB")
-    peer.say(b"".join(frame(b"\1\0replay/a/%d\0-1\0" % n) for n in range(5000)))
-    assert rig.until(lambda: ended(peer))
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root may become another user")
+def test_unix_sockets_of_a_run_are_out_of_reach_of_other_users() -> None:
+    folder = SocketFolder()
+    try:
+        path = folder.address().removeprefix("ipc://")
+        with socket.socket(socket.AF_UNIX) as bound:
+            bound.bind(path)
+            bound.listen()
+            Path(path).chmod(0o777)  # whatever the umask is
+            connected = subprocess.run([sys.executable, "-c", STRANGER, path], capture_output=True, text=True)
+            assert connected.stdout.split() == ["PermissionError"], connected.stderr
+            with socket.socket(socket.AF_UNIX) as own:
+                own.connect(path)
+            folder.path.chmod(0o755)  # so that the test can fail
+            connected = subprocess.run([sys.executable, "-c", STRANGER, path], capture_output=True, text=True)
+            assert connected.stdout.split() == ["connected"], connected.stderr
+    finally:
+        folder.close()
+    assert not folder.path.exists()

@@ -30,6 +30,7 @@ from afspm.model import (
     ResponseDetail,
     ScopeStatus,
 )
+from afspm.model.events import LONGEST_ANNOUNCEMENT
 
 HOST = "supervisor:host"
 OK = ControlResponse.SUCCESS

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -39,6 +40,7 @@ class Lab:
         self.log = folder / "packets"
         self.clock = FakeClock()
         self.sockets: Any = MagicMock()
+        self.sockets.router.due_s = math.inf
         core = SchedulerCore(SchedulerSettings(), WireCodec())
         state = StateFile(folder / "scheduler.json", LOG)
         self.writes = WriteAhead(state, PacketLog(self.log), core.cached, LOG)

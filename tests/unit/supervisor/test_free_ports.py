@@ -2,10 +2,14 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import stat
+from pathlib import Path
 
 import pytest
 
-from afspm.supervisor.ports import CAN_HOLD, HIGHEST, LOWEST, FreePorts
+from afspm.supervisor import ports
+from afspm.supervisor.ports import CAN_HOLD, HIGHEST, LONGEST_FOLDER, LOWEST, FreePorts, SocketFolder, new_addresses
+from afspm.transport.network import HAS_PRIVATE_SOCKETS
 
 
 def test_no_port_is_given_twice() -> None:
@@ -41,3 +45,38 @@ def test_a_port_is_nobody_else_s_before_it_is_bound_while_it_is_bound_and_betwee
         assert not is_free()
     with socket.socket() as peer, pytest.raises(ConnectionRefusedError):
         peer.connect(address)
+
+
+@pytest.mark.skipif(not HAS_PRIVATE_SOCKETS, reason="there are no unix sockets")
+def test_socket_folder_is_for_its_owner_alone_and_short_whatever_the_environment_says(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    deep = tmp_path / ("a" * LONGEST_FOLDER)
+    deep.mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(deep))
+    folder = SocketFolder()
+    try:
+        assert stat.S_IMODE(folder.path.stat().st_mode) == 0o700
+        assert deep not in folder.path.parents
+        addresses = [folder.address() for _ in range(100)]
+        assert len(set(addresses)) == 100
+        assert max(map(len, addresses)) < len("ipc://") + 103
+    finally:
+        folder.close()
+    assert not folder.path.exists()
+
+
+@pytest.mark.parametrize(
+    ("private", "tcp", "schemes"),
+    [(True, False, ("ipc", "ipc")), (False, False, ("tcp", "ipc")), (False, True, ("tcp", "tcp"))],
+)
+@pytest.mark.parametrize("has", [True, False])
+def test_new_addresses_are_unix_sockets_where_they_are_wanted_and_there(
+    monkeypatch: pytest.MonkeyPatch, private: bool, tcp: bool, schemes: tuple[str, str], has: bool
+) -> None:
+    if has and not HAS_PRIVATE_SOCKETS:
+        pytest.skip("there are no unix sockets")
+    monkeypatch.setattr(ports, "HAS_PRIVATE_SOCKETS", has)
+    with new_addresses(private=private, tcp=tcp) as new:
+        found = tuple(address.partition("://")[0] for address in (new.of_socket(), new.of_heartbeat()))
+    assert found == (schemes if has else ("tcp", "tcp"))

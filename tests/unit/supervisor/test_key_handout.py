@@ -81,6 +81,33 @@ def test_each_gets_its_own_pair_and_the_public_keys_of_whom_it_has_to_know(tmp_p
     assert set(found.guest["servers"].values()) == {"scheduler"}
 
 
+PUBLISHING = """
+[writer]
+component = true
+command = ["python", "y.py"]
+publisher = "tcp://127.0.0.1:29104"
+"""
+
+
+def test_every_port_has_keys_and_of_unix_sockets_those_of_requests(tmp_path: Path) -> None:
+    made = experiment(tmp_path, PUBLISHING)
+    for scheme, published in (("tcp://127.0.0.1:", {"scheduler", "microscope"}), ("ipc:///x/", set[str]())):
+        numbers = itertools.count(21_000)
+        found = hand_over(made, made.launches(take_address=lambda s=scheme, n=numbers: f"{s}{next(n)}"))
+        for start in found.starts:
+            sockets, own = start.launch.sockets, from_launch(start.launch.name, start.launch.keys)
+            assert own is not None
+            if sockets.serve:
+                assert own.binds_encrypted(sockets.serve, requests=True)
+            if sockets.publish and start.launch.name != "writer":
+                is_encrypted = own.binds_encrypted(sockets.publish, requests=False)
+                assert is_encrypted == (start.launch.name in published)
+            for address in sockets.subscribe:
+                assert (own.server_key(address) is not None) == address.startswith("tcp://")
+        # a program in another language knows all or nothing
+        assert lines(found)["writer"]["everywhere"] == scheme.startswith("tcp")
+
+
 def test_keys_are_new_in_each_run(tmp_path: Path) -> None:
     made = experiment(tmp_path)
     assert lines(handed(made))["series"]["secret"] != lines(handed(made))["series"]["secret"]

@@ -22,7 +22,7 @@ def beats(listener: HeartbeatListener, count: int, timeout_s: float = 5.0) -> li
 
 def test_the_first_beat_comes_at_once_and_others_follow_with_the_age_of_the_step(open_: Any) -> None:
     listener = open_(HeartbeatListener())
-    address = listener.listen("Component")
+    address = listener.listen("Component")[0]
     sender = open_(HeartbeatSender(address, 60.0, lambda: 1.5, lambda: 30.0))
     assert beats(listener, 1) == [Heartbeat("Component", False, 1.5, 30.0)]
     sender.close()
@@ -31,14 +31,14 @@ def test_the_first_beat_comes_at_once_and_others_follow_with_the_age_of_the_step
 
 def test_beats_come_at_their_period_while_the_main_thread_does_nothing_of_the_kind(open_: Any) -> None:
     listener = open_(HeartbeatListener())
-    open_(HeartbeatSender(listener.listen("Component"), 0.02, lambda: 0.0, lambda: 30.0))
+    open_(HeartbeatSender(listener.listen("Component")[0], 0.02, lambda: 0.0, lambda: 30.0))
     assert len(beats(listener, 5)) >= 5
 
 
 def test_each_process_is_heard_under_its_own_name(open_: Any) -> None:
     listener = open_(HeartbeatListener())
     for name in ("One", "Two"):
-        open_(HeartbeatSender(listener.listen(name), 0.02, lambda: 0.0, lambda: 30.0))
+        open_(HeartbeatSender(listener.listen(name)[0], 0.02, lambda: 0.0, lambda: 30.0))
     names: set[str] = set()
     deadline_s = time.monotonic() + 5.0
     while names != {"One", "Two"}:
@@ -50,7 +50,7 @@ def test_each_process_is_heard_under_its_own_name(open_: Any) -> None:
 def test_nobody_else_can_say_that_a_process_closes_or_lives(open_: Any, needs_token: bool) -> None:
     """A process that knows its token is known by it: from the beginning, or from its first beat on."""
     listener = open_(HeartbeatListener())
-    address = listener.listen("Component", token="secret", needs_token=needs_token)
+    address = listener.listen("Component", token="secret", needs_token=needs_token)[0]
     sender = open_(HeartbeatSender(address, 0.02, lambda: 0.0, lambda: 30.0, "secret"))
     found = beats(listener, 1)
     for token in ("", "guess"):  # each says at its end that it closes
@@ -68,13 +68,14 @@ def test_nobody_else_can_say_that_a_process_closes_or_lives(open_: Any, needs_to
 
 def test_a_program_of_version_1_is_heard_without_a_token(open_: Any) -> None:
     listener = open_(HeartbeatListener())
-    open_(HeartbeatSender(listener.listen("Component", token="secret"), 0.02, lambda: 0.0, lambda: 30.0))
+    open_(HeartbeatSender(listener.listen("Component", token="secret")[0], 0.02, lambda: 0.0, lambda: 30.0))
     assert not beats(listener, 2)[-1].closing
 
 
 def test_waiting_for_beats_ends_when_woken_up(open_: Any) -> None:
     wake_up: WakeUp[str] = open_(WakeUp())
-    listener = open_(HeartbeatListener(wake_up))
+    listener = open_(HeartbeatListener())
+    listener.end_polls_by(wake_up.fileno())
     listener.listen("Component")
     wake_up.post("signal")
     assert listener.poll(None) == []

@@ -180,6 +180,25 @@ def test_half_requests_keep_nobody_out(serve: Serve) -> None:
     assert closes(halves[0])
 
 
+def test_tls_handshakes_that_never_end_keep_nobody_out_and_end_in_time(certificate: Path) -> None:
+    bound = listening("127.0.0.1", 0)
+    address = bound.getsockname()
+    server = WebServer(hello, bound, certificate, certificate.with_suffix(".key"), head_s=2.0)
+    server.start()
+    silent: list[socket.socket] = []
+    try:
+        silent += (socket.create_connection(address) for _ in range(2 * web_server.MOST_UNFINISHED))
+        trusting = ssl.create_default_context(cafile=certificate)
+        with urlopen(url_of(*address, encrypted=True), context=trusting, timeout=10.0) as answer:
+            assert answer.read() == b"https"
+        assert all(closes(one) for one in silent[: web_server.MOST_UNFINISHED])  # of too many the oldest
+        assert closes(silent[-1])
+    finally:
+        for one in silent:
+            one.close()
+        server.stop()
+
+
 @pytest.mark.parametrize("sent", [b"", HALF], ids=["nothing", "half"])
 def test_head_that_does_not_come_ends_the_connection(serve: Serve, sent: bytes) -> None:
     connection = serve(head_s=0.3)()

@@ -50,6 +50,9 @@ final class Heartbeat implements AutoCloseable {
             context.setLinger(Sockets.LINGER_MS);
             // XPUB, since it sees the listener subscribe: a beat sent before that would be lost
             ZMQ.Socket socket = Sockets.open(context, SocketType.XPUB);
+            if (launch.keys != null && launch.keys.servers.containsKey(launch.sockets.heartbeat)) {
+                Sockets.encrypt(socket, launch.keys, launch.sockets.heartbeat);
+            }
             socket.connect(launch.sockets.heartbeat);
             socket.setReceiveTimeOut((int) (launch.beatPeriodS * 1000));
             socket.recv();
