@@ -19,6 +19,7 @@ DRIVERS = "afspm.drivers"  # class = "Name" of a translator
 COMPONENTS = "afspm.components"  # class = "Name" of a component
 READERS = "afspm.readers"  # by the suffix of a file, without its dot: (path, zone) -> FileContent
 ESTIMATORS = "afspm.estimators"  # of drift, by name
+FORMS = "afspm.forms"  # of experiment files: experiment.forms.FileForm
 COMMANDS = "afspm.commands"  # afspm NAME: a function, or a typer.Typer
 
 
