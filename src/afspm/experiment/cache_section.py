@@ -1,4 +1,4 @@
-"""[cache], and its form in the paper (PBCScanLogic): under which envelopes packets are kept, and how many.
+"""[cache]: under which envelopes packets are kept, and how many.
 
 [cache]
 history = { Scan2d = 10 }
@@ -22,10 +22,8 @@ from pydantic import Field
 from afspm.errors import AfspmError
 from afspm.experiment import class_loader
 from afspm.experiment.document import Document
-from afspm.experiment.published import length_m, wire_of
 from afspm.experiment.sections import Section, parse
 from afspm.experiment.toml_lines import Settings, Table
-from afspm.experiment.wiring_classes import WiringClass
 from afspm.logic.envelopes import CacheRule, Envelopes
 from afspm.model import PacketHeader
 from afspm.units import Length
@@ -78,12 +76,8 @@ class CacheSettings:
         return {"rules": rules, "mapping": self.mapping, "history": dict(self.history)}
 
 
-def read(table: Table, logic: Table | None, document: Document) -> CacheSettings:
-    """Return the section, with what the paper's form says of the cache where the section says nothing.
-
-    Args:
-        logic: the table that the scheduler's cache refers to in the paper's form.
-    """
+def read(table: Table, document: Document) -> CacheSettings:
+    """Return the section."""
     section = parse(CacheSection, "cache", dict(table), document)
     rules = []
     for i, rule in enumerate(section.rules):
@@ -95,11 +89,7 @@ def read(table: Table, logic: Table | None, document: Document) -> CacheSettings
             document.error(f"[cache] rules[{i}]: {error.what}", "cache", "rules", i, hint=error.hint)
     if section.mapping is not None:
         _check_mapping(section.mapping, document)
-    history = dict(section.history)
-    if logic is not None and wire_of(logic) is WiringClass.CACHE_LOGIC:
-        history = _published_history(logic) | history
-        rules += _published_rules(logic)
-    return CacheSettings(tuple(rules), section.mapping, history)
+    return CacheSettings(tuple(rules), section.mapping, dict(section.history))
 
 
 def _check_mapping(name: str, document: Document) -> None:
@@ -117,24 +107,3 @@ def _check_mapping(name: str, document: Document) -> None:
         except AfspmError as error:
             document.error(f"[cache] mapping: {error.what}", "cache", "mapping", hint=error.hint)
             return
-
-
-def _published_history(logic: Table) -> dict[str, int]:
-    count = logic.get("default_scan_history")
-    return {"Scan2d": count} if isinstance(count, int) and count > 0 else {}
-
-
-def _published_rules(logic: Table) -> list[CacheRule]:
-    """Histories by size, [[width, height], count]; a number is in nm, as in the envelopes' names."""
-    histories = logic.get("proto_with_history_list")
-    if wire_of(histories) is not WiringClass.HISTORIES or not isinstance(histories, Mapping):
-        return []
-    rules = []
-    channels = histories.get("channels_list") or []
-    for number, entry in enumerate(histories.get("sizes_with_hist_list", ())):
-        match entry:
-            case [[width, *_], int(count)] if count > 0:
-                channel = channels[number] if number < len(channels) else None
-                wide = length_m(width)
-                rules.append(CacheRule("Scan2d", channel, None, wide * 0.999, wide * 1.001, None, count))
-    return rules

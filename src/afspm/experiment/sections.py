@@ -71,8 +71,6 @@ class ControlSection(Section):
     """Those states; None: what the watchdog takes for dangerous by itself."""
     adjustable: tuple[AdjustableParameter, ...] = ()
     """Parameters that who may operate sets in AUTOMATED mode, too, beside the component in control."""
-    spectra_by_variable: StrictBool = False
-    """Whether the translator sends the values of a spectrum variable after variable, as some of version 1 do."""
     roles: RolesSection = RolesSection()
 
 
