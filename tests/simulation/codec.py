@@ -35,8 +35,5 @@ class TableCodec:
         thing = self.decode(payload)
         return thing if isinstance(thing, Parameter) else None
 
-    def by_point(self, spectrum: bytes | memoryview) -> bytes:
-        return bytes(spectrum)
-
     def decode_packet(self, message: str, payload: bytes | memoryview) -> Any:
         return self.decode(payload)

@@ -88,13 +88,7 @@ class ReplayRequested:
 
 @dataclass(frozen=True, slots=True)
 class TranslatorUp:
-    """The translator can be asked.
-
-    Attributes:
-        knows_ids: one of ours does, one of version 1 does not; None: its answers will tell.
-    """
-
-    knows_ids: bool | None = None
+    """The translator can be asked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,14 +173,12 @@ class Reply:
 
     Attributes:
         asked: the number of the request that is answered.
-        tells_why: the reason is told to a peer of version 1, too.
     """
 
     connection: int
     name: str
     response: Response
     asked: int = 0
-    tells_why: bool = False
 
 
 @dataclass(slots=True)
@@ -243,11 +235,9 @@ class Kill:
 
     Attributes:
         tip_is_safe: the translator may leave; if not, it sees to the tip when it is asked to.
-        stop: the action that stops what the microscope measures; empty: nothing.
     """
 
     tip_is_safe: bool = True
-    stop: str = ""
 
 
 Effect = Reply | Forward | Publish | Replay | SaveState | Log | Kill
@@ -267,9 +257,6 @@ class Codec(Protocol):
 
     def decode_parameter(self, payload: bytes) -> Parameter | None:
         """A ParameterMsg out of a response; None if it is not one."""
-
-    def by_point(self, spectrum: bytes | memoryview) -> bytes:
-        """A Spec1d whose values came variable after variable, with its values point by point. Raises AfspmError."""
 
     def decode_packet(self, message: str, payload: bytes | memoryview) -> object:
         """The object of a small packet (ScopeStatus, Feedback, ProcessStates …); None if malformed."""

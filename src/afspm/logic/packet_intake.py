@@ -21,14 +21,9 @@ from afspm.model import (
     ScopeStatus,
 )
 
-SPECTRUM = "Spec1d"
 _TELLING = frozenset({"ScopeStateMsg", "ZCtrlParameters", "ScanParameters2d", "ProbePosition"})
 """Messages from which we learn what the microscope is in. All others pass unread."""
 _MOST_LOGGED = 1000
-_DOUBT = (
-    "the translator is of version 1: those of the published implementation for Nanonis and Asylum send the values of a "
-    "spectrum variable after variable; if curves look scrambled, set spectra_by_variable = true in [control]"
-)
 
 
 def take_packet(draft: StateDraft, event: PacketIn) -> None:
@@ -43,9 +38,6 @@ def take_packet(draft: StateDraft, event: PacketIn) -> None:
     if published is None:
         return
     draft.effects.append(published)
-    by_variable = draft.env.settings.spectra_by_variable
-    if draft.idempotency.ids_known is False and message == SPECTRUM and not by_variable:
-        _log_once(draft, "WARNING", _DOUBT)
     if told is not None:
         _learn(draft, told)
 
@@ -56,8 +48,6 @@ def _published(draft: StateDraft, packet: Packet, header: PacketHeader) -> Publi
         _log_once(draft, "WARNING", "the translator publishes a ControlState, which is the scheduler's: dropped")
         return None
     try:
-        if env.settings.spectra_by_variable and header.message == SPECTRUM:
-            packet = Packet(packet.envelope, env.codec.by_point(packet.payload), packet.time_ns)
         if env.frame is not None:
             packet = env.frame.incoming(packet, header, draft.now_ns)
         taken = env.cache.take(packet, header, draft.now_ns)

@@ -27,7 +27,6 @@ class SchedulerSettings:
         cache_bytes: how much is cached at most.
         catch_up_s: how long (real) a scheduler waits at its start for what the translator has published before.
         malfunction_after_s: how long (real) the microscope may be lost before that is flagged as a malfunction.
-        spectra_by_variable: the translator sends the values of a spectrum variable after variable.
         clock: `ExperimentClock.as_dict()`, to be told to those who ask; empty: real time.
         run: the identity of the run, which is told with it; empty: it has none.
         simulated: whether the microscope is, which is told with it.
@@ -48,7 +47,6 @@ class SchedulerSettings:
     cache_bytes: int = 512 * 2**20
     catch_up_s: float = 1.0
     malfunction_after_s: float = 5.0
-    spectra_by_variable: bool = False
     clock: Mapping[str, float] = field(default_factory=dict)
     run: str = ""
     simulated: bool = False

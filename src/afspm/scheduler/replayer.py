@@ -127,8 +127,7 @@ class Replayer:
     def _answer(self) -> None:
         for event in self._router.receive():
             if isinstance(event, PeerAsked) and event.frames:
-                number = int.from_bytes(event.frames[0][:1])
-                self._router.reply(event.connection, wire.encode_answer(self._response(event), number))
+                self._router.reply(event.connection, wire.encode_response(self._response(event)))
 
     def _response(self, asked: PeerAsked) -> Response:
         try:

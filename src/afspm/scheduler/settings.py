@@ -22,7 +22,7 @@ def scheduler_settings(
 ) -> SchedulerSettings:
     """All of them. Raises ConfigError, naming the section."""
     known = {"lease_s", "grace_s", "malfunction_after_s", "stop_scan_on_problem", "stop_scan_on_manual"}
-    known |= {"retract", "dangerous", "roles", "spectra_by_variable", "adjustable", "end_on"}
+    known |= {"retract", "dangerous", "roles", "adjustable", "end_on"}
     if unknown := control.keys() - known:
         raise ConfigError(f"unknown settings {sorted(unknown)}", where="[control]", hint=f"known: {sorted(known)}")
     try:
@@ -40,7 +40,6 @@ def scheduler_settings(
             envelopes=_envelopes(cache),
             grace_s=control.get("grace_s", SchedulerSettings.grace_s),
             malfunction_after_s=control.get("malfunction_after_s", SchedulerSettings.malfunction_after_s),
-            spectra_by_variable=control.get("spectra_by_variable", False),
         )
     except (TypeError, ValueError, KeyError) as error:
         raise ConfigError(f"the scheduler's settings make no sense: {error}") from error

@@ -32,9 +32,6 @@ class WireCodec:
         of = "ProbePosition" if message in ("Spec1d", "ProbePosition") else "ScanParameters2d"
         return wire.relocated(message, payload, wire.place_in(of, told))
 
-    def by_point(self, spectrum: bytes | memoryview) -> bytes:
-        return wire.by_point(spectrum)
-
     def decode_packet(self, message: str, payload: bytes | memoryview) -> object:
         try:
             return wire.decode(message, payload)

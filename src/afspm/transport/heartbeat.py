@@ -111,7 +111,7 @@ class HeartbeatListener:
     """Listens to the heartbeats of several processes, each at an address of its own, by a token of its own.
 
     Any program of this computer can send to such an address: a beat of a process that knows its token counts with it
-    alone. A program of version 1, which sends none, is believed as it is.
+    alone. A program that sends none is believed as it is.
 
     Args:
         wake_up: ends a `poll` under way; taking what was posted is left to its owner.
@@ -165,7 +165,7 @@ def _is_by(expected: _Expected, frames: list[bytes]) -> bool:
 
 
 def read_beat(name: str, frames: list[bytes]) -> Heartbeat | None:
-    """Return a beat of ours or of version 1 (one frame); None if it is neither."""
+    """Return a beat, of one frame or of four; None if it is neither."""
     if not frames or frames[0] not in (BEAT, CLOSING):
         return None
     ages = [_seconds(frame) for frame in frames[1:3]]

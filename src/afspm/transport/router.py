@@ -13,7 +13,6 @@ from afspm.transport.keys import MARK
 from afspm.transport.network import ACCEPTED, DISCONNECTED, REFUSED, Monitor, Network
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.tcp_guard import TcpGuard
-from afspm.wire.protocol import ANSWER, QUESTION
 
 _LAST_WORDS = 200
 """Messages looked through for the last words of who has gone."""
@@ -54,7 +53,7 @@ class _Connection:
 
 
 class Router:
-    """REQ and DEALER peers, ours and of version 1, each known by its connection.
+    """REQ and DEALER peers, each known by its connection.
 
     A name belongs to the newest connection that uses it, so that a restarted component is the same client.
     """
@@ -139,9 +138,6 @@ class Router:
         content = [frame.bytes for frame in frames]
         if len(content) < 2 or content[1]:
             self._log.warning(f"dropped a request of {sender.name or 'a nameless peer'}: no empty frame before it")
-            return []
-        if content[2:] == [*QUESTION]:  # whether we are one of ours; whose name it is does not matter for that
-            self.reply(sender.number, ANSWER)
             return []
         return [(sender, PeerAsked(sender.number, sender.name, sender.user, content[2:]))]
 

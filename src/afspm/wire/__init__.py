@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from afspm.wire.codec import by_point, decode, encode, header
+from afspm.wire.codec import decode, encode, header
 from afspm.wire.frames import (
     decode_packet,
     decode_parameter,
     decode_request,
     decode_response,
-    encode_answer,
     encode_packet,
     encode_request,
     encode_response,
@@ -23,10 +22,7 @@ from afspm.wire.protocol import (
     CLOSING,
     KILL,
     PROTOCOL_VERSION,
-    VERSION_2_ACTION,
     Topic,
-    Version,
-    version_of,
 )
 from afspm.wire.split import Buffer
 from afspm.wire.values import encode_place, place_in, relocated
@@ -37,11 +33,8 @@ __all__ = [
     "CLOSING",
     "KILL",
     "PROTOCOL_VERSION",
-    "VERSION_2_ACTION",
     "Buffer",
     "Topic",
-    "Version",
-    "by_point",
     "decode",
     "decode_orders",
     "decode_packet",
@@ -49,7 +42,6 @@ __all__ = [
     "decode_request",
     "decode_response",
     "encode",
-    "encode_answer",
     "encode_orders",
     "encode_packet",
     "encode_place",
@@ -65,5 +57,4 @@ __all__ = [
     "place_in",
     "register",
     "relocated",
-    "version_of",
 ]

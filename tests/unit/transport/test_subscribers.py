@@ -131,8 +131,7 @@ def test_a_plain_subscriber_that_takes_nothing_is_disconnected_when_too_much_wai
     slow.setsockopt(zmq.RCVHWM, 1)
     slow.subscribe(b"Scan")
     slow.connect(lab.publisher.address)
-    lab.publish()
-    until(lambda: slow.poll(0), (lab, lab.events))
+    until(lambda: lab.publish() or slow.poll(0), (lab, lab.events))
     for _ in range(MOST_WAITING // SCAN + 10):
         lab.publish()
     until(lambda: DISCONNECTED in lab.events, (lab, lab.events), timeout_s=SOON_S)
