@@ -9,9 +9,7 @@ from typing import Any, Final
 from afspm import units
 from afspm.errors import AfspmError, InvalidValue
 from afspm.experiment.document import Document
-from afspm.experiment.findings import SourceLocation
 from afspm.experiment.parts import ExperimentParts
-from afspm.experiment.resolution import ResolvedExperiment
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.toml_writer import value as toml
 from afspm.experiment.wiring_classes import WIRE_KEYS
@@ -389,37 +387,19 @@ INSTEAD: Final[dict[str, str]] = {
 """What to write instead of a published class that calls code written against the published implementation."""
 
 
-class PublishedForm:
-    """The form of the published implementation: see `experiment.forms.FileForm`."""
-
-    def convert(self, tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
-        """Return the components of a file as ours; the intermediaries and [cache] of `parts` become ours as well."""
-        channels = renamed_channels(tables)
-        conversion = _Conversion(channels, parts, document)
-        for table in tables.values():
-            conversion.add_cache(table)
-        for name, table in parts.intermediaries.items():
-            conversion.note_intermediary(name, table)
-            parts.intermediaries[name] = _kept_inside(table, channels)
-        found = {name: conversion.component(name, converted(table, channels), table) for name, table in tables.items()}
-        ours = {name: table for name, table in found.items() if table is not None}
-        conversion.drop_rescanners(ours)
-        return ours
-
-    def explained(self, resolved: ResolvedExperiment) -> list[tuple[SourceLocation, str, str]]:
-        """Return for each line of the file where it is, what it sets, and what has become of it."""
-        from afspm.plugins.published.short_form import explained
-
-        return explained(resolved)
-
-    def short(self, resolved: ResolvedExperiment) -> str:
-        """Return the experiment in the short form."""
-        from afspm.plugins.published.short_form import short
-
-        return short(resolved)
-
-
-FORM: Final = PublishedForm()
+def convert(tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
+    """Return the components of a file as ours; the intermediaries and [cache] of `parts` become ours as well."""
+    channels = renamed_channels(tables)
+    conversion = _Conversion(channels, parts, document)
+    for table in tables.values():
+        conversion.add_cache(table)
+    for name, table in parts.intermediaries.items():
+        conversion.note_intermediary(name, table)
+        parts.intermediaries[name] = _kept_inside(table, channels)
+    found = {name: conversion.component(name, converted(table, channels), table) for name, table in tables.items()}
+    ours = {name: table for name, table in found.items() if table is not None}
+    conversion.drop_rescanners(ours)
+    return ours
 
 
 def _kept_inside(table: Table, channels: Mapping[str, str]) -> Settings:
