@@ -86,7 +86,7 @@ class Experiment(Client):
         return self.control.holder == self.identity
 
 
-class Version1Experiment(Experiment):
+class ExperimentWithoutIds(Experiment):
     """The same, without ids: what is not answered is not repeated."""
 
     knows_ids = False

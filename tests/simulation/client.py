@@ -32,7 +32,7 @@ class Client(Process):
 
     Attributes:
         identity: what it calls itself to the scheduler; an impostor's differs from its `name`.
-        knows_ids: ours sends ids and repeats a request that is not answered; one of version 1 does neither.
+        knows_ids: it sends ids and repeats a request that is not answered; a program without ids does neither.
         listens: how the envelopes begin that it subscribes to.
         on_received: called with every packet that reaches it.
     """

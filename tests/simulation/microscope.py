@@ -69,7 +69,6 @@ class Habits:
     """How the translator behaves; may be changed while it runs.
 
     Attributes:
-        knows_ids: ours does, one of version 1 does not.
         service_s: the longest a request takes, mostly much less.
         hangs: the chance that one takes up to `hang_s`.
         loses_answer: the chance that an answer never comes.
@@ -79,7 +78,6 @@ class Habits:
         retracts: whether it has an action that withdraws the tip.
     """
 
-    knows_ids: bool = True
     service_s: float = 0.02
     hangs: float = 0.0
     hang_s: float = 20.0
@@ -180,7 +178,7 @@ class FakeMicroscope(Process):
 
     def _handle(self, request: Request) -> Response:
         outcomes = RequestOutcomes(self._kept, all_or_nothing=False)
-        if self.habits.knows_ids and (known := outcomes.outcome(request)) is not None:
+        if (known := outcomes.outcome(request)) is not None:
             return known
         code = self._carry_out(request)
         payload = b""
@@ -188,7 +186,7 @@ class FakeMicroscope(Process):
             assert isinstance(request.subject, Parameter)
             payload = self._codec.encode(self._in_force(request.subject))
         response = Response(int(code), payload, "" if code is ControlResponse.SUCCESS else f"it is {self.state.name}")
-        if self.habits.knows_ids and request.id:
+        if request.id:
             response.id = request.id
             outcomes.begin(request)
             outcomes.finish(request, response)

@@ -38,7 +38,7 @@ _FEW = ("experiment", "classifier", "corrector", "feedback", "person")
 
 
 def _bad_night(seed: int) -> Plan:
-    """A night in which much goes wrong, half of them with a translator of version 1, some with somebody greedy."""
+    """A night in which much goes wrong, in some with a greedy client."""
     away = [Fault("outage", "experiment", (seed % 10) / 10.0, 60.0)]
     drawn = plan(seed, hours=4.0)
     if seed % 4 == 3:  # few others and slow, so that control stays where it is
@@ -53,7 +53,7 @@ def _bad_night(seed: int) -> Plan:
     there = ("scheduler", "translator", *drawn.cast)
     faults = (*(fault for fault in drawn.faults if fault.whom in there), *away)
     slow = replace(drawn, speed=drawn.speed / 2.0)  # in more real time more connections come and go
-    return replace(slow, faults=faults, ids_known=seed % 2 == 0, dies_in_step=0.003, doubles=0.1, hangs=0.005)
+    return replace(slow, faults=faults, dies_in_step=0.003, doubles=0.1, hangs=0.005)
 
 
 def _rows(

@@ -82,7 +82,7 @@ def test_two_changes_of_control_at_the_end_of_an_outage_are_told_one_after_the_o
     """The scheduler comes back, says who is in control, and finds at the same moment that its lease has run out."""
     faults = (Fault("outage", "scheduler", 0.6640625, 5.0), Fault("freeze", "scheduler", 0.84375, 5.0))
     cast = tuple(CAST)
-    night = Plan(0, hours=2.0, speed=200.0, cast=cast, impostor=False, ids_known=False, lease_s=900.0)
+    night = Plan(0, hours=2.0, speed=200.0, cast=cast, impostor=False, lease_s=900.0)
     Night(replace(night, faults=(*faults, Fault("cut", "scheduler", 0.0, 40.0)), dies_in_step=0.0, doubles=0.05)).run()
 
 
@@ -101,14 +101,13 @@ _faults = st.builds(
     seed=st.integers(0, 2**32),
     faults=st.lists(_faults, max_size=12),
     impostor=st.booleans(),
-    ids_known=st.booleans(),
     lease_s=st.sampled_from([None, 900.0]),
     dies_in_step=st.sampled_from([0.0, 0.002]),
 )
 def test_no_schedule_of_faults_breaks_an_invariant(
-    seed: int, faults: list[Fault], impostor: bool, ids_known: bool, lease_s: float | None, dies_in_step: float
+    seed: int, faults: list[Fault], impostor: bool, lease_s: float | None, dies_in_step: float
 ) -> None:
     cast = tuple(name for name in CAST if lease_s is not None or name != "greedy")
     faults = [fault for fault in faults if fault.whom in ("scheduler", "translator", *cast)]
-    made = Plan(seed, hours=2.0, speed=200.0, cast=cast, impostor=impostor, ids_known=ids_known, lease_s=lease_s)
+    made = Plan(seed, hours=2.0, speed=200.0, cast=cast, impostor=impostor, lease_s=lease_s)
     Night(replace(made, faults=tuple(faults), dies_in_step=dies_in_step, doubles=0.05)).run()

@@ -180,10 +180,8 @@ struct Control {
     monitor: Socket,
     address: String,
     connected: bool,
-    /// The scheduler has shown that it speaks our version.
+    /// The scheduler has answered.
     known: bool,
-    /// What is sent when that is known; None: it was not asked yet.
-    held_back: Option<Vec<Frames>>,
     /// The id of the last request, if there was no answer since.
     unanswered: Vec<u8>,
     greetings: u64,
@@ -196,7 +194,6 @@ impl Control {
         let monitor = socket.monitor(zmq::CONNECTED | zmq::DISCONNECTED)?;
         connect(&socket, &shared.launch, address)?;
         let (shared, address) = (shared.clone(), address.to_owned());
-        let (held_back, unanswered) = (None, Vec::new());
         Ok(Control {
             shared,
             socket,
@@ -204,8 +201,7 @@ impl Control {
             address,
             connected: false,
             known: false,
-            held_back,
-            unanswered,
+            unanswered: Vec::new(),
             greetings: 0,
         })
     }
@@ -247,7 +243,7 @@ impl Control {
 
     /// Follow the scheduler's coming and going; say by a request's id of which run we are.
     fn connection(&mut self, connected: bool) {
-        (self.connected, self.held_back) = (connected, None);
+        self.connected = connected;
         self.unanswered.clear();
         if connected {
             self.greetings += 1;
@@ -270,15 +266,9 @@ impl Control {
         }
         if self.unanswered == frames[2] {
             self.reconnect();
-        } else if self.known {
-            self.unanswered.clone_from(&frames[2]);
-            self.send(&frames);
         } else {
             self.unanswered.clone_from(&frames[2]);
-            if self.held_back.is_none() {
-                self.send(&question());
-            }
-            self.held_back.get_or_insert_default().push(frames);
+            self.send(&frames);
         }
     }
 
@@ -294,7 +284,7 @@ impl Control {
     }
 
     fn reconnect(&mut self) {
-        (self.connected, self.held_back) = (false, None);
+        self.connected = false;
         self.unanswered.clear();
         let again = self.socket.disconnect(&self.address).and_then(|()| self.socket.connect(&self.address));
         if let Err(error) = again {
@@ -307,28 +297,14 @@ impl Control {
         if frames.len() < 2 || !frames[0].is_empty() {
             return; // an empty frame alone: the scheduler has looked whether we are there
         }
-        let is_yes = frames.len() == 3 && *frames[1] == [0] && *frames[2] == *wire::action("x-version-2");
         match wire::response(&frames[1..]) {
-            Ok(answer) if self.held_back.is_some() => self.learn_version(answer, is_yes),
-            Ok(answer) if !is_yes => self.answer(answer),
-            Ok(_) => {}
+            Ok(answer) => self.answer(answer),
             Err(error) => warn(&format!("dropped a reply: {error}")),
         }
     }
 
-    fn learn_version(&mut self, answer: Response, is_yes: bool) {
-        if !is_yes && answer.id.is_empty() {
-            let text = "the scheduler speaks version 1 of the protocol, which this client does not";
-            return self.shared.finish(Error::Config(text.into()));
-        }
-        self.known = true;
-        self.unanswered.clear();
-        for frames in self.held_back.take().unwrap_or_default() {
-            self.ask(frames);
-        }
-    }
-
     fn answer(&mut self, answer: Response) {
+        self.known = true;
         self.unanswered.clear();
         if answer.response == wire::OTHER_RUN {
             self.shared.finish(Error::Config(answer.reason.clone()));
@@ -339,11 +315,6 @@ impl Control {
             }
         });
     }
-}
-
-/// Return the request whose answer tells a scheduler of ours from one of version 1.
-fn question() -> Frames {
-    vec![vec![12], wire::action("x-version-2")]
 }
 
 // --- packets ---

@@ -23,7 +23,7 @@ def check(
         bool,
         typer.Option(
             "--explain",
-            help="Print the short form of a file of the published implementation, and say what each line has become.",
+            help="Print a file of another form, as the published one, in ours; say what each line has become.",
         ),
     ] = False,
 ) -> None:
@@ -51,11 +51,12 @@ def check(
 
 def _explain(experiment: Experiment, console: Console) -> None:
     """Print the short form, and to the console what has become of each line."""
-    from afspm.experiment.short_form import explained, short
+    from afspm.experiment.forms import all_forms
 
-    for place, line, became in explained(experiment):
-        console.print(f"{place}: {line}: {became}", markup=False, emoji=False, soft_wrap=True)
-    typer.echo(short(experiment), nl=False)
+    for form in all_forms():
+        for place, line, became in form.explained(experiment.resolved):
+            console.print(f"{place}: {line}: {became}", markup=False, emoji=False, soft_wrap=True)
+        typer.echo(form.short(experiment.resolved), nl=False)
 
 
 def show(findings: Sequence[Finding], console: Console) -> None:

@@ -40,8 +40,8 @@ _ASKED_FOR: dict[int, str] = {
     RELAY_REQUEST: "the note",
 }
 _NO_STATE = (
-    "waiting for the microscope, which has published no state yet: is its translator running? One of version 1 "
-    "that started before the scheduler publishes its state at the next change: restart it, or scan once by hand"
+    "waiting for the microscope, which has published no state yet: is its translator running? If it never publishes "
+    "what is in force when a scheduler connects: restart it, or scan once by hand"
 )
 NOT_IN_CONTROL = {ControlResponse.NOT_IN_CONTROL, ControlResponse.WRONG_CONTROL_MODE}
 
@@ -93,7 +93,7 @@ class CommandRetry:
             return self.ask(kind, subject, until_s=until_s)
 
     def read(self, kind: ControlRequest, subject: object, until_s: float | None) -> Response:
-        """Ask for what anybody may know; schedulers of version 1 tell only the holder of control."""
+        """Ask for a reading; where the scheduler gives it to the holder of control alone, take control around it."""
         response = self.send(kind, subject, until_s=until_s)
         if response.code != ControlResponse.NOT_IN_CONTROL:
             return response

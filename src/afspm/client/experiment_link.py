@@ -41,7 +41,7 @@ LONGER_THAN_THE_SCHEDULER = 1.2
 """Factor on the time that the scheduler waits for the microscope: what it says then is an answer, and a component that
 asks again instead makes the connection anew, as if the scheduler were gone."""
 CAUGHT_UP_WITHIN_S = 2.0
-"""A scheduler of version 1 replays without saying when it is done: after that long it is taken to be."""
+"""Before a warning that nothing is heard of what the scheduler publishes."""
 UNHEARD = "the scheduler is there, but nothing is heard of what it publishes"
 Listener = Callable[[Packet, bool], None]
 
@@ -166,11 +166,7 @@ class ExperimentLink:
         while not self.wait_connected(self.is_caught_up, CAUGHT_UP_WITHIN_S, until_s):
             if until_s is not None and self.clock.monotonic_s() >= until_s:
                 raise NoResponse(UNHEARD, where=self._source or self.name, hint="does a firewall block this address?")
-            if self.version is wire.Version.UNKNOWN:
-                self.request(ControlRequest.ACTION_SUPPORT, wire.VERSION_2_ACTION, until_s=until_s)
-            if self.version is wire.Version.ONE:
-                self._caught_up.add(self._source or "")
-            elif not is_told:
+            if not is_told:
                 is_told = True
                 self.log.warning("%s; waiting for that (%s)", UNHEARD, self._source or "any address")
 
@@ -212,10 +208,6 @@ class ExperimentLink:
     def connections(self) -> int:
         return self.requests.connections
 
-    @property
-    def version(self) -> wire.Version:
-        return self.requests.version
-
     def next_id(self) -> str:
         return self.requests.next_id()
 
@@ -235,7 +227,7 @@ class ExperimentLink:
         frames, requests, sent = wire.encode_request(request), self.requests, 0
         requests.expect(request.id)
         try:
-            while sent < self._tries(kind):
+            while sent <= self._retries:
                 self._wait_for_scheduler(until_s)
                 connections = self.connections
                 self.port.send(frames)
@@ -247,9 +239,8 @@ class ExperimentLink:
                     return self._checked(requests.answer)
                 if until_s is not None and self.clock.monotonic_s() >= until_s:
                     break
-                # a connection that was lost is the scheduler's restart, not its silence; one of version 1 may have
-                # ended over just this request
-                sent += connections == self.connections or self.version is wire.Version.ONE
+                # a connection that was lost is the scheduler's restart, not its silence
+                sent += connections == self.connections
                 self.log.debug("asking %s (%s) again", request_name(kind), request.id)
         finally:
             requests.expect("")
@@ -279,12 +270,6 @@ class ExperimentLink:
         self.log.warning("the scheduler does not answer; waiting for it")
         if not self.wait(lambda: self.connected, until_s):
             raise NoResponse("the scheduler does not answer", where=self.name, hint="is the experiment running?")
-
-    def _tries(self, kind: int) -> int:
-        # a scheduler of version 1 does not know ids: what it may have done must not be asked for twice
-        if kind == ControlRequest.ACTION and self.version is wire.Version.ONE:
-            return 1
-        return 1 + self._retries
 
     # --- what arrives ---
 

@@ -20,7 +20,6 @@ class RequestTracker:
     Attributes:
         connections: how often the scheduler was connected.
         answer: to the request that is waited for; None: not yet there.
-        version: of the scheduler, as far as its answers show.
     """
 
     def __init__(self, send: Send, name: str, session: str) -> None:
@@ -34,7 +33,6 @@ class RequestTracker:
         self.connections = 0
         self.connected = False
         self.answer: Response | None = None
-        self.version = wire.Version.UNKNOWN
 
     def next_id(self) -> str:
         """Return an id for a request, not used before in any life of this component."""
@@ -53,8 +51,6 @@ class RequestTracker:
 
     def tell(self, thing: object, now_s: float, timeout_s: float) -> None:
         """Have the scheduler publish `thing`. Until that is answered, only the newest of each kind waits."""
-        if self.version is not wire.Version.OURS:
-            return  # its answer could be taken for that to the next request
         told = RelayedMessage(*wire.encode(thing))
         self._untold[told.message] = told
         if self._told is None or self._told[1] < now_s - timeout_s:
@@ -65,14 +61,13 @@ class RequestTracker:
         self.connected = True
         self._told = None  # its answer may be lost with the connection
         if run_of(self._name, f"{self._name}/{self._session}/0"):
-            self.send_only(CLOCK_REQUEST)  # shows by its id which run is ours; only a scheduler of ours has such runs
+            self.send_only(CLOCK_REQUEST)  # shows by its id which run is ours
 
     def on_reply(self, response: Response, now_s: float) -> None:
         if self._told is not None and response.id == self._told[0]:
             self._told = None
             self._tell_next(now_s)
-        elif self._asked and response.id in ("", self._asked):  # else it is late: it was given up on
-            self.version = wire.version_of(self._asked, response)
+        elif self._asked and response.id == self._asked:  # else it is late: it was given up on
             self.answer = response
 
     def _tell_next(self, now_s: float) -> None:

@@ -16,7 +16,6 @@ from afspm.client.keyed_results import KeyedResults, check_key
 from afspm.client.measurement import MeasurementRunner
 from afspm.client.measurement_setup import MeasurementSetup
 from afspm.client.parameter_values import Value, to_parameter, value_in
-from afspm.client.problem_flags import ProblemFlags
 from afspm.client.targets import ScanTarget, SpectrumTarget, xy_of
 from afspm.errors import ExperimentEnded, InvalidValue
 from afspm.model import (
@@ -75,7 +74,6 @@ class Scope(ExperimentView):
         super().__init__(link, problems or ProblemNames(), between)
         self._frame = frame
         self._begun: tuple[int, int] | None = None  # what was done when progress was first told, and when
-        self._problem_flags = ProblemFlags(link, self._tell, self.is_flagged)
         self._control = ControlHold(link, self.problems)
         self._commands = CommandRetry(link, self._control)
         self._setup = MeasurementSetup(link.view, self._commands)
@@ -246,11 +244,16 @@ class Scope(ExperimentView):
         Raises:
             ExperimentEnded: it is over; the record says nevertheless that the problem was seen.
         """
-        self._problem_flags.flag(self.problems.number(problem))
+        number = self.problems.number(problem)
+        try:
+            self._tell(ControlRequest.ADD_EXP_PRBLM, number)
+        except ExperimentEnded:
+            self._link.send_only(ControlRequest.ADD_EXP_PRBLM, number)
+            raise
 
     def clear(self, problem: int | str) -> None:
         """Remove the flag of a problem; that it was not flagged is no error."""
-        self._problem_flags.clear(self.problems.number(problem))
+        self._tell(ControlRequest.RMV_EXP_PRBLM, self.problems.number(problem))
 
     def clear_all(self) -> tuple[str, ...]:
         """Remove the flag of every problem that is flagged, and return their names."""

@@ -131,7 +131,7 @@ class PlannedScans(Component):
         count = rounds * len(self.plan.regions)
         told = f"missed {count} scan{'s' if count > 1 else ''} while it could not scan; {_MISSED[self.missed]}"
         self.log.warning("%s", told)
-        with suppress(RequestError):  # a scheduler of version 1 knows no notes
+        with suppress(RequestError):  # a scheduler of another make may know no notes
             self.scope.note(told)
 
     def _add(self, counter: str, rounds: int) -> None:

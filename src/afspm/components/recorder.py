@@ -80,7 +80,7 @@ class Recorder(Component):
                             writer.put(incoming.packet, incoming.source)
                         case PacketReceived() if heard is None and not segments(log):
                             writer.put(incoming.packet, SCHEDULER)
-                        case PacketReceived() if not segments(log):  # a scheduler of version 1 keeps no log
+                        case PacketReceived() if not segments(log):  # a scheduler of another make keeps no log
                             heard, is_to_ask_again = None, True
                         case Killed():
                             ended_s = min(ended_s, context.clock.monotonic_s())

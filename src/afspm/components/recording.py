@@ -81,7 +81,7 @@ class RecordWriter:
 
     def put(self, packet: Packet, source: str) -> None:
         """Have a packet recorded that is not in the log."""
-        if packet.time_ns is None:  # of a publisher of version 1
+        if packet.time_ns is None:  # of a publisher of another make
             packet = Packet(packet.envelope, packet.payload, self._clock.now_ns())
         self._inbox.put(SourcedPacket(packet, source), is_disk_full=self._told_full)
 

@@ -19,10 +19,10 @@ from afspm import entry_points
 from afspm.errors import ConfigError
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.parts import DECLARED_KEYS
-from afspm.experiment.published import GUIDE
 from afspm.experiment.toml_lines import Table
 from afspm.model import Role
 
+_OTHER_MAKE = "is it written for the published implementation? see docs/how-to/from-the-published-implementation.md"
 # By where they come from: a class of the user is recognised by what it is derived from.
 _ROLE_BY_BASE = (
     ("afspm.scheduler", Role.SCHEDULER),
@@ -137,12 +137,13 @@ def find_module(name: str, folders: Sequence[Path]) -> ModuleSpec | None:
 
 
 def role_of(component: type) -> Role | None:
-    """Return scheduler, translator or component, by the bases of a class; None: it is none of them."""
+    """Return scheduler, translator or component, by the bases of a class or its `role`; None: it is none of them."""
     for base in component.__mro__:
         for package, role in _ROLE_BY_BASE:
             if base.__module__ == package or base.__module__.startswith(package + "."):
                 return role
-    return Role.COMPONENT if hasattr(component, "run_process") else None
+    stated = getattr(component, "role", Role.COMPONENT)
+    return stated if isinstance(stated, Role) and hasattr(component, "run_process") else None
 
 
 def _attribute(module: ModuleType, name: str) -> Any:
@@ -173,7 +174,7 @@ def _no_module(module: str, error: ModuleNotFoundError) -> Unloadable:
     if module != missing and not module.startswith(missing + "."):
         package = missing.partition(".")[0]
         if package == "afspm":
-            return Unloadable(f"{module} is written for the published implementation: it needs {missing!r}", GUIDE)
+            return Unloadable(f"{module} needs {missing!r}, which afspm does not have", _OTHER_MAKE)
         hint = "" if package == module.partition(".")[0] else f"if it is spelt right: pip install {missing}"
         return Unloadable(f"importing {module} fails: it needs {missing!r}, which is not installed", hint)
     parent, _, last = missing.rpartition(".")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import document as documents
+from afspm.experiment import forms
 from afspm.experiment import parts as sorting
 from afspm.experiment.findings import Finding, Findings
 from afspm.experiment.implied_parts import RECORDS
@@ -54,7 +55,7 @@ class Experiment:
 
     def __init__(self, document: documents.Document) -> None:
         self._document = document
-        self.parts = sorting.sort(document)
+        self.parts = sorting.sort(document, forms.all_forms())
 
     @property
     def name(self) -> str:

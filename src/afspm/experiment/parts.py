@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any, Final, Protocol
 
-from afspm.errors import AfspmError
-from afspm.experiment import published
 from afspm.experiment.document import Document
 from afspm.experiment.findings import SourceLocation, closest, nearest
-from afspm.experiment.published import PublishedSetting, wire_of
 from afspm.experiment.toml_lines import Path, Settings, Table
-from afspm.experiment.toml_writer import value as toml
-from afspm.experiment.wiring_classes import WIRE_KEYS
+from afspm.experiment.wiring_classes import WIRE_KEYS, wire_of
 
 SECTIONS: Final = (
     "clock", "control", "limits", "problems", "cache", "security", "restart", "record", "metadata", "notify",
@@ -36,7 +32,7 @@ class ExperimentPart:
     """One process of the experiment as the file has it, references replaced.
 
     Attributes:
-        class_path: as written (a class of the published form already ours); empty for a command.
+        class_path: as written (a class of another form already ours); empty for a command.
         command: program and arguments; empty for a Python class.
         settings: what goes to the constructor, still with units.
         own: the keys of the table that are for us (wiring, envelopes, role …).
@@ -61,7 +57,7 @@ class ExperimentParts:
     intermediaries: dict[str, Settings] = field(default_factory=dict)
     components: list[ExperimentPart] = field(default_factory=list)
     became: dict[Path, str] = field(default_factory=dict)
-    """Of each line of the published form, where it is ours under another name or is no more."""
+    """What became of each line of another form (`forms`)."""
     instead: dict[str, Settings] = field(default_factory=dict)
     """Tables of components that have no counterpart, by their names, as they are in the file."""
 
@@ -73,7 +69,19 @@ class ExperimentParts:
         return next(name for name in names if name not in taken)
 
 
-def sort(document: Document) -> ExperimentParts:
+class Converter(Protocol):
+    """Makes components of another form of files ours."""
+
+    def convert(self, tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
+        """Return the components of a file as ours, by name; those that are ours already as they are.
+
+        Args:
+            tables: the components, with their references replaced.
+            parts: the rest of the file; intermediaries and sections may be changed, `became` says what was.
+        """
+
+
+def sort(document: Document, converters: Iterable[Converter] = ()) -> ExperimentParts:
     """Sort and expand; report what can't be part of an experiment."""
     parts = ExperimentParts()
     raw_components: dict[str, Settings] = {}
@@ -91,14 +99,10 @@ def sort(document: Document) -> ExperimentParts:
     parts.sections = {k: references.expand(v, (k,)) for k, v in parts.sections.items()}
     parts.intermediaries = {k: references.expand(v, (k,)) for k, v in parts.intermediaries.items()}
     tables = {name: references.expand(table, (name,)) for name, table in raw_components.items()}
-    channels = published.renamed_channels(tables)
-    ours = _FromPublished(channels, parts, document)
-    for name, table in parts.intermediaries.items():
-        renamed = published.with_channels(table, channels)
-        parts.intermediaries[name] = {k: published.evaluated(v, channels) for k, v in renamed.items()}
+    for converter in converters:
+        tables = converter.convert(tables, parts, document)
     for name, table in tables.items():
-        part = _component(name, published.evaluated(table, channels), document)
-        if part is not None and (part := ours.translated(part)) is not None:
+        if (part := _component(name, table, document)) is not None:
             parts.components.append(part)
     _report_unused(parts, references.used, document)
     return parts
@@ -137,51 +141,6 @@ def _component(name: str, table: Settings, document: Document) -> ExperimentPart
         own={k: v for k, v in table.items() if k in own_keys},
         place=document.place(name),
     )
-
-
-@dataclass(frozen=True)
-class _FromPublished:
-    """Makes components of the published implementation ours, and notes what became of their lines."""
-
-    channels: Mapping[str, str]
-    parts: ExperimentParts
-    document: Document
-
-    def translated(self, part: ExperimentPart) -> ExperimentPart | None:
-        """Return the component as ours; None: it has no process of its own here."""
-        table = {"class": part.class_path, **part.own, **part.settings}
-        here = (part.name, "class")
-        if instead := published.without_counterpart(part.class_path):
-            self.parts.instead[part.name] = table
-            self.parts.became[here] = instead
-            what = f"[{part.name}] {published.last(table)} calls code that is written for the published implementation"
-            self.document.error(what, *here, hint=f"{instead}; {published.GUIDE}")
-            return None
-        ours = published.class_of(table)
-        if ours is None:
-            return part
-        if ours.ours == "Dashboard":
-            for other in self.parts.components:
-                if other.class_path == ours.ours:
-                    self.parts.became[here] = f"the dashboard, [{other.name}], shows this too"
-                    return None
-        self.parts.became[here] = f'class = "{ours.ours}"{ours.why and "; "}{ours.why}'
-        settings = {key: value for key, value in part.settings.items() if key not in ours.settings}
-        for key in filter(ours.settings.__contains__, part.settings):
-            self._put(settings, ours.settings[key], (part.name, key), table)
-        return replace(part, class_path=ours.ours, settings=settings)
-
-    def _put(self, settings: Settings, setting: PublishedSetting, here: tuple[str, str], table: Table) -> None:
-        value = table[here[1]]
-        try:
-            becomes = setting.becomes(self.channels.get(value, value) if here[1] == "channel_id" else value, table)
-            for name, one in becomes.items():
-                published.put(settings, name, one)
-        except (AfspmError, TypeError, ValueError) as error:
-            what, hint = (error.what, error.hint) if isinstance(error, AfspmError) else (str(error), "")
-            self.document.error(f"[{here[0]}] {here[1]} = {value!r}: {what}", *here, hint=hint)
-            return
-        self.parts.became[here] = ", ".join(f"{name} = {toml(one)}" for name, one in becomes.items()) or setting.why
 
 
 def _misspelt(table: Table, wanted: tuple[str, ...]) -> str:

@@ -239,9 +239,7 @@ def _declared(component: type, part: ExperimentPart) -> ComponentDeclaration:
 def _resolve_sections(resolved: ResolvedExperiment) -> None:
     """The sections whose meaning depends on the components: what is kept, what is allowed, what is planned."""
     parts, document = resolved.parts, resolved.document
-    processes = resolved.processes.values()
-    logic = next((process.wires.cache_logic for process in processes if process.wires.cache_logic), None)
-    resolved.caching = cache_section.read(parts.sections.get("cache", {}), logic, document)
+    resolved.caching = cache_section.read(parts.sections.get("cache", {}), document)
     translators = resolved.with_role(Role.TRANSLATOR)
     has = next((has for translator in translators if (has := translator.capabilities())), None)
     reader = limits_section.LimitsReader(
@@ -257,7 +255,7 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
         for action, reason in planned_measurements.refused_actions(resolved.limits):
             what = f"[{translator.name}] actions: the limits would always refuse {reason}"
             resolved.document.error(what, translator.name, "actions", action)
-    for process in processes:
+    for process in resolved.processes.values():
         if process.component is None:
             continue
         if process.wrong is not None:

@@ -35,11 +35,11 @@ class ClockSection(Section):
 
 
 class SecuritySection(Section):
-    """[security]: the folder of CURVE keys, or the spoken word that there are none."""
+    """[security]: the folder of CURVE keys, or consent that there are none."""
 
     keys: str | None = None
     plain: StrictBool = False
-    """No keys are made for the run either: programs of this computer that know nothing of keys can join."""
+    """Programs without keys may join through a bridge, which opens plain sockets; all other sockets stay private."""
     insecure: StrictBool = False
     tcp: StrictBool = False
     """Unix sockets are not used: for programs whose library has none. Every socket has keys then."""
@@ -47,7 +47,7 @@ class SecuritySection(Section):
     @property
     def are_sockets_private(self) -> bool:
         """Whether sockets without an address in the file are unix sockets, where the system has them."""
-        return not (self.keys or self.plain or self.insecure or self.tcp)
+        return not (self.keys or self.insecure or self.tcp)
 
 
 class RestartSection(Section):

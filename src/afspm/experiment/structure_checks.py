@@ -14,14 +14,15 @@ from afspm.experiment import class_loader, wiring
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.handlers import check_handlers
 from afspm.experiment.implied_parts import check_notify, is_program
-from afspm.experiment.published import wire_of
 from afspm.experiment.resolution import ResolvedExperiment, ResolvedProcess
-from afspm.experiment.wiring_classes import WIRE_SETTINGS
+from afspm.experiment.wiring_classes import WIRE_SETTINGS, wire_of
 from afspm.model import Role, component_of, is_process_name
 from afspm.model.events import LONGEST_PROCESS_NAME, PERSON
 from afspm.transport.network import is_local
 from afspm.wire.messages import SCAN_LINES
 
+OPENS_PLAIN: Final = "opens_plain"
+"""An attribute by which a class says that programs without keys can send requests by it."""
 ADDRESS: Final = "address"
 """By convention the setting of a translator that says where its controller is."""
 _WORD = re.compile(r"[A-Za-z_][\w-]*")
@@ -287,6 +288,10 @@ def check_names_of_people(resolved: ResolvedExperiment) -> None:
         hint = "leave [security] plain away, or make keys with `afspm keys` and set [security] keys"
         what = "[control.roles] without keys: any program that takes the name has the role"
         resolved.document.warning(what, "control", "roles", hint=hint)
+    for name in resolved.saying(OPENS_PLAIN):
+        if not (security.plain or security.insecure):
+            what = f"[{name}] lets programs without keys command the microscope"
+            resolved.document.error(what, name, "class", hint="[security] plain = true allows that")
     if keys is not None and not keys.is_dir():
         what = f"[security] keys: there is no folder {str(keys)!r}"
         resolved.document.error(what, "security", "keys", hint="`afspm keys` makes it")

@@ -15,9 +15,8 @@ from afspm.addresses import hint_on, is_address
 from afspm.experiment.document import Document
 from afspm.experiment.findings import SourceLocation
 from afspm.experiment.parts import ExperimentPart
-from afspm.experiment.published import wire_of
-from afspm.experiment.toml_lines import Settings, Table
-from afspm.experiment.wiring_classes import WIRE_KEYS, WiringClass
+from afspm.experiment.toml_lines import Table
+from afspm.experiment.wiring_classes import WIRE_KEYS, WiringClass, wire_of
 from afspm.model import Role
 
 if TYPE_CHECKING:
@@ -50,7 +49,6 @@ class WiringKeys:
     cache_out: str | None = None
     request_timeout_s: float | None = None
     request_retries: int | None = None
-    cache_logic: Settings | None = None
 
 
 @dataclass(frozen=True)
@@ -115,10 +113,6 @@ def _apply_table(wires: WiringKeys, table: Table) -> None:
             wires.publish = table.get("url")
         case WiringClass.SUBSCRIBER:
             _add_subscriber(wires, table)
-        case WiringClass.COMBINED:
-            for one in table.get("subs", ()):
-                if isinstance(one, dict):
-                    _add_subscriber(wires, one)
         case WiringClass.CLIENT:
             wires.control = table.get("url")
             _apply_timeouts(wires, table)
@@ -129,8 +123,6 @@ def _apply_table(wires: WiringKeys, table: Table) -> None:
             _apply_timeouts(wires, table)
         case WiringClass.CACHE:
             wires.cache_out, wires.cache_in = table.get("url"), table.get("sub_url")
-            logic = table.get("update_cache_kwargs")
-            wires.cache_logic = logic.get("cache_logic") if isinstance(logic, dict) else None
 
 
 def _add_subscriber(wires: WiringKeys, table: Table) -> None:
@@ -192,7 +184,7 @@ def _sources(
     own = process.wires
     published = f"{scheduler.name}/publish" if scheduler else ""
     if own.subscribe is not None:
-        # a publisher of the scheduler's own (rescans in the published form) is its one publisher here
+        # a publisher of the scheduler's own (rescans, in the paper's form) is its one publisher here
         extra = {scheduler.wires.publish: published} if scheduler and scheduler.wires.publish else {}
         return tuple(dict.fromkeys(extra.get(url, url) for url in own.subscribe))
     sources = [published] if scheduler else []

@@ -62,8 +62,8 @@ def _check_links(file: h5py.File, path: Path) -> None:
 def _check_heaps(data: bytes, path: Path) -> None:
     """Heaps of texts whose sizes do not add up are refused here: the library would go round in them for ever.
 
-    A heap: "GCOL", version 1, its size; objects of number, count of references, size and data up to a multiple of 8;
-    number 0 is the free rest, its size that with its head (HDF5 file format specification, III.E).
+    A heap: "GCOL", the version (1), its size; objects of number, count of references, size and data up to a multiple
+    of 8; number 0 is the free rest, its size that with its head (HDF5 file format specification, III.E).
     """
     at = data.find(_HEAP)
     while at >= 0:

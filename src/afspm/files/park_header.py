@@ -35,7 +35,7 @@ HEADER: Final = np.dtype(
     + [("z_gain", "<f8"), ("z_range", "<f8"), ("xy_voltage", "V16"), ("z_voltage", "V16"), ("xy_servo", "V16")]
     + [("numbers", "<u4")]
 )
-"""The beginning of a header; version 1 ends before `z_gain`, and its numbers are of the first kind."""
+"""The beginning of a header; the first version ends before `z_gain`, and its numbers are of the first kind."""
 
 CHANNELS: Final = 8
 CURVE_KINDS: Final = {1: "indentation", 2: "force", 3: "IV", 4: "indentation", 5: "photo-current"} | {

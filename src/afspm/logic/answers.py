@@ -27,10 +27,9 @@ def answer(
     reply(draft, event, response)
 
 
-def reply(draft: StateDraft, event: RequestIn, response: Response, *, tells_why: bool = False) -> None:
+def reply(draft: StateDraft, event: RequestIn, response: Response) -> None:
     """Answer a request this time; asked again, it is decided anew."""
-    kind = event.request.kind
-    draft.effects.append(Reply(event.connection, event.name, response, kind, tells_why=tells_why))
+    draft.effects.append(Reply(event.connection, event.name, response, event.request.kind))
     write_down(draft, event.name, event.request, response, event.heard_s)
 
 
@@ -39,7 +38,7 @@ def refuse_peer(draft: StateDraft, event: RequestIn, why: str, code: int = Contr
     draft.pending, was_refused = refused_again(draft.pending, event.connection)
     if not was_refused:
         draft.log("WARNING", f"refused a request of {event.name or 'a nameless peer'}: {why}")
-    reply(draft, event, Response(int(code), b"", why, event.request.id), tells_why=True)
+    reply(draft, event, Response(int(code), b"", why, event.request.id))
 
 
 def answer_unsent(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:

@@ -87,13 +87,7 @@ class ReplayRequested:
 
 @dataclass(frozen=True, slots=True)
 class TranslatorUp:
-    """The translator can be asked.
-
-    Attributes:
-        knows_ids: one of ours does, one of version 1 does not; None: its answers will tell.
-    """
-
-    knows_ids: bool | None = None
+    """The translator can be asked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,14 +207,12 @@ class Reply:
 
     Attributes:
         asked: the number of the request that is answered.
-        tells_why: the reason is told to a peer of version 1, too.
     """
 
     connection: int
     name: str
     response: Response
     asked: int = 0
-    tells_why: bool = False
 
 
 @dataclass(slots=True)
@@ -277,11 +269,9 @@ class Kill:
 
     Attributes:
         tip_is_safe: the translator may leave; if not, it sees to the tip when it is asked to.
-        stop: the action that stops what the microscope measures; empty: nothing.
     """
 
     tip_is_safe: bool = True
-    stop: str = ""
 
 
 @dataclass(slots=True)

@@ -1,6 +1,6 @@
 """The one scheduler that a translator obeys: that of its own run, in its newest life.
 
-A scheduler puts its epoch before each request, where a translator of version 1 does not see it. Two experiments with
+A scheduler puts its epoch before each request. Two experiments with
 the same addresses would else command one microscope, and neither would notice.
 """
 

@@ -1,6 +1,6 @@
 """The line to the translator: one request in flight, the others wait, each has a deadline, and every one is answered.
 
-A translator of version 1 serves one request after the other and says nothing while it does. So one is in flight; the
+A translator serves one request after the other and says nothing while it does. So one is in flight; the
 others wait here, where they can still be called back, and a request that waited too long is answered unsent. The line
 keeps the order and the times; whether a request is sent, and as what, is decided as its turn comes
 (`request_pipeline.send_next`).

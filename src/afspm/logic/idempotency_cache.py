@@ -80,15 +80,13 @@ class IdempotencyCache:
         table: of each client the older ids and the latest.
         floors: kept over a restart, as far as they were saved.
         clients: most clients.
-        sent_actions: those that only we know of, kept over a restart. A translator of version 1 would do them again;
-            one of ours would not, but for an action that was done already the microscope must not be moved.
-        ids_known: whether the translator knows request ids; None: not known yet.
+        sent_actions: those that only we know of, kept over a restart. The translator would not do them again, but for
+            an action that was done already the microscope must not be moved.
     """
 
     per_client: int = 256
     clients: int = 256
     sent_actions: tuple[SentAction, ...] = ()
-    ids_known: bool | None = None
     floors: Floors = field(default_factory=Floors)
     table: Mapping[_Shelf, tuple[_Outcomes, _Outcomes]] = field(default_factory=dict)
 

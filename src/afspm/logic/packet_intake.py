@@ -21,14 +21,10 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
-from afspm.wire.messages import CONTROL_STATE, SPECTRUM
+from afspm.wire.messages import CONTROL_STATE
 
 _MOST_LOGGED = 1000
 _STATE, _TRANSLATOR = wire.MessageKind.STATE, Role.TRANSLATOR
-_DOUBT = (
-    "the translator is of version 1: those of the published implementation for Nanonis and Asylum send the values of a "
-    "spectrum variable after variable; if curves look scrambled, set spectra_by_variable = true in [control]"
-)
 
 
 def take_packet(draft: StateDraft, event: PacketIn) -> None:
@@ -44,9 +40,6 @@ def take_packet(draft: StateDraft, event: PacketIn) -> None:
     if published is None:
         return
     draft.effects.append(published)
-    by_variable = draft.env.settings.control.spectra_by_variable
-    if draft.idempotency.ids_known is False and message == SPECTRUM.name and not by_variable:
-        _log_once(draft, "WARNING", _DOUBT)
     if told is not None:
         _learn(draft, told)
 
@@ -62,8 +55,6 @@ def _published(draft: StateDraft, packet: Packet, header: PacketHeader) -> Publi
         _log_once(draft, "WARNING", "the translator publishes a ControlState, which is the scheduler's: dropped")
         return None
     try:
-        if env.settings.control.spectra_by_variable and header.message == SPECTRUM.name:
-            packet = Packet(packet.envelope, wire.by_point(packet.payload), packet.time_ns)
         draft.frame, packet = draft.frame.incoming(packet, header, draft.now_ns)
         taken = env.cache.take(packet, header, draft.now_ns)
     except AfspmError as error:

@@ -145,10 +145,8 @@ def _repeated(draft: StateDraft, event: RequestIn, outcome: RequestStatus | Resp
     if outcome is RequestStatus.FORGOTTEN:
         answers.reply(draft, event, _unknown(request, TOO_OLD))
         return True
-    # A translator that knows ids answers what became of it. Setting something twice does no harm either; an
-    # action does, so what nobody knows stays unknown.
-    may_send = draft.idempotency.ids_known or request.kind != _ACTION
-    if may_send and (draft.control.holder == name or reads(request)):
+    # the translator, which knows its id, answers what became of it
+    if draft.control.holder == name or reads(request):
         return False
     answers.reply(draft, event, _unknown(request, "it was sent once, and is not sent again"))
     return True
@@ -309,7 +307,7 @@ def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None
     draft.forwarder = draft.forwarder.sent(job, draft.now_s)
     if not request.id:
         return
-    is_kept = request.kind == _ACTION and (draft.frame.is_moving or not draft.idempotency.ids_known)
+    is_kept = request.kind == _ACTION and draft.frame.is_moving
     if is_kept or (job.command and draft.limits.counts(job.outgoing)):
         draft.idempotency = draft.idempotency.sent(name, request)
     elif mapped is not None:
@@ -473,10 +471,6 @@ def settle(draft: StateDraft, settled: SettledRequest) -> None:
     """Take the end of a request: tell, and remember, its outcome."""
     job, end, response = settled.job, settled.end, settled.response
     if end in (ForwardOutcome.ANSWERED, ForwardOutcome.LATE):
-        if job.request.id:
-            ids_known = response.id == job.request.id
-            if ids_known is not draft.idempotency.ids_known:
-                draft.idempotency = replace(draft.idempotency, ids_known=ids_known)
         response = answers.with_id(response, job.request)
         if response.ok and (job.command or job.request.kind == _PARAM):
             response = _learn(draft, job, response)

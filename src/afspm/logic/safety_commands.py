@@ -1,4 +1,4 @@
-"""The scheduler's own requests, which go first: what the watchdog wants, and what kind of translator it is."""
+"""The scheduler's own requests, which go first: what the watchdog wants, and whether the translator can do it."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from afspm.logic.state import StateDraft
 from afspm.logic.watchdog import SafetyResult, TipDuty
 from afspm.model import ControlRequest, ControlResponse, Request, Response
 
-_ID = "scheduler/are-ids-known"
+_ID = "scheduler/does-it-retract"
 
 
 def begin(draft: StateDraft) -> None:
-    """Ask a new translator: does it retract, and does it know ids (ours do, those of version 1 do not)?"""
+    """Ask a new translator whether it retracts."""
     action = draft.watchdog.question
     request = Request(int(ControlRequest.ACTION_SUPPORT), action, id=_ID)
     draft.forwarder, _ = draft.forwarder.ask_own(request, draft.now_s)

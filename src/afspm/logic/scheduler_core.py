@@ -48,7 +48,6 @@ from afspm.logic.events import (
 )
 from afspm.logic.forwarder import AskForFrame
 from afspm.logic.frozen import replace
-from afspm.logic.microscope_status import STOPS
 from afspm.logic.saved_state import SavedState
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.state import Environment, SchedulerState, StateDraft, restored_state, saved_state
@@ -265,8 +264,6 @@ def _on_translator_up(draft: StateDraft, event: TranslatorUp) -> None:
     draft.forwarder, settled = draft.forwarder.connected()
     for one in settled:
         request_pipeline.settle(draft, one)
-    if event.knows_ids is not None:
-        draft.idempotency = replace(draft.idempotency, ids_known=event.knows_ids)
     safety_commands.begin(draft)
     request_pipeline.read_ahead(draft)
 
@@ -338,7 +335,7 @@ def _end_when_safe(draft: StateDraft) -> None:
         answers.answer(draft, event, code, why, detail=detail)
     draft.send_forwards()
     publishing.publish_entries(draft)
-    draft.effects.append(Kill(not owes_retract, STOPS.get(draft.microscope.state, "")))
+    draft.effects.append(Kill(not owes_retract))
 
 
 def _on_tick(draft: StateDraft, event: Tick) -> None:

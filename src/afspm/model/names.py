@@ -1,4 +1,4 @@
-"""Names of actions and parameters. Those beginning with `x-` are extensions a peer of version 1 may not know."""
+"""Names of actions and parameters. Those beginning with `x-` are extensions to those of the paper."""
 
 from __future__ import annotations
 

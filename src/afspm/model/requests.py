@@ -29,18 +29,18 @@ class ControlRequest(IntEnum):
 
 
 CLOCK_REQUEST = 101
-"""A request of ours, not in version 1: what time it is in the experiment."""
+"""A request of ours: what time it is in the experiment."""
 RELAY_REQUEST = 102
-"""A request of ours, not in version 1: a supervisor has something to publish; its answer are orders to it."""
+"""A request of ours: a supervisor has something to publish; its answer are orders to it."""
 RESTART_REQUEST = 103
-"""A request of ours, not in version 1: a process is to be started anew; its subject is the process's name."""
+"""A request of ours: a process is to be started anew; its subject is the process's name."""
 LEASE_REQUEST = 104
-"""A request of ours, not in version 1: the holder loses control when it has let so many real seconds pass without
+"""A request of ours: the holder loses control when it has let so many real seconds pass without
 another command or another of these, whatever the microscope does; its subject is that number."""
 LONGEST_LEASE_S = 86_400.0
 
 OTHER_RUN_RESPONSE = 100
-"""A response of ours, not in version 1, and only to those who named their run: it is not that of the scheduler."""
+"""A response of ours, and only to those who named their run: it is not that of the scheduler."""
 
 _OURS = {CLOCK_REQUEST: "CLOCK", RELAY_REQUEST: "TELL", RESTART_REQUEST: "RESTART", LEASE_REQUEST: "LEASE"}
 
@@ -109,7 +109,7 @@ class Request:
         subject: what it is about: a ScanParameters, Feedback, ProbePosition or Parameter, the name of an action,
             the number of a problem or control mode; None if nothing.
         payload: the subject as it came, in bytes.
-        id: the same for every repetition of one request; empty from peers of version 1.
+        id: the same for every repetition of one request; empty if it may not be repeated.
     """
 
     kind: int

@@ -56,8 +56,7 @@ class Replayer:
             self.close()
             raise
         self._poller: Poller[Callable[[], object]] = Poller(self._wake_up)
-        for socket in (self._publisher.socket, self._publisher.monitor.socket):
-            self._poller.register(socket, self._publisher.serve)
+        self._poller.register(self._publisher.socket, self._publisher.serve)
         for socket in (self._router.socket, self._router.monitor.socket):
             self._poller.register(socket, self._answer)
         self._ended = self._stopping = False
@@ -124,8 +123,7 @@ class Replayer:
     def _answer(self) -> None:
         for event in self._router.receive():
             if isinstance(event, PeerAsked) and event.frames:
-                number = int.from_bytes(event.frames[0][:1])
-                self._router.reply(event.connection, wire.encode_answer(self._response(event), number))
+                self._router.reply(event.connection, wire.encode_response(self._response(event)))
 
     def _response(self, asked: PeerAsked) -> Response:
         try:

@@ -17,16 +17,13 @@ from afspm.model import (
     ControlResponse,
     LoggedPacket,
     Packet,
-    Request,
     Response,
     ResponseDetail,
 )
 from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
-from afspm.transport.state_delay import StateDelay
 from afspm.transport.translator_link import LinkReply, LinkUp
-from afspm.wire.messages import SCOPE_STATE
 from afspm.wire.protocol import LONGEST_ID
 
 if TYPE_CHECKING:
@@ -89,7 +86,6 @@ class SchedulerShell:
         self._warnings = warnings
         self._log = log
         self._replay: tuple[Packet, ...] = ()
-        self._state_delay = StateDelay()
         self._look_at_s = 0.0  # at the deadlines, in real monotonic time
         self.ended = False
         self._tip_is_safe = True
@@ -125,19 +121,17 @@ class SchedulerShell:
                 self._requests()
             elif source is sockets.link:
                 heard = sockets.link.receive()
-                if isinstance(heard, LinkUp):
-                    self._take(events.TranslatorUp(knows_ids=sockets.link.version is wire.Version.OURS))
-                elif heard is not None:
+                if heard is not None:
                     self._take(events.TranslatorReply(heard.number, _response(heard)))
             elif source is sockets.subscriber:
                 self._packets()
-            elif source in (sockets.publisher, sockets.publisher.monitor):
+            elif source is sockets.publisher:
                 sockets.publisher.serve()
             elif source is sockets.subscriber.monitor:
                 sockets.subscriber.follow()
             else:
-                for _ in sockets.link.follow():
-                    self._take(events.TranslatorDown())
+                for change in sockets.link.follow():
+                    self._take(events.TranslatorUp() if isinstance(change, LinkUp) else events.TranslatorDown())
         now_s = self._clock.monotonic_s()
         if now_s >= sockets.router.due_s:
             self._requests()
@@ -150,16 +144,16 @@ class SchedulerShell:
         """After the end: nothing happens any more, but whoever comes is told so."""
         sockets = self._sockets
         for source in ready:
-            if source in (sockets.publisher, sockets.publisher.monitor):
+            if source is sockets.publisher:
                 if sockets.publisher.serve():
                     sockets.publisher.kill()
             elif source in (sockets.router, sockets.router.monitor):
                 self._requests()
             elif source is sockets.link:
-                if isinstance(sockets.link.receive(), LinkUp):
-                    self._let_translator_go()
+                sockets.link.receive()
             elif source is sockets.link.monitor:
-                sockets.link.follow()
+                if any(isinstance(change, LinkUp) for change in sockets.link.follow()):
+                    self._let_translator_go()
             elif source is sockets.subscriber:
                 sockets.subscriber.receive()
             else:
@@ -167,15 +161,12 @@ class SchedulerShell:
         if self._clock.monotonic_s() >= sockets.router.due_s:
             self._requests()
 
-    def _let_translator_go(self, stop: str = "") -> None:
-        """It subscribes to nobody. One of version 1 goes on until it is stopped, but not with its scan.
+    def _let_translator_go(self) -> None:
+        """End the translator, which subscribes to nothing.
 
-        One whose tip is in danger is left to find that nobody is there any more: then it sees to the tip by itself.
+        One whose tip is in danger is left to find that the scheduler is gone: then it sees to the tip by itself.
         """
-        if self._sockets.link.version is wire.Version.ONE:
-            if stop:
-                self._sockets.link.send(0, wire.encode_request(Request(ControlRequest.ACTION, stop)))
-        elif self._tip_is_safe:
+        if self._tip_is_safe:
             self._sockets.link.send(0, [wire.CLOSE])
 
     def _asked_late(self, asked: RouterEvent) -> None:
@@ -236,8 +227,7 @@ class SchedulerShell:
         self._carry_out(self._core.step(event, now_s, self._clock.now_ns()))
 
     def _answer(self, asked: PeerAsked, response: Response) -> None:
-        number = int.from_bytes(asked.frames[0][:1]) if asked.frames else 0
-        self._reply(events.Reply(asked.connection, asked.name, response, number))
+        self._reply(events.Reply(asked.connection, asked.name, response))
 
     def _packets(self) -> None:
         """Take in the translator's packets; several small ones are written down together, then published.
@@ -269,11 +259,9 @@ class SchedulerShell:
         return self._replay
 
     def _deadlines(self, now_s: float) -> None:
-        self._release(now_s)
         if self._core_due_s() <= now_s:
             self._take(events.Tick())
-        held_s = self._state_delay.due_s
-        self._look_at_s = self._core_due_s() if held_s is None else min(held_s, self._core_due_s())
+        self._look_at_s = self._core_due_s()
 
     def _core_due_s(self) -> float:
         due_s = self._core.deadline_s()
@@ -295,7 +283,7 @@ class SchedulerShell:
                 case events.Forward():
                     sockets.link.send(effect.number, wire.encode_request(effect.request))
                 case events.Publish():
-                    self._publish(effect.packet)
+                    sockets.publisher.publish(effect.packet)
                 case events.Replay():
                     self._replay = effect.packets
                 case events.Log():
@@ -304,28 +292,14 @@ class SchedulerShell:
                     assert self._worker is not None, "a frame with jobs has a worker"
                     self._worker.take(effect.job)
                 case events.Kill():
-                    self._release()
                     sockets.publisher.serve()  # whoever subscribes at this moment is to hear it too
                     sockets.publisher.kill()
                     self._tip_is_safe = effect.tip_is_safe
-                    self._let_translator_go(effect.stop)
+                    self._let_translator_go()
                     self.ended = True
 
     def _reply(self, reply: events.Reply) -> None:
-        response = reply.response
-        frames = wire.encode_response(response) if reply.tells_why else wire.encode_answer(response, reply.asked)
-        self._sockets.router.reply(reply.connection, frames)
-
-    def _publish(self, packet: Packet) -> None:
-        publisher, now_s = self._sockets.publisher, self._clock.monotonic_s()
-        for one in self._state_delay.take(packet, now_s, wanted=publisher.has_plain_subscriber(SCOPE_STATE.name)):
-            publisher.publish(one)
-        if self._state_delay.due_s is not None:
-            self._look_at_s = min(self._look_at_s, self._state_delay.due_s)
-
-    def _release(self, now_s: float = math.inf) -> None:
-        for packet in self._state_delay.release(now_s):
-            self._sockets.publisher.publish(packet)
+        self._sockets.router.reply(reply.connection, wire.encode_response(reply.response))
 
     def _write_down(self, effects: list[events.Effect]) -> None:
         """Write what must outlive a crash before anybody is told."""

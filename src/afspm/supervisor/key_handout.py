@@ -60,7 +60,7 @@ def hand_over(experiment: Experiment, starts: Sequence[ProcessStart]) -> KeyHand
     if experiment.keys_folder is not None:
         return KeyHandout([_with(start, _of_file(experiment, start), _scheduler(experiment)) for start in starts])
     security = experiment.resolved.sections.security
-    encrypted = {} if security.plain or security.insecure else _encrypted(experiment, starts)
+    encrypted = {} if security.insecure else _encrypted(experiment, starts)
     return _made(starts, encrypted, _scheduler(experiment)) if encrypted else KeyHandout(starts)
 
 

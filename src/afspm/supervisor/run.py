@@ -133,7 +133,7 @@ def go(
         reporter = reporter_of(experiment, starts, clock, common.run, handed.supervisor)
         tasks = [from_start(start) for start in handed.starts]
         ends_idle = experiment.ends_idle([task.name for task in tasks])
-        encrypts = not (security.plain or security.insecure)
+        encrypts = not security.insecure
         beats = HeartbeatListener(take_address=addresses.of_heartbeat, encrypts=encrypts)
         supervisor = Supervisor(tasks, log, clock, _child_policy(experiment), reporter, beats, ends_idle=ends_idle)
         with handed.laid_down(folder):

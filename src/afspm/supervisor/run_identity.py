@@ -42,7 +42,7 @@ def new_identity() -> str:
 
 
 def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
-    """Ask the scheduler that `launch` leads to, which is waited for. One of version 1 knows real time alone.
+    """Ask the scheduler that `launch` leads to, which is waited for. One that knows no time goes by real time.
 
     Raises:
         ConfigError: it does not tell.

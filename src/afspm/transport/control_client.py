@@ -9,34 +9,25 @@ import zmq
 from afspm import wire
 from afspm.errors import WireError
 from afspm.logic.sessions import token_of
-from afspm.model import CLOCK_REQUEST, Request, Response
+from afspm.model import CLOCK_REQUEST, Request
 from afspm.transport.frames import receive_frames, send_frames
 from afspm.transport.keys import routing_id
 from afspm.transport.network import CONNECTED, DISCONNECTED, Monitor, Network
 from afspm.transport.port import ControlConnected, ControlDisconnected, Incoming, ReplyReceived
 from afspm.transport.rate_limited_log import RateLimitedLog
-from afspm.wire.protocol import ANSWER, QUESTION, Version, as_version_1, is_of_version_1, not_of_version_1
 
 
 class ControlClient:
     """Asks the scheduler: the same bytes as a REQ socket, without its lock step.
 
-    Before the first request the scheduler is asked, in a way that all understand, whether it is one of ours. One of
-    version 1 is sent no ids, and nothing that it would end over: such requests are answered here.
-
     Args:
         name: of the component. Restarted, it is the same client to the scheduler.
-
-    Attributes:
-        version: of the scheduler, once it has answered.
     """
 
     def __init__(self, network: Network, name: str, address: str, log: RateLimitedLog) -> None:
         self._log = log
         self._address = address
-        self.version = Version.UNKNOWN
-        self._until_known: list[Sequence[bytes]] | None = None
-        self._connected = False
+        self._connected = self._has_asked = False
         self._unanswered = b""
         self._name, self._token = name, ""
         # a scheduler of version 1, which has no keys, takes the whole identity for the name
@@ -47,59 +38,31 @@ class ControlClient:
         self.monitor = Monitor(network, self.socket, CONNECTED | DISCONNECTED)
         network.connect(self.socket, address)
 
-    def send(self, frames: Sequence[bytes]) -> Response | None:
-        """Ask; dropped while there is no scheduler. Return the answer to what is not sent to one of version 1.
+    def send(self, frames: Sequence[bytes]) -> None:
+        """Ask; dropped while there is no scheduler.
 
         A request repeated without an answer in between makes the connection anew: a connection that stands but leads
         nowhere (cut off, or its identity was taken by another process) would never lead anywhere again.
         """
         if self._moving is not None:
             self._moving.append(frames)
-            return None
+            return
         if not self._connected:
-            return None
+            return
         asked = frames[2] if len(frames) > 2 else b""
         if asked and not self._token:  # the same in all of a process's ids that have one
             self._token = token_of(self._name, asked.decode()) or ""
         if asked and asked == self._unanswered:
             self._reconnect()
-            return None
-        self._unanswered = asked
-        if self.version is Version.UNKNOWN:
-            self._send_when_known(frames)
-            return None
-        if self.version is Version.ONE:
-            if not is_of_version_1(frames[0][0]):
-                self._unanswered = b""
-                return not_of_version_1(frames, "scheduler")
-            frames = as_version_1(frames)
+            return
+        self._unanswered, self._has_asked = asked, True
         self._send(frames)
-        return None
 
     def _send(self, frames: Sequence[bytes]) -> None:
         send_frames(self.socket, [b"", *frames])  # or not, if it is full: the scheduler has stood still for thousands
 
-    def _send_when_known(self, frames: Sequence[bytes]) -> None:
-        if self._until_known is None:
-            self._until_known = []
-            self._send(QUESTION)
-        self._until_known.append(frames)
-
-    def _known(self, version: Version) -> list[Incoming]:
-        """The scheduler's version is known: send what has waited for that."""
-        self.version = version
-        if version is Version.OURS and self._is_bare:
-            self._is_bare = False
-            self._moving = self._until_known or []
-            self.socket.setsockopt(zmq.ROUTING_ID, routing_id(self._name))
-            self._reconnect()
-            return []
-        waiting, self._until_known, self._unanswered = self._until_known or [], None, b""
-        answers = [self.send(frames) for frames in waiting]
-        return [ReplyReceived(answer) for answer in answers if answer is not None]
-
     def _reconnect(self) -> None:
-        self._connected, self._unanswered, self._until_known = False, b"", None
+        self._connected, self._unanswered = False, b""
         self.socket.disconnect(self._address)
         self.socket.connect(self._address)
 
@@ -108,8 +71,6 @@ class ControlClient:
         frames = [frame.bytes for frame in receive_frames(self.socket)]
         if not frames or frames == [b""]:  # an empty one: the scheduler has looked whether we are there
             return []
-        if frames == [b"", *ANSWER]:
-            return self._known(Version.OURS) if self._until_known is not None else []
         try:
             return self._interpret(frames)
         except WireError as error:
@@ -120,12 +81,7 @@ class ControlClient:
         """Return the scheduler's coming and going."""
         found: list[Incoming] = []
         for event in self.monitor.drain():
-            if self._moving is not None:
-                self._moved(event.kind)
-                continue
-            self._connected, self._unanswered, self._until_known = event.kind == CONNECTED, b"", None
-            if self.version is Version.ONE:
-                self.version = Version.UNKNOWN  # what comes next may be one of ours
+            self._connected, self._unanswered = event.kind == CONNECTED, b""
             if self._connected:
                 self._greet()
             found.append(ControlConnected() if self._connected else ControlDisconnected())
@@ -142,9 +98,6 @@ class ControlClient:
         if len(frames) < 2 or frames[0]:
             raise WireError("the empty frame before it is missing")
         response = wire.decode_response(frames[1:])
-        if self._until_known is not None:
-            # an answer with an id is to what an earlier process of this name has asked one of ours
-            return self._known(Version.OURS if response.id else Version.ONE)
         self._unanswered = b""
         return [ReplyReceived(response)]
 
@@ -152,9 +105,8 @@ class ControlClient:
         """Say who we are to a scheduler that was restarted, or that has not yet seen our last connection close.
 
         It may be waiting for us, who are in control; and what we ask next may have an id that does not say who we are.
-        Only to ours, known by its answers: one of version 1 might end over a request that it does not know.
         """
-        if self.version is Version.OURS and self._token:
+        if self._has_asked and self._token:
             self._send(wire.encode_request(Request(CLOCK_REQUEST, id=f"{self._name}/{self._token}/0")))
-        elif self.version is Version.OURS:
+        elif self._has_asked:
             self._send([])

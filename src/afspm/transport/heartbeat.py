@@ -114,7 +114,7 @@ class HeartbeatListener:
 
     Other users of this computer get to no such address: it is a unix socket, or encrypted, by a key that the process
     alone gets. Other processes of this user may: a beat of a process that knows its token counts with it alone. A
-    program of version 1, which sends none, is believed as it is.
+    program that sends none is believed as it is.
 
     Args:
         take_address: returns a new address.
@@ -178,7 +178,7 @@ def _is_by(expected: _Expected, frames: list[bytes]) -> bool:
 
 
 def read_beat(name: str, frames: list[bytes]) -> Heartbeat | None:
-    """Return a beat of ours or of version 1 (one frame); None if it is neither."""
+    """Return a beat, of one frame or of four; None if it is neither."""
     if not frames or frames[0] not in (BEAT, CLOSING):
         return None
     ages = [_seconds(frame) for frame in frames[1:3]]

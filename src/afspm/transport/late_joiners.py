@@ -5,8 +5,7 @@ A subscriber of ours subscribes to a marker, a topic of its own that also says w
     \\0replay/<name>/<nonce> \\0 <since_ns> \\0 <prefix> \\0 <prefix> …
 
 The publisher sends what it has kept as `[topic, envelope, message, timestamp]` and at last `[topic]` alone, where topic
-is the first part of the marker: nobody else is subscribed to that. A publisher of version 1 never publishes anything
-that begins so, and ignores it.
+is the first part of the marker: nobody else is subscribed to that.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from typing import NamedTuple
 
 from afspm.clock import Clock
 from afspm.model import Packet
+from afspm.wire import Buffer
 
 History = Callable[[Hashable, tuple[str, ...], int], Iterable[Packet]]
 """(who, prefixes, since_ns) -> what was published under these prefixes and is newer, oldest first."""
@@ -98,7 +98,7 @@ class PublishedHistory:
         self._last: dict[str, Packet] = {}
         self._newest_ns = 0
 
-    def stamp(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> Packet:
+    def stamp(self, envelope: str, payload: Buffer, time_ns: int | None = None, *, keep: bool = True) -> Packet:
         """Return a packet that is newer than all before it; it is remembered, unless `keep` is False.
 
         Args:

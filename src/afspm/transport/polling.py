@@ -77,6 +77,11 @@ class Poller(Generic[S]):
         """Leave `socket` alone until it is registered again."""
         self._poller.unregister(socket)
 
+    def forget(self, socket: zmq.Socket[bytes]) -> None:
+        """Leave `socket` alone for good, before it is closed."""
+        self._poller.unregister(socket)
+        del self._sources[socket]
+
     def wait(self, timeout_ms: int | None) -> tuple[list[S], bool]:
         """Return the sources of the sockets that can be read, and whether we were woken up."""
         ready = [which for which, _ in self._poller.poll(timeout_ms)]

@@ -29,7 +29,7 @@ class PacketReceived:
 
 @dataclass(slots=True)
 class ReplyReceived:
-    """The scheduler answered; `response.id` is the id of the request that it answers ("": from version 1)."""
+    """The scheduler answered; `response.id` is the id of the request that it answers."""
 
     response: Response
 
@@ -38,8 +38,7 @@ class ReplyReceived:
 class CaughtUp:
     """The publisher at `source` has sent all that it had cached for us; what follows is live.
 
-    Comes again after every reconnection. A publisher of version 1 replays without saying when it is done: no
-    `CaughtUp` comes from it.
+    Comes again after every reconnection.
     """
 
     source: str

@@ -24,7 +24,6 @@ from afspm.transport.frames import descriptor_of, property_of, receive_frames, s
 from afspm.transport.keys import MARK
 from afspm.transport.network import DISCONNECTED, REFUSED, Monitor, Network
 from afspm.transport.rate_limited_log import RateLimitedLog
-from afspm.wire.protocol import ANSWER, QUESTION
 
 _LAST_WORDS = 200
 """Messages received before the end of a sender is passed on."""
@@ -148,8 +147,6 @@ class Router:
         content = [frame.bytes for frame in frames]
         if len(content) < 2 or content[1]:
             self._log.warning(f"dropped a request of {sender.name or 'a nameless peer'}: no empty frame before it")
-        elif content[2:] == [*QUESTION]:  # whose name it is does not matter for that
-            self._send([sender.identity, b"", *ANSWER])
         else:
             events.append(PeerAsked(sender.number, sender.name, sender.user, content[2:]))
         return events

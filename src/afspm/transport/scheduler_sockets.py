@@ -49,7 +49,7 @@ class SchedulerSockets:
         self._poller: Poller[Source] = Poller(self._wake_up)
         for source in (self.router, self.link, self.publisher, self.subscriber):
             self._poller.register(source.socket, source)
-        for monitor in (self.router.monitor, self.link.monitor, self.publisher.monitor, self.subscriber.monitor):
+        for monitor in (self.router.monitor, self.link.monitor, self.subscriber.monitor):
             self._poller.register(monitor.socket, monitor)
 
     def wait(self, timeout_ms: int | None) -> list[Source]:

@@ -22,7 +22,7 @@ _BATCH = 16
 
 
 class Subscriber:
-    """A connection to one publisher, ours or of version 1.
+    """A connection to one publisher.
 
     Args:
         name: of this component.

@@ -10,14 +10,12 @@ import zmq
 from afspm.transport.frames import receive_frames, send_frames
 from afspm.transport.network import CONNECTED, DISCONNECTED, Monitor, Network
 from afspm.transport.rate_limited_log import RateLimitedLog
-from afspm.wire.protocol import ANSWER, QUESTION, Version, as_version_1, is_of_version_1
 
 _LONGEST_NUMBER = 18
-_VERSION = b"version"  # stands where the numbers of requests do
 
 
 class LinkUp(NamedTuple):
-    """The translator can be asked: it has answered which version of the protocol it speaks."""
+    """The translator can be asked."""
 
 
 class LinkDown(NamedTuple):
@@ -32,26 +30,19 @@ class LinkReply(NamedTuple):
 
 
 class TranslatorLink:
-    """Asks the translator, ours or of version 1.
+    """Asks the translator.
 
     A REP socket gives back what stands before the empty frame: a number, so that a late answer is never taken for
-    another's, and our epoch, by which a translator of ours obeys us alone.
-
-    Before anything else it is asked, in a way that all understand, whether it is one of ours. One of version 1 is sent
-    no ids, no epoch and no requests that it would end over.
+    another's, and our epoch, by which it obeys us alone.
 
     Args:
         epoch: of the scheduler; empty: it has none.
-
-    Attributes:
-        version: of the translator that is there now.
     """
 
     def __init__(self, network: Network, address: str, log: RateLimitedLog, epoch: bytes = b"") -> None:
         self._log = log
         self._before = [epoch, b""] if epoch else [b""]
         self._address = address
-        self.version = Version.UNKNOWN
         self.socket = network.socket(zmq.DEALER)
         # nothing waits for a translator that is gone, to be carried out when it is back. (With this an answer may be
         # lost together with the connection: it is asked for again by its id.)
@@ -60,22 +51,14 @@ class TranslatorLink:
         network.connect(self.socket, address)
 
     def send(self, number: int, frames: Sequence[bytes]) -> bool:
-        """Ask; False if there is no translator to ask, or it has no such request."""
-        if self.version is Version.ONE:
-            if not is_of_version_1(frames[0][0]):
-                return False
-            frames = as_version_1(frames)
-        before = self._before if self.version is Version.OURS else [b""]
-        return send_frames(self.socket, [b"%d" % number, *before, *frames])
+        """Ask; False if there is no translator to ask."""
+        return send_frames(self.socket, [b"%d" % number, *self._before, *frames])
 
-    def receive(self) -> LinkReply | LinkUp | None:
+    def receive(self) -> LinkReply | None:
         """Return the next answer; None: there is none, or it is malformed."""
         frames = [frame.bytes for frame in receive_frames(self.socket)]
         if not frames or frames == [b""]:  # an empty one: the translator has looked whether we are there
             return None
-        if frames[0] == _VERSION:
-            self.version = Version.OURS if frames[2:] == [*ANSWER] else Version.ONE
-            return LinkUp()
         before, content = _parted(frames)
         number = before[0] if before else b""
         is_ours = before[1:] in ([], self._before[:-1]) and number.isdigit() and len(number) <= _LONGEST_NUMBER
@@ -84,16 +67,9 @@ class TranslatorLink:
             return None
         return LinkReply(int(number), content)
 
-    def follow(self) -> list[LinkDown]:
-        """Return the translator's going. One that comes is asked for its version; `receive` tells its answer."""
-        gone: list[LinkDown] = []
-        for event in self.monitor.drain():
-            self.version = Version.UNKNOWN
-            if event.kind == CONNECTED:
-                send_frames(self.socket, [_VERSION, b"", *QUESTION])
-            else:
-                gone.append(LinkDown())
-        return gone
+    def follow(self) -> list[LinkUp | LinkDown]:
+        """Return the translator's coming and going."""
+        return [LinkUp() if event.kind == CONNECTED else LinkDown() for event in self.monitor.drain()]
 
 
 def _parted(frames: list[bytes]) -> tuple[list[bytes], list[bytes]]:

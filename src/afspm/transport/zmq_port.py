@@ -13,7 +13,7 @@ from afspm.transport.control_client import ControlClient
 from afspm.transport.late_joiners import PublishedHistory
 from afspm.transport.network import Network
 from afspm.transport.polling import Poller, WakeUp, milliseconds
-from afspm.transport.port import Incoming, ReplyReceived
+from afspm.transport.port import Incoming
 from afspm.transport.publisher import Publisher
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.subscriber import Subscriber
@@ -39,7 +39,6 @@ class BasePort(Generic[T]):
         if publish is not None:
             self._publisher = Publisher(network, publish, self._published)
             self._poller.register(self._publisher.socket, self._serve)
-            self._poller.register(self._publisher.monitor.socket, self._serve)
 
     @property
     def clock(self) -> Clock:
@@ -120,8 +119,7 @@ class ZmqPort(BasePort[Incoming]):
             raise ConfigError(
                 "this component has no address of a scheduler", where=self._name, hint="control = address"
             )
-        if (answer := self._control.send(frames)) is not None:
-            self._wake_up.post(ReplyReceived(answer))
+        self._control.send(frames)
 
     def publish(self, envelope: str, payload: bytes) -> None:
         if self._publisher is None:

@@ -9,13 +9,11 @@ import zmq
 from afspm.clock import Clock
 from afspm.errors import ConfigError
 from afspm.launch import Launch
-from afspm.transport.frames import property_of, receive_frames, send_frames, user_of
+from afspm.transport.frames import receive_frames, send_frames, user_of
 from afspm.transport.network import Network
 from afspm.transport.port import RequestReceived, Served, SubscriberJoined
 from afspm.transport.zmq_port import BasePort
-from afspm.wire.protocol import ANSWER, QUESTION, answer_as_version_1
 
-_WITH_ID = 3  # frames of a request
 _WITHOUT_EPOCH = 3  # frames up to the empty one: connection, number; the epoch comes behind them
 
 
@@ -23,7 +21,7 @@ class ZmqServerPort(BasePort[Served]):
     """See `transport.port.ServerPort`.
 
     To a requester it is a REP socket: it gives back whatever came before the empty frame, so that a scheduler of ours
-    can number its requests, and one of version 1 need not. It is a ROUTER since an answer may also be withheld.
+    can number its requests. It is a ROUTER since an answer may also be withheld.
 
     Args:
         serve: the address to answer requests on.
@@ -41,7 +39,6 @@ class ZmqServerPort(BasePort[Served]):
         self._allowed = allowed
         self._has_keys = network.keys is not None and network.keys.binds_encrypted(serve, requests=True)
         self._asker: list[bytes] | None = None
-        self._asked_by_version_1: int | None = None
         self._socket = network.socket(zmq.ROUTER)
         # A name belongs to its newest connection, else a scheduler that connects anew before the old connection is
         # found dead is never heard. And what it says is never freed: the library keeps the queues that nobody reads.
@@ -78,23 +75,15 @@ class ZmqServerPort(BasePort[Served]):
             return None  # no telling where an answer would go; or a peer says its name, as to a scheduler
         self._asker = parts[:start]
         epoch = parts[start - 2] if start > _WITHOUT_EPOCH else b""
-        is_of_version_1 = not epoch and len(parts) - start < _WITH_ID
-        self._asked_by_version_1 = int.from_bytes(parts[start][:1]) if is_of_version_1 else None
         user = user_of(frames[0]) if self._has_keys else None
         if self._allowed is not None and self._has_keys and user != self._allowed:
-            self._asked_by_version_1 = None  # it hears why, whichever version it is of
             self.reply([b"\1", b"", f"only {self._allowed} may send requests to this address, not {user}".encode()])
-        elif parts[start:] == [*QUESTION] and property_of(frames[0], "Socket-Type") == "DEALER":
-            self.reply(ANSWER)  # a REQ socket is that of a scheduler of version 1, which passes on what it is asked
-        else:
-            return RequestReceived(parts[start:], user, epoch, parts[0])
-        return None
+            return None
+        return RequestReceived(parts[start:], user, epoch, parts[0])
 
     def reply(self, frames: Sequence[bytes] | None) -> None:
         asker, self._asker = self._asker, None
         if asker is not None and frames is not None:
-            if self._asked_by_version_1 is not None:
-                frames = answer_as_version_1(self._asked_by_version_1, frames)
             self._send([*asker, *frames])
 
     def is_connected(self, connection: bytes) -> bool:

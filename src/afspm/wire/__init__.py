@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from afspm.wire.codec import by_point, decode, encode, header
+from afspm.wire.codec import decode, encode, header
 from afspm.wire.frames import (
     decode_packet,
     decode_parameter,
     decode_request,
     decode_response,
-    encode_answer,
     encode_packet,
     encode_request,
     encode_response,
@@ -36,9 +35,6 @@ from afspm.wire.protocol import (
     CLOSING,
     KILL,
     PROTOCOL_VERSION,
-    VERSION_2_ACTION,
-    Version,
-    version_of,
 )
 from afspm.wire.split import Buffer
 from afspm.wire.values import encode_place, place_in, relocated
@@ -49,12 +45,9 @@ __all__ = [
     "CLOSING",
     "KILL",
     "PROTOCOL_VERSION",
-    "VERSION_2_ACTION",
     "Buffer",
     "MessageDeclaration",
     "MessageKind",
-    "Version",
-    "by_point",
     "declaration",
     "declare",
     "declared",
@@ -65,7 +58,6 @@ __all__ = [
     "decode_request",
     "decode_response",
     "encode",
-    "encode_answer",
     "encode_orders",
     "encode_packet",
     "encode_place",
@@ -83,5 +75,4 @@ __all__ = [
     "place_in",
     "register",
     "relocated",
-    "version_of",
 ]

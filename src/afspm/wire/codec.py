@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -186,18 +185,6 @@ def _decode_spectrum(payload: Buffer) -> model.Spectrum:
         time_ns(message.timestamp) if message.HasField("timestamp") else None,
         message.filename,
     )
-
-
-def by_point(payload: Buffer) -> bytes:
-    """Return a Spec1d whose values came variable after variable with its values point by point.
-
-    Raises:
-        WireError: the bytes are no Spec1d.
-    """
-    spectrum = _decode_spectrum(payload)
-    points, variables = spectrum.values.shape
-    values = spectrum.values.reshape(variables, points).T
-    return _encode_spectrum(replace(spectrum, values=values))[1]
 
 
 def _spectrum_header(payload: Buffer) -> model.PacketHeader:

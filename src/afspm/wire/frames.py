@@ -30,7 +30,7 @@ from afspm.wire.codec import encode
 from afspm.wire.generated import control_pb2, scan_pb2, spectroscopy_pb2
 from afspm.wire.mapping import FEEDBACK, PARAMETER, RELAYED, known, time_ns, timestamp
 from afspm.wire.messages import parse
-from afspm.wire.protocol import LONGEST_ENVELOPE, LONGEST_ID, answer_as_version_1, as_version_1
+from afspm.wire.protocol import LONGEST_ENVELOPE, LONGEST_ID
 from afspm.wire.split import Buffer
 
 
@@ -78,9 +78,11 @@ def decode_packet(frames: Sequence[Buffer]) -> Packet:
 
 
 def encode_request(request: Request) -> list[bytes]:
-    """[number, object, id]; the object's frame is there, if empty, where the request has an object or an id."""
-    frames = [bytes([request.kind]), request.payload or encode_subject(request.subject)]
-    return [*frames, request.id.encode()] if request.id else as_version_1(frames)
+    """[number, object, id]; frames at the end that are empty are left out."""
+    frames = [bytes([request.kind]), request.payload or encode_subject(request.subject), request.id.encode()]
+    while len(frames) > 1 and not frames[-1]:
+        frames.pop()
+    return frames
 
 
 def encode_subject(subject: object) -> bytes:
@@ -147,16 +149,6 @@ def encode_response(response: Response) -> list[bytes]:
     while len(frames) > 1 and not frames[-1]:
         frames.pop()
     return frames
-
-
-def encode_answer(response: Response, asked: int) -> list[bytes]:
-    """Return a response as its peer reads it: one that asked without an id is of version 1.
-
-    Args:
-        asked: the number of the request that is answered.
-    """
-    frames = encode_response(response)
-    return frames if response.id else answer_as_version_1(asked, frames)
 
 
 def decode_response(frames: Sequence[Buffer]) -> Response:

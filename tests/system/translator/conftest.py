@@ -82,10 +82,11 @@ class Peer:
 
     def next(self, timeout_s: float = DEADLINE_S) -> tuple[str, Any, bytes] | None:
         """The next packet: envelope, message, timestamp."""
-        if not self._subscriber.poll(int(timeout_s * 1000)):
-            return None
-        envelope, payload, stamp = self._subscriber.recv_multipart()
-        return envelope.decode(), MESSAGES[envelope.decode()].FromString(payload), stamp
+        while self._subscriber.poll(int(timeout_s * 1000)):
+            envelope, payload, stamp = self._subscriber.recv_multipart()
+            if envelope.decode() in MESSAGES:
+                return envelope.decode(), MESSAGES[envelope.decode()].FromString(payload), stamp
+        return None
 
     def until(self, state: int) -> list[tuple[str, Any]]:
         """All that is heard up to this state, the state included."""

@@ -34,10 +34,8 @@ initial = { tip-bias-voltage = "200 mV", scan-angle = "3 deg" }
 PLAIN = """
 [microscope]
 component = true
-command = ["python", "{script}"]
-role = "translator"
-simulated = true
-heartbeats = false
+class = "SimulatedPublishedTranslator"
+program = ["python", "{script}"]
 """
 SAMPLE_COORDINATES = """
 [control]

@@ -109,7 +109,6 @@ class Lab:
         self._inbox: list[Incoming] = []
         self._newest_ns = 0
         self.open = True
-        self.echoes_ids = True
         self.connect()
         self.publish(ScopeStatus(self.state))
         self.publish(self.parameters)
@@ -126,7 +125,7 @@ class Lab:
         if answer == "go on":
             answer = self._answer_once(request)
         if isinstance(answer, Response):
-            answer.id = request.id if self.echoes_ids else ""
+            answer.id = request.id
             self.at(0.01, lambda: self._inbox.append(ReplyReceived(answer)))
 
     def poll(self, timeout_s: float | None) -> list[Incoming]:

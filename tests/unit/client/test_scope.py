@@ -454,39 +454,6 @@ def test_the_answer_to_an_earlier_request_is_not_taken_for_this_ones(lab: Lab, s
     scope.flag(TIP)
 
 
-def test_a_version_1_scheduler_is_never_asked_twice_for_an_action(lab: Lab, scope: Scope) -> None:
-    """It knows no ids: it would execute the action twice."""
-    from afspm.transport.port import ReplyReceived
-
-    def version_1(request: model.Request) -> None:
-        if request.subject != "x-pulse":
-            code = lab._answer(request).code
-            lab.at(0.01, lambda: lab._inbox.append(ReplyReceived(Response(code))))
-
-    lab.intercept = version_1
-    with pytest.raises(NoResponse, match="asked 1 times"):
-        scope.action("x-pulse")
-    assert sum(request.subject == "x-pulse" for request in lab.requests) == 1
-
-
-def test_a_version_1_scheduler_is_asked_to_clear_only_what_is_flagged(lab: Lab, scope: Scope) -> None:
-    """It ends over clearing a problem that is not set."""
-    lab.echoes_ids = False
-    scope.clear(TIP)
-    scope.flag(TIP)
-    scope.clear(TIP)
-    scope.clear(TIP)
-    assert lab.count(ControlRequest.RMV_EXP_PRBLM) == 1
-    assert not lab.control.problems
-
-
-def test_a_version_1_scheduler_that_never_says_that_it_has_replayed_is_not_waited_for(lab: Lab, scope: Scope) -> None:
-    lab._inbox.remove(CaughtUp(SOURCE))
-    lab.echoes_ids = False
-    scope.scan(REGION)
-    assert lab.clock.passed_s == pytest.approx(SCAN_S, abs=5.0)
-
-
 def test_nothing_is_measured_before_what_a_scheduler_of_ours_publishes_is_heard(lab: Lab, scope: Scope) -> None:
     """It may tell that we have measured already."""
     lab._inbox.remove(CaughtUp(SOURCE))
@@ -511,7 +478,6 @@ def test_a_scheduler_of_ours_is_asked_to_clear_what_may_be_flagged_unheard(lab: 
 def test_that_the_microscope_tells_no_state_is_said_once(
     lab: Lab, scope: Scope, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As a translator of version 1 that was there before the scheduler."""
     lab._inbox = [one for one in lab._inbox if getattr(getattr(one, "packet", None), "envelope", "") != "ScopeStateMsg"]
     lab.at(20.0, lambda: lab.publish(ScopeStatus(ScopeState.FREE)))
     scope.set("tip-bias-voltage", "1 V")
@@ -703,7 +669,7 @@ def test_reading_needs_no_control(lab: Lab, scope: Scope) -> None:
     assert lab.count(ControlRequest.REQUEST_CTRL) == 0
 
 
-def test_a_version_1_scheduler_tells_values_only_in_control(lab: Lab, scope: Scope) -> None:
+def test_a_scheduler_that_tells_values_only_in_control_is_asked_in_control(lab: Lab, scope: Scope) -> None:
     lab.intercept = lambda request: (
         Response(ControlResponse.NOT_IN_CONTROL)
         if request.kind == ControlRequest.PARAM and lab.control.holder != lab.name
@@ -775,14 +741,6 @@ def test_sleeping_passes_the_time_of_the_experiment(lab: Lab, scope: Scope) -> N
     assert lab.clock.passed_s == pytest.approx(900.0)
 
 
-def test_a_microscope_that_says_nothing_of_itself_can_still_be_asked() -> None:
-    lab = Lab()
-    lab._inbox = lab._inbox[:1]  # connected, and neither states nor the end of the replay: a scheduler of version 1
-    lab.echoes_ids = False
-    scope = Scope(ExperimentLink(LabPort(lab), lab.name, source=SOURCE))
-    assert scope.scan(REGION).region == REGION
-
-
 def test_control_that_is_lost_while_the_microscope_is_silent_is_waited_for(lab: Lab, scope: Scope) -> None:
     """Then the answer is never coming: nobody asks for somebody who is not in control."""
     lab.intercept = lambda request: (
@@ -816,8 +774,6 @@ def test_an_action_whose_answer_and_control_were_lost_is_not_done_twice(lab: Lab
 
 
 def test_a_scan_that_is_seen_to_begin_needs_no_answer(lab: Lab, scope: Scope) -> None:
-    """A translator of version 1 whose answer was lost: the scheduler can't ask it again."""
-
     def lost(request: model.Request) -> Response | str:
         if request.subject != "start-scan":
             return "go on"

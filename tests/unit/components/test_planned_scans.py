@@ -270,15 +270,6 @@ def test_a_series_without_end_tells_no_progress() -> None:
     assert told_progress(lab) == []
 
 
-def test_a_scheduler_of_version_1_is_told_nothing() -> None:
-    """It would answer without an id, and the answer be taken for that to the next request."""
-    lab = Lab("series")
-    lab.echoes_ids = False
-    run(series(), lab)
-    assert len(lab.finished) == 3
-    assert told_progress(lab) == []
-
-
 def test_a_grid_of_spectra_tells_its_progress() -> None:
     lab = Lab("grid")
     run(SpectroscopyGrid(counts=(2, 1), spacing=(1e-9, 1e-9), end_when_done=True), lab)

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from afspm.cli.app import app
 from afspm.experiment import Experiment, load
-from afspm.experiment.short_form import explained, short
+from afspm.plugins.published.short_form import explained, short
 
 from .conftest import Write, errors, line_of
 
@@ -343,7 +343,7 @@ def test_user_code_that_needs_published_modules_is_never_to_be_had_from_pip(writ
     (tmp_path / "roi.py").write_text("from afspm.utils import csv\n", encoding="utf-8")
     text = '[own]\ncomponent = true\nclass = "roi.Experimenter"\nsubscriber = "sub"\n'
     (error,) = errors(published(write, MEDIATOR, PICTURE, text))
-    assert "written for the published implementation" in error.what
+    assert "written for the published implementation" in error.hint
     assert "pip install" not in error.hint
     assert "from-the-published-implementation" in error.hint
 
@@ -358,7 +358,7 @@ def test_a_variable_that_only_a_second_file_has_is_told(write: Write) -> None:
 
 def test_the_short_form_is_the_same_experiment(write: Write, tmp_path: Path) -> None:
     long = published(write, DRIFT, PICTURE, SERIES.replace('"sub"', '"full_sub"'), SHOWN, METADATA)
-    text = short(long)
+    text = short(long.resolved)
     assert "tcp://" not in text
     assert "afspm." not in text
     (tmp_path / "short.toml").write_text(text, encoding="utf-8")
@@ -378,14 +378,14 @@ def test_addresses_of_other_computers_stay_in_the_short_form(write: Write, tmp_p
     wiring = WIRING.replace('psc_url = "tcp://127.0.0.1', 'psc_url = "tcp://192.168.1.20').replace(
         'router_url = "tcp://127.0.0.1', 'router_url = "tcp://192.168.1.20'
     )
-    text = short(write(wiring + MEDIATOR + PICTURE + SERIES + "[security]\ninsecure = true\n", frame=""))
+    text = short(write(wiring + MEDIATOR + PICTURE + SERIES + "[security]\ninsecure = true\n", frame="").resolved)
     (tmp_path / "short.toml").write_text(text, encoding="utf-8")
     links = load(tmp_path / "short.toml").resolved.net.links["experiment"]
     assert (links.subscribe, links.control) == (("tcp://192.168.1.20:9001",), "tcp://192.168.1.20:6667")
 
 
 def test_a_series_that_a_published_function_took_is_proposed(write: Write, tmp_path: Path) -> None:
-    text = short(published(write, MEDIATOR, PICTURE, SCANNING))
+    text = short(published(write, MEDIATOR, PICTURE, SCANNING).resolved)
     assert "see that this is so" in text
     (tmp_path / "short.toml").write_text(text, encoding="utf-8")
     proposed = load(tmp_path / "short.toml")
@@ -398,7 +398,7 @@ def test_a_series_that_a_published_function_took_is_proposed(write: Write, tmp_p
 
 def test_every_line_is_told_what_it_has_become(write: Write) -> None:
     experiment = published(write, DRIFT, PICTURE, SCANNING, SHOWN, METADATA)
-    told = {line: became for _, line, became in explained(experiment)}
+    told = {line: became for _, line, became in explained(experiment.resolved)}
     assert told["[mediator] update_weight"] == (
         'drift.tracker.class = "paper", drift.tracker.w_update = 0.8, drift.tracker.queue = 7'
     )
@@ -413,12 +413,30 @@ def test_every_line_is_told_what_it_has_become(write: Write) -> None:
     assert written <= told.keys()
 
 
+def test_the_time_of_a_scan_is_a_speed(write: Write) -> None:
+    experiment = published(write, MEDIATOR, PICTURE, SERIES)
+    assert experiment.resolved.processes["translator"].settings["initial"] == {"scan-speed": "25.6 um/s"}
+    assert "25.6 um/s" in short(experiment.resolved)
+    told = {line: became for _, line, became in explained(experiment.resolved)}
+    assert told["[translator] scan_time_s"] == 'initial.scan-speed = "25.6 um/s"'
+
+
+def test_a_rescanner_without_a_drift_scheduler_is_left_out(write: Write, tmp_path: Path) -> None:
+    rescanner = DRIFT[DRIFT.index("[rescanner]") :]
+    experiment = published(write, MEDIATOR, PICTURE, SERIES, rescanner)
+    assert errors(experiment) == []
+    assert "rescanner" not in experiment.component_names
+    assert "escanner" not in short(experiment.resolved)
+    told = {line: became for _, line, became in explained(experiment.resolved)}
+    assert told["[rescanner] class"].startswith("left out: there is no drift scheduler")
+
+
 def test_the_command_prints_the_short_form_alone_to_stdout(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     experiment = published(write, DRIFT, PICTURE, SERIES)
     monkeypatch.chdir(experiment.folder)
     done = CliRunner().invoke(app, ["check", "--explain", "night.toml"])
     assert done.exit_code == 0, done.stderr
-    assert done.stdout == short(load("night.toml"))
+    assert done.stdout == short(load("night.toml").resolved)
     line = line_of(experiment, "update_weight")
     assert f"night.toml:{line}: [mediator] update_weight: drift.tracker.class" in done.stderr
 

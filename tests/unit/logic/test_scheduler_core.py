@@ -310,17 +310,6 @@ def test_a_silent_translator_is_told_of_and_its_late_answer_is_kept_for_a_repeti
     assert len(lab.forwarded) == 1
 
 
-def test_spectra_of_a_translator_of_version_1_are_doubted_once(lab: Lab) -> None:
-    spectrum = Packet("Spec1d", lab.codec.encode("a spectrum"), lab.now_ns)
-    for knows_ids, expected in ((True, 0), (False, 1), (False, 0)):
-        lab.step(TranslatorUp(knows_ids))
-        lab.later(experiment_s=1.0)
-        packet = Packet("Spec1d", spectrum.payload, lab.now_ns)
-        done = lab.step(PacketIn(packet, PacketHeader("Spec1d", kind="IV")))
-        assert len([one for one in done if isinstance(one, Log) and "spectra_by_variable" in one.text]) == expected
-        assert [one.payload for one in published(done)] == [spectrum.payload]
-
-
 def test_while_the_translator_is_slow_everybody_else_is_served(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.ask("experiment", ACTION, "start-scan", "experiment/a/1")
@@ -334,20 +323,6 @@ def test_what_nobody_knows_the_end_of_is_asked_again_of_a_translator_that_knows_
     lab.step(TranslatorDown())
     lab.translator()
     assert kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")) == ["Forward"]
-
-
-def test_and_never_of_one_of_version_1() -> None:
-    lab = Lab()
-    lab.step(TranslatorUp())
-    lab.step(TranslatorReply(lab.forwarded.pop().number, Response(int(OK))))
-    lab.take_control("experiment")
-    assert kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")) == ["SaveState", "Forward"]
-    lab.step(TranslatorDown())
-    lab.step(TranslatorUp())
-    lab.step(TranslatorReply(lab.forwarded[-1].number, Response(int(OK))))
-    for _ in range(3):
-        assert lab.says("experiment", ACTION, "x-pulse", "experiment/a/1") is NO_RESPONSE
-    assert [f.request.subject for f in lab.forwarded].count("x-pulse") == 1
 
 
 def test_what_was_not_sent_may_be_asked_again(lab: Lab) -> None:

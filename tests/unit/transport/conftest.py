@@ -9,8 +9,6 @@ from typing import Any
 
 import pytest
 
-from afspm.transport.network import DISCONNECTED
-
 
 @pytest.fixture
 def open_() -> Iterator[Callable[[Any], Any]]:
@@ -22,30 +20,6 @@ def open_() -> Iterator[Callable[[Any], Any]]:
             return thing
 
         yield opened
-
-
-class Gone:
-    """Records the connections that a publisher sees end."""
-
-    def __init__(self, publisher: Any) -> None:
-        self._drain = publisher.monitor.drain
-        self._kinds: list[int] = []
-        publisher.monitor.drain = self._recorded
-
-    def _recorded(self) -> list[Any]:
-        events: list[Any] = self._drain()
-        self._kinds += [event.kind for event in events if event.kind == DISCONNECTED]
-        return events
-
-    def take(self) -> list[int]:
-        """Return those since the last call."""
-        kinds, self._kinds = self._kinds, []
-        return kinds
-
-
-@pytest.fixture
-def gone() -> type[Gone]:
-    return Gone
 
 
 @pytest.fixture

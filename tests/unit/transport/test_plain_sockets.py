@@ -1,4 +1,4 @@
-"""Peers of version 1, as plain sockets with the golden bytes, in every place that they can take."""
+"""Programs of other makes, as plain sockets with the golden bytes, in every place that they can take."""
 
 from __future__ import annotations
 
@@ -11,12 +11,10 @@ import zmq
 
 from afspm import wire
 from afspm.clock import ExperimentClock
-from afspm.model import ControlRequest, ControlResponse
 from afspm.transport.network import Network
 from afspm.transport.port import CaughtUp, ControlConnected, Killed, PacketReceived, ReplyReceived
 from afspm.transport.zmq_port import ZmqPort
 from afspm.transport.zmq_server import ZmqServerPort
-from afspm.wire.protocol import ANSWER, QUESTION
 
 ANY = "tcp://127.0.0.1:0"
 CLOCK = ExperimentClock.real()
@@ -41,9 +39,7 @@ def test_a_plain_req_socket_asks_our_server(open_: Any, plain: Any, until: Any) 
         until(lambda asked=asked: asked, (server, asked))
         assert asked[0].frames == request
         server.reply(response)
-        # the client of version 1 takes the object of an answer to REQ_PARAM as given, be it a refusal
-        expected = [*response, b""][:2] if request[0][0] == ControlRequest.PARAM else response
-        assert requester.recv_multipart() == expected
+        assert requester.recv_multipart() == response
 
 
 def test_a_name_that_is_in_use_is_heard_by_its_newest_connection(open_: Any, plain: Any, until: Any) -> None:
@@ -64,12 +60,9 @@ def test_our_component_asks_a_plain_router(open_: Any, plain: Any, until: Any) -
     until(lambda: ControlConnected() in found, (port, found))
     for number, (request, response) in enumerate(zip(REQUESTS, RESPONSES * len(REQUESTS), strict=False)):
         found.clear()
-        port.send([*[*request, b""][:2], b"Component/session/%d" % number])  # its id is not for version 1
-        if not number:
-            assert router.recv_multipart() == [b"Component", b"", *QUESTION]
-            router.send_multipart([b"Component", b"", bytes([ControlResponse.NOT_IN_CONTROL])])
-            port.poll(0.1)
-        assert router.recv_multipart() == [b"Component", b"", *request]
+        sent = [*[*request, b""][:2], b"Component/session/%d" % number]
+        port.send(sent)
+        assert router.recv_multipart() == [b"Component", b"", *sent]
         router.send_multipart([b"Component", b"", *response])
         until(lambda: found, (port, found))
         assert found == [ReplyReceived(wire.decode_response(response))]
@@ -134,60 +127,6 @@ def test_a_plain_sub_gets_what_was_published_before_oldest_first_and_then_what_f
     assert [payload for _, payload, _ in got] == [b"%d" % n for n in range(10)] + [b"live"]
     times = [wire.decode_packet(frames).time_ns for frames in got]
     assert times == sorted(set(times))
-
-
-def test_a_plain_sub_to_everything_is_sent_the_messages_of_version_1_alone(open_: Any, plain: Any, until: Any) -> None:
-    publisher, subscriber = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=ANY)), plain(zmq.SUB)
-    ours, theirs = ("ScanLines", "Scan2", "Crystal", "JournalEntries"), ("Scan2d_1.0_Height", "ScopeStateMsg")
-    for envelope in (*ours, *theirs):
-        publisher.publish(envelope, b"before")
-    subscriber.setsockopt(zmq.SUBSCRIBE, b"")
-    subscriber.connect(publisher.publish_address)
-    until(lambda: subscriber.poll(0), (publisher, []))
-    for envelope in (*ours, *theirs):
-        publisher.publish(envelope, b"live")
-    publisher.kill()
-    got = []
-    while (frames := subscriber.recv_multipart()) != [b"KILL"]:
-        got.append((frames[0].decode(), frames[1]))
-    assert got == [(envelope, when) for when in (b"before", b"live") for envelope in theirs]
-
-
-def test_a_plain_sub_that_takes_back_one_prefix_keeps_what_another_means(open_: Any, plain: Any, until: Any) -> None:
-    publisher, subscriber = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=ANY)), plain(zmq.SUB)
-    for prefix in (b"", b"Scan2d", b"KILL"):
-        subscriber.setsockopt(zmq.SUBSCRIBE, prefix)
-    subscriber.connect(publisher.publish_address)
-    joined: list[Any] = []
-    until(lambda: joined, (publisher, joined))
-    subscriber.setsockopt(zmq.UNSUBSCRIBE, b"")
-    got: set[bytes] = set()
-
-    def narrowed() -> bool:
-        got.clear()
-        for envelope in ("ScopeStateMsg", "Scan2d"):
-            publisher.publish(envelope, b"")
-        while b"Scan2d" not in got:
-            got.add(subscriber.recv_multipart()[0])
-        return got == {b"Scan2d"}
-
-    until(narrowed, (publisher, []))
-
-
-def test_a_scheduler_of_version_1_that_passes_the_question_on_is_not_taken_for_ours(
-    open_: Any, plain: Any, until: Any
-) -> None:
-    server = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=None))
-    ours, theirs = plain(zmq.DEALER), plain(zmq.REQ)
-    for socket in (ours, theirs):
-        socket.connect(server.serve_address)
-    asked: list[Any] = []
-    ours.send_multipart([b"", *QUESTION])
-    until(lambda: ours.poll(0), (server, asked))
-    assert ours.recv_multipart() == [b"", *ANSWER]
-    theirs.send_multipart([*QUESTION])
-    until(lambda: asked, (server, asked))
-    assert [one.frames for one in asked] == [[*QUESTION]]
 
 
 def test_a_plain_sub_to_everything_does_not_see_the_replay_for_one_of_ours(open_: Any, plain: Any, until: Any) -> None:

@@ -62,8 +62,12 @@ def test_what_waits_for_one_that_stands_still_is_dropped_and_others_miss_nothing
     stalled.subscribe(b"")
     stalled.connect(publisher.address)
     healthy, got, happened = open_(ZmqPort(Network(), "Healthy", CLOCK, subscribe=[publisher.address])), [], []
-    publisher.publish(b"for both")
-    until(lambda: stalled.poll(0) and any(isinstance(i, PacketReceived) for i in got), (publisher, []), (healthy, got))
+
+    def both_receive() -> bool:
+        publisher.publish(b"for both")
+        return bool(stalled.poll(0)) and any(isinstance(i, PacketReceived) for i in got)
+
+    until(both_receive, (publisher, []), (healthy, got))
     got.clear()
     payload = bytes(len(SCAN))
     kept = sys.getrefcount(payload)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -194,11 +193,6 @@ def test_what_a_newer_peer_appends_to_a_response_is_not_looked_at() -> None:
     assert wire.decode_response(newer) == Response(ControlResponse.FAILURE, b"", "why", "a/1/2")
 
 
-def test_peers_of_version_1_are_sent_no_detail() -> None:
-    response = Response(ControlResponse.FAILURE, b"", "why", "", ResponseDetail.EXPERIMENT_ENDED)
-    assert wire.encode_answer(response, ControlRequest.ACTION) == [b"\1"]
-
-
 def test_a_parameter_without_a_value_asks_for_it() -> None:
     request = wire.decode_request(wire.encode_request(Request(ControlRequest.PARAM, Parameter("scan-speed"), id="1")))
     assert request.subject == Parameter("scan-speed")
@@ -293,16 +287,6 @@ def test_any_frames_are_understood_or_refused(frames: list[bytes]) -> None:
     for read in (wire.decode_request, wire.decode_response, wire.decode_packet):
         with contextlib.suppress(WireError):
             read(frames)
-
-
-@pytest.mark.parametrize("shape", [(5, 2), (2, 5), (1, 3), (4, 1), (0, 2)])
-def test_a_spectrum_that_came_variable_after_variable_is_put_in_order(shape: tuple[int, int]) -> None:
-    points, variables = shape
-    values = np.arange(float(points * variables)).reshape(shape)
-    names = tuple(f"v{n}" for n in range(variables))
-    right = Spectrum((1e-9, 2e-9), "IV", names, ("V",) * variables, values, 1_700_000_000_000_000_001, "a.dat")
-    scrambled = wire.encode(replace(right, values=values.T.copy().reshape(shape)))[1]
-    assert wire.by_point(scrambled) == wire.encode(right)[1]
 
 
 @pytest.mark.parametrize("lease_s", [1e-9, 0.5, 20.0, 86_400.0])

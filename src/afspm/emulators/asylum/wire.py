@@ -1,7 +1,7 @@
 """ZeroMQ-XOP's side of its protocol: what a request asks for, and the bytes of a reply. Pure.
 
-After the source and specification of ZeroMQ-XOP, interface version 1; written apart from the translator's, so that
-each is a check of the other.
+After the source and specification of ZeroMQ-XOP, first version of the interface; written apart from the
+translator's, so that each is a check of the other.
 """
 
 from __future__ import annotations

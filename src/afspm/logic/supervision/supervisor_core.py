@@ -200,7 +200,8 @@ class SupervisorCore:
             else:
                 self._log(child.spec.name, "DEBUG", child.last_exit)
         elif code == ExitCode.DONE and child.spec.role is Role.TRANSLATOR and not life.is_closing:
-            # one of version 1 that has caught an error of its own ends like that; one that closes on purpose says so
+            # a program of another language that has caught an error of its own ends like that; one that closes on
+            # purpose says so
             told = f"{how} before the end of the experiment, without announcing it"
             self._apply(child, child.watch.exited(ExitCode.CRASHED, self._now_s, told))
         else:

@@ -1,6 +1,6 @@
 """Requests to ZeroMQ-XOP and its replies: a function of Igor's is called by JSON. Pure.
 
-After the source and specification of ZeroMQ-XOP (byte physics and the Allen Institute), interface version 1.
+After the source and specification of ZeroMQ-XOP (byte physics and the Allen Institute), first version of the interface.
 """
 
 from __future__ import annotations

@@ -16,7 +16,6 @@ from afspm.transport.keys import Keys
 from afspm.transport.late_joiners import LONGEST, Marker
 from afspm.transport.network import ACCEPTED, Monitor, Network
 from afspm.transport.polling import Poller, WakeUp, milliseconds
-from afspm.wire.protocol import ANSWER, QUESTION
 
 
 @dataclass(frozen=True)
@@ -142,9 +141,7 @@ class ScriptedScheduler:
         request = ScriptedRequest(peer, tuple(frames))
         if not frames or frames == [b""]:
             return
-        if tuple(frames) == QUESTION:
-            self.send(peer, ANSWER)
-        elif frames[0] == bytes([CLOCK_REQUEST]):
+        if frames[0] == bytes([CLOCK_REQUEST]):
             self.greetings.append(request)
             self._answer(request, self.greeting)
         else:

@@ -10,43 +10,34 @@ from afspm.addresses import is_address
 from afspm.errors import UnitError
 from afspm.experiment.findings import SourceLocation
 from afspm.experiment.parts import ExperimentPart
-from afspm.experiment.published import INSTEAD, envelope, last, wire_of
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.toml_writer import dumps
 from afspm.experiment.toml_writer import value as toml
-from afspm.experiment.wiring_classes import WIRE_KEYS, WiringClass
+from afspm.experiment.wiring_classes import WIRE_KEYS, WiringClass, wire_of
 from afspm.model import Role
+from afspm.plugins.published.files import INSTEAD, last
 from afspm.transport.network import is_local
 
 if TYPE_CHECKING:
-    from afspm.experiment.experiment import Experiment
     from afspm.experiment.resolution import ResolvedExperiment
     from afspm.experiment.wiring import WiringKeys
 
 _VARIABLES: Final[tuple[str, ...]] = ("name", "messages")
 _FILLED_IN: Final = "filled in: processes on one computer find each other"
-_WIRES: Final[dict[WiringClass, str]] = {
-    **dict.fromkeys((WiringClass.PUBLISHER, WiringClass.CACHE, WiringClass.COMBINED, WiringClass.SERVER), _FILLED_IN),
-    **dict.fromkeys((WiringClass.ROUTER, WiringClass.CLIENT), f"{_FILLED_IN}; timeouts are [control] request_timeout"),
-    WiringClass.SUBSCRIBER: f"{_FILLED_IN}; topics are `envelopes` of the component",
-    **dict.fromkeys((WiringClass.CACHE_LOGIC, WiringClass.HISTORIES), "[cache]"),
-}
 
 
-def explained(experiment: Experiment) -> list[tuple[SourceLocation, str, str]]:
+def explained(resolved: ResolvedExperiment) -> list[tuple[SourceLocation, str, str]]:
     """Return for each line of the file where it is, what it sets, and what has become of it."""
-    resolved = experiment.resolved
     return [(resolved.document.place(*path), _shown(path), became) for path, became in _lines(resolved)]
 
 
-def short(experiment: Experiment) -> str:
+def short(resolved: ResolvedExperiment) -> str:
     """Return the experiment in the short form: components with their settings, and what is not usual.
 
     A component that has no counterpart is the one that may stand for it, where that can be told from its settings,
     else a comment that says what to write.
     """
-    resolved = experiment.resolved
-    parts = experiment.parts
+    parts = resolved.parts
     kept = {name: parts.variables[name] for name in _VARIABLES if name in parts.variables}
     blocks = [dumps(kept)] if kept else []
     blocks += [dumps({name: table}) for name, table in _sections(resolved).items()]
@@ -70,7 +61,7 @@ def _lines(resolved: ResolvedExperiment) -> Iterator[tuple[tuple[str, ...], str]
             for key in raw:
                 yield (name, key), parts.became.get((name, key)) or (_FILLED_IN if key in WIRE_KEYS else "as it is")
         else:
-            yield (name,), _intermediary(parts.intermediaries[name])
+            yield (name,), parts.became.get((name,)) or _intermediary(parts.intermediaries[name])
 
 
 def _addresses(resolved: ResolvedExperiment) -> set[str]:
@@ -91,11 +82,15 @@ def _variable(name: str, value: object, addresses: Collection[str]) -> str:
 
 
 def _intermediary(table: Table) -> str:
-    kind = wire_of(table)
-    if kind in (WiringClass.ENVELOPE, WiringClass.SPECTRA):
-        return f"the envelope {toml(envelope(table))}"
-    if kind is not None:
-        return _WIRES[kind]
+    match wire_of(table):
+        case None:
+            pass
+        case WiringClass.ROUTER | WiringClass.CLIENT:
+            return f"{_FILLED_IN}; timeouts are [control] request_timeout"
+        case WiringClass.SUBSCRIBER:
+            return f"{_FILLED_IN}; topics are `envelopes` of the component"
+        case _:
+            return _FILLED_IN
     if "component" in table:
         return "switched off"
     return "its settings are those of the component that names it"
@@ -142,30 +137,7 @@ def _sections(resolved: ResolvedExperiment) -> dict[str, Settings]:
     asked = {"request_retries": max(retries)} if retries else {}
     if control := {**given, **asked, **sections.get("control", {})}:
         sections["control"] = control
-    if any(wires.cache_logic for wires in wirings):
-        sections["cache"] = {**_cache(resolved), **sections.get("cache", {})}
     return sections
-
-
-def _cache(resolved: ResolvedExperiment) -> Settings:
-    rules = [
-        {
-            "message": rule.message,
-            "channel": rule.channel,
-            "kind": rule.kind,
-            "above": _length(rule.above_m),
-            "up_to": _length(rule.up_to_m),
-            "envelope": rule.envelope,
-            "history": rule.history,
-        }
-        for rule in resolved.caching.rules
-    ]
-    found = {"history": dict(resolved.caching.history), "rules": rules}
-    return {key: value for key, value in found.items() if value}
-
-
-def _length(length_m: float | None) -> str | None:
-    return None if length_m is None else f"{length_m * 1e9:.9g} nm"
 
 
 def _instead(name: str, table: Table) -> str:

@@ -45,11 +45,6 @@ SUCCESS, NOT_IN_CONTROL = int(ControlResponse.SUCCESS), int(ControlResponse.NOT_
 SCANNING, FREE = 2, 3
 
 
-@pytest.fixture
-def router(plain: Any) -> Router:
-    return Router(plain(zmq.ROUTER))
-
-
 def until(condition: Any, *pumped: Any) -> Any:
     deadline_s = time.monotonic() + 10.0
     while not (value := condition()):
@@ -160,14 +155,13 @@ def test_who_looks_at_the_last_state_sees_those_that_pass_in_a_moment(rig: Any, 
     rig.until(lambda: theirs.state == FREE and ours.packets("ScopeStateMsg"))
     for _ in range(5):
         for passing in (ScopeState.MOVING, ScopeState.INTERRUPTED):
-            count = len(ours.packets("ScopeStateMsg"))
             seen: list[int | None] = []
             for state in (ScopeState.SCANNING, passing, ScopeState.FREE):
                 rig.publish_packet(*wire.encode(ScopeStatus(state)))
 
-            def all_told(seen: list[int | None] = seen, count: int = count) -> bool:
+            def all_told(seen: list[int | None] = seen) -> bool:
                 seen.append(theirs.state)
-                return seen[-1] == FREE and len(ours.packets("ScopeStateMsg")) == count + 3
+                return seen[-1] == FREE and set(seen) != {FREE}
 
             rig.until(all_told)
             assert int(passing) in seen
@@ -232,7 +226,7 @@ def test_their_translator_is_sent_what_version_1_has_until_after_the_end(rig: An
 
 
 def test_spectra_that_come_variable_after_variable_are_put_in_order(rig: Any, server: Server) -> None:
-    rig.settings = {"control": {"spectra_by_variable": True}}
+    rig.translator_settings = {"spectra_by_variable": True}
     rig.start()
     ours = rig.component("Ours")
     rig.until(lambda: ours.ask(ControlRequest.ACTION_SUPPORT, "start-scan").ok)
@@ -265,7 +259,7 @@ def test_our_supervisor_tells_their_scheduler_nothing_and_says_so_once(router: R
     until(lambda: complaints, router.pump)
     reporter.close()
     assert [text for text in complaints if "version 1" in text] == complaints[:1] == complaints
-    assert [frames[0][0] for _, frames in router.asked] == [ControlRequest.ACTION_SUPPORT]
+    assert router.asked == []
 
 
 def test_with_their_scheduler_the_experiment_goes_by_real_time(router: Router) -> None:
@@ -314,4 +308,4 @@ def test_our_component_asks_their_scheduler_what_version_1_has(port: ZmqPort, ro
         assert link.request(kind, thing).ok
         link.tell(LogLines(()))
     assert not link.request(RELAY_REQUEST, RelayedMessage("Progress", b"")).ok
-    assert [frames[0][0] for _, frames in router.asked] == [12, *(int(kind) for kind, _ in requests)]
+    assert [frames[0][0] for _, frames in router.asked] == [int(kind) for kind, _ in requests]

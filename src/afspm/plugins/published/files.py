@@ -1,4 +1,4 @@
-"""Files of the published implementation: what its classes and settings are called here, and what has no counterpart."""
+"""Files of the published implementation: the names of its classes and settings here, and what has no counterpart."""
 
 from __future__ import annotations
 
@@ -8,14 +8,37 @@ from typing import Any, Final
 
 from afspm import units
 from afspm.errors import AfspmError, InvalidValue
+from afspm.experiment.document import Document
+from afspm.experiment.parts import ExperimentParts
 from afspm.experiment.toml_lines import Settings, Table
-from afspm.experiment.wiring_classes import PUBLISHED_WIRES, SHORT_WIRE_CLASSES, WIRE_CLASSES, WiringClass
+from afspm.experiment.toml_writer import value as toml
+from afspm.experiment.wiring_classes import WIRE_KEYS
 from afspm.logic.envelopes import default_envelope
 from afspm.model import PacketHeader
 
 COMPONENTS: Final = "afspm.components."
 """Where the published implementation has its components. Their modules moved between its versions."""
 GUIDE: Final = "see docs/how-to/from-the-published-implementation.md"
+WIRES: Final = "afspm.io."
+"""Where the published implementation has its intermediary classes. Their modules moved between its versions."""
+_WIRES: Final = {
+    "Publisher": "Publisher",
+    "PubSubCache": "Cache",
+    "Subscriber": "Subscriber",
+    "ComboSubscriber": "Subscriber",
+    "ControlServer": "Server",
+    "ControlRouter": "Router",
+    "ControlClient": "Client",
+    "AdminControlClient": "Client",
+}
+CACHE_LOGIC: Final = ("PBCScanLogic", "ProtoBasedCacheLogic", "CacheLogic")
+ENVELOPES: Final = ("create_roi_scan_envelope", "create_spec_envelope")
+FUNCTIONS: Final = (*CACHE_LOGIC, *ENVELOPES, "create_roi_proto_hist_list")
+_MEANINGLESS: Final = (
+    "get_envelope_for_proto", "pub_get_envelope_for_proto", "sub_extract_proto", "extract_proto_kwargs",
+    "update_cache", "update_cache_kwargs", "uuid",
+)  # fmt: skip
+"""Settings that only say how Python is to decode or to name packets: decoding is the wire's, naming is [cache]'s."""
 CHANNEL: Final = "Height"
 """The channel of the simulated microscope that stands for the one that a published picture was given."""
 
@@ -44,39 +67,78 @@ class PublishedClass:
     why: str = ""
 
 
-def wire_of(table: object) -> WiringClass | None:
-    """Return the kind of intermediary that a value is, or None."""
+def wire_of(table: object) -> str:
+    """Return the name of the published intermediary or function that a value is, without its module; empty: none."""
     name = table.get("class") if isinstance(table, Mapping) else None
-    if not isinstance(name, str):
-        return None
-    last = name.rpartition(".")[2]
-    return WIRE_CLASSES.get(last) if name.startswith(PUBLISHED_WIRES) else SHORT_WIRE_CLASSES.get(name)
+    if not isinstance(name, str) or not name.startswith(WIRES):
+        return ""
+    last_name = name.rpartition(".")[2]
+    return last_name if last_name in _WIRES or last_name in FUNCTIONS else ""
 
 
-def evaluated(value: object, channels: Mapping[str, str]) -> Any:
-    """Replace each call of a published function in a value by the envelope that the function would return.
+def converted(value: object, channels: Mapping[str, str]) -> Any:
+    """Replace within a value intermediaries by ours, and calls of published functions by the envelope that they return.
 
     Args:
         channels: those of the file that have another name here.
     """
     if isinstance(value, list):
-        return [evaluated(item, channels) for item in value]
+        return [converted(item, channels) for item in value]
     if not isinstance(value, dict):
         return value
-    if wire_of(value) in (WiringClass.ENVELOPE, WiringClass.SPECTRA):
+    kind = wire_of(value)
+    if kind in ENVELOPES:
         return envelope(with_channels(value, channels))
-    return {key: evaluated(item, channels) for key, item in with_channels(value, channels).items()}
+    inside = {key: converted(item, channels) for key, item in with_channels(value, channels).items()}
+    if kind == "ComboSubscriber":
+        return _combined(inside)
+    if kind in _WIRES:
+        inside["class"] = _WIRES[kind]
+        return {key: item for key, item in inside.items() if key not in _MEANINGLESS}
+    return inside
+
+
+def _combined(table: Table) -> Settings:
+    """Several subscribers as one."""
+    urls: list[object] = []
+    topics: list[object] = []
+    for one in table.get("subs", ()):
+        if isinstance(one, Mapping):
+            given, wanted = one.get("sub_url", ()), one.get("topics_to_sub", ())
+            urls += [given] if isinstance(given, str) else given
+            topics += [wanted] if isinstance(wanted, str) else wanted
+    return {"class": "Subscriber", "sub_url": urls} | ({"topics_to_sub": topics} if topics else {})
 
 
 def with_channels(table: Table, channels: Mapping[str, str]) -> Settings:
     """Return the table of a published function with the names that its channels have here; others as they are."""
     renamed = dict(table)
     match wire_of(renamed):
-        case WiringClass.ENVELOPE if "channel" in renamed:
+        case "create_roi_scan_envelope" if "channel" in renamed:
             renamed["channel"] = channels.get(renamed["channel"], renamed["channel"])
-        case WiringClass.HISTORIES if isinstance(given := renamed.get("channels_list"), list):
+        case "create_roi_proto_hist_list" if isinstance(given := renamed.get("channels_list"), list):
             renamed["channels_list"] = [channels.get(channel, channel) for channel in given]
     return renamed
+
+
+def cache_section(logic: object) -> Settings:
+    """Return [cache] as a published logic of the cache has it. A number among the sizes is in nm, as in envelopes."""
+    if wire_of(logic) not in CACHE_LOGIC or not isinstance(logic, Mapping):
+        return {}
+    count = logic.get("default_scan_history")
+    section: Settings = {"history": {"Scan2d": count}} if isinstance(count, int) and count > 0 else {}
+    histories = logic.get("proto_with_history_list")
+    rules: list[Settings] = []
+    if isinstance(histories, Mapping) and wire_of(histories) == "create_roi_proto_hist_list":
+        channels = histories.get("channels_list") or []
+        for number, entry in enumerate(histories.get("sizes_with_hist_list", ())):
+            match entry:
+                case [[width, *_], int(most)] if most > 0:
+                    nm = length_m(width) * 1e9
+                    rule = {"above": f"{nm * 0.999:.9g} nm", "up_to": f"{nm * 1.001:.9g} nm", "history": most}
+                    channel = {"channel": channels[number]} if number < len(channels) else {}
+                    rules.append({"message": "Scan2d", **channel, **rule})
+    return section | ({"rules": rules} if rules else {})
 
 
 def envelope(table: Table) -> object:
@@ -84,7 +146,7 @@ def envelope(table: Table) -> object:
 
     A size without a unit is in nm, as in the envelopes themselves. What makes no envelope is returned as it is.
     """
-    if wire_of(table) is WiringClass.SPECTRA:
+    if wire_of(table) == "create_spec_envelope":
         return default_envelope(PacketHeader("Spec1d", kind=str(table.get("type", ""))))
     try:
         width_m, height_m = (length_m(side) for side in table["size"])
@@ -219,12 +281,21 @@ def _width(value: Any, table: Table) -> Settings:
     return {"width": f"{value[0]} {table.get('physical_units', 'nm')}"} if "img_path" in table else {}
 
 
+def _speed(value: Any, table: Table) -> Settings:
+    """The speed at which a scan over the width of the picture takes that long: each line forth and back."""
+    size, unit = table.get("physical_size"), str(table.get("physical_units", "nm"))
+    width_m = units.si(f"{size[0]} {unit}", "m") if isinstance(size, list) else _WIDTH_M
+    return {"initial.scan-speed": f"{2 * _LINES * width_m / float(value) * 1e6:.6g} um/s"}
+
+
 def _velocity(value: Any, table: Table) -> Settings:
     unit = f"{table.get('spatial_units', 'nm')}/{table.get('temporal_units', 's')}"
     x, y = (units.si(f"{part} {unit}", "m/s") for part in value)
     return {"drift.velocity_m_per_s": [x, y, 0.0]}
 
 
+_LINES, _WIDTH_M = 128, 1e-6
+"""Of a scan that nothing was set for."""
 _PICTURES: Final = ("ImageTranslator", "DriftImageTranslator")
 _EVERY: Final[dict[str, PublishedSetting]] = {
     **_gone("a process waits for its next message and never sleeps", "loop_sleep_s", "poll_timeout_ms"),
@@ -238,7 +309,8 @@ _PICTURE: Final[dict[str, PublishedSetting]] = {
     "drift_rate": PublishedSetting(_velocity),
     **_gone("the middle of the sample is the origin", "physical_origin"),
     **_gone("each length has its unit", "physical_units", "data_units", "spatial_units", "temporal_units"),
-    **_gone('initial = { scan-speed = "4 um/s" } says how fast the tip moves', "scan_time_s", "move_time_s"),
+    "scan_time_s": PublishedSetting(_speed),
+    **_gone("the tip moves as fast as it scans", "move_time_s"),
     **_gone(f"the channel is {CHANNEL}", "channel_id"),
 }
 _ASYLUM: Final[dict[str, PublishedSetting]] = {
@@ -313,3 +385,106 @@ INSTEAD: Final[dict[str, str]] = {
     **dict.fromkeys(("MicroscopeTranslator", "ConfigTranslator", "MapTranslator", "SXMTranslator"), _TRANSLATOR),
 }
 """What to write instead of a published class that calls code written against the published implementation."""
+
+
+def convert(tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
+    """Return the components of a file as ours; the intermediaries and [cache] of `parts` become ours as well."""
+    channels = renamed_channels(tables)
+    conversion = _Conversion(channels, parts, document)
+    for table in tables.values():
+        conversion.add_cache(table)
+    for name, table in parts.intermediaries.items():
+        conversion.note_intermediary(name, table)
+        parts.intermediaries[name] = _kept_inside(table, channels)
+    found = {name: conversion.component(name, converted(table, channels), table) for name, table in tables.items()}
+    ours = {name: table for name, table in found.items() if table is not None}
+    conversion.drop_rescanners(ours)
+    return ours
+
+
+def _kept_inside(table: Table, channels: Mapping[str, str]) -> Settings:
+    """An intermediary as ours; a call of a function, which is its result where it is named, keeps its table."""
+    whole = converted(table, channels)
+    return whole if isinstance(whole, dict) else with_channels(table, channels)
+
+
+def _wires_of(table: Table) -> Settings:
+    return {key: table[key] for key in WIRE_KEYS if key in table}
+
+
+@dataclass(frozen=True)
+class _Conversion:
+    """Makes the components of one file ours, and notes what became of its lines."""
+
+    channels: Mapping[str, str]
+    parts: ExperimentParts
+    document: Document
+
+    def add_cache(self, table: Table) -> None:
+        """Put what the cache of a scheduler is told into [cache], where that says nothing."""
+        logic = _within(table, "pubsubcache", "update_cache_kwargs", "cache_logic")
+        if isinstance(logic, Mapping) and isinstance(histories := logic.get("proto_with_history_list"), Mapping):
+            logic = {**logic, "proto_with_history_list": with_channels(histories, self.channels)}
+        if section := cache_section(logic):
+            given = self.parts.sections.setdefault("cache", {})
+            history = {**section.get("history", {}), **given.get("history", {})}
+            rules = [*given.get("rules", []), *section.get("rules", [])]
+            given.update({key: value for key, value in (("history", history), ("rules", rules)) if value})
+
+    def note_intermediary(self, name: str, table: Table) -> None:
+        """Note what became of an intermediary table."""
+        kind = wire_of(table)
+        if kind in ENVELOPES:
+            self.parts.became[(name,)] = f"the envelope {toml(envelope(with_channels(table, self.channels)))}"
+        elif kind in FUNCTIONS:
+            self.parts.became[(name,)] = "[cache]"
+
+    def component(self, name: str, table: Settings, written: Table) -> Settings | None:
+        """Return a component as ours; None: it has no process of its own here.
+
+        Args:
+            written: the same before its intermediaries became ours.
+        """
+        here, path = (name, "class"), table.get("class")
+        if not isinstance(path, str):
+            return table
+        if instead := without_counterpart(path):
+            self.parts.instead[name] = table
+            self.parts.became[here] = instead
+            what = f"[{name}] {last(table)} calls code that is written for the published implementation"
+            self.document.error(what, *here, hint=f"{instead}; {GUIDE}")
+            return None
+        ours = class_of(table)
+        if ours is None:
+            return table
+        if ours.ours == "Dashboard":
+            for other, became in self.parts.became.items():
+                if became.startswith('class = "Dashboard"'):
+                    self.parts.became[here] = f"the dashboard, [{other[0]}], shows this too"
+                    return None
+        self.parts.became[here] = f'class = "{ours.ours}"{ours.why and "; "}{ours.why}'
+        settings = {key: value for key, value in table.items() if key not in ours.settings or key in WIRE_KEYS}
+        for key in filter(ours.settings.__contains__, table):
+            self._put(settings, ours.settings[key], (name, key), {**table, **_wires_of(written)})
+        return {**settings, "class": ours.ours}
+
+    def drop_rescanners(self, ours: dict[str, Settings]) -> None:
+        """Leave out a rescanner where no scheduler says what is to be scanned again."""
+        if any(table.get("class") == "DriftCompensatedScheduler" for table in ours.values()):
+            return
+        for name in [name for name in ours if self.parts.became.get((name, "class")) == 'class = "Rescanner"']:
+            del ours[name]
+            why = "left out: there is no drift scheduler that would say what to scan again"
+            self.parts.became[name, "class"] = why
+
+    def _put(self, settings: Settings, setting: PublishedSetting, here: tuple[str, str], table: Table) -> None:
+        value = table[here[1]]
+        try:
+            becomes = setting.becomes(self.channels.get(value, value) if here[1] == "channel_id" else value, table)
+            for name, one in becomes.items():
+                put(settings, name, one)
+        except (AfspmError, TypeError, ValueError) as error:
+            what, hint = (error.what, error.hint) if isinstance(error, AfspmError) else (str(error), "")
+            self.document.error(f"[{here[0]}] {here[1]} = {value!r}: {what}", *here, hint=hint)
+            return
+        self.parts.became[here] = ", ".join(f"{name} = {toml(one)}" for name, one in becomes.items()) or setting.why

@@ -1,0 +1,37 @@
+"""The form of the files of the published implementation, as the entry point `afspm.forms` names it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from afspm.plugins.published.files import convert
+
+if TYPE_CHECKING:
+    from afspm.experiment.document import Document
+    from afspm.experiment.findings import SourceLocation
+    from afspm.experiment.parts import ExperimentParts
+    from afspm.experiment.resolution import ResolvedExperiment
+    from afspm.experiment.toml_lines import Settings
+
+
+class PublishedForm:
+    """See `experiment.forms.FileForm`."""
+
+    def convert(self, tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
+        """Return the components of a file as ours."""
+        return convert(tables, parts, document)
+
+    def explained(self, resolved: ResolvedExperiment) -> list[tuple[SourceLocation, str, str]]:
+        """Return for each line of the file where it is, what it sets, and what has become of it."""
+        from afspm.plugins.published.short_form import explained  # not needed to run a file
+
+        return explained(resolved)
+
+    def short(self, resolved: ResolvedExperiment) -> str:
+        """Return the experiment in the short form."""
+        from afspm.plugins.published.short_form import short
+
+        return short(resolved)
+
+
+FORM: Final = PublishedForm()
