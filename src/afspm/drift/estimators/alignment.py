@@ -32,6 +32,10 @@ ALL: Index = np.arange(COUNT, dtype=np.intp)
 ROUNDS = 4
 SETTLED_PX = 1e-3
 DIGITS = 1e-6  # of products of columns of 32 bits
+LEAST_CURVATURE = 0.4
+"""The least curvature H'QJ, as a share of H'QH, in any direction. On the worst pairs (one bar in view) it is a fifth to
+two fifths: most of H'QH is noise there, and a fit that took it for the surface was up to five times too certain of
+stretch. With 0.2 hard pairs get worse, since the share itself is then hardly known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +48,7 @@ class Believed:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Where it has come to, and the equations there, per block of the image and over the variance of the noise.
+    """The end of the iteration, and the equations there, per block of the image and over the variance of the noise.
 
     Attributes:
         theta: (COUNT,), see `WarpedPair`.
@@ -57,6 +61,19 @@ class Fit:
     curvature: Array
     spread: Array
     slope: Array
+
+    def information(self, believed: Believed) -> tuple[Array, Array]:
+        """Return the information M' S^-1 M of the slope on theta, and its product with the theta of the images alone.
+
+        M is the curvature and S the covariance of the slope (Godambe, Ann. Math. Stat. 31, 1208, 1960). M alone would
+        count the noise in H as a surface where M is less than S.
+        """
+        curvature = self.curvature.sum(axis=0)
+        # S alone is singular in small overlaps; a hundredth of the prior matters only where the images know less
+        spread = _symmetric(self.spread.sum(axis=0)) + 0.01 * believed.precision
+        back = np.linalg.solve(spread, curvature)
+        found = _symmetric(curvature.T @ back)
+        return found, found @ self.theta + back.T @ believed.precision @ (self.theta - believed.mean)
 
 
 def least_squares(pair: WarpedPair, theta: Array, believed: Believed, free: Index, steps: int) -> Array:
@@ -94,6 +111,8 @@ def _round(pair: WarpedPair, theta: Array, believed: Believed, seen_through: Fin
     slope changes by is H'QJ with a J without noise. The noise in both is taken from their product.
     """
     one, two, known = pair.warped(theta)
+    if not known.any():  # where a small overlap tells next to nothing, a step may lead out of it
+        raise Unusable("without a displacement that fits")
     mean, residual = (one + two) / 2, two - one
     left = without_lines(residual, known, pair.crossing)
     gradient = derivative(mean, 1), derivative(mean, 0)
@@ -133,8 +152,9 @@ def _signal(
 
 
 def _no_less(curvature: Array, spread: Array, precision: Array) -> Array:
-    """H'QJ, but in no direction less than H'QH. They are about the same; where a direction is hardly seen, nothing but
-    noise may be left of the difference that the curvature is.
+    """Return H'QJ, but in no direction less than `LEAST_CURVATURE` of H'QH.
+
+    Where a direction is hardly seen, nothing but noise may be left of the difference that the curvature is.
 
     The precision of the prior is on both sides: in an overlap of some 10 px the nuisances act through one gradient and
     are nearly dependent, and products of columns of 32 bits are not definite any more. Scaled to a diagonal of 1, what
@@ -149,7 +169,7 @@ def _no_less(curvature: Array, spread: Array, precision: Array) -> Array:
     white = size[:, None] * axes / np.sqrt(np.maximum(powers, DIGITS))
     values, turned = np.linalg.eigh(white.T @ (total + precision) @ white)
     vectors = white @ turned
-    missing = np.maximum(1.0 - values, 0.0)
+    missing = np.maximum(LEAST_CURVATURE - values, 0.0)
     raised: Array = curvature + (spread + precision / len(spread)) @ (vectors * missing) @ vectors.T @ least
     return raised
 

@@ -149,9 +149,7 @@ def _fine(
     fit = generalised_least_squares(pair, theta, believed, fine)
     spread, doubt = covariance(fit, believed)
     seen = LinearSeen(fit.theta[LINEAR].reshape(2, 2), spread[LINEAR, LINEAR])
-    curvature = fit.curvature.sum(axis=0)
-    information = (curvature + curvature.T) / (2.0 * DISTRUST)
-    pull = information @ fit.theta + believed.precision @ (fit.theta - believed.mean) / DISTRUST
+    information, pull = (each / DISTRUST for each in fit.information(believed))
     free = believed.precision.copy()
     free[2:SLOPES] = 0.0
     theta, total = averaged(information, pull + free @ believed.mean, free, shear)
