@@ -48,7 +48,7 @@ class Believed:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The end of the iteration, and the equations there, per block of the image and over the variance of the noise.
+    """The end of the iteration and the equations there, per block of rows and over the variance of the noise.
 
     Attributes:
         theta: (COUNT,), see `WarpedPair`.
@@ -77,7 +77,7 @@ class Fit:
 
 
 def least_squares(pair: WarpedPair, theta: Array, believed: Believed, free: Index, steps: int) -> Array:
-    """theta after some steps with plain weights, for the coarse stages."""
+    """Return theta after some steps with plain weights, for the coarse stages."""
     theta = theta.copy()
     for _ in range(steps):
         one, two, known = pair.warped(theta)
@@ -93,8 +93,10 @@ def least_squares(pair: WarpedPair, theta: Array, believed: Believed, free: Inde
 
 
 def generalised_least_squares(pair: WarpedPair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
-    """theta by rows (see `rows`), where scars count less. The gradient, the noise and the weights are estimated anew in
-    each round, from what the one before has left."""
+    """Iterate theta by generalised least squares, in which scars count less.
+
+    Each round estimates gradient, noise and weights again, from the residual of the round before.
+    """
     for _ in range(ROUNDS):
         fit = _round(pair, theta, believed, seen_through)
         moved = np.hypot(*(fit.theta - theta)[:2])
@@ -105,11 +107,9 @@ def generalised_least_squares(pair: WarpedPair, theta: Array, believed: Believed
 
 
 def _round(pair: WarpedPair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
-    """Newton's step to H'Q r + P (theta - mean) = 0; H is the gradient J without most of its noise (see `shrink`).
-
-    Noise moves with theta as the surface does, but so does what of it has been left in H, and both cancel: what the
-    slope changes by is H'QJ with a J without noise. The noise in both is taken from their product.
-    """
+    # A Newton step to H'Q r + P (theta - mean) = 0 with H, the gradient J without most of its noise (see `denoised`).
+    # Noise moves with theta as the surface does, and so does the noise left in H; both cancel. The slope therefore
+    # changes by H'QJ with a J without noise, and the product of both noises is subtracted.
     one, two, known = pair.warped(theta)
     if not known.any():  # where a small overlap tells next to nothing, a step may lead out of it
         raise Unusable("without a displacement that fits")
@@ -137,11 +137,8 @@ def _round(pair: WarpedPair, theta: Array, believed: Believed, seen_through: Fin
 def _signal(
     gradient: Both, noise: Array, known: NDArray[np.bool_], crossing: CrossingLines | None
 ) -> tuple[Both, Both, Both]:
-    """Return the signal of a gradient, what of noise would come through with it, and that noise.
-
-    Rows are flattened first: the step from one row to the next holds the offsets of both, and a patch can't tell them
-    from a feature.
-    """
+    # Rows are flattened first: the step from one row to the next holds the offsets of both, and a patch can't
+    # distinguish them from a feature.
     nx, ny = (without_lines(derivative(noise, axis), known, crossing) for axis in (1, 0))
     flat = [
         flatten_rows(each, known) if crossing is None else without_lines(each, known, crossing) for each in gradient
@@ -152,14 +149,10 @@ def _signal(
 
 
 def _no_less(curvature: Array, spread: Array, precision: Array) -> Array:
-    """Return H'QJ, but in no direction less than `LEAST_CURVATURE` of H'QH.
-
-    Where a direction is hardly seen, nothing but noise may be left of the difference that the curvature is.
-
-    The precision of the prior is on both sides: in an overlap of some 10 px the nuisances act through one gradient and
-    are nearly dependent, and products of columns of 32 bits are not definite any more. Scaled to a diagonal of 1, what
-    is smaller than their digits is nothing.
-    """
+    # H'QJ, but in no direction less than `LEAST_CURVATURE` of H'QH: where a direction is hardly visible, the difference
+    # that the curvature is may be noise alone. The precision of the prior is on both sides: in an overlap of some 10 px
+    # the nuisances act through one gradient and are nearly dependent, and products of columns of 32 bits are not
+    # definite any more. Scaled to a diagonal of 1, values below their digits count as nothing.
     total, whole = (_symmetric(each.sum(axis=0)) for each in (curvature, spread))
     if not (np.isfinite(total).all() and np.isfinite(whole).all()):
         return curvature
@@ -180,7 +173,6 @@ def _symmetric(matrix: Array) -> Array:
 
 
 def _stepped(theta: Array, curvature: Array, slope: Array, believed: Believed, free: Index) -> tuple[Array, float]:
-    """One step of what is free, and how far the shift moved, px."""
     precision = believed.precision[np.ix_(free, free)]
     pull = (believed.precision @ (theta - believed.mean))[free]
     step = -np.linalg.solve(curvature + precision + 1e-9 * np.eye(free.size), slope + pull)
@@ -190,7 +182,7 @@ def _stepped(theta: Array, curvature: Array, slope: Array, believed: Believed, f
 
 
 def _row_weights(residual: Array, known: NDArray[np.bool_]) -> Array:
-    """1 / (1 + 4 (e - 1.3)²) of rows whose root mean square e, over the median of rows, exceeds 1.3: scars."""
+    # 1 / (1 + 4 (e - 1.3)²), e the rms of a row over the median of rows: scars weigh little
     count = known.sum(axis=1)
     rms = np.sqrt((residual**2 * known).sum(axis=1) / np.maximum(count, 1))
     typical = float(np.median(rms[count > 0])) if count.any() else 1.0
@@ -224,7 +216,7 @@ class Doubt:
     leverage: float
 
     def features(self) -> dict[str, float]:
-        """The same as logarithms, 0 for no doubt."""
+        """Return the same as logarithms, 0 for no doubt."""
         return {
             "varied": math.log(max(self.varied, 1.0)),
             "shared": math.log(max(self.shared, 1.0)),
@@ -234,15 +226,18 @@ class Doubt:
 
     @property
     def spread(self) -> float:
-        """The factor by which the covariance is larger, fitted by `python -m benchmarks.drift.fit`. It is never more
-        than for nearly all of the pairs of that fit: what grows as a power means nothing beyond them."""
+        """Factor by which the covariance is larger than its model, fitted by `python -m benchmarks.drift.fit`.
+
+        It is limited to the range of the fit: a power law means nothing beyond it.
+        """
         factor = SPREAD["all"] * math.exp(sum(SPREAD[name] * value for name, value in self.features().items()))
         return min(factor, SPREAD["most"])
 
 
 def covariance(fit: Fit, believed: Believed) -> tuple[Array, Doubt]:
-    """(COUNT, COUNT) of theta: (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ (White, Econometrica 50, 1,
-    1982), times the spread of its doubt.
+    """Return the covariance (COUNT, COUNT) of theta, enlarged by the spread of its doubt, and the doubt.
+
+    It is (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ (White, Econometrica 50, 1, 1982).
 
     What the shift varies by with blocks left out is that of the cluster jackknife (CV3; MacKinnon, Nielsen and Webb,
     J. Appl. Econom. 38, 671, 2023), which allows for noise that is correlated within a block. As few blocks hold most

@@ -97,11 +97,9 @@ class Features:
         return FORMS[self.transform]
 
     def _limit_m(self, reference: DriftScan, scan: DriftScan) -> float:
-        """A share of the resolution, in m: for pixels that are not square the mean of both axes."""
         return self.residual_threshold * float(np.mean([reference.region.size_m, scan.region.size_m]))
 
     def _consensus(self, a: Array, b: Array, limit_m: float, fine_m: float) -> Consensus | None:
-        """The paper's search with its inlier limit, and what that leaves tightened."""
         search = Search(self._form, self.iterations, self.bend_max, np.random.default_rng(self.seed))
         best = search.among(a, b, limit_m)
         if best is None or not self.tighten:
@@ -158,8 +156,7 @@ class Sift(Features):
 def _matched(
     grid: CommonGrid, first: Keypoints, second: Keypoints, prior: Prior | None, *, slack_m: float
 ) -> tuple[Array, Array]:
-    """Positions (n, 2) of the pairs in tip coordinates. With a prior only those that it allows are looked at, and
-    `slack_m` more: what a keypoint may be off, and a small turn moves it."""
+    # with a prior only pairs that it allows are matched, plus `slack_m` for the error of a keypoint and a small turn
     a, b = first.xy_px @ grid.to_m.T + grid.reference_m, second.xy_px @ grid.to_m.T + grid.scan_m
     if prior is None:
         pairs = matched(first.descriptors, second.descriptors)

@@ -115,8 +115,7 @@ class LeastSquares:
 
 
 def _coarse(scene: Scene, expected: ExpectedShift | None) -> tuple[Array, float, float] | None:
-    """theta within a fraction of a pixel, its log-likelihood and that of the best other; on smaller images where they
-    are large."""
+    # theta within a fraction of a pixel, its log-likelihood and the likelihood of the best rival
     small, factor, offset = scene.smaller()
     scaled = None if expected is None else expected.on_smaller(factor, offset)
     best = Scorer(small, scaled).best(candidates(small, scaled))
@@ -139,7 +138,6 @@ def _fine(
     expected: ExpectedShift | None,
     shear: Shear,
 ) -> tuple[Array, Array, LinearSeen, Doubt]:
-    """theta and its covariance, its linear map as the images alone tell it, and doubts."""
     scene = without_spikes(without_scars_of_one(scene, theta), theta)
     fine = FineFilter.of(scene.first.values, scene.second.values)
     values = fine.applied(scene.first.values), fine.applied(scene.second.values)
@@ -159,13 +157,12 @@ def _fine(
 
 
 def _in_m(seen: LinearSeen, grid: CommonGrid) -> LinearSeen:
-    """The same in tip coordinates, by where a feature is in the reference."""
     to_m = np.kron(grid.to_m, np.linalg.inv(grid.to_m).T)
     return LinearSeen(grid.linear_m(_from_reference(seen.linear)), to_m @ seen.covariance @ to_m.T)
 
 
 def _from_reference(linear: Array) -> Array:
-    """A displacement d = A q is given half-way between both scans; here by where a feature is in the reference."""
+    # d = A q is given half-way between both scans; here by the position in the reference
     whole: Array = linear @ np.linalg.inv(np.eye(2) - linear / 2)
     return whole
 
@@ -182,8 +179,6 @@ def _believed(expected: ExpectedShift | None) -> Believed:
 
 @dataclass(frozen=True, eq=False)
 class _Lines:
-    """How the lines of two scans lie on their common grid; see `WarpedPair`."""
-
     own_px: tuple[float, float]
     to_own: Array
 
@@ -201,7 +196,6 @@ class _Lines:
 
 
 def _expected_shear(prior: Prior | None, reference: DriftScan, scan: DriftScan, grid: CommonGrid) -> Shear:
-    """The linear map of pixels that drift makes, where its velocity is known."""
     mean_m, sd = shear_by_drift(prior, reference, scan)
     width, height = np.hypot(*grid.to_m)
     if sd is None:
