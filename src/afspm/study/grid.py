@@ -83,7 +83,6 @@ def _is_in_force(name: str, settings: NightSettings) -> bool:
 
 
 def _value(text: str) -> object:
-    """A value of TOML, or else a text as it is."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:

@@ -112,7 +112,6 @@ def _taken(
 
 
 def _again(settings: NightSettings, place: Region, scan: DriftScan, update: Update) -> str:
-    """Return why a scan is to be taken again; empty if not."""
     scanned = update.after.mapping.to_sample(scan.region)
     if settings.rescan == "paper":
         return too_little_shared(place, scanned, settings.f_rescan)
@@ -123,7 +122,7 @@ def _again(settings: NightSettings, place: Region, scan: DriftScan, update: Upda
 
 
 def _world(settings: NightSettings, seed: int) -> dict[str, object]:
-    """A slow and a fast relaxation, the day, and a random walk, as in section 6 of what was measured."""
+    # a slow and a fast relaxation, the day, and a random walk
     random = np.random.default_rng([seed, 6])
     slow, fast, day = (settings.drift_m * share for share in (1.0, 0.2, 0.1))
     directions = random.uniform(0.0, 2.0 * np.pi, 3)

@@ -88,7 +88,7 @@ def on_cluster(
 def _until_one_dies(
     function: Callable[..., object], left: dict[int, tuple[object, ...]], jobs: int
 ) -> Iterator[TaskOutcome]:
-    """All outcomes that come before a worker dies, which ends them all."""
+    # a dead worker ends all others
     # spawn: the same on all systems, and none of the threads of numpy are copied half
     with ProcessPoolExecutor(min(jobs, len(left)), mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
@@ -102,7 +102,7 @@ def _until_one_dies(
 
 
 def _result(future: Any, index: int) -> TaskOutcome:
-    """Of a task on a cluster; done again, if the worker that had it died before it was fetched."""
+    # a task is done again if its worker died before the result was fetched
     try:
         outcome: TaskOutcome = future.result()
     except Exception as error:  # of the cluster: a task tells its own
@@ -111,7 +111,7 @@ def _result(future: Any, index: int) -> TaskOutcome:
 
 
 def _done(function: Callable[..., object], index: int, task: tuple[object, ...]) -> TaskOutcome:
-    """One task, in whatever process. Errors go back as text: not every exception survives the way."""
+    # errors are returned as text: not every exception can be pickled
     try:
         return TaskOutcome(index, function(*task))
     except Exception as error:

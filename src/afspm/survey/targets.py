@@ -115,18 +115,17 @@ def flattened(scan: Scan, order: int) -> Floats:
 
 
 def _pixel_m(scan: Scan) -> tuple[float, float]:
-    """Return the distance of (rows, columns)."""
     (width, height), (ny, nx) = scan.region.size_m, scan.shape
     return height / max(ny - 1, 1), width / max(nx - 1, 1)
 
 
 def _blur_px(detail_m: float, pixel_m: Sequence[float]) -> list[float]:
-    """Return the blur that leaves details of this size, and takes the grain of a particle's top away."""
+    # leaves details of this size, and takes away the grain of a particle's top
     return [max(_LEAST_BLUR_PX, detail_m / 20.0 / size) for size in pixel_m]
 
 
 def _smooth(flat: Floats, blur_px: Sequence[float]) -> Floats:
-    """Return heights without scars, blurred; what was not measured is ground."""
+    # scars removed, blurred; missing values are ground
     from scipy import ndimage
 
     return np.asarray(ndimage.gaussian_filter(_without_scars(np.nan_to_num(flat)), blur_px))

@@ -112,7 +112,7 @@ def draw_pairs(pairs: Sequence[ScanPair]) -> Figure:
 
 
 def _arrow(ax: Axes, pair: ScanPair) -> None:
-    """From the middle of the frame to where that feature is now; a dot, where that is less than a pixel away."""
+    # from the middle of the frame to the feature's place now; a dot below one pixel
     start = 1e6 * np.asarray(pair.second.region.center_m)
     end = start + 1e6 * pair.moved_m
     if np.hypot(*pair.moved_m) > max(pair.second.pixel_m):
@@ -244,7 +244,7 @@ def draw_features(reference: DriftScan, scan: DriftScan, matches: Matches | None
 
 
 def _in_frame(scan: DriftScan, xy_m: Array) -> Array:
-    """Positions in the frame before it is turned, in which scans are drawn, in µm."""
+    # positions in the frame before it is turned, µm
     angle = scan.region.angle_rad
     cos, sin = np.cos(angle), np.sin(angle)
     center = np.asarray(scan.region.center_m)
@@ -253,7 +253,7 @@ def _in_frame(scan: DriftScan, xy_m: Array) -> Array:
 
 
 def _join(made: Figure, axes: Array, points: list[Array], which: NDArray[np.bool_], colours: str | None) -> None:
-    """Lines between the two scans; of many, some evenly chosen: all would hide the scans."""
+    # of many lines some are drawn, evenly chosen: all would hide the scans
     from matplotlib import colormaps
 
     chosen = np.flatnonzero(which)

@@ -79,7 +79,7 @@ class BankSettings:
 
     @classmethod
     def split(cls, settings: Plain) -> tuple[BankSettings, Choice]:
-        """Those of the bank and those of its references.
+        """Split settings into those of the bank and those of its references.
 
         Raises:
             ConfigError: a name that neither has, or a value without a meaning.
@@ -100,11 +100,11 @@ class BankSettings:
             raise ConfigError(f"the settings of the tracker: {error}") from error
 
     def models(self) -> Models:
-        """How a filter moves for each density, fading and walk."""
+        """Return a model of motion for each density, fading and walk."""
         densities, fadings, walks = np.meshgrid(self.densities_m2_s3, self.fadings_s, self.walks_m2_s, indexing="ij")
         return Models(densities.ravel(), 1.0 / fadings.ravel(), walks.ravel())
 
     def filters(self, first: DriftScan) -> Filters:
-        """All filters with the first scan."""
+        """Return all filters after the first scan."""
         position_sd_m = self.start_px * min(first.pixel_m)
         return Filters.start(self.models(), first.mid_s, position_sd_m, self.start_velocity_sd_m_s, first.duration_s)
