@@ -1,4 +1,4 @@
-"""The overlap of regions and the ratio of resolutions, by which pairs are compared and scans are taken again.
+"""Overlap of regions and ratio of resolutions: the criteria for comparing pairs and for taking a scan again.
 
 Both after the paper, "Overarching workflow": intersection_ratio, sr_norm, f'.
 """

@@ -35,7 +35,7 @@ class DriftRecord:
         center_m: (n, 2) centre of its region.
         drift_m: (n, 2) displacement of the sample under the tip since the start, known after the scan.
         covariance_m2: (n, 2, 2) of it.
-        rate_m_s: (n, 2) velocity of the sample then; after the first scan none is known, which is told as zero.
+        rate_m_s: (n, 2) velocity of the sample then; zero after the first scan, when it is unknown.
         matched: (n,) whether the scan could be registered; where not, the drift is predicted.
         reasons: why it could not, for a person.
         outcomes: how the position of each scan is known.

@@ -24,7 +24,7 @@ class DriftScan:
         region: in tip coordinates. Its first and last pixels lie on its border.
         start_s, end_s: experiment time of its first and last row.
         upwards: whether small y was scanned first; None: not known.
-        key: by which the caller knows it again.
+        key: the caller's name of it.
     """
 
     values: Array

@@ -4,8 +4,8 @@ Rows are taken one after the other, so a feature at `p` when half of the scan is
 x = p + v a e.(x - c), with c the centre, e the direction of the slow axis and a the time per length along it, negative
 when scanning down. Two scans with a_1 and a_2 are then related by 1 + A = (1 - a_2 v e')^-1 (1 - a_1 v e'), that is
 A e = v (a_2 - a_1) / (1 - a_2 v.e): an up frame and a down frame differ by a shear and a stretch of 2 v for each height
-per duration, whatever lies in between. That is a velocity without a lattice's ambiguity; the displacement between
-their middles is another, more precise one.
+per duration, at any drift in between. The shear gives a velocity without a lattice's ambiguity, the displacement
+between their middles a more precise one.
 """
 
 from __future__ import annotations

@@ -63,13 +63,13 @@ class Update:
 
     Attributes:
         key: the scan's.
-        before: what had been predicted for the middle of the scan.
-        after: what is known now of the same time.
+        before: the prediction for the middle of the scan.
+        after: the knowledge of the same time with the scan.
         matched: whether any reference could be registered with it (the first scan of all counts as matched).
         reason: why not, or why only coarsely, for a person.
         lost: the tracker does not know any more where it is.
         registrations: by the key of the reference.
-        forecast: of what is known now.
+        forecast: from the knowledge with the scan.
     """
 
     key: str

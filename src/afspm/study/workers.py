@@ -19,7 +19,7 @@ _MOST_DEATHS = 3  # of workers one after the other while nothing gets done
 
 @dataclass(frozen=True)
 class TaskOutcome:
-    """Of one task.
+    """The result or the error of a task.
 
     Attributes:
         index: which one.
@@ -33,7 +33,7 @@ class TaskOutcome:
 
 
 def processes(asked: int | None, pixels: int) -> int:
-    """Return how many processes to use: as asked for, or one a core where that pays."""
+    """Return the number of processes: `jobs`, or one a core where that pays."""
     if asked is not None:
         return asked
     return 1 if pixels <= _FEW_PIXELS else os.cpu_count() or 1
@@ -64,8 +64,9 @@ def on_cores(
 def on_cluster(
     function: Callable[..., object], tasks: Sequence[tuple[object, ...]], *, address: str
 ) -> Iterator[TaskOutcome]:
-    """As `on_cores`, on the workers of a Dask cluster, which need the same afspm installed. What a worker was at when
-    it died is done by another.
+    """Yield outcomes as `on_cores` does, from the workers of a Dask cluster with the same afspm installed.
+
+    The task of a dead worker goes to another.
 
     Raises:
         ConfigError: `distributed` is not installed, or nobody answers at the address.

@@ -33,7 +33,7 @@ _DIRECTIONS: Final = 72
 
 @dataclass(frozen=True)
 class Target:
-    """A place to look at closer.
+    """A place for a zoom.
 
     Attributes:
         position_m: (x, y), in the frame of the scan that it was found in.
@@ -132,7 +132,7 @@ def _smooth(flat: Floats, blur_px: Sequence[float]) -> Floats:
 
 
 def _above_ground(heights: Floats, widest_px: Sequence[float]) -> Floats:
-    """Return heights above the ground: what is left where everything narrow is cut off."""
+    # the rest after everything narrow is cut off
     from scipy import ndimage
 
     rows, columns = (min(2 * n - 1, max(3, round(px))) for px, n in zip(widest_px, heights.shape, strict=True))
@@ -146,7 +146,7 @@ def _scatter(values: Floats) -> float:
 
 
 def _line_offsets(flat: Floats) -> Floats:
-    """Return the median of each line's ground; 0 where a line shows none."""
+    # the median of each line's ground; 0 for a line without ground
     is_ground = np.abs(flat - np.nanmedian(flat)) < 2.5 * _scatter(flat)
     offsets = np.zeros(len(flat))
     for row, ground in enumerate(is_ground):  # what was not measured is never ground
@@ -155,7 +155,7 @@ def _line_offsets(flat: Floats) -> Floats:
 
 
 def _without_scars(flat: Floats) -> Floats:
-    """Replace long stretches of a line that rise from the ground of the lines on both sides by the mean of those."""
+    # long stretches that rise above the ground of both neighbours become their mean
     from scipy import ndimage
 
     padded = np.pad(flat, ((1, 1), (0, 0)), mode="reflect")
@@ -167,7 +167,7 @@ def _without_scars(flat: Floats) -> Floats:
 
 
 def _tops(above: Floats, scan: Scan, least: float) -> list[Target]:
-    """Return every top: its height, and the centre of what stands above half of it, up to the saddles around it."""
+    # height, and centre of the part above half of it, up to the saddles around
     require_installed("finding particles", "afspm[features]")
     import skimage
 
@@ -190,7 +190,7 @@ def _tops(above: Floats, scan: Scan, least: float) -> list[Target]:
 
 
 def _at(values: Floats, scan: Scan, x_m: Floats, y_m: Floats) -> Floats:
-    """Return values at places, linear between pixels; NaN outside."""
+    # linear between pixels; NaN outside
     from scipy import ndimage
 
     region, (ny, nx) = scan.region, scan.shape

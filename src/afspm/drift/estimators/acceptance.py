@@ -32,8 +32,8 @@ class MatchEvidence:
         overlap: part of the smaller scan.
         sd_px: largest standard deviation of the shift.
         gap: how much likelier, in nats, than any other shift.
-        rival: likelihood of another shift, in nats, over that of the match, both compared with none. Where features of
-            one kind are far apart, one may fit another as well as itself, and only shows less.
+        rival: likelihood of another shift over the match's, in nats, both compared with no match. Where features of one
+            kind are far apart, one may fit another as well as itself, and only shows less.
         agreement: share of the parts of the overlap with features that correlate.
         above_repeats: standard deviations by which the match exceeds the sites about it that look the same. A prior
             singles out one site, whether or not it is the right one. A wrong one is one of many, and as far from their

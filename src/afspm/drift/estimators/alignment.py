@@ -1,4 +1,4 @@
-"""Alignment of two images by Gauss-Newton steps, its covariance, and what an expected shear tells of it."""
+"""Alignment of two images by Gauss-Newton steps, and its covariance."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def _round(pair: WarpedPair, theta: Array, believed: Believed, seen_through: Fin
     # Noise moves with theta as the surface does, and so does the noise left in H; both cancel. The slope therefore
     # changes by H'QJ with a J without noise, and the product of both noises is subtracted.
     one, two, known = pair.warped(theta)
-    if not known.any():  # where a small overlap tells next to nothing, a step may lead out of it
+    if not known.any():  # in a small overlap with next to no features a step may lead out of it
         raise Unusable("without a displacement that fits")
     mean, residual = (one + two) / 2, two - one
     left = without_lines(residual, known, pair.crossing)
@@ -192,7 +192,7 @@ def _row_weights(residual: Array, known: NDArray[np.bool_]) -> Array:
 
 FLOOR_PX = 1e-3
 CLEAR_PX = 0.02  # a shift known better than this is as certain as its model says
-EVEN = 0.2  # a share of what is known that one block of rows may well hold
+EVEN = 0.2  # a share of the information that one block of rows may well hold
 
 
 @dataclass(frozen=True)
@@ -200,14 +200,13 @@ class Doubt:
     """The signs that a shift is less certain than the model of its noise says.
 
     Attributes:
-        varied: its variance with blocks of the image left out in turn, over that of the model.
-        shared: its standard deviation over what it would be if the rest of theta were known: what shear, creep and
-            contrast do to an image that the model knows nothing of goes to the shift as well.
-        sd_px: the largest standard deviation by the model: the weaker the features are beside the noise, the more do
-            disturbances count.
-        leverage: the largest share that one block of rows holds of all that is known of the shift in some direction
-            (MacKinnon, Nielsen and Webb, J. Econometrics 235, 2001, 2023): what disturbs these rows has nothing beside
-            it that it would average with, nor any that would show it.
+        varied: its variance with blocks of the image left out in turn, over the model's.
+        shared: its standard deviation, over the one with the rest of theta known: unmodelled effects of shear, creep
+            and contrast act on the shift as well.
+        sd_px: the largest standard deviation by the model: the weaker the features, the more disturbances count.
+        leverage: the largest share of the information on the shift, in any direction, in one block of rows (MacKinnon,
+            Nielsen and Webb, J. Econometrics 235, 2001, 2023): a disturbance of these rows neither averages out nor
+            shows.
     """
 
     varied: float
@@ -239,7 +238,7 @@ def covariance(fit: Fit, believed: Believed) -> tuple[Array, Doubt]:
 
     It is (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ (White, Econometrica 50, 1, 1982).
 
-    What the shift varies by with blocks left out is that of the cluster jackknife (CV3; MacKinnon, Nielsen and Webb,
+    The variance of the shift with blocks left out is the cluster jackknife (CV3; MacKinnon, Nielsen and Webb,
     J. Appl. Econom. 38, 671, 2023), which allows for noise that is correlated within a block. As few blocks hold most
     of the features it scatters widely, so it is one sign among others.
     """

@@ -16,11 +16,11 @@ from afspm.errors import ConfigError
 Array = NDArray[np.float64]
 
 _SMOOTH_PX = 1.0
-_APART_PX = 4.0  # from the highest peak: what is nearer belongs to it
+_APART_PX = 4.0  # from the highest peak: nearer ones belong to it
 # Edges of the overlap, and what the flattening of rows leaves around high features, pull by about this much at any
 # noise.
 _SYSTEMATIC_PX = 0.2
-_GATE = 25.0  # squared standard deviations from what is expected, beyond which nothing is looked for
+_GATE = 25.0  # chi² from the expectation, the limit of the search
 
 
 @dataclass(frozen=True)

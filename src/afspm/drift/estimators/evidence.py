@@ -1,4 +1,4 @@
-"""The evidence of matched features: can so many agree by chance, and how sure are they of the displacement?
+"""Evidence of matched features: the probability of their agreement by chance, and the uncertainty of the displacement.
 
 Against chance their number counts; against a periodic surface that no other displacement has nearly as many; against
 one feature that happens to look alike that they lie in several places.

@@ -25,7 +25,7 @@ from afspm.errors import ConfigError
 Array = NDArray[np.float64]
 
 FINE_PX = 1.5  # how far a right pair lies from the transform
-GATE = 25.0  # squared standard deviations from what is expected, beyond which nothing is looked for
+GATE = 25.0  # chi² from the expectation, the limit of the search
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Features:
         transform: "translation", "euclidean", "similarity" or "affine".
         residual_threshold: how far a match may lie from the transform to be an inlier of RANSAC, as part of the scan's
             resolution.
-        iterations: of RANSAC: so many times a random few matches are tried. More are needed where fewer are right.
-        tighten: whether the inliers are then reduced to those that lie as near as most of them; the paper does not.
+        iterations: of RANSAC, each with a random few matches. More are needed where fewer are right.
+        tighten: whether the inliers are then reduced to the ones as near as most of them; the paper does not.
         max_keypoints: the strongest are kept.
         false_alarms: how often chance may give a result that is accepted, for scans that have nothing in common.
         inlier_share: of all matches, that must agree.

@@ -1,4 +1,4 @@
-"""Around any estimator: an error of the estimator is told apart from a refusal, reported, and bridged.
+"""A guard around any estimator: distinguishes errors from refusals, reports errors and bridges them.
 
 A refusal says that two scans can't be registered. An error says nothing about the scans: it is reported with the pair,
 and a plain correlation takes the place of the estimate where it is known where to look, and that is sure of its peak.
@@ -32,7 +32,7 @@ class PairFailure:
     Attributes:
         estimator: its name.
         reference, scan: the keys of both scans.
-        reason: the exception, or what is wrong with the result.
+        reason: the exception, or the defect of the result.
     """
 
     estimator: str

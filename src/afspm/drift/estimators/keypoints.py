@@ -58,7 +58,7 @@ def sift(image: Image, count_max: int) -> Keypoints:
     values = _unit(image.values)
     if not _found(detector.detect, values):
         return _none(128)
-    # Only of those that are kept the descriptors are worked out: that is what takes long.
+    # descriptors take the time, so only the kept keypoints get them
     kept = _strongest_blobs(image.values, detector, count_max)
     kept = kept[_known(image, detector.positions[kept], 2.0 * detector.sigmas[kept])]
     for name in ("keypoints", "positions", "sigmas", "scales", "orientations", "octaves"):
@@ -150,7 +150,7 @@ _CELLS = 1 << 20  # of the table of distances that exist at one time: 4 MB
 
 
 def matched(first: Descriptors, second: Descriptors, allowed: Allowed | None = None) -> NDArray[np.intp]:
-    """Pairs of rows each of which is the other's nearest (Euclidean; of two as near the earlier one).
+    """Return pairs of rows that are each other's nearest (Euclidean; of two as near the earlier one).
 
     Args:
         first, second: (n, d) and (m, d).

@@ -94,7 +94,7 @@ BLOCK_ROWS = 8
 BLOCKS = 8  # at least, where rows are few, of two rows or more
 CACHED = 1 << 15  # numbers
 LEAST_NOISE = 1e-8
-"""Variance, where that of the scan is 1: digits end somewhere, and two scans that agree beyond are not known better."""
+"""Least variance, where the scan's is 1: scans have a few digits, and agreement beyond them is no knowledge."""
 HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it the filter leaves little of them
 
 
@@ -159,11 +159,10 @@ def seen(
     """Return Q f free of parabolas: its product with another image g is f'Qg, free of the parabolas of both.
 
     Generalised least squares row by row: each row has a parabola of its own, and noise with a memory. A row is scanned
-    in seconds and the next one begins anew (feedback, flattening by up to the second order, drift of the z piezo), so
-    nothing is assumed of its parabola, and the noise within it is white plus 1/f, with covariance C and Q = C^-1. What
-    is left of a row f after the nuisance B = [1, x, x²] is fitted in this metric, f - B (B'QB)^-1 B'Q f,
-    carries all that the row tells (Frisch and Waugh, Econometrica 1, 387, 1933; Aitken, Proc. R. Soc. Edinb. 55, 42,
-    1936).
+    in seconds and the next one starts again (feedback, flattening by up to the second order, drift of the z piezo), so
+    nothing is assumed of its parabola, and the noise within it is white plus 1/f, with covariance C and Q = C^-1. The
+    rest of a row f after the nuisance B = [1, x, x²] is fitted in this metric, f - B (B'QB)^-1 B'Q f, carries all
+    information of the row (Frisch and Waugh, Econometrica 1, 387, 1933; Aitken, Proc. R. Soc. Edinb. 55, 42, 1936).
 
     Args:
         columns: [y, column, x].
@@ -257,7 +256,7 @@ def noise_metric(residual: Array, known: NDArray[np.bool_], seen_through: FineFi
         return None
     model = np.stack([np.ones(used.sum()), 1.0 / f[used]], axis=1)
     expected = power
-    for _ in range(3):  # the scatter of a spectrum is in proportion to what is expected of it
+    for _ in range(3):  # the scatter of a spectrum is proportional to its expectation
         (a, b), _ = nnls(model / expected[:, None], power / expected)
         expected = np.maximum(model @ (a, b), 1e-3 * power.max())
     if not b * width > 0.3 * a:
@@ -295,7 +294,7 @@ def denoised(image: Array, noise: Array) -> tuple[Array, Array]:
         with a noise of one's own: Ramani, Blu and Unser, IEEE Trans. Image Process. 17, 1540, 2008).
     """
     c, n = _coefficients(image), _coefficients(noise)  # in 32 bits: half the time, and precise enough for a weight
-    # those that don't overlap hold as much, and of many some tell as much of all
+    # patches without overlap hold as much information, and some of many are enough
     apart = max(PATCH_PX // STEP_PX, math.isqrt(c[..., 0].size // ENOUGH_PATCHES))
     power = _typical(n[::apart, ::apart] ** 2) + TINY
     texture = np.maximum(_typical(c[::apart, ::apart] ** 2) - power, 0.0)

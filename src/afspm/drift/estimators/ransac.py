@@ -166,7 +166,7 @@ def consensus(a: Array, b: Array, transform: Transform | None, radius: float) ->
 def tightened(
     a: Array, b: Array, start: Consensus, form: Form, *, least: float, most: float, bend_max: float
 ) -> Consensus:
-    """The fit to those that lie as near as most of the inliers do: three robust standard deviations, from `least` to
+    """Fit to the pairs as near as most inliers: three robust standard deviations, from `least` to
     `most`, until nothing changes. A wide radius lets mismatches in, and each of them pulls."""
     best = start
     for _ in range(10):

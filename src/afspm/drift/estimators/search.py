@@ -58,7 +58,7 @@ class ExpectedShift:
 def shear_by_drift(prior: Prior | None, reference: DriftScan, scan: DriftScan) -> tuple[Array, float | None]:
     """Return the displacement of rows by drift, in m per m along the slow axis, and its standard deviation.
 
-    What drift does while a scan is taken is v t, and t runs along its slow axis. Nothing can be said (zero, None)
+    Drift displaces a row by v t, and t runs along the slow axis. The result is unknown (zero, None)
     unless both scans have been taken alike: the prior knows the difference of two velocities, and that alone.
     """
     nothing = np.zeros(2), None

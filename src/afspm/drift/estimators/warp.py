@@ -22,7 +22,7 @@ class Spline:
     """An image as cubic splines, evaluated at pixel coordinates (x, y) from its centre.
 
     Attributes:
-        known: where it is more than two pixels from what is not known, and not made up; None: everywhere.
+        known: more than two pixels from unknown pixels, and not made up; None: everywhere.
     """
 
     coefficients: Array
@@ -124,7 +124,7 @@ class OverlapBox:
         return np.array([self.x.mean(), self.y.mean()])
 
 
-LEAST_SEARCHED_PX = 32  # of a side of the smaller image: what is left of fewer may be too little to be compared
+LEAST_SEARCHED_PX = 32  # of a side of the smaller image: the rest of a smaller one may be too little to compare
 CREEP_PX = (4.0, 9.0)  # within which what a line starts with is gone to 1/e
 LINEAR = slice(2, 6)  # the linear map among the parameters theta of a pair
 CREEP = slice(6, 6 + 2 * len(CREEP_PX))  # from the left and from the right, for each length
@@ -142,7 +142,7 @@ class WarpedPair:
     as z + h z² / 2: feedback and tip do that to edges).
 
     Attributes:
-        shift_px: (2,) about u: by which the lines of both start at different places of the box.
+        shift_px: (2,) about u: the distance between the starts of the lines of both on the box.
         own_px: width of a pixel of each scan, in pixels of the grid: lines creep for some of their own pixels, which in
             a zoom is next to nothing. 0: its lines don't lie along the rows of the grid, so there is no model.
         crossing: the lines of the second scan, where they don't.

@@ -57,7 +57,7 @@ class DriftRun:
         record: of the tracker.
         parts: one after the other.
         matched: a registration of two scans (indices) that rests on features, if there is one.
-        truth_m: (n, 2) what the drift really was, where somebody knows.
+        truth_m: (n, 2) true drift, where it is known.
     """
 
     scans: Sequence[DriftScan]

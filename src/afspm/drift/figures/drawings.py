@@ -41,7 +41,7 @@ def draw_offsets(
 
     Args:
         record: of the run.
-        truth_m: (n, 2) what the drift really was, from any zero on, where somebody knows.
+        truth_m: (n, 2) true drift from any zero, where it is known.
         switched_on_s: when drift correction was switched on.
     """
     with styled():
@@ -126,7 +126,7 @@ def draw_estimates(record: DriftRecord, *, title: str = "", truth_m: Array | Non
 
     Args:
         record: of the pairs; `matched` says which were accepted.
-        truth_m: (n, 2) what it really was, where somebody knows.
+        truth_m: (n, 2) true values, where known.
     """
     with styled():
         made = figure(WIDTH_IN, 2.6)
@@ -297,7 +297,7 @@ def draw_errors(record: DriftRecord, truth_m: Array, *, switched_on_s: float | N
 
 def _misplaced(ax: Axes, off_m: Array, hours: Array) -> None:
     distance_m = np.hypot(*off_m.T)
-    distance_m[distance_m == 0.0] = np.nan  # that of the first scan has no place on a logarithmic axis
+    distance_m[distance_m == 0.0] = np.nan  # the zero of the first scan has no place on a logarithmic axis
     ax.semilogy(hours, distance_m * 1e9, "o-", color="black", markersize=2.5, linewidth=0.6)
     ax.set_ylabel("position error of the scan / nm")
 

@@ -61,25 +61,25 @@ class BankState:
 class BankTracker:
     """Filters that each expect drift to move differently, weighted by how well they foresaw it.
 
-    A scan is registered with several earlier ones: with an anchor, the scan that first showed its part of the sample,
-    for as long as it can be recognised, and with recent ones. Each result is a measurement of the difference of two
-    positions, and the positions of all scans that are kept are part of the filters' state, so what is known of each
-    stays consistent and nothing is counted twice. Positions are those at the middle of a scan; where the overlap lies
-    elsewhere, the time that its rows were taken at counts.
+    A scan is registered with several earlier ones: with recent ones, and with an anchor, the scan that first showed its
+    part of the sample, for as long as that can be recognised. Each result measures the difference of two positions. The
+    positions of all stored scans are part of the filters' state, so they stay consistent and nothing is counted twice.
+    A position holds for the middle of a scan; where the overlap lies elsewhere, the time of its rows counts.
 
-    A result far from all that was expected is believed only if that of the next scan is too. A scan that nothing could
-    be registered with is adrift: kept where it was predicted, but it proves nothing, and neither do those that are
-    known by it alone; how they lie to each other is still followed. Several scans in a row without a place of their own
-    mean that all of them may lie anywhere: it is lost, as it is when one has no place while the standard deviation of
-    its position is more than half of what a scan may be misplaced and still be compared. It then looks everywhere, and
-    is found again when a scan has a place; those adrift are then put right with it. A scan that can be compared with
-    none, a zoom too fine for the overview, begins a row of its own. A zoom is looked for in an overview only where it
-    is expected, and is not lost because the overview does not show it clearly: a particle looks like the next.
+    A result far from every prediction is believed only if the next scan confirms it. A scan that matches no other is
+    adrift: it is stored at its predicted place, and proves nothing; neither do scans that match only scans adrift.
+    Their places relative to each other are still followed. After several such scans in a row the tracker is lost, as it
+    is after one if the standard deviation of its position exceeds half of the misplacement at which scans can still be
+    compared. A lost tracker searches everywhere. The first scan with a place ends that, and corrects the scans adrift.
+
+    A scan that can be compared with no other, such as a zoom too fine for the overview, starts a series of its own. A
+    zoom is searched in an overview only where it is expected, and the tracker is not lost because an overview does not
+    show it clearly: one particle looks like the next.
 
     With the transform "similarity", scans are straightened before all that: see `Similarity`.
 
     Args:
-        estimator: gets what is expected as prior.
+        estimator: gets the prediction as prior.
         settings: fields of `BankSettings` and `Choice`.
 
     Raises:
@@ -161,7 +161,7 @@ class BankTracker:
         """Note that the controller moves tip coordinates with a velocity (2,) from a time on.
 
         Raises:
-            InvalidValue: before the middle of the newest scan: its position has been told already.
+            InvalidValue: before the middle of the newest scan: its position has been published already.
         """
         state = self._state
         if state.newest_s is not None and time_s < state.newest_s:

@@ -2,8 +2,8 @@
 
 The state of each is (x, y, v_x, v_y), the displacement of the sample and its velocity, followed by four of the same for
 each scan that is kept: the displacement at which it shows the sample, and the velocity during it. These stay correlated
-with each other and with the drift, so a scan that is compared many times is not taken for many, and what is learned
-later counts (as landmarks in simultaneous localisation and mapping: Smith, Self and Cheeseman 1990).
+with each other and with the drift, so a scan that is compared many times does not count as many, and later knowledge
+counts (as landmarks in simultaneous localisation and mapping: Smith, Self and Cheeseman 1990).
 """
 
 from __future__ import annotations

@@ -23,8 +23,8 @@ class ReferenceScan:
 
     Attributes:
         compensated_m_s: (2,) velocity with which tip coordinates followed the sample then.
-        anchor: it stands for its part of the sample from now on.
-        adrift: it could not be compared with any that was not, so where it is was predicted and not seen.
+        anchor: whether it stands for its part of the sample.
+        adrift: no scan with a place matched it, so its place is a prediction.
         refusals: how often in a row it could not be registered while another one could.
         used: number of the scan that was last registered with it.
     """

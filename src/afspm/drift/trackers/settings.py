@@ -28,8 +28,8 @@ class BankSettings:
         fadings_s: after which a velocity is gone to 1/e; inf for one that stays.
         walks_m2_s: variance that positions gain in a second besides. There is a filter for each density, fading and
             walk.
-        jitter_m: standard deviation of the position of a scan that no registration sees.
-        start_velocity_sd_m_s: what may be before anything is known.
+        jitter_m: standard deviation of a scan's position that no registration can measure.
+        start_velocity_sd_m_s: standard deviation of the velocity at the start.
         start_px: standard deviation of where the sample is found in the first scan, in its pixels.
         forget: share of the logarithm of the weights of the filters that is kept from one scan to the next.
         rarest: least weight of a filter, beside the largest.
@@ -37,8 +37,8 @@ class BankSettings:
             to each of its scans.
         widening: of the covariance of an expected displacement, where the estimator is told to search.
         doubt: chi2 above which a result is not believed before the next scan says so too.
-        second_looks: references that are searched without an expectation where none was found where it was expected.
-        lost_after: scans in a row that should have matched something and did not.
+        second_looks: references that are searched without a prediction after none was found with it.
+        lost_after: scans in a row that should have matched and did not.
         transform: "translation"; or "similarity": rotation and scale are estimated as well.
         linear_walk_per_s: variance that the angle (rad) and the logarithm of the scale gain in a second.
     """
