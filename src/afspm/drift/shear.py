@@ -114,7 +114,10 @@ def velocity_by_shear(reference: DriftScan, scan: DriftScan, found: Registration
         return None
     height_m = min(reference.region.size_m[1], scan.region.size_m[1])
     covariance = found.covariance_m2 * (12.0 * (_SAFETY / (height_m * difference)) ** 2)
-    return slope / shrunk, covariance
+    velocity = slope / shrunk
+    # some controllers count the time of the last row, others do not: durations are known to one row
+    rows = min(reference.values.shape[0], scan.values.shape[0])
+    return velocity, covariance + float(velocity @ velocity) / rows**2 * np.eye(2)
 
 
 def velocity_from_up_down(up: DriftScan, down: DriftScan, estimator: Estimator) -> DriftVelocity:
