@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.drift.estimators.acceptance import MatchEvidence, above_repeats, agreement
+from afspm.drift.estimators.acceptance import WRONG_AT_MOST, MatchEvidence, above_repeats, agreement
 from afspm.drift.estimators.alignment import (
     COARSE,
     FLOOR_PX,
@@ -19,7 +19,6 @@ from afspm.drift.estimators.alignment import (
     generalised_least_squares,
     least_squares,
 )
-from afspm.drift.estimators.coefficients import WRONG_AT_MOST
 from afspm.drift.estimators.images import CommonGrid, Unusable, onto_common_grid, prepare
 from afspm.drift.estimators.noise import CrossingLines, FineFilter, without_lines
 from afspm.drift.estimators.nuisances import CREEP_SD_PX, Shear, averaged
