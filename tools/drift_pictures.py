@@ -106,7 +106,7 @@ def _correlation(ax: Axes, first: DriftScan, second: DriftScan) -> None:
     row, column = np.unravel_index(int(np.argmax(cut)), cut.shape)
     at = (np.array([column, row]) - reach) * first.pixel_m[0] * NM
     ax.plot(*at, "o", markersize=9, markerfacecolor="none", markeredgecolor=ORANGE)
-    ax.set(xlabel="shift in x / nm", ylabel="shift in y / nm", title="how alike, at every shift")
+    ax.set(xlabel="shift in x / nm", ylabel="shift in y / nm", title="correlation at every shift")
 
 
 def _difference(first: DriftScan, second: DriftScan, moved_px: Array) -> Array:
@@ -171,7 +171,7 @@ def shear() -> Figure:
             letter(ax, name)
         nm_min = np.array((*v, *velocity)) * 60e9
         made.suptitle(
-            f"velocity told by the two frames ({nm_min[0]:.1f}, {nm_min[1]:.1f}) nm/min; "
+            f"velocity from both frames ({nm_min[0]:.1f}, {nm_min[1]:.1f}) nm/min; "
             f"true ({nm_min[2]:.1f}, {nm_min[3]:.1f}) nm/min",
             size=7,
         )

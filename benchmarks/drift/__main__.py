@@ -31,7 +31,7 @@ from benchmarks.drift.parts import Plan
 from benchmarks.drift.workers import done
 from benchmarks.rows import Row
 
-PARTS = ("tracks", "sizes", "accuracy", "false_acceptance", "unseen", "independent")  # the longest jobs first
+PARTS = ("tracks", "sizes", "accuracy", "unseen", "independent")  # the longest jobs first
 RESULT = Path("build/bench-drift.json")
 NAMES = entry_points.names(entry_points.ESTIMATORS)
 

@@ -93,7 +93,6 @@ CONDITIONS: dict[str, Condition] = {
     "hard": Condition(**_HARD),  # type: ignore[arg-type]
     "dtip": Condition(**_REAL, second_tip_px=2.5),  # type: ignore[arg-type]
     "null": Condition(**_REAL, elsewhere=True),  # type: ignore[arg-type]
-    "nullh": Condition(**_HARD, elsewhere=True),  # type: ignore[arg-type]
 }
 
 

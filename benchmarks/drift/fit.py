@@ -41,8 +41,6 @@ MORE_SEEDS = (30_000, 40_000)  # of stampers alone: how well they are known is t
 RIDGE = 1.0
 KEPT = Path("build")
 COEFFICIENTS = Path(acceptance.__file__).with_name("coefficients.py")
-THRESHOLDS = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15)
-WRONG_SHARE = 0.0035  # of accepted ones, at most: on others it is half as many again, and 0.5 % is wanted
 DOUBTS = ("varied", "shared", "unclear", "leverage")
 COVERED = 0.96  # of right matches, by the ellipses of 95 %: on others it will be less
 DOMAIN = 0.99  # of accepted right matches are within the largest spread
@@ -117,8 +115,8 @@ def evidence(outcome: Outcome) -> MatchEvidence | None:
 
 
 def fitted(outcomes: Sequence[Outcome]) -> str:
-    """The module of coefficients: a logistic regression with a ridge, by features of unit variance; the most that a
-    match may be wrong by; and the spread of the ellipses, with which the former have been found."""
+    """Return the module of coefficients: a logistic regression with a ridge, by features of unit variance, and the
+    spread of the ellipses."""
     found = [(one, each) for one in outcomes if (each := evidence(one)) is not None]
     wrong = np.array([one.failed for one, _ in found], dtype=np.float64)
     accepted = np.array([one.accepted for one, _ in found])
@@ -130,8 +128,7 @@ def fitted(outcomes: Sequence[Outcome]) -> str:
         scale = np.maximum(x.std(axis=0), 1e-9)  # what none of the pairs tells apart weighs nothing
         weights = _logistic((x - right) / scale, wrong)
         probability = 1.0 / (1.0 + np.exp(-weights[0] - (x - right) / scale @ weights[1:]))
-        most = _threshold(probability, wrong)
-        accepted = probability <= most
+        accepted = probability <= acceptance.WRONG_AT_MOST
     names = list(features[0])
     return "\n".join([
         '"""Coefficients of the default estimator. Written by `python -m benchmarks.drift.fit`.',
@@ -147,9 +144,6 @@ def fitted(outcomes: Sequence[Outcome]) -> str:
         "",
         *_table("RIGHT", names, right),
         '"""The median of right matches."""',
-        "",
-        f"WRONG_AT_MOST = {most}",
-        f'"""The largest probability with which at most {WRONG_SHARE:.2%} of those accepted were wrong."""',
         "",
         *_table("SPREAD", list(spread), list(spread.values())),
         '"""By which covariances are larger than their model says, see `Doubt`."""',
@@ -172,11 +166,6 @@ def _log_spread(outcome: Outcome, spread: Mapping[str, float]) -> float:
     return min(found, math.log(spread["most"]))
 
 
-def _threshold(probability: Array, wrong: Array) -> float:
-    fitting = [at for at in THRESHOLDS if wrong[probability <= at].sum() <= WRONG_SHARE * (probability <= at).sum()]
-    return max(fitting, default=min(THRESHOLDS))
-
-
 def _spread(right: Sequence[Outcome]) -> dict[str, float]:
     """By how much errors of accepted right matches exceed their model, so that ellipses of 95 % hold `COVERED` of them
     whatever the doubt: linear quantile regression (Koenker and Bassett, Econometrica 46, 33, 1978)."""
@@ -186,7 +175,9 @@ def _spread(right: Sequence[Outcome]) -> dict[str, float]:
     cost = np.concatenate([np.zeros(2 * free), np.full(count, COVERED), np.full(count, 1.0 - COVERED)])
     parts: list[Any] = [columns, -columns, sparse.eye(count), -sparse.eye(count)]
     equal: Any = sparse.hstack(parts)
-    found = linprog(cost, A_eq=equal, b_eq=log_chi2, bounds=(0.0, None)).x
+    # a sign of doubt never makes an ellipse smaller, as chance would have it in few pairs
+    limits = [(0.0, None)] * (free + 1) + [(0.0, 0.0)] * len(DOUBTS) + [(0.0, None)] * (2 * count)
+    found = linprog(cost, A_eq=equal, b_eq=log_chi2, bounds=limits).x
     assert found is not None, "there is always a solution"
     best = found[:free] - found[free : 2 * free]
     most = math.exp(np.quantile(columns @ best, DOMAIN))

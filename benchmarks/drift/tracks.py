@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from afspm.drift.estimators import DEFAULT, estimator, unguarded
+from afspm.drift.estimators import unguarded
 from afspm.drift.trackers import tracker
 from afspm.drift.tracking import Tracker
 from benchmarks.drift.families import Half
@@ -96,10 +96,7 @@ class Track:
         if self.scheme in (ORACLE, FIRST_ORDER):
             return tracker({"class": kind, **({"compared": 1} if kind == "bank" else {})}, Oracle(night.drift))
         settings = {"compared": LONG_REFERENCES} if self.scheme == LONG else {}
-        return tracker(
-            {"class": kind, **settings},
-            unguarded(self.estimator) if self.estimator == DEFAULT else estimator(self.estimator),
-        )
+        return tracker({"class": kind, **settings}, unguarded(self.estimator))
 
 
 def jobs(plan: Plan) -> list[Track]:

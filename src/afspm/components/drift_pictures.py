@@ -26,7 +26,7 @@ _ALBUM = "afspm.drift.figures.album"
 
 @dataclass(frozen=True)
 class TabledScan:
-    """A scan of the table: its file, and whether components were given sample coordinates when it was told."""
+    """A scan of the table: its file, and whether components had sample coordinates at its time."""
 
     file: str
     correcting: bool
@@ -41,7 +41,7 @@ def parts(told: Sequence[TabledScan]) -> list[tuple[str, int, int]]:
 
 
 class _AsSaved(Sequence["DriftScan"]):
-    """Scans that are read whenever they are asked for."""
+    # scans are read at each access: a night's worth may not fit into memory
 
     def __init__(self, told: Sequence[TabledScan], read: Callable[[TabledScan], DriftScan]) -> None:
         self._told, self._read = told, read

@@ -49,7 +49,7 @@ class DriftTable(Component):
 
 
 def drift_row(message: Any) -> list[str]:
-    """A DriftMapping as a row."""
+    """Return a DriftMapping as a row."""
     time_ns = message.timestamp.ToNanoseconds()
     drift_x, drift_y = drift_at(np.array(message.matrix).reshape(2, 3), message.center)
     xx, xy, _, yy = message.covariance or (math.nan,) * 4  # of a scan before anything was known

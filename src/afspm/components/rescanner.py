@@ -25,7 +25,7 @@ _IN_WORDS = {
 
 
 class Rescanner(Component):
-    """Waits to be asked by a `DriftRescan`, and takes the region again, or in the other direction, or a wider one.
+    """Takes a region again on a `DriftRescan`: as it was, in the other direction, or wider.
 
     Meanwhile thermal-drift is flagged, so that nobody else scans. It tries a few times. A scan that still lies too far
     off is then told, and the experiment goes on; where the sample is not found again a person is needed, for which it
@@ -95,7 +95,7 @@ class Rescanner(Component):
             self.scope.clear(self.problem)
 
     def _take(self, message: Any, parameters: ScanParameters, told: Events) -> bool:
-        """Scan until it is as it was asked for. What was changed for that is set back."""
+        # until the scan is as requested; changed settings are then restored
         region, shape = parameters.region, parameters.shape
         assert isinstance(region, Region)
         assert shape is None or isinstance(shape, tuple)
@@ -116,18 +116,16 @@ class Rescanner(Component):
             self._put_back()
 
     def _turn(self, message: Any) -> None:
-        """Set the direction that is wanted."""
         if message.HasField("upwards"):
             self._note_before(_BEFORE, str(self.scope.get(names.SCAN_DIRECTION)))
             self.scope.set(names.SCAN_DIRECTION, names.UP if message.upwards else names.DOWN)
 
     def _note_before(self, name: str, value: object) -> None:
-        """Keep what was set before until it is put back, also by a life after a kill."""
+        # the settings are saved, so that a life after a kill restores them, too
         self.memory.setdefault(name, value)
         self.memory.save()
 
     def _put_back(self) -> None:
-        """Undo what was changed to scan again: the next scan may take what it finds."""
         if (direction := self.memory.get(_BEFORE)) is not None:
             self.scope.set(names.SCAN_DIRECTION, direction)
             self.memory.pop(_BEFORE)
@@ -137,7 +135,7 @@ class Rescanner(Component):
         self.memory.save()
 
     def _put_back_at_last(self) -> None:
-        """Undo it where control was lost before that: another component has cleared the drift."""
+        # control was lost before the settings were restored: another component has cleared the drift
         if _BEFORE not in self.memory and _FRAME_BEFORE not in self.memory:
             return
         try:
@@ -147,7 +145,7 @@ class Rescanner(Component):
             self.log.warning("direction and region of the scans before could not be set again: %s", error.what)
 
     def _search(self, region: Region, shape: Pixels, times: int) -> None:
-        """Scan a wider region, or the widest that the limits and the scanner allow."""
+        # a wider region, at most the widest that limits and scanner allow
         for fewer in range(times, -1, -1):
             wider, pixels = self._wider(region, shape, fewer)
             try:
@@ -176,7 +174,7 @@ class Rescanner(Component):
             self.log.warning("the region of the scans before could not be set again: %s", refused.reason)
 
     def _is_as_asked(self, kind: int, told: Events) -> bool:
-        """Return whether the scan succeeded, by the drift mapping that was published right before it."""
+        # by the drift mapping published right before the scan
         mapping = None
         for event in told:
             mapping = event.message
@@ -187,7 +185,6 @@ class Rescanner(Component):
         return bool(mapping.matched and not mapping.lost and (is_enough or not mapping.rescan))
 
     def _forget(self, told: Events) -> None:
-        """Drop the drift mappings of earlier scans."""
         for _ in told:
             pass
 

@@ -178,7 +178,7 @@ class Survey(Component):
                     self.scope.set(name, quantity)
 
     def _targets(self, survey: Scan) -> list[Target]:
-        """Return the targets, in every life the same: a function of the user's may leave some to chance."""
+        # saved, so that they are the same in every life: a user's function may be random
         if "targets" not in self.memory:
             with self.clock.late():
                 found = self.finder.targets(survey)
@@ -191,7 +191,7 @@ class Survey(Component):
         return [Target((x, y), height) for x, y, height in self.memory["targets"]]
 
     def _visit(self, visit: Visit, mappings: Events) -> None:
-        """Take the zoom and the curves of a target; what is refused is noted."""
+        # refusals are recorded
         region = self._closer.region.moved_to(visit.target.position_m)
         try:
             scans = self.scope.scan(region, shape=self._closer.shape, key=f"zoom-{visit.number}")
@@ -212,7 +212,7 @@ class Survey(Component):
     def _position(
         self, visit: Visit, scans: ScanSet, mappings: Events
     ) -> tuple[RegistrationOutcome | None, float | None]:
-        """Return how the position of a zoom is known, by what the scheduler published just before it."""
+        # by the mapping that the scheduler published just before the zoom
         kept = self.memory.setdefault("positions", {})
         files = {scan.filename for scan in scans.values() if scan.filename}
         for event in mappings:
@@ -223,7 +223,7 @@ class Survey(Component):
         return None if outcome is None else RegistrationOutcome(outcome), sd_m
 
     def _center(self, visit: Visit, zoom: Scan) -> XY:
-        """Return where the target lies in its zoom, in every life the same."""
+        # saved, so that it is the same in every life
         centers = self.memory.setdefault("centers", {})
         if str(visit.number) not in centers:
             with self.clock.late():
@@ -241,7 +241,7 @@ class Survey(Component):
         return scans[self.channel]
 
     def _keep(self, record: SurveyRecord) -> None:
-        """Write the table; where that can't be, on a full disk, it is said, and the next target tries again."""
+        # on a full disk the error is logged, and the next target tries again
         with self._outage.trying():
             record.write(Path(self.run_dir) / f"{self.file}.csv")
 
@@ -259,20 +259,19 @@ class Survey(Component):
 
 
 def _fine_enough(wide: Region, closer: Region) -> Pixels:
-    """Return the pixels of a survey in which a zoom is wide enough to be recognised."""
+    # pixels of a survey in which a zoom is wide enough to be recognised
     needed = max(LEAST_ZOOM_PX * large / small for large, small in zip(wide.size_m, closer.size_m, strict=True))
     side = min(max(USUAL_PX, math.ceil((needed + 1) / _STEP_PX) * _STEP_PX), MOST_PX)
     return side, side
 
 
 def _zoom_px(wide: Region, pixels: Pixels, closer: Region) -> float:
-    """Return how many pixels of the survey the shorter side of a zoom is wide."""
+    # survey pixels along the shorter side of a zoom
     sides = zip(closer.size_m, wide.size_m, pixels, strict=True)
     return min(small / large * (n - 1) for small, large, n in sides)
 
 
 def _too_coarse(wide: Region, pixels: Pixels, closer: Region, *, is_given: bool) -> Iterator[ConfigError]:
-    """Yield why a zoom may not be recognised in the survey, where drift is to be followed."""
     if (zoom_px := _zoom_px(wide, pixels, closer)) >= LEAST_ZOOM_PX:
         return
     finer = _fine_enough(wide, closer)

@@ -42,19 +42,19 @@ class Mapping:
 
     @classmethod
     def identity(cls) -> Mapping:
-        """Of the start of an experiment: both coordinate systems are the same."""
+        """Return the mapping at the start: both coordinate systems are the same."""
         return cls(np.eye(3))
 
     @classmethod
     def of(cls, linear: ArrayLike, translation_m: ArrayLike) -> Mapping:
-        """From its 2 x 2 part and its translation."""
+        """Return the mapping of a 2 x 2 part and a translation."""
         matrix = np.eye(3)
         matrix[:2, :2], matrix[:2, 2] = linear, translation_m
         return cls(matrix)
 
     @classmethod
     def of_drift(cls, drift_m: ArrayLike) -> Mapping:
-        """The translation that undoes a displacement of the sample."""
+        """Return the translation that undoes a displacement of the sample."""
         return cls.of(np.eye(2), -np.asarray(drift_m, dtype=np.float64))
 
     @property
@@ -67,31 +67,34 @@ class Mapping:
 
     @cached_property
     def inverse(self) -> Mapping:
-        """From sample to tip coordinates."""
+        """Mapping from sample to tip coordinates."""
         return Mapping(np.vstack([np.linalg.inv(self.matrix)[:2], (0.0, 0.0, 1.0)]))
 
     def __matmul__(self, first: Mapping) -> Mapping:
-        """`first`, then this."""
+        """Return the mapping that applies `first`, then this one."""
         return Mapping(self.matrix @ first.matrix)
 
     def apply(self, xy_m: ArrayLike) -> Array:
-        """Points, shape (..., 2), mapped."""
+        """Map points, shape (..., 2)."""
         mapped: Array = np.asarray(xy_m, dtype=np.float64) @ self.linear.T + self.translation_m
         return mapped
 
     @property
     def angle_rad(self) -> float:
-        """By how much it turns, counter-clockwise: that of the rotation nearest to its 2 x 2 part."""
+        """Angle, counter-clockwise, of the rotation nearest to the 2 x 2 part."""
         (a, b), (c, d) = self.linear
         return math.atan2(c - b, a + d)
 
     @property
     def scale(self) -> float:
-        """By how much it enlarges lengths (square root of the determinant)."""
+        """Enlargement of lengths (square root of the determinant)."""
         return math.sqrt(abs(float(np.linalg.det(self.linear))))
 
     def to_sample(self, region: Region) -> Region:
-        """A region of the tip's coordinates in those of the sample.
+        """Map a region from tip to sample coordinates.
+
+        A rectangle stays a rectangle: its centre is mapped, and it turns and grows by the nearest similarity. Shear is
+        left out, because a microscope scans rectangles.
 
         A rectangle stays one: its centre is mapped, it turns and grows by the nearest similarity, and what shear there
         is besides is left out (a microscope scans rectangles).
@@ -99,7 +102,7 @@ class Mapping:
         return self._mapped(region, Frame.SAMPLE)
 
     def to_tip(self, region: Region) -> Region:
-        """A region of the sample's coordinates in those of the tip; see `to_sample`."""
+        """Map a region from sample to tip coordinates; see `to_sample`."""
         return self.inverse._mapped(region, Frame.TIP)
 
     def _mapped(self, region: Region, frame: Frame) -> Region:
@@ -113,7 +116,8 @@ class Mapping:
 
 
 def unlike_drift(linear: Array) -> str:
-    """Why a finite 2 x 2 part can't be what a sample does between two scans, for a person; empty if it can."""
+    """Return why a finite 2 x 2 part is impossible for a sample between two scans, for a person; empty if it is
+    possible."""
     if np.linalg.det(linear) <= 0.0:
         return f"mirrored or flat: {linear.tolist()}"
     stretches = np.linalg.svd(linear, compute_uv=False)

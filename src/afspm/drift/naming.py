@@ -14,7 +14,7 @@ from afspm.requirements import require
 
 
 def named(what: str, spec: str | PlainMapping, default: str, *arguments: object) -> tuple[object, str]:
-    """Return the part that a user asks for, and its name.
+    """Return the part named by a user's setting, and its name.
 
     Args:
         what: "estimator" or "tracker".
@@ -65,7 +65,7 @@ def _declared(what: str, name: str) -> type[object]:
 
 
 def _check_settings(what: str, name: str, class_: type[object], settings: PlainMapping, given: int) -> None:
-    """Settings are looked at first, so that a typo is told as one."""
+    # settings are checked before the constructor runs, so that a typo gives its own error
     try:
         parameters = list(inspect.signature(class_).parameters.values())[given:]
     except ValueError:  # a class of C code without a signature

@@ -21,13 +21,16 @@ Array = NDArray[np.float64]
 
 
 def followed(scans: Sequence[DriftScan], tracker: Tracker) -> Iterator[Update]:
-    """Yield what the tracker says of each scan, in the order of time."""
+    """Yield the tracker's update of each scan, in the order of time."""
     for scan in scans:
         yield tracker.add(scan)
 
 
 def against_first(record: DriftRecord, scans: Sequence[DriftScan], pairs: Sequence[Registration]) -> DriftRecord:
-    """The displacements from the first scan to each later one, each by itself, as a record.
+    """Return the displacements from the first scan to each later one, each by itself, as a record.
+
+    A registration holds in the middle of the overlap, which was not taken in the middle of either scan. The drift in
+    between is subtracted, with the rates of the tracker.
 
     A registration speaks of the middle of what two scans share, which was not taken in the middle of either: the way
     that the sample went in between is taken off, with the rates of the tracker.
@@ -55,8 +58,7 @@ def against_first(record: DriftRecord, scans: Sequence[DriftScan], pairs: Sequen
 
 
 def spread_pairs(record: DriftRecord, apart_s: float, count: int) -> list[tuple[int, int]]:
-    """Indices of matched scans that are about so far apart in time, spread over the run, for the eye. Of a run that is
-    too short, its ends."""
+    """Return indices of matched scans about `apart_s` apart, spread over the run; of a shorter run its ends."""
     good = np.flatnonzero(record.matched)
     if len(good) < 2:
         return []
@@ -70,7 +72,7 @@ def spread_pairs(record: DriftRecord, apart_s: float, count: int) -> list[tuple[
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """n pictures of one piece of the sample.
+    """Pictures of one piece of the sample.
 
     Attributes:
         values: [scan, y, x]; NaN where nothing was measured.
@@ -85,7 +87,7 @@ class Stack:
     keys: tuple[str, ...]
 
     def write(self, path: Path, *, channel: str = "values", unit: str = "") -> None:
-        """As NetCDF (classic), which xarray opens with its coordinates.
+        """Write NetCDF (classic), which xarray opens with its coordinates.
 
         Raises:
             FileError: it can't be written.
@@ -113,7 +115,10 @@ class Stack:
 
 
 def corrected(scans: Sequence[DriftScan], drift_m: Array, rate_m_s: Array | None = None) -> Stack:
-    """The stack, with the pixels and the angle of the first scan.
+    """Return the stack, with the pixels and the angle of the first scan.
+
+    A scan is taken row after row while the sample moves, so the place of a row on the sample depends on its time. The
+    rate undoes this, in scans whose row direction is known.
 
     A scan is taken row after row while the sample moves on, so where a row lies on the sample depends on its time: this
     is undone with the rate, in scans that say in which direction their rows were taken.
@@ -143,7 +148,7 @@ def corrected(scans: Sequence[DriftScan], drift_m: Array, rate_m_s: Array | None
 
 
 def common_area(scans: Sequence[DriftScan], drift_m: Array) -> tuple[Region, tuple[int, int]]:
-    """The rectangle on the sample, in sample coordinates, that all scans show, and its pixels (ny, nx).
+    """Return the rectangle on the sample that all scans show, in sample coordinates, and its pixels (ny, nx).
 
     Raises:
         InvalidValue: there is none, or not all scans have the same angle.
@@ -167,11 +172,9 @@ def common_area(scans: Sequence[DriftScan], drift_m: Array) -> tuple[Region, tup
 
 
 def _pixels_at(scan: DriftScan, x_m: Array, y_m: Array, rate_m_s: Array) -> tuple[Array, Array]:
-    """Row and column of a scan at which a place of the sample was met, that at mid-scan was at (x, y) under the tip.
-
-    With u along the rows and v across them, from the centre of the frame, the row at v is taken v / v_scan after the
-    middle, and meanwhile the sample goes on with w: v = v_mid + w_v v / v_scan, which is linear in v.
-    """
+    # Row and column at which a scan met a place of the sample that was at (x, y) under the tip at mid-scan. With u
+    # along the rows and v across them, from the centre of the frame, the row at v is taken v / v_scan after the middle,
+    # and meanwhile the sample moves with w: v = v_mid + w_v v / v_scan, which is linear in v.
     (ny, nx), (dx, dy) = scan.values.shape, scan.pixel_m
     cos, sin = math.cos(scan.region.angle_rad), math.sin(scan.region.angle_rad)
     x, y = x_m - scan.region.center_m[0], y_m - scan.region.center_m[1]

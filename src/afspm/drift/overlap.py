@@ -1,4 +1,4 @@
-"""The overlap of regions and the ratio of resolutions, by which pairs are compared and scans are taken again.
+"""Overlap of regions and ratio of resolutions: the criteria for comparing pairs and for taking a scan again.
 
 Both after the paper, "Overarching workflow": intersection_ratio, sr_norm, f'.
 """
@@ -16,7 +16,9 @@ Array = NDArray[np.float64]
 
 
 def intersection_m(first: Region, second: Region) -> Array:
-    """The polygon that two turned rectangles share.
+    """Return the polygon that two turned rectangles share.
+
+    Clips one against each side of the other (Sutherland and Hodgman 1974), which is exact for convex polygons.
 
     Clips one against each side of the other (Sutherland and Hodgman 1974), which is exact for convex ones.
 
@@ -51,8 +53,8 @@ def intersection_ratio(first: Region, second: Region) -> float:
 
 
 def intersection_center_m(first: Region, second: Region) -> Array | None:
-    """The centre of mass (2,) of what two regions share, None where they share nothing. Raises InvalidValue as
-    `intersection_m` does."""
+    """Return the centre of mass (2,) of the shared area, None without one. Raises InvalidValue as `intersection_m`
+    does."""
     polygon = intersection_m(first, second)
     if not len(polygon):
         return None
@@ -64,16 +66,21 @@ def intersection_center_m(first: Region, second: Region) -> Array | None:
 
 
 def overlap_center_m(reference: Region, scan: Region, displacement_m: ArrayLike) -> Array | None:
-    """The middle (2,) of what both have seen if features of the reference are found `displacement_m` further in the
-    scan; in the coordinates of the reference. None where that is nothing. Raises InvalidValue as `intersection_m`."""
+    """Return the middle (2,) of the area that both scans show, in the coordinates of the reference.
+
+    Features of the reference are `displacement_m` further in the scan. None without an overlap. Raises InvalidValue as
+    `intersection_m`.
+    """
     x_m, y_m = np.asarray(displacement_m, dtype=np.float64)
     center = intersection_center_m(_moved(reference, x_m, y_m), scan)
     return None if center is None else center - (x_m, y_m)
 
 
 def overlap_ratio(reference: Region, scan: Region, displacement_m: ArrayLike) -> float:
-    """Return the part of the smaller one that both have seen, 0 to 1, if features of the reference are found
-    `displacement_m` further in the scan. Raises InvalidValue as `intersection_m` does."""
+    """Return the share of the smaller region that both scans show, 0 to 1.
+
+    Features of the reference are `displacement_m` further in the scan. Raises InvalidValue as `intersection_m` does.
+    """
     x_m, y_m = np.asarray(displacement_m, dtype=np.float64)
     return intersection_ratio(_moved(reference, x_m, y_m), scan)
 
@@ -101,7 +108,7 @@ def _moved(region: Region, x_m: float, y_m: float) -> Region:
 
 
 def _clipped(polygon: list[XY], start: XY, end: XY) -> list[XY]:
-    """Return the part of a polygon left of the line from `start` to `end`."""
+    # the part of a polygon left of the line from `start` to `end`
     along_x, along_y = end[0] - start[0], end[1] - start[1]
     left = [along_x * (y - start[1]) - along_y * (x - start[0]) for x, y in polygon]
     kept = []
@@ -123,7 +130,6 @@ def _area(polygon: Array) -> float:
 
 
 def _after(corners: Array) -> Array:
-    """The corner that follows on each."""
     return np.concatenate([corners[1:], corners[:1]])
 
 
@@ -131,7 +137,8 @@ F_RESCAN = 0.75
 
 
 def too_little_shared(asked: Region, scanned: Region, f_rescan: float = F_RESCAN) -> str:
-    """The rule of the paper ("Overarching Workflow"): f' = intersection_ratio(r', r) below f_rescan.
+    """Return why a scan is to be taken again by the paper's rule, f' = intersection_ratio(r', r) below f_rescan; empty
+    if not.
 
     Raises:
         InvalidValue: a region that is not in sample coordinates.
@@ -144,7 +151,10 @@ def too_little_shared(asked: Region, scanned: Region, f_rescan: float = F_RESCAN
 
 
 def too_far_off(asked: Region, scanned: Region, sd_m: float, tolerance_m: float) -> str:
-    """Return why a scan is to be taken again: its furthest corner may be further off than is tolerated.
+    """Return why a scan is to be taken again: its furthest corner may be further off than tolerated; empty if not.
+
+    The paper's rule lets a scan be off by an eighth of its size. Here the user sets the tolerance, and the uncertainty
+    counts: |residual| + 2 sd > tolerance.
 
     The paper's rule lets a scan be off by an eighth of its size. Here the user says how much it may be, and what is
     uncertain counts: |residual| + 2 sd > tolerance.

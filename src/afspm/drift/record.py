@@ -26,7 +26,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class DriftRecord:
-    """n scans in the order of time; positions in tip coordinates.
+    """The drift of n scans in the order of time; positions in tip coordinates.
 
     Attributes:
         keys: the name of each scan.
@@ -34,7 +34,7 @@ class DriftRecord:
         center_m: (n, 2) centre of its region.
         drift_m: (n, 2) displacement of the sample under the tip since the start, known after the scan.
         covariance_m2: (n, 2, 2) of it.
-        rate_m_s: (n, 2) velocity of the sample then; after the first scan none is known, which is told as zero.
+        rate_m_s: (n, 2) velocity of the sample then; zero after the first scan, when it is unknown.
         matched: (n,) whether the scan could be registered; where not, the drift is predicted.
         reasons: why it could not, for a person.
         outcomes: how the position of each scan is known.
@@ -56,11 +56,11 @@ class DriftRecord:
         return len(self.keys)
 
     def __getitem__(self, part: slice) -> DriftRecord:
-        """Some of the scans."""
+        """Return some of the scans."""
         return self.chosen(range(len(self.keys))[part])
 
     def chosen(self, which: Sequence[int]) -> DriftRecord:
-        """Those of some numbers."""
+        """Return the scans of some numbers."""
         at = list(which)
         return DriftRecord(
             tuple(self.keys[k] for k in at), self.time_s[at], self.center_m[at], self.drift_m[at],
@@ -74,12 +74,12 @@ class DriftRecord:
 
     @property
     def sd_m(self) -> Array:
-        """(n, 2) standard deviations of x and y of the drift."""
+        """Standard deviations of x and y of the drift, (n, 2)."""
         return np.sqrt(np.diagonal(self.covariance_m2, axis1=1, axis2=2))
 
     @property
     def rate_then_m_s(self) -> Array:
-        """(n, 2) the velocity during each scan: if none was known after the first, that of the next holds for it."""
+        """Velocity during each scan, (n, 2); the first scan has that of the second if it knows none."""
         rates = self.rate_m_s.copy()
         if len(rates) > 1 and not rates[0].any():
             rates[0] = rates[1]
@@ -87,14 +87,14 @@ class DriftRecord:
 
     @property
     def misplacement_m(self) -> Array:
-        """(n, 2) by how much the features lie elsewhere in a scan than in the first: what correction left over."""
+        """Displacement of the features from their place in the first scan, (n, 2), which correction left over."""
         followed = self.center_m - self.center_m[:1]
         misplaced: Array = self.drift_m - self.drift_m[:1] - followed
         return misplaced
 
     @classmethod
     def of(cls, scans: Sequence[DriftScan], updates: Sequence[Update]) -> DriftRecord:
-        """From what a tracker said of each scan."""
+        """Make the record from a tracker's updates of the scans."""
         after = [update.after for update in updates]
         return cls(
             keys=tuple(scan.key for scan in scans),
@@ -112,7 +112,7 @@ class DriftRecord:
         )
 
     def write(self, path: Path) -> None:
-        """As CSV, in SI units.
+        """Write CSV, in SI units.
 
         Raises:
             FileError: it can't be written.
@@ -135,7 +135,7 @@ class DriftRecord:
 
     @classmethod
     def read(cls, path: Path) -> DriftRecord:
-        """Read what `write` wrote; further columns are left aside.
+        """Read a file that `write` wrote; further columns are ignored.
 
         Raises:
             FileError: missing, or not such a table.

@@ -24,7 +24,7 @@ class DriftScan:
         region: in tip coordinates. Its first and last pixels lie on its border.
         start_s, end_s: experiment time of its first and last row.
         upwards: whether small y was scanned first; None: not known.
-        key: by which the caller knows it again.
+        key: the caller's name of it.
     """
 
     values: Array
@@ -42,7 +42,7 @@ class DriftScan:
 
     @property
     def mid_s(self) -> float:
-        """The time that its position stands for."""
+        """Time for which its position holds."""
         return (self.start_s + self.end_s) / 2
 
     @property
@@ -58,7 +58,7 @@ class DriftScan:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """The displacement that is expected before the scans are looked at.
+    """The expected displacement before the scans are compared.
 
     Attributes:
         mean_m: (2,) expected displacement.
@@ -76,7 +76,7 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Feature pairs, for those who draw them. Positions (n, 2) are (x, y) in tip coordinates, m.
+    """Feature pairs, for drawings. Positions (n, 2) are (x, y) in tip coordinates, m.
 
     Attributes:
         inlier: (n,) whether the estimate rests on the pair.
@@ -89,7 +89,7 @@ class Matches:
 
 @dataclass(frozen=True, eq=False)
 class LinearSeen:
-    """A linear part as the scans alone tell it, where `Registration.linear` may be what is likely.
+    """The linear part from the scans alone; `Registration.linear` may be pulled towards the likely.
 
     Attributes:
         linear: (2, 2).
@@ -102,7 +102,9 @@ class LinearSeen:
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """A feature at `x` of the reference is found at `x + displacement_m + linear @ (x - center_m)` in the scan, both in
+    """The displacement between two scans.
+
+    A feature at `x` of the reference is found at `x + displacement_m + linear @ (x - center_m)` in the scan, both in
     tip coordinates.
 
     Attributes:
@@ -133,7 +135,7 @@ class Registration:
 
     @classmethod
     def refused(cls, reason: str, quality: Table[str, float] | None = None) -> Registration:
-        """Nothing could be estimated."""
+        """Return a result without an estimate."""
         none, unknown = np.full(2, np.nan), np.full((2, 2), np.nan)
         return cls(
             accepted=False,
@@ -164,9 +166,12 @@ class Registration:
 
 
 class Estimator(Protocol):
-    """Registers two scans of the same channel. It keeps nothing from call to call."""
+    """Registers two scans of the same channel. Keeps no state between calls."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
-        """Where the features of `reference` are in `scan`. Never raises for what is in the scans: what can't be
-        registered (nothing measured, constant, no common features, ambiguous) is refused with the reason."""
+        """Return the place of the features of `reference` in `scan`.
+
+        Never raises for the content of scans: pairs that can't be registered (no values, constant, no common features,
+        ambiguous) are refused with the reason.
+        """
         ...

@@ -4,8 +4,8 @@ Rows are taken one after the other, so a feature at `p` when half of the scan is
 x = p + v a e.(x - c), with c the centre, e the direction of the slow axis and a the time per length along it, negative
 when scanning down. Two scans with a_1 and a_2 are then related by 1 + A = (1 - a_2 v e')^-1 (1 - a_1 v e'), that is
 A e = v (a_2 - a_1) / (1 - a_2 v.e): an up frame and a down frame differ by a shear and a stretch of 2 v for each height
-per duration, whatever lies in between. That is a velocity without a lattice's ambiguity; the displacement between
-their middles is another, more precise one.
+per duration, at any drift in between. The shear gives a velocity without a lattice's ambiguity, the displacement
+between their middles a more precise one.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class DriftVelocity:
 
     @classmethod
     def refused(cls, reason: str, time_s: float, registration: Registration | None = None) -> DriftVelocity:
-        """Nothing that may be used."""
+        """Return a result without a velocity."""
         nothing, unknown = np.full(2, np.nan), np.full((2, 2), np.nan)
         return cls(
             accepted=False,
@@ -69,14 +69,13 @@ class DriftVelocity:
 
 
 def slow_axis(scan: DriftScan) -> Array:
-    """(2,) unit vector along which rows follow each other with ascending y, in tip coordinates."""
+    """Return the (2,) unit vector along which rows follow each other with ascending y, in tip coordinates."""
     angle = scan.region.angle_rad
     return np.array([-math.sin(angle), math.cos(angle)])
 
 
 def delay_per_length_s_m(scan: DriftScan) -> float | None:
-    """a: how much later a position that lies further along the slow axis is taken; None where the direction is not
-    known."""
+    """Return a, the delay of a position per length along the slow axis; None if the direction is unknown."""
     if scan.upwards is None:
         return None
     return (1.0 if scan.upwards else -1.0) * scan.duration_s / scan.region.size_m[1]
@@ -89,7 +88,10 @@ def row_delay_s(scan: DriftScan, position_m: Array) -> float | None:
 
 
 def velocity_by_shear(reference: DriftScan, scan: DriftScan, found: Registration) -> tuple[Array, Array] | None:
-    """Velocity (2,) and its covariance from the shear between scans of different directions or speeds.
+    """Return velocity (2,) and covariance from the shear between scans of different directions or speeds.
+
+    Features are assumed to be spread evenly over the image: the slope over a height h is then known to sqrt(12) / h of
+    the uncertainty of the displacement.
 
     Its covariance takes what is in the image as spread evenly over it: a slope over a height h is then known to
     sqrt(12) / h of what the displacement is known to.
@@ -112,11 +114,18 @@ def velocity_by_shear(reference: DriftScan, scan: DriftScan, found: Registration
         return None
     height_m = min(reference.region.size_m[1], scan.region.size_m[1])
     covariance = found.covariance_m2 * (12.0 * (_SAFETY / (height_m * difference)) ** 2)
-    return slope / shrunk, covariance
+    velocity = slope / shrunk
+    # some controllers count the time of the last row, others do not: durations are known to one row
+    rows = min(reference.values.shape[0], scan.values.shape[0])
+    return velocity, covariance + float(velocity @ velocity) / rows**2 * np.eye(2)
 
 
 def velocity_from_up_down(up: DriftScan, down: DriftScan, estimator: Estimator) -> DriftVelocity:
-    """The velocity from an up frame and the down frame after it (or the other way round), of about the same region.
+    """Return the velocity from an up frame and a down frame, in either order, of about the same region.
+
+    Both are first registered freely. If that is refused, or if displacement and shear contradict each other (another
+    site of a lattice, a picture with little shear), the velocity of either route is a guess. Both scans are freed from
+    that drift and registered again with a prior from it, and the remaining displacement and shear must agree.
 
     Registers them freely. If that is refused, or displacement and shear contradict each other (another site of a
     lattice, a picture in which shear hardly shows), what either says is taken as a guess: both scans are freed from
@@ -140,7 +149,6 @@ def velocity_from_up_down(up: DriftScan, down: DriftScan, estimator: Estimator) 
 
 
 def _guesses(first: DriftScan, second: DriftScan, free: Registration) -> list[Array]:
-    """Velocities that the shear and the displacement of a registration mean."""
     sheared = velocity_by_shear(first, second, free)
     if sheared is None:
         return []
@@ -148,7 +156,7 @@ def _guesses(first: DriftScan, second: DriftScan, free: Registration) -> list[Ar
 
 
 def _prior_from(first: DriftScan, second: DriftScan, free: Registration, guess: Array) -> Prior:
-    """The displacement between the middles that a velocity lets expect, as uncertain as the shear."""
+    # as uncertain as the shear
     sheared = velocity_by_shear(first, second, free)
     covariance = np.zeros((2, 2)) if sheared is None else sheared[1]
     between_s = second.mid_s - first.mid_s
@@ -166,11 +174,7 @@ def _freed(scan: DriftScan, velocity_m_s: Array) -> DriftScan:
 
 
 def _combined(first: DriftScan, second: DriftScan, found: Registration, freed_m_s: Array) -> DriftVelocity:
-    """Both routes of a registration, put together if they agree.
-
-    Args:
-        freed_m_s: (2,) the drift that the scans have been freed from.
-    """
+    # Both routes of a registration, combined if they agree. `freed_m_s` is the drift already taken out of the scans.
     time_s = (first.mid_s + second.mid_s) / 2
     sheared = velocity_by_shear(first, second, found)
     if not found.accepted or sheared is None:
@@ -199,7 +203,7 @@ def _combined(first: DriftScan, second: DriftScan, found: Registration, freed_m_
 
 
 def _between_s(first: DriftScan, second: DriftScan, found: Registration) -> float:
-    """From when the first passed the overlap to when the second did."""
+    # from the passage of the overlap in the first scan to that in the second
     there_m = found.center_m + found.displacement_m
     late_s, later_s = row_delay_s(first, found.center_m) or 0.0, row_delay_s(second, there_m) or 0.0
     return second.mid_s + later_s - first.mid_s - late_s

@@ -23,7 +23,7 @@ FORECAST_VERSION = 2
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Where sample coordinates lie at one time.
+    """The mapping to sample coordinates at one time.
 
     Attributes:
         time_s: experiment time.
@@ -46,14 +46,14 @@ class Prediction:
 
 
 class Forecast(Protocol):
-    """A tracker's knowledge, to be asked at other times: small, immutable, JSON-able, without the scans."""
+    """A tracker's knowledge for other times: small, immutable, JSON-able, without the scans."""
 
     def at(self, time_s: float) -> Prediction:
-        """The prediction for any time (before the newest scan too: the estimate for the newest scan, moved back)."""
+        """Return the prediction for any time; before the newest scan it is the estimate of that scan, moved back."""
         ...
 
     def to_dict(self) -> Plain:
-        """As plain JSON, for `forecast_from_dict`."""
+        """Return plain JSON, for `forecast_from_dict`."""
         ...
 
 
@@ -63,13 +63,13 @@ class Update:
 
     Attributes:
         key: the scan's.
-        before: what had been predicted for the middle of the scan.
-        after: what is known now of the same time.
+        before: the prediction for the middle of the scan.
+        after: the knowledge of the same time with the scan.
         matched: whether any reference could be registered with it (the first scan of all counts as matched).
         reason: why not, or why only coarsely, for a person.
         lost: the tracker does not know any more where it is.
         registrations: by the key of the reference.
-        forecast: of what is known now.
+        forecast: from the knowledge with the scan.
     """
 
     key: str
@@ -97,7 +97,7 @@ class Update:
 
 
 def require_newer(scan: DriftScan, newest_s: float | None) -> None:
-    """Refuse a scan out of its turn.
+    """Raise for a scan out of order.
 
     Raises:
         InvalidValue: it is older than the newest one.
@@ -112,17 +112,17 @@ class Tracker(Protocol):
 
     @property
     def forecast(self) -> Forecast:
-        """The knowledge of now."""
+        """Forecast from all scans so far."""
         ...
 
     def add(self, scan: DriftScan) -> Update:
-        """Take a scan in (in the order of time; one that is older than the newest is refused with InvalidValue)."""
+        """Add a scan, in the order of time. Raises InvalidValue for a scan older than the newest."""
         ...
 
     def state(self) -> Plain:
-        """All that must survive a kill: numbers, texts, lists and dicts of JSON, and numpy arrays."""
+        """Return everything that must survive a kill: numbers, texts, lists and dicts of JSON, and numpy arrays."""
         ...
 
     def restore(self, state: PlainMapping) -> None:
-        """Take up what `state` gave."""
+        """Restore a state that `state` returned."""
         ...

@@ -14,7 +14,7 @@ from afspm.study.settings import PARTS, NightSettings
 
 @dataclass(frozen=True)
 class SettingsGrid:
-    """Every combination of the values.
+    """All combinations of the values of some settings.
 
     Attributes:
         values: by name; see `NightSettings.of`. What belongs to a tracker that a combination does not have
@@ -25,7 +25,7 @@ class SettingsGrid:
 
     @classmethod
     def of(cls, given: Sequence[str]) -> SettingsGrid:
-        """From a command line: files ending in .toml, and NAME=VALUE[,VALUE…], which go on top of them.
+        """Read a grid from a command line: files ending in .toml, and NAME=VALUE[,VALUE…], which override them.
 
         Raises:
             ConfigError: not such a text, or wrong TOML. FileError: the file can't be read.
@@ -45,11 +45,11 @@ class SettingsGrid:
 
     @property
     def varied(self) -> tuple[str, ...]:
-        """The names with more than one value."""
+        """Names with more than one value."""
         return tuple(name for name, values in self.values.items() if len(values) > 1)
 
     def settings(self) -> Iterator[tuple[str, NightSettings]]:
-        """Each combination once, and what it is called: what differs between them; the defaults first.
+        """Return each combination once, with the settings that differ as its name; the defaults first.
 
         Raises:
             ConfigError, InvalidValue: as `NightSettings.of`; or what is told to a part that no night has.
@@ -83,7 +83,6 @@ def _is_in_force(name: str, settings: NightSettings) -> bool:
 
 
 def _value(text: str) -> object:
-    """A value of TOML, or else a text as it is."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:

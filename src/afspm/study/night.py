@@ -26,7 +26,7 @@ _95_PERCENT = -2.0 * math.log(0.05)  # of the square of a normal error of two co
 
 @dataclass(frozen=True, eq=False)
 class SimulatedNight:
-    """The outcome of a night. "Misplaced" is how far off its place on the sample a scan was taken.
+    """The outcome of a night. "Misplaced" is the distance of a scan from its place on the sample.
 
     Attributes:
         record: scan by scan, without the second direction of the first one.
@@ -42,13 +42,13 @@ class SimulatedNight:
 
     @property
     def misplaced_m(self) -> Array:
-        """(n,) of each scan."""
+        """Misplacement of each scan, (n,)."""
         off: Array = np.hypot(*(self.truth_m - (self.record.center_m - self.record.center_m[:1])).T)
         return off
 
     @property
     def unknown_m(self) -> Array:
-        """(n, 2) believed minus true drift, after each scan."""
+        """Believed minus true drift after each scan, (n, 2)."""
         return self.record.drift_m - self.record.drift_m[:1] - self.truth_m
 
     def metrics(self) -> dict[str, float]:
@@ -112,7 +112,6 @@ def _taken(
 
 
 def _again(settings: NightSettings, place: Region, scan: DriftScan, update: Update) -> str:
-    """Return why a scan is to be taken again; empty if not."""
     scanned = update.after.mapping.to_sample(scan.region)
     if settings.rescan == "paper":
         return too_little_shared(place, scanned, settings.f_rescan)
@@ -123,7 +122,7 @@ def _again(settings: NightSettings, place: Region, scan: DriftScan, update: Upda
 
 
 def _world(settings: NightSettings, seed: int) -> dict[str, object]:
-    """A slow and a fast relaxation, the day, and a random walk, as in section 6 of what was measured."""
+    # a slow and a fast relaxation, the day, and a random walk
     random = np.random.default_rng([seed, 6])
     slow, fast, day = (settings.drift_m * share for share in (1.0, 0.2, 0.1))
     directions = random.uniform(0.0, 2.0 * np.pi, 3)

@@ -66,8 +66,8 @@ class NightSettings:
 
     @classmethod
     def of(cls, names: Table) -> NightSettings:
-        """From names: those of the fields, and "paper.queue" for what the tracker (estimator) "paper" is told,
-        where that is chosen.
+        """Make settings from names: fields, and "paper.queue" for a setting of the tracker (estimator) "paper" where it
+        is chosen.
 
         Raises:
             ConfigError: unknown names. InvalidValue: values that don't fit each other.

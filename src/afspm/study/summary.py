@@ -35,7 +35,7 @@ class Summary:
 
     @property
     def median(self) -> float:
-        """Of what settings are judged by; infinite without a night."""
+        """Median of the metric of the ranking; infinite without a night."""
         return self.quartiles[BY][1] if self.nights else float("inf")
 
 

@@ -19,7 +19,7 @@ _MOST_DEATHS = 3  # of workers one after the other while nothing gets done
 
 @dataclass(frozen=True)
 class TaskOutcome:
-    """Of one task.
+    """The result or the error of a task.
 
     Attributes:
         index: which one.
@@ -33,7 +33,7 @@ class TaskOutcome:
 
 
 def processes(asked: int | None, pixels: int) -> int:
-    """Return how many processes to use: as asked for, or one a core where that pays."""
+    """Return the number of processes: `jobs`, or one a core where that pays."""
     if asked is not None:
         return asked
     return 1 if pixels <= _FEW_PIXELS else os.cpu_count() or 1
@@ -64,8 +64,9 @@ def on_cores(
 def on_cluster(
     function: Callable[..., object], tasks: Sequence[tuple[object, ...]], *, address: str
 ) -> Iterator[TaskOutcome]:
-    """As `on_cores`, on the workers of a Dask cluster, which need the same afspm installed. What a worker was at when
-    it died is done by another.
+    """Yield outcomes as `on_cores` does, from the workers of a Dask cluster with the same afspm installed.
+
+    The task of a dead worker goes to another.
 
     Raises:
         ConfigError: `distributed` is not installed, or nobody answers at the address.
@@ -88,7 +89,7 @@ def on_cluster(
 def _until_one_dies(
     function: Callable[..., object], left: dict[int, tuple[object, ...]], jobs: int
 ) -> Iterator[TaskOutcome]:
-    """All outcomes that come before a worker dies, which ends them all."""
+    # a dead worker ends all others
     # spawn: the same on all systems, and none of the threads of numpy are copied half
     with ProcessPoolExecutor(min(jobs, len(left)), mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
@@ -102,7 +103,7 @@ def _until_one_dies(
 
 
 def _result(future: Any, index: int) -> TaskOutcome:
-    """Of a task on a cluster; done again, if the worker that had it died before it was fetched."""
+    # a task is done again if its worker died before the result was fetched
     try:
         outcome: TaskOutcome = future.result()
     except Exception as error:  # of the cluster: a task tells its own
@@ -111,7 +112,7 @@ def _result(future: Any, index: int) -> TaskOutcome:
 
 
 def _done(function: Callable[..., object], index: int, task: tuple[object, ...]) -> TaskOutcome:
-    """One task, in whatever process. Errors go back as text: not every exception survives the way."""
+    # errors are returned as text: not every exception can be pickled
     try:
         return TaskOutcome(index, function(*task))
     except Exception as error:

@@ -53,7 +53,7 @@ def draw_survey(record: SurveyRecord, path: str | Path, *, title: str = "", simu
 
 
 class _Picture:
-    """The figure; its parts are placed in inches from the upper left corner."""
+    # parts are placed in inches from the upper left corner
 
     def __init__(self, record: SurveyRecord) -> None:
         self._record = record
@@ -111,7 +111,7 @@ class _Picture:
             self._mark(axes, visit)
 
     def _bar_below(self, scan: Scan, axes: Axes) -> None:
-        """Draw the scale bar of the survey under it, where it hides no target."""
+        # under the survey, where it hides no target
         width, height = _shown_size(scan)
         bar_m = round_length_m(scan.region.size_m[0] / 4.0)
         low = -0.14 / _SURVEY_IN * max(width, height)
@@ -119,7 +119,6 @@ class _Picture:
         axes.text(1e9 * bar_m + 0.02 * width, low, typeset_length(bar_m), size=9, va="center")
 
     def _mark(self, axes: Axes, visit: Visit) -> None:
-        """Draw the outline of a zoom in its place, or a cross, and its number."""
         scan = self._record.survey
         if visit.zoom is None:
             x, y = _within(scan, [visit.center_m])[0]
@@ -175,7 +174,7 @@ class _Picture:
                 axes.plot(x, y, "o", color=colour, markersize=4, markeredgecolor="white", markeredgewidth=0.7)
 
     def _curves(self, axes: Axes, visit: Visit, spectra: Sequence[Spectrum], *, left: bool, low: bool) -> None:
-        """Draw the curves of a target; all are drawn to one scale."""
+        # all curves have one scale
         x_scale, y_scale = (_scale_of([column(curve) for curve in spectra]) for column in (_swept, _shown_of))
         for name, colour in zip(self._record.curves, self._colours(), strict=False):
             if (curve := visit.curves.get(name)) is not None:
@@ -202,7 +201,6 @@ class _Picture:
         return [_CURVES[index % len(_CURVES)] for index in range(len(self._record.curves))]
 
     def _image(self, scan: Scan, values: Floats, colours: Normalize, place: tuple[float, float, float]) -> Axes:
-        """Draw a scan in a square, in the lengths of `_within`."""
         left_in, top_in, side_in = place
         axes = self._axes(left_in, top_in, side_in, side_in)
         axes.set(facecolor=NEUTRAL, xticks=[], yticks=[])
@@ -216,11 +214,6 @@ class _Picture:
     def _colour_bar(
         self, images: Sequence[Floats], scan: Scan, left_in: float, side_in: float
     ) -> tuple[float, Normalize]:
-        """Draw a bar as high as the scan in its square.
-
-        Returns:
-            The factor to the unit that it is labelled with, and the colours of its values.
-        """
         span = shared_range(images)
         low, high = span.low, span.high
         factor, shown = scale(max(abs(low), abs(high)), scan.unit)
@@ -245,7 +238,7 @@ def _shown_size(scan: Scan) -> tuple[float, float]:
 
 
 def _within(scan: Scan, places_m: Sequence[XY] | Floats) -> Floats:
-    """Return places in nm from the lower left corner of a scan, along its sides."""
+    # places in nm from the lower left corner of a scan, along its sides
     region = scan.region
     x, y = (np.asarray(places_m, dtype=np.float64) - region.center_m).T
     cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
@@ -261,7 +254,7 @@ def _swept(curve: Spectrum) -> Variable:
 
 
 def _shown_of(curve: Spectrum) -> Variable:
-    """The variable that is named like the kind of the curve, else the first that is not swept."""
+    # the variable named like the kind of the curve, else the first that is not swept
     index = next((i for i, name in enumerate(curve.names) if name.lower() == curve.kind.lower()), 1)
     index = min(index, len(curve.names) - 1)
     return curve.names[index], curve.units[index], curve.values[:, index]

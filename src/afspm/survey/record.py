@@ -112,7 +112,6 @@ class SurveyRecord:
 
 
 def _within(measured: Scan | Spectrum | None, folder: Path) -> str:
-    """Return the file of a measurement, from a folder if it lies there; empty if there is none."""
     if measured is None or not measured.filename:
         return ""
     file = Path(measured.filename)

@@ -33,7 +33,7 @@ _DIRECTIONS: Final = 72
 
 @dataclass(frozen=True)
 class Target:
-    """A place to look at closer.
+    """A place for a zoom.
 
     Attributes:
         position_m: (x, y), in the frame of the scan that it was found in.
@@ -115,25 +115,24 @@ def flattened(scan: Scan, order: int) -> Floats:
 
 
 def _pixel_m(scan: Scan) -> tuple[float, float]:
-    """Return the distance of (rows, columns)."""
     (width, height), (ny, nx) = scan.region.size_m, scan.shape
     return height / max(ny - 1, 1), width / max(nx - 1, 1)
 
 
 def _blur_px(detail_m: float, pixel_m: Sequence[float]) -> list[float]:
-    """Return the blur that leaves details of this size, and takes the grain of a particle's top away."""
+    # leaves details of this size, and takes away the grain of a particle's top
     return [max(_LEAST_BLUR_PX, detail_m / 20.0 / size) for size in pixel_m]
 
 
 def _smooth(flat: Floats, blur_px: Sequence[float]) -> Floats:
-    """Return heights without scars, blurred; what was not measured is ground."""
+    # scars removed, blurred; missing values are ground
     from scipy import ndimage
 
     return np.asarray(ndimage.gaussian_filter(_without_scars(np.nan_to_num(flat)), blur_px))
 
 
 def _above_ground(heights: Floats, widest_px: Sequence[float]) -> Floats:
-    """Return heights above the ground: what is left where everything narrow is cut off."""
+    # the rest after everything narrow is cut off
     from scipy import ndimage
 
     rows, columns = (min(2 * n - 1, max(3, round(px))) for px, n in zip(widest_px, heights.shape, strict=True))
@@ -147,7 +146,7 @@ def _scatter(values: Floats) -> float:
 
 
 def _line_offsets(flat: Floats) -> Floats:
-    """Return the median of each line's ground; 0 where a line shows none."""
+    # the median of each line's ground; 0 for a line without ground
     is_ground = np.abs(flat - np.nanmedian(flat)) < 2.5 * _scatter(flat)
     offsets = np.zeros(len(flat))
     for row, ground in enumerate(is_ground):  # what was not measured is never ground
@@ -156,7 +155,7 @@ def _line_offsets(flat: Floats) -> Floats:
 
 
 def _without_scars(flat: Floats) -> Floats:
-    """Replace long stretches of a line that rise from the ground of the lines on both sides by the mean of those."""
+    # long stretches that rise above the ground of both neighbours become their mean
     from scipy import ndimage
 
     padded = np.pad(flat, ((1, 1), (0, 0)), mode="reflect")
@@ -168,7 +167,7 @@ def _without_scars(flat: Floats) -> Floats:
 
 
 def _tops(above: Floats, scan: Scan, least: float) -> list[Target]:
-    """Return every top: its height, and the centre of what stands above half of it, up to the saddles around it."""
+    # height, and centre of the part above half of it, up to the saddles around
     require_installed("finding particles", "afspm[features]")
     import skimage
 
@@ -191,7 +190,7 @@ def _tops(above: Floats, scan: Scan, least: float) -> list[Target]:
 
 
 def _at(values: Floats, scan: Scan, x_m: Floats, y_m: Floats) -> Floats:
-    """Return values at places, linear between pixels; NaN outside."""
+    # linear between pixels; NaN outside
     from scipy import ndimage
 
     region, (ny, nx) = scan.region, scan.shape

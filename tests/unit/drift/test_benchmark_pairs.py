@@ -11,6 +11,7 @@ from benchmarks.drift import cuts, families, pairs
 from benchmarks.drift.bounds import bounds, row_precision, unknown_rough
 from benchmarks.drift.conditions import CONDITIONS, Array, flattened, measured
 from benchmarks.drift.pairs import HEIGHT_M, PIXEL_M, Sampling, pair
+from benchmarks.drift.published import PublishedBrief
 from benchmarks.drift.surfaces import OVERSAMPLING, SURFACES, Grid, rough_power
 from benchmarks.drift.trials import PUBLISHED, Cell, Trial
 from scipy import ndimage
@@ -225,3 +226,12 @@ def test_a_pair_cut_from_a_real_image_matches_itself_at_its_truth(monkeypatch: p
     moved = found_at(made.scan, there_m)
     seen = np.isfinite(moved)
     assert np.corrcoef(moved[seen], made.reference.values[seen])[0, 1] > 0.999
+
+
+def test_trial_shows_the_error_of_a_compared_method(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stumble(*_: object) -> None:
+        raise ArithmeticError("no corners")
+
+    monkeypatch.setattr(PublishedBrief, "register", stumble)
+    with pytest.raises(ArithmeticError):  # a guard would have put a plain correlation in its place
+        Trial("real", "rough", "real", 3, (PUBLISHED,), size=64, prior_sd_px=1.5).run()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from afspm.drift.estimators.alignment import Believed, Fit
 from afspm.drift.estimators.images import without_scars
 from afspm.drift.estimators.least_squares import LeastSquares
 from afspm.drift.estimators.noise import denoised
@@ -183,3 +184,15 @@ def test_a_derivative_is_exact_for_short_waves_and_at_borders() -> None:
     found = derivative(np.stack([wave] * 12, axis=1), 0)[8:-8, 3]
     assert found == pytest.approx(2 * np.pi / 5 * np.cos(2 * np.pi * x / 5)[8:-8], abs=0.015)
     assert derivative(np.stack([3.0 * x] * 12), 1) == pytest.approx(3.0)
+
+
+def test_noise_in_the_gradient_is_no_information() -> None:
+    spread, seen = np.diag(np.geomspace(1e4, 1e6, COUNT)), np.full(COUNT, 1.0)
+    seen[2] = 0.5  # of the slope's variance in this direction, half is noise
+    believed = Believed(np.zeros(COUNT), np.eye(COUNT))
+    curvature, theta = spread * seen, np.linspace(0.1, 1.0, COUNT)
+    fit = Fit(theta, curvature[None], spread[None], np.zeros((1, COUNT)))
+    information, pull = fit.information(believed)
+    assert np.diag(information) == pytest.approx(seen**2 * np.diag(spread), rel=1e-4)
+    by_images_alone = theta + np.linalg.solve(curvature, theta)  # the prior has pulled theta towards zero
+    assert pull == pytest.approx(information @ by_images_alone, rel=1e-6)

@@ -105,6 +105,15 @@ def test_both_routes_together_are_better_than_either(*, up_first: bool) -> None:
     assert found.covariance[0, 0] < (0.1 * NM / FRAME_S) ** 2
 
 
+def test_uncertainty_of_the_shear_covers_a_duration_that_counts_the_last_row() -> None:
+    first, second = frames()
+    found = Lattice(VELOCITY, sd_m=1e-3 * NM).register(first, second)
+    sheared = velocity_by_shear(first, second, replace(found, linear=found.linear * 63 / 64))
+    assert sheared is not None
+    off = sheared[0] - VELOCITY
+    assert 0.1 < off @ np.linalg.solve(sheared[1], off) < 4.0
+
+
 def test_the_shear_resolves_a_lattice() -> None:
     """A drift of more than half a lattice constant between the frames, so the nearest site is a wrong one."""
     lattice = Lattice(VELOCITY, spacing_m=30 * NM, sd_m=0.02 * NM)

@@ -21,7 +21,7 @@ DEFAULT = "least-squares"
 
 
 def estimator(spec: str | PlainMapping | Estimator = DEFAULT, report: Report = log_failure) -> Estimator:
-    """Return the estimator that is meant, guarded: its errors are reported, and bridged by a coarse estimate.
+    """Return an estimator by name, guarded: its errors are reported, and bridged by a coarse estimate.
 
     Args:
         spec: a name that a package declares or "module.Name"; a table with that as its `class` and the settings of it
@@ -37,7 +37,7 @@ def estimator(spec: str | PlainMapping | Estimator = DEFAULT, report: Report = l
 
 
 def unguarded(spec: str | PlainMapping | Estimator = DEFAULT) -> Estimator:
-    """Return the estimator that is meant as it is, for tests and benchmarks, where an error has to show.
+    """Return an estimator by name without a guard, for tests and benchmarks, where an error has to show.
 
     Raises:
         ConfigError: as `estimator`.

@@ -22,6 +22,10 @@ PART_PX = 4  # smaller ones hold too little to correlate
 APART_PX = 4  # nearer than this a repetition is the match itself
 FEW = 10  # with fewer repetitions a surface doesn't repeat itself
 MOST_REPEATS = 30.0  # standard deviations: a place of its own
+WRONG_AT_MOST = 0.05
+"""The largest probability of being wrong with which a match is accepted. A choice, not fitted: wrong matches among the
+accepted are too few to count in a fit. Of the families, where a third of the pairs share nothing, 0.6 % of the accepted
+are wrong at this value, nearly all of them stampers without a prior."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +36,8 @@ class MatchEvidence:
         overlap: part of the smaller scan.
         sd_px: largest standard deviation of the shift.
         gap: how much likelier, in nats, than any other shift.
-        rival: likelihood of another shift, in nats, over that of the match, both compared with none. Where features of
-            one kind are far apart, one may fit another as well as itself, and only shows less.
+        rival: likelihood of another shift over the match's, in nats, both compared with no match. Where features of one
+            kind are far apart, one may fit another as well as itself, and only shows less.
         agreement: share of the parts of the overlap with features that correlate.
         above_repeats: standard deviations by which the match exceeds the sites about it that look the same. A prior
             singles out one site, whether or not it is the right one. A wrong one is one of many, and as far from their
@@ -53,7 +57,7 @@ class MatchEvidence:
     searched: float
 
     def features(self) -> dict[str, float]:
-        """The same on scales on which they add up, within what is ever seen of right matches and wrong ones."""
+        """Return the same on scales on which they add up, limited to the range of real matches."""
         return {
             "overlap": math.log(max(self.overlap, 0.05)),
             "sd_px": math.log(min(max(self.sd_px, 1e-3), 10.0)),
@@ -66,13 +70,13 @@ class MatchEvidence:
         }
 
     def objections(self) -> dict[str, float]:
-        """What each piece of evidence adds to the logarithm of the odds that the match is wrong, beside that of a
-        typical right match."""
+        """Return the contribution of each figure to the log odds that the match is wrong, compared with a typical
+        match."""
         return {name: WEIGHTS[name] * (value - RIGHT[name]) for name, value in self.features().items()}
 
     @property
     def wrong(self) -> float:
-        """The probability that the shift is wrong by more than a pixel."""
+        """Probability that the shift is wrong by more than a pixel."""
         odds = INTERCEPT + sum(self.objections().values())
         return 1.0 / (1.0 + math.exp(min(-odds, 700.0)))
 
@@ -98,8 +102,11 @@ _REASONS = {
 
 
 def agreement(one: Array, two: Array, known: Mask) -> float:
-    """Return, of those of up to 8 x 8 parts of two aligned images that have features (twice the power of what a typical
-    part has left), the share that correlates by more than 0.5."""
+    """Return the share of parts with features in which two aligned images correlate by more than 0.5.
+
+    The overlap is divided into up to 8 x 8 parts. A part has features if its power is twice what a typical part has
+    left.
+    """
     n = np.maximum(_sums(known.astype(np.float64)), 1.0)
     a, b = _sums(one * known) / n, _sums(two * known) / n
     aa, bb, ab = (
@@ -111,7 +118,6 @@ def agreement(one: Array, two: Array, known: Mask) -> float:
 
 
 def _sums(values: Array) -> Array:
-    """Over each part."""
     for axis in (0, 1):
         parts = min(max(values.shape[axis] // PART_PX, 2), PARTS)
         values = np.add.reduceat(values, np.arange(parts) * values.shape[axis] // parts, axis=axis)
@@ -119,8 +125,9 @@ def _sums(values: Array) -> Array:
 
 
 def above_repeats(found: Array, overlap: Array, origin: Array) -> float:
-    """By how much the correlation of two aligned images, [y, x] with no shift at the origin, exceeds the mean of those
-    at which the surface repeats itself, in standard deviations of them.
+    """Return how far a match stands out of the sites at which the surface repeats itself, in standard deviations.
+
+    `found` holds the correlation of two aligned images, [y, x] with no shift at `origin`.
 
     These are the peaks at least half as high, where at least half as much overlaps. Coefficients are compared as
     Fisher does, by atanh. Infinite if there are next to no such peaks.

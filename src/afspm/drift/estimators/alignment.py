@@ -1,4 +1,4 @@
-"""Alignment of two images by Gauss-Newton steps, its covariance, and what an expected shear tells of it."""
+"""Alignment of two images by Gauss-Newton steps, and its covariance."""
 
 from __future__ import annotations
 
@@ -32,6 +32,10 @@ ALL: Index = np.arange(COUNT, dtype=np.intp)
 ROUNDS = 4
 SETTLED_PX = 1e-3
 DIGITS = 1e-6  # of products of columns of 32 bits
+LEAST_CURVATURE = 0.4
+"""The least curvature H'QJ, as a share of H'QH, in any direction. On the worst pairs (one bar in view) it is a fifth to
+two fifths: most of H'QH is noise there, and a fit that took it for the surface was up to five times too certain of
+stretch. With 0.2 hard pairs get worse, since the share itself is then hardly known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +48,7 @@ class Believed:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Where it has come to, and the equations there, per block of the image and over the variance of the noise.
+    """The end of the iteration and the equations there, per block of rows and over the variance of the noise.
 
     Attributes:
         theta: (COUNT,), see `WarpedPair`.
@@ -58,9 +62,22 @@ class Fit:
     spread: Array
     slope: Array
 
+    def information(self, believed: Believed) -> tuple[Array, Array]:
+        """Return the information M' S^-1 M of the slope on theta, and its product with the theta of the images alone.
+
+        M is the curvature and S the covariance of the slope (Godambe, Ann. Math. Stat. 31, 1208, 1960). M alone would
+        count the noise in H as a surface where M is less than S.
+        """
+        curvature = self.curvature.sum(axis=0)
+        # S alone is singular in small overlaps; a hundredth of the prior matters only where the images know less
+        spread = _symmetric(self.spread.sum(axis=0)) + 0.01 * believed.precision
+        back = np.linalg.solve(spread, curvature)
+        found = _symmetric(curvature.T @ back)
+        return found, found @ self.theta + back.T @ believed.precision @ (self.theta - believed.mean)
+
 
 def least_squares(pair: WarpedPair, theta: Array, believed: Believed, free: Index, steps: int) -> Array:
-    """theta after some steps with plain weights, for the coarse stages."""
+    """Return theta after some steps with plain weights, for the coarse stages."""
     theta = theta.copy()
     for _ in range(steps):
         one, two, known = pair.warped(theta)
@@ -76,8 +93,10 @@ def least_squares(pair: WarpedPair, theta: Array, believed: Believed, free: Inde
 
 
 def generalised_least_squares(pair: WarpedPair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
-    """theta by rows (see `rows`), where scars count less. The gradient, the noise and the weights are estimated anew in
-    each round, from what the one before has left."""
+    """Iterate theta by generalised least squares, in which scars count less.
+
+    Each round estimates gradient, noise and weights again, from the residual of the round before.
+    """
     for _ in range(ROUNDS):
         fit = _round(pair, theta, believed, seen_through)
         moved = np.hypot(*(fit.theta - theta)[:2])
@@ -88,12 +107,12 @@ def generalised_least_squares(pair: WarpedPair, theta: Array, believed: Believed
 
 
 def _round(pair: WarpedPair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
-    """Newton's step to H'Q r + P (theta - mean) = 0; H is the gradient J without most of its noise (see `shrink`).
-
-    Noise moves with theta as the surface does, but so does what of it has been left in H, and both cancel: what the
-    slope changes by is H'QJ with a J without noise. The noise in both is taken from their product.
-    """
+    # A Newton step to H'Q r + P (theta - mean) = 0 with H, the gradient J without most of its noise (see `denoised`).
+    # Noise moves with theta as the surface does, and so does the noise left in H; both cancel. The slope therefore
+    # changes by H'QJ with a J without noise, and the product of both noises is subtracted.
     one, two, known = pair.warped(theta)
+    if not known.any():  # in a small overlap with next to no features a step may lead out of it
+        raise Unusable("without a displacement that fits")
     mean, residual = (one + two) / 2, two - one
     left = without_lines(residual, known, pair.crossing)
     gradient = derivative(mean, 1), derivative(mean, 0)
@@ -118,11 +137,8 @@ def _round(pair: WarpedPair, theta: Array, believed: Believed, seen_through: Fin
 def _signal(
     gradient: Both, noise: Array, known: NDArray[np.bool_], crossing: CrossingLines | None
 ) -> tuple[Both, Both, Both]:
-    """Return the signal of a gradient, what of noise would come through with it, and that noise.
-
-    Rows are flattened first: the step from one row to the next holds the offsets of both, and a patch can't tell them
-    from a feature.
-    """
+    # Rows are flattened first: the step from one row to the next holds the offsets of both, and a patch can't
+    # distinguish them from a feature.
     nx, ny = (without_lines(derivative(noise, axis), known, crossing) for axis in (1, 0))
     flat = [
         flatten_rows(each, known) if crossing is None else without_lines(each, known, crossing) for each in gradient
@@ -133,13 +149,10 @@ def _signal(
 
 
 def _no_less(curvature: Array, spread: Array, precision: Array) -> Array:
-    """H'QJ, but in no direction less than H'QH. They are about the same; where a direction is hardly seen, nothing but
-    noise may be left of the difference that the curvature is.
-
-    The precision of the prior is on both sides: in an overlap of some 10 px the nuisances act through one gradient and
-    are nearly dependent, and products of columns of 32 bits are not definite any more. Scaled to a diagonal of 1, what
-    is smaller than their digits is nothing.
-    """
+    # H'QJ, but in no direction less than `LEAST_CURVATURE` of H'QH: where a direction is hardly visible, the difference
+    # that the curvature is may be noise alone. The precision of the prior is on both sides: in an overlap of some 10 px
+    # the nuisances act through one gradient and are nearly dependent, and products of columns of 32 bits are not
+    # definite any more. Scaled to a diagonal of 1, values below their digits count as nothing.
     total, whole = (_symmetric(each.sum(axis=0)) for each in (curvature, spread))
     if not (np.isfinite(total).all() and np.isfinite(whole).all()):
         return curvature
@@ -149,7 +162,7 @@ def _no_less(curvature: Array, spread: Array, precision: Array) -> Array:
     white = size[:, None] * axes / np.sqrt(np.maximum(powers, DIGITS))
     values, turned = np.linalg.eigh(white.T @ (total + precision) @ white)
     vectors = white @ turned
-    missing = np.maximum(1.0 - values, 0.0)
+    missing = np.maximum(LEAST_CURVATURE - values, 0.0)
     raised: Array = curvature + (spread + precision / len(spread)) @ (vectors * missing) @ vectors.T @ least
     return raised
 
@@ -160,7 +173,6 @@ def _symmetric(matrix: Array) -> Array:
 
 
 def _stepped(theta: Array, curvature: Array, slope: Array, believed: Believed, free: Index) -> tuple[Array, float]:
-    """One step of what is free, and how far the shift moved, px."""
     precision = believed.precision[np.ix_(free, free)]
     pull = (believed.precision @ (theta - believed.mean))[free]
     step = -np.linalg.solve(curvature + precision + 1e-9 * np.eye(free.size), slope + pull)
@@ -170,7 +182,7 @@ def _stepped(theta: Array, curvature: Array, slope: Array, believed: Believed, f
 
 
 def _row_weights(residual: Array, known: NDArray[np.bool_]) -> Array:
-    """1 / (1 + 4 (e - 1.3)²) of rows whose root mean square e, over the median of rows, exceeds 1.3: scars."""
+    # 1 / (1 + 4 (e - 1.3)²), e the rms of a row over the median of rows: scars weigh little
     count = known.sum(axis=1)
     rms = np.sqrt((residual**2 * known).sum(axis=1) / np.maximum(count, 1))
     typical = float(np.median(rms[count > 0])) if count.any() else 1.0
@@ -180,7 +192,7 @@ def _row_weights(residual: Array, known: NDArray[np.bool_]) -> Array:
 
 FLOOR_PX = 1e-3
 CLEAR_PX = 0.02  # a shift known better than this is as certain as its model says
-EVEN = 0.2  # a share of what is known that one block of rows may well hold
+EVEN = 0.2  # a share of the information that one block of rows may well hold
 
 
 @dataclass(frozen=True)
@@ -188,14 +200,13 @@ class Doubt:
     """The signs that a shift is less certain than the model of its noise says.
 
     Attributes:
-        varied: its variance with blocks of the image left out in turn, over that of the model.
-        shared: its standard deviation over what it would be if the rest of theta were known: what shear, creep and
-            contrast do to an image that the model knows nothing of goes to the shift as well.
-        sd_px: the largest standard deviation by the model: the weaker the features are beside the noise, the more do
-            disturbances count.
-        leverage: the largest share that one block of rows holds of all that is known of the shift in some direction
-            (MacKinnon, Nielsen and Webb, J. Econometrics 235, 2001, 2023): what disturbs these rows has nothing beside
-            it that it would average with, nor any that would show it.
+        varied: its variance with blocks of the image left out in turn, over the model's.
+        shared: its standard deviation, over the one with the rest of theta known: unmodelled effects of shear, creep
+            and contrast act on the shift as well.
+        sd_px: the largest standard deviation by the model: the weaker the features, the more disturbances count.
+        leverage: the largest share of the information on the shift, in any direction, in one block of rows (MacKinnon,
+            Nielsen and Webb, J. Econometrics 235, 2001, 2023): a disturbance of these rows neither averages out nor
+            shows.
     """
 
     varied: float
@@ -204,7 +215,7 @@ class Doubt:
     leverage: float
 
     def features(self) -> dict[str, float]:
-        """The same as logarithms, 0 for no doubt."""
+        """Return the same as logarithms, 0 for no doubt."""
         return {
             "varied": math.log(max(self.varied, 1.0)),
             "shared": math.log(max(self.shared, 1.0)),
@@ -214,17 +225,20 @@ class Doubt:
 
     @property
     def spread(self) -> float:
-        """The factor by which the covariance is larger, fitted by `python -m benchmarks.drift.fit`. It is never more
-        than for nearly all of the pairs of that fit: what grows as a power means nothing beyond them."""
+        """Factor by which the covariance is larger than its model, fitted by `python -m benchmarks.drift.fit`.
+
+        It is limited to the range of the fit: a power law means nothing beyond it.
+        """
         factor = SPREAD["all"] * math.exp(sum(SPREAD[name] * value for name, value in self.features().items()))
         return min(factor, SPREAD["most"])
 
 
 def covariance(fit: Fit, believed: Believed) -> tuple[Array, Doubt]:
-    """(COUNT, COUNT) of theta: (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ (White, Econometrica 50, 1,
-    1982), times the spread of its doubt.
+    """Return the covariance (COUNT, COUNT) of theta, enlarged by the spread of its doubt, and the doubt.
 
-    What the shift varies by with blocks left out is that of the cluster jackknife (CV3; MacKinnon, Nielsen and Webb,
+    It is (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ (White, Econometrica 50, 1, 1982).
+
+    The variance of the shift with blocks left out is the cluster jackknife (CV3; MacKinnon, Nielsen and Webb,
     J. Appl. Econom. 38, 671, 2023), which allows for noise that is correlated within a block. As few blocks hold most
     of the features it scatters widely, so it is one sign among others.
     """

@@ -16,11 +16,11 @@ from afspm.errors import ConfigError
 Array = NDArray[np.float64]
 
 _SMOOTH_PX = 1.0
-_APART_PX = 4.0  # from the highest peak: what is nearer belongs to it
+_APART_PX = 4.0  # from the highest peak: nearer ones belong to it
 # Edges of the overlap, and what the flattening of rows leaves around high features, pull by about this much at any
 # noise.
 _SYSTEMATIC_PX = 0.2
-_GATE = 25.0  # squared standard deviations from what is expected, beyond which nothing is looked for
+_GATE = 25.0  # chi² from the expectation, the limit of the search
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,6 @@ class Correlation:
         return _Peak(shifts[at] + _top(c, at), quality)
 
     def _objection(self, quality: dict[str, float]) -> str:
-        """Why it is not accepted; empty if it is."""
         if quality["correlation"] < self.coefficient:
             return f"the correlation is only {quality['correlation']:.2f}"
         if quality["rival"] > self.rival:
@@ -115,8 +114,6 @@ class Correlation:
 
 @dataclass(frozen=True, eq=False)
 class _Peak:
-    """The best shift (x, y) between the centres, and its figures of merit by name."""
-
     shift_px: Array
     quality: dict[str, float]
 
@@ -132,7 +129,7 @@ def _smooth(image: Image) -> Array:
 
 
 def _deviations(shifts_px: Array, grid: CommonGrid, prior: Prior) -> Array:
-    """Squared standard deviations of shifts (…, 2) from the expected one; half a pixel is what the grid is off."""
+    # half a pixel is added: the grid of shifts is that coarse
     back = np.linalg.inv(grid.to_m)
     inverse = np.linalg.inv(back @ prior.covariance_m2 @ back.T + 0.25 * np.eye(2))
     off = shifts_px - grid.shift_px(prior.mean_m)
@@ -140,7 +137,7 @@ def _deviations(shifts_px: Array, grid: CommonGrid, prior: Prior) -> Array:
 
 
 def _top(c: Array, at: tuple[np.intp, ...]) -> Array:
-    """Return how far (x, y) from a peak the top of the parabola through its neighbours is; at most half a pixel."""
+    # the top of the parabola through a peak and its neighbours, (x, y)
     offset = np.zeros(2)
     for axis, size in enumerate(c.shape):
         if not 0 < at[axis] < size - 1:
@@ -154,8 +151,8 @@ def _top(c: Array, at: tuple[np.intp, ...]) -> Array:
 
 
 def _covariance_px2(first: Image, found: _Peak) -> Array:
-    """Return the covariance: what is not alike as noise against the slopes of the overlap (the Cramér-Rao bound for
-    white noise, times the area over which it was smoothed), and what no noise explains."""
+    # Cramér-Rao bound for white noise of the size of the difference, times the area of the smoothing, plus errors that
+    # no noise explains
     smooth = _smooth(first)
     down, right = np.gradient(smooth)
     slopes = np.stack([right, down])[:, first.known]

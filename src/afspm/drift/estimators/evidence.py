@@ -1,4 +1,4 @@
-"""The evidence of matched features: can so many agree by chance, and how sure are they of the displacement?
+"""Evidence of matched features: the probability of their agreement by chance, and the uncertainty of the displacement.
 
 Against chance their number counts; against a periodic surface that no other displacement has nearly as many; against
 one feature that happens to look alike that they lie in several places.
@@ -38,7 +38,10 @@ _DEVIATIONS_MAX = 25.0  # squared, from what was expected
 
 @dataclass(frozen=True, eq=False)
 class ConsensusEvidence:
-    """All matches, `a` and `b` (n, 2) in tip coordinates, m; which of them agree on what; the common pixel."""
+    """Matched features, and the pairs of them that agree.
+
+    `a` and `b` are (n, 2) in tip coordinates, m; `pixel_m` is the common pixel.
+    """
 
     a: Array
     b: Array
@@ -48,7 +51,7 @@ class ConsensusEvidence:
 
     @property
     def radius_m(self) -> float:
-        """The distance from the transform at which a pair still agrees with it."""
+        """Distance from the transform within which a pair agrees with it."""
         return max(self.consensus.radius, _RADIUS_PX * self.pixel_m)
 
 
@@ -72,7 +75,7 @@ def weighed(
     covariance: Array,
     center: Array,
 ) -> tuple[dict[str, float], str]:
-    """Figures of merit by name, and the reason for which it is not to be accepted (empty: there is none)."""
+    """Return figures of merit by name, and the reason for a refusal (empty: none)."""
     inlier, transform = evidence.consensus.inlier, evidence.consensus.transform
     off = transform(evidence.a[inlier]) - evidence.b[inlier]
     figures = {
@@ -92,7 +95,7 @@ def weighed(
 
 
 def covariance_m2(evidence: ConsensusEvidence, reference: Region, scan: Region, center: Array) -> Array:
-    """Covariance (2, 2) of the displacement at `center`; NaN where the inliers are too few places to tell."""
+    """Return the covariance (2, 2) of the displacement at `center`; NaN if the inliers lie in too few places."""
     inlier = evidence.consensus.inlier
     a, b = evidence.a[inlier], evidence.b[inlier]
     scatter = jackknife_covariance(a, b, _blocks(a, reference), evidence.form, center)
@@ -120,7 +123,7 @@ def _objection(
 
 
 def _log10_false_alarms(evidence: ConsensusEvidence, reference: Region, prior: Prior | None) -> float:
-    """Of matches that see the same feature one counts: they are no independent witnesses."""
+    # matches of one feature are no independent witnesses: one of them counts
     radius_m = evidence.radius_m
     # Two places thrown into the scans lie a given displacement apart with at most this density.
     area_m2 = reference.size_m[0] * reference.size_m[1]
@@ -134,7 +137,6 @@ def _log10_false_alarms(evidence: ConsensusEvidence, reference: Region, prior: P
 
 
 def _second(evidence: ConsensusEvidence, standards: Standards) -> float:
-    """Return how many of the others agree on one other displacement, for each that agrees on the best."""
     transform, radius_m = evidence.consensus.transform, evidence.radius_m
     far = ((transform(evidence.a) - evidence.b) ** 2).sum(axis=1) > (2.0 * radius_m) ** 2
     search = Search(FORMS["translation"], standards.iterations, 1.0, np.random.default_rng(standards.seed))
@@ -143,12 +145,10 @@ def _second(evidence: ConsensusEvidence, standards: Standards) -> float:
 
 
 def _places(points: Array, reach_m: float) -> int:
-    """Return the number of squares of that size that hold points (n, 2)."""
     return len(np.unique(np.floor(points / reach_m).astype(np.int64), axis=0))
 
 
 def _blocks(points: Array, reference: Region) -> NDArray[np.intp]:
-    """In which of 4 x 4 parts of the reference each of the points (n, 2) lies."""
     cos, sin = math.cos(reference.angle_rad), math.sin(reference.angle_rad)
     along = (points - np.array(reference.center_m)) @ np.array([[cos, -sin], [sin, cos]])
     number = np.floor((along / reference.size_m + 0.5) * _BLOCKS).astype(np.intp).clip(0, _BLOCKS - 1)

@@ -25,7 +25,7 @@ from afspm.errors import ConfigError
 Array = NDArray[np.float64]
 
 FINE_PX = 1.5  # how far a right pair lies from the transform
-GATE = 25.0  # squared standard deviations from what is expected, beyond which nothing is looked for
+GATE = 25.0  # chi² from the expectation, the limit of the search
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Features:
         transform: "translation", "euclidean", "similarity" or "affine".
         residual_threshold: how far a match may lie from the transform to be an inlier of RANSAC, as part of the scan's
             resolution.
-        iterations: of RANSAC: so many times a random few matches are tried. More are needed where fewer are right.
-        tighten: whether the inliers are then reduced to those that lie as near as most of them; the paper does not.
+        iterations: of RANSAC, each with a random few matches. More are needed where fewer are right.
+        tighten: whether the inliers are then reduced to the ones as near as most of them; the paper does not.
         max_keypoints: the strongest are kept.
         false_alarms: how often chance may give a result that is accepted, for scans that have nothing in common.
         inlier_share: of all matches, that must agree.
@@ -97,11 +97,9 @@ class Features:
         return FORMS[self.transform]
 
     def _limit_m(self, reference: DriftScan, scan: DriftScan) -> float:
-        """A share of the resolution, in m: for pixels that are not square the mean of both axes."""
         return self.residual_threshold * float(np.mean([reference.region.size_m, scan.region.size_m]))
 
     def _consensus(self, a: Array, b: Array, limit_m: float, fine_m: float) -> Consensus | None:
-        """The paper's search with its inlier limit, and what that leaves tightened."""
         search = Search(self._form, self.iterations, self.bend_max, np.random.default_rng(self.seed))
         best = search.among(a, b, limit_m)
         if best is None or not self.tighten:
@@ -158,8 +156,7 @@ class Sift(Features):
 def _matched(
     grid: CommonGrid, first: Keypoints, second: Keypoints, prior: Prior | None, *, slack_m: float
 ) -> tuple[Array, Array]:
-    """Positions (n, 2) of the pairs in tip coordinates. With a prior only those that it allows are looked at, and
-    `slack_m` more: what a keypoint may be off, and a small turn moves it."""
+    # with a prior only pairs that it allows are matched, plus `slack_m` for the error of a keypoint and a small turn
     a, b = first.xy_px @ grid.to_m.T + grid.reference_m, second.xy_px @ grid.to_m.T + grid.scan_m
     if prior is None:
         pairs = matched(first.descriptors, second.descriptors)

@@ -1,4 +1,4 @@
-"""Around any estimator: an error of the estimator is told apart from a refusal, reported, and bridged.
+"""A guard around any estimator: distinguishes errors from refusals, reports errors and bridges them.
 
 A refusal says that two scans can't be registered. An error says nothing about the scans: it is reported with the pair,
 and a plain correlation takes the place of the estimate where it is known where to look, and that is sure of its peak.
@@ -32,7 +32,7 @@ class PairFailure:
     Attributes:
         estimator: its name.
         reference, scan: the keys of both scans.
-        reason: the exception, or what is wrong with the result.
+        reason: the exception, or the defect of the result.
     """
 
     estimator: str
@@ -46,7 +46,6 @@ class PairFailure:
 
 
 def _file(key: str) -> str:
-    """Return the name of a file without its folder, for keys that are files."""
     return re.split(r"[\\/]", key)[-1] or "a scan"
 
 
@@ -110,7 +109,6 @@ def _copied(scan: DriftScan) -> DriftScan:
 
 
 def _malformed(found: object) -> str:
-    """Return what makes a result unusable; empty for nothing."""
     if not isinstance(found, Registration):
         return f"its result is a {type(found).__name__} instead of a Registration"
     arrays = {
@@ -134,7 +132,6 @@ def _malformed(found: object) -> str:
 
 
 def _malformed_linear(seen: object) -> str:
-    """Return what makes a linear part with its covariance unusable; empty for nothing, and for None."""
     if seen is None:
         return ""
     if not isinstance(seen, LinearSeen):
@@ -150,7 +147,6 @@ def _malformed_linear(seen: object) -> str:
 
 
 def _impossible(found: Registration, reference: DriftScan, scan: DriftScan) -> str:
-    """Why an accepted result of the right form can't be true of any sample; empty if it can."""
     if not found.accepted:
         return ""
     seen = found.linear if found.linear_seen is None else np.asarray(found.linear_seen.linear)

@@ -19,7 +19,7 @@ MOST_SATURATED = 0.6  # of the pixels at exactly the lowest or the highest value
 
 
 class Unusable(Exception):
-    """The scan can't be registered with any other; the text says why."""
+    """A scan that can't be registered with any other; the text is the reason."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ def prepare(values: Array) -> Image:
 
 
 def flatten_rows(values: Array, known: Mask) -> Array:
-    """Minus a straight line in each row, by two rounds of weighted least squares that trust outliers less."""
+    """Subtract a straight line from each row, by two rounds of weighted least squares in which outliers count less."""
     flat = _less_lines(values, known.astype(np.float64))
     for _ in range(2):
         scale = 1.4826 * np.median(np.abs(flat[known]), overwrite_input=True)
@@ -111,15 +111,18 @@ def without_scars(values: Array) -> Array:
 
 
 def levelled(values: Array) -> Array:
-    """An image less the offsets of its rows, by the medians of the steps between them."""
+    """Subtract the offsets of the rows, by the medians of the steps between them."""
     steps = np.median(np.diff(values, axis=0), axis=1)
     level: Array = values - np.concatenate([[0.0], np.cumsum(steps)])[:, None]
     return level
 
 
 def standing_out(level: Array, thick: int) -> tuple[Array, Array, Array]:
-    """Return how far so many rows are all above both of the rows beside them, how far all below, and how far their
-    middle is from the mean of both. Each is an image without the first row and the last ones."""
+    """Return how far `thick` rows are all above both neighbours, how far all below, and how far their middle is from
+    the mean of both.
+
+    Each is an image without the first row and the last ones.
+    """
     count = len(level) - thick - 1
     above, below = level[:count], level[thick + 1 :]
     inside = [level[1 + k : 1 + k + count] for k in range(thick)]
@@ -129,12 +132,12 @@ def standing_out(level: Array, thick: int) -> tuple[Array, Array, Array]:
 
 
 def spread_of(values: Array) -> float:
-    """Standard deviation of a normal distribution, by the median."""
+    """Return the standard deviation of a normal distribution, by the median."""
     return 1.4826 * float(np.median(abs(values - np.median(values))))
 
 
 def scarred(up: Mask, down: Mask, thick: int) -> Mask:
-    """Where there are scars of so many rows, of where they stand out."""
+    """Return where scars of `thick` rows are, from where the rows stand out."""
     there = _mostly(up) | _mostly(down)
     scar = np.zeros((there.shape[0] + thick + 1, there.shape[1]), dtype=bool)
     for k in range(thick):
@@ -143,7 +146,7 @@ def scarred(up: Mask, down: Mask, thick: int) -> Mask:
 
 
 def mended_rows(values: Array, level: Array, scar: Mask) -> Array:
-    """An image with what lies between the rows beside a scar in its place.
+    """Replace scars by a line between the rows beside them.
 
     Args:
         level: the image without the offsets of its rows.
@@ -166,7 +169,6 @@ def mended_rows(values: Array, level: Array, scar: Mask) -> Array:
 
 
 def _mostly(which: Mask) -> Mask:
-    """Where most of the pixels of a row about this one are."""
     from scipy.ndimage import uniform_filter1d
 
     share: Array = uniform_filter1d(which.astype(np.float64), SCAR_PX, axis=1, mode="constant")
@@ -174,7 +176,7 @@ def _mostly(which: Mask) -> Mask:
 
 
 def _unfinished(values: Array) -> Mask:
-    """Rows at the start or the end of a scan that hold one and the same value: it was stopped before them."""
+    # rows at the start or the end with one value throughout: the scan was stopped before them
     same = (values == values[:, :1]).all(axis=1)
     first = np.logical_and.accumulate(same & (values[:, 0] == values[0, 0]))
     last = np.logical_and.accumulate((same & (values[:, 0] == values[-1, 0]))[::-1])[::-1]
@@ -183,7 +185,6 @@ def _unfinished(values: Array) -> Mask:
 
 
 def _filled(values: Array, known: Mask) -> Array:
-    """With the nearest measured value of the column in place of what is missing."""
     if known.all():
         return np.array(values, dtype=np.float64)
     from scipy.ndimage import distance_transform_edt
@@ -194,8 +195,8 @@ def _filled(values: Array, known: Mask) -> Array:
 
 
 def _without_gaps(values: Array, known: Mask) -> tuple[Array, Mask]:
-    """With the mean of the rows beside it in place of a row that is missing alone, and known there: where nothing is,
-    the rows beside it are lost as well, since filters and splines reach across."""
+    # a single missing row becomes the mean of its neighbours: otherwise filters and splines, which reach across, lose
+    # the rows beside it as well
     missing: Mask = ~np.any(known, axis=1)
     alone = 1 + np.flatnonzero(missing[1:-1] & ~missing[:-2] & ~missing[2:])
     if not alone.size:
@@ -207,7 +208,7 @@ def _without_gaps(values: Array, known: Mask) -> tuple[Array, Mask]:
 
 
 def _topography(values: Array, rows: Mask) -> float:
-    """Greatest correlation of rows up to four apart."""
+    # largest correlation of rows up to four apart
     measured = values[rows] - values[rows].mean(axis=1, keepdims=True)
     power = float(np.mean(measured**2))
     return max(abs(float(np.mean(measured[lag:] * measured[:-lag]))) / power for lag in (1, 2, 3, 4))
@@ -215,7 +216,9 @@ def _topography(values: Array, rows: Mask) -> float:
 
 @dataclass(frozen=True, eq=False)
 class CommonGrid:
-    """Pixel coordinates (x, y) count from the centre of each scan, along the axes of the reference.
+    """Two scans on one pixel grid.
+
+    Pixel coordinates (x, y) count from the centre of each scan, along the axes of the reference.
 
     Attributes:
         to_m: (2, 2) from pixels to metres in tip coordinates.
@@ -229,22 +232,22 @@ class CommonGrid:
     scan_m: Array
 
     def shift_px(self, displacement_m: Array) -> Array:
-        """The shift between pixel coordinates that a displacement in tip coordinates makes."""
+        """Convert a displacement in tip coordinates to a shift between pixel coordinates."""
         shift: Array = np.linalg.inv(self.to_m) @ (displacement_m - (self.scan_m - self.reference_m))
         return shift
 
     def displacement_m(self, shift_px: Array) -> Array:
-        """The inverse of `shift_px`."""
+        """Invert `shift_px`."""
         displacement: Array = self.to_m @ shift_px + (self.scan_m - self.reference_m)
         return displacement
 
     def position_m(self, position_px: Array) -> Array:
-        """Tip coordinates of a pixel of the reference."""
+        """Convert a pixel of the reference to tip coordinates."""
         position: Array = self.to_m @ position_px + self.reference_m
         return position
 
     def linear_m(self, linear_px: Array) -> Array:
-        """A linear map of pixel coordinates as one of tip coordinates."""
+        """Convert a linear map of pixel coordinates to tip coordinates."""
         linear: Array = self.to_m @ linear_px @ np.linalg.inv(self.to_m)
         return linear
 
@@ -252,9 +255,9 @@ class CommonGrid:
 def onto_common_grid(
     reference: DriftScan, image1: Image, scan: DriftScan, image2: Image
 ) -> tuple[CommonGrid, Image, Image]:
-    """Both images with the axes of the reference and the coarser pixel of the two.
+    """Resample both images to the axes of the reference and the coarser pixel of the two.
 
-    An image that has them already is left as it is: interpolation costs accuracy.
+    An image that has them already is not touched: interpolation costs accuracy.
     """
     angle = reference.region.angle_rad
     turn = scan.region.angle_rad - angle
@@ -271,11 +274,9 @@ def onto_common_grid(
 
 
 def _resampled(image: Image, step: Array) -> Image:
-    """On the grid whose pixel (x, y) is `step` @ (x, y) pixels of the old, both counted from the centre.
-
-    What is finer than the new pixel is smoothed away first, to the width that a pixel of the new size would have had
-    (a Gaussian of half a pixel); outside of the old image nothing is known.
-    """
+    # On the grid whose pixel (x, y) is `step` @ (x, y) old pixels, both counted from the centre. Details finer than the
+    # new pixel are smoothed away first, to the width that a pixel of the new size would have had (a Gaussian of half a
+    # pixel).
     if np.abs(step - np.eye(2)).max() < 1e-6:
         return image
     from scipy.ndimage import gaussian_filter, map_coordinates

@@ -58,7 +58,7 @@ def sift(image: Image, count_max: int) -> Keypoints:
     values = _unit(image.values)
     if not _found(detector.detect, values):
         return _none(128)
-    # Only of those that are kept the descriptors are worked out: that is what takes long.
+    # descriptors take the time, so only the kept keypoints get them
     kept = _strongest_blobs(image.values, detector, count_max)
     kept = kept[_known(image, detector.positions[kept], 2.0 * detector.sigmas[kept])]
     for name in ("keypoints", "positions", "sigmas", "scales", "orientations", "octaves"):
@@ -84,7 +84,7 @@ def _keypoints(image: Image, rows_columns: np.ndarray, descriptors: Descriptors)
 
 
 def _found(detect: Callable[[Array], None], values: Array) -> bool:
-    """scikit-image raises where it finds nothing."""
+    # scikit-image raises if it finds nothing
     try:
         detect(values)
     except RuntimeError:
@@ -97,20 +97,19 @@ def _none(length: int) -> Keypoints:
 
 
 def _unit(values: Array) -> Array:
-    """Between 0 and 1, which is what thresholds of pictures mean."""
+    # thresholds of scikit-image mean values between 0 and 1
     low, high = float(values.min()), float(values.max())
     return (values - low) / ((high - low) or 1.0)
 
 
 def _signs(bits: np.ndarray) -> Descriptors:
-    """Bits as ±1/2: the squared Euclidean distance is then the number of bits that differ."""
+    # ±1/2: the squared Euclidean distance is then the number of differing bits
     signs: Descriptors = np.where(bits, 0.5, -0.5).astype(np.float32)
     return signs
 
 
 def _known(image: Image, rows_columns: np.ndarray, reach_px: float | np.ndarray) -> NDArray[np.bool_]:
-    """Which of the positions (n, 2) see nothing but measured pixels within their reach: a border pulls at what is
-    found near it."""
+    # a border pulls at keypoints near it, so all pixels within reach must be measured
     away = ndimage.distance_transform_edt(np.pad(image.known, 1))[1:-1, 1:-1]
     at = np.rint(rows_columns).astype(int).clip(0, np.array(image.values.shape) - 1)
     inside: NDArray[np.bool_] = away[at[:, 0], at[:, 1]] > reach_px
@@ -118,7 +117,6 @@ def _known(image: Image, rows_columns: np.ndarray, reach_px: float | np.ndarray)
 
 
 def _sharpened(response: Array, corners: np.ndarray) -> Array:
-    """Positions (row, column) of peaks between the pixels: the tops of parabolas along both axes."""
     padded = np.pad(response, 1, mode="edge")
     row, column = corners[:, 0] + 1, corners[:, 1] + 1
     position = corners.astype(np.float64)
@@ -132,7 +130,6 @@ def _sharpened(response: Array, corners: np.ndarray) -> Array:
 
 
 def _strongest_blobs(values: Array, detector: Any, count_max: int) -> NDArray[np.intp]:
-    """Numbers of the keypoints with the highest contrast: the Laplacian of a Gaussian of about their size, there."""
     count = len(detector.positions)
     if count <= count_max:
         return np.arange(count)
@@ -153,7 +150,7 @@ _CELLS = 1 << 20  # of the table of distances that exist at one time: 4 MB
 
 
 def matched(first: Descriptors, second: Descriptors, allowed: Allowed | None = None) -> NDArray[np.intp]:
-    """Pairs of rows each of which is the other's nearest (Euclidean; of two as near the earlier one).
+    """Return pairs of rows that are each other's nearest (Euclidean; of two as near the earlier one).
 
     Args:
         first, second: (n, d) and (m, d).

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.drift.estimators.acceptance import MatchEvidence, above_repeats, agreement
+from afspm.drift.estimators.acceptance import WRONG_AT_MOST, MatchEvidence, above_repeats, agreement
 from afspm.drift.estimators.alignment import (
     COARSE,
     FLOOR_PX,
@@ -19,7 +19,6 @@ from afspm.drift.estimators.alignment import (
     generalised_least_squares,
     least_squares,
 )
-from afspm.drift.estimators.coefficients import WRONG_AT_MOST
 from afspm.drift.estimators.images import CommonGrid, Unusable, onto_common_grid, prepare
 from afspm.drift.estimators.noise import CrossingLines, FineFilter, without_lines
 from afspm.drift.estimators.nuisances import CREEP_SD_PX, Shear, averaged
@@ -115,8 +114,7 @@ class LeastSquares:
 
 
 def _coarse(scene: Scene, expected: ExpectedShift | None) -> tuple[Array, float, float] | None:
-    """theta within a fraction of a pixel, its log-likelihood and that of the best other; on smaller images where they
-    are large."""
+    # theta within a fraction of a pixel, its log-likelihood and the likelihood of the best rival
     small, factor, offset = scene.smaller()
     scaled = None if expected is None else expected.on_smaller(factor, offset)
     best = Scorer(small, scaled).best(candidates(small, scaled))
@@ -139,7 +137,6 @@ def _fine(
     expected: ExpectedShift | None,
     shear: Shear,
 ) -> tuple[Array, Array, LinearSeen, Doubt]:
-    """theta and its covariance, its linear map as the images alone tell it, and doubts."""
     scene = without_spikes(without_scars_of_one(scene, theta), theta)
     fine = FineFilter.of(scene.first.values, scene.second.values)
     values = fine.applied(scene.first.values), fine.applied(scene.second.values)
@@ -149,9 +146,7 @@ def _fine(
     fit = generalised_least_squares(pair, theta, believed, fine)
     spread, doubt = covariance(fit, believed)
     seen = LinearSeen(fit.theta[LINEAR].reshape(2, 2), spread[LINEAR, LINEAR])
-    curvature = fit.curvature.sum(axis=0)
-    information = (curvature + curvature.T) / (2.0 * DISTRUST)
-    pull = information @ fit.theta + believed.precision @ (fit.theta - believed.mean) / DISTRUST
+    information, pull = (each / DISTRUST for each in fit.information(believed))
     free = believed.precision.copy()
     free[2:SLOPES] = 0.0
     theta, total = averaged(information, pull + free @ believed.mean, free, shear)
@@ -161,13 +156,12 @@ def _fine(
 
 
 def _in_m(seen: LinearSeen, grid: CommonGrid) -> LinearSeen:
-    """The same in tip coordinates, by where a feature is in the reference."""
     to_m = np.kron(grid.to_m, np.linalg.inv(grid.to_m).T)
     return LinearSeen(grid.linear_m(_from_reference(seen.linear)), to_m @ seen.covariance @ to_m.T)
 
 
 def _from_reference(linear: Array) -> Array:
-    """A displacement d = A q is given half-way between both scans; here by where a feature is in the reference."""
+    # d = A q is given half-way between both scans; here by the position in the reference
     whole: Array = linear @ np.linalg.inv(np.eye(2) - linear / 2)
     return whole
 
@@ -184,8 +178,6 @@ def _believed(expected: ExpectedShift | None) -> Believed:
 
 @dataclass(frozen=True, eq=False)
 class _Lines:
-    """How the lines of two scans lie on their common grid; see `WarpedPair`."""
-
     own_px: tuple[float, float]
     to_own: Array
 
@@ -203,7 +195,6 @@ class _Lines:
 
 
 def _expected_shear(prior: Prior | None, reference: DriftScan, scan: DriftScan, grid: CommonGrid) -> Shear:
-    """The linear map of pixels that drift makes, where its velocity is known."""
     mean_m, sd = shear_by_drift(prior, reference, scan)
     width, height = np.hypot(*grid.to_m)
     if sd is None:

@@ -18,7 +18,7 @@ BLUR_PX = 0.45  # takes what interpolation would alias
 
 
 def cosine_frequencies(shape: tuple[int, ...]) -> Array:
-    """Length of the frequency of each coefficient of a cosine transform, cycles per pixel."""
+    """Return the frequency of each coefficient of a cosine transform, cycles per pixel."""
     fy, fx = (np.arange(n) / (2.0 * n) for n in shape)
     length: Array = np.hypot(fy[:, None], fx[None, :])
     return length
@@ -43,7 +43,7 @@ class FineFilter:
 
     @classmethod
     def of(cls, first: Array, second: Array) -> FineFilter:
-        """For two images."""
+        """Estimate the filter from two images."""
         from scipy.fft import dctn
 
         shapes = [first.shape, second.shape]
@@ -59,19 +59,19 @@ class FineFilter:
         return cls((np.arange(power.size) + 0.5) * width, gain)
 
     def at(self, frequency: Array) -> Array:
-        """H"""
+        """Return H at frequencies."""
         h: Array = np.interp(frequency, self.frequency, self.gain) * np.exp(-2.0 * (np.pi * frequency * BLUR_PX) ** 2)
         return h
 
     def applied(self, values: Array) -> Array:
-        """An image, filtered."""
+        """Return an image filtered."""
         from scipy.fft import dctn, idctn
 
         filtered: Array = idctn(dctn(values, norm="ortho") * self.at(cosine_frequencies(values.shape)), norm="ortho")
         return filtered
 
     def along_rows(self, frequency: Array) -> Array:
-        """Return what the filter makes of the power of each row's own noise, at frequencies along the rows."""
+        """Return the power of unit row noise after the filter, at frequencies along the rows."""
         across = (np.arange(64) + 0.5) / 128
         power: Array = np.mean(self.at(np.hypot(frequency[:, None], across)) ** 2, axis=1)
         return power
@@ -94,13 +94,13 @@ BLOCK_ROWS = 8
 BLOCKS = 8  # at least, where rows are few, of two rows or more
 CACHED = 1 << 15  # numbers
 LEAST_NOISE = 1e-8
-"""Variance, where that of the scan is 1: digits end somewhere, and two scans that agree beyond are not known better."""
+"""Least variance, where the scan's is 1: scans have a few digits, and agreement beyond them is no knowledge."""
 HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it the filter leaves little of them
 
 
 @dataclass(frozen=True, eq=False)
 class CrossingLines:
-    """The lines of a scan that is turned against the grid: of each of them a parabola is unknown as well.
+    """The lines of a scan that is turned against the grid; each has an unknown parabola of its own.
 
     Attributes:
         number: [y, x], the line that each pixel of the grid is nearest to, from 0 on.
@@ -112,14 +112,18 @@ class CrossingLines:
 
     @classmethod
     def of(cls, x: Array, y: Array) -> CrossingLines:
-        """Of own pixel coordinates [y, x] of the pixels of a grid. Lines are told apart by halves: what lies between
-        two lines shows some of both."""
+        """Number the lines by own pixel coordinates [y, x] of a grid.
+
+        Lines are numbered by halves: a pixel between two lines shows some of both.
+        """
         half = np.rint(2.0 * y).astype(np.intp)
         return cls(half - half.min(), 2.0 * (x - x.min()) / max(float(np.ptp(x)), 1.0) - 1.0)
 
     def seen(self, columns: NDArray[Real], weight: Array) -> NDArray[Real]:
-        """Like `seen` with white noise, and free of the crossing lines as well: by projections in turn (von Neumann,
-        Functional Operators II, 1950)."""
+        """Return `seen` with white noise, also free of the crossing lines.
+
+        Both sets are projected away in turn (von Neumann, Functional Operators II, 1950).
+        """
         root = np.sqrt(weight)
         left = (columns * root[:, None, :]).astype(columns.dtype)
         basis, inverse = self._basis(root)
@@ -133,7 +137,7 @@ class CrossingLines:
         return np.asarray(left * root[:, None, :], dtype=columns.dtype)
 
     def _basis(self, root: Array) -> tuple[Any, Array]:
-        """1, x, x² of each line, (pixel, 3 lines), sparse; and the inverse of their products, (line, 3, 3)."""
+        # 1, x, x² of each line as (pixel, 3 lines), sparse, and the inverse of their products
         from scipy.sparse import csr_array
 
         number, count = self.number.ravel(), int(self.number.max()) + 1
@@ -152,14 +156,13 @@ PROJECTIONS = 4
 def seen(
     columns: NDArray[Real], weight: Array, metric: Array | None, crossing: CrossingLines | None = None
 ) -> NDArray[Real]:
-    """Return Q f less what parabolas explain of it: the product with another image g is f'Qg free of both of theirs.
+    """Return Q f free of parabolas: its product with another image g is f'Qg, free of the parabolas of both.
 
     Generalised least squares row by row: each row has a parabola of its own, and noise with a memory. A row is scanned
-    in seconds and the next one begins anew (feedback, flattening by up to the second order, drift of the z piezo), so
-    nothing is assumed of its parabola, and the noise within it is white plus 1/f, with covariance C and Q = C^-1. What
-    is left of a row f after the nuisance B = [1, x, x²] is fitted in this metric, f - B (B'QB)^-1 B'Q f,
-    carries all that the row tells (Frisch and Waugh, Econometrica 1, 387, 1933; Aitken, Proc. R. Soc. Edinb. 55, 42,
-    1936).
+    in seconds and the next one starts again (feedback, flattening by up to the second order, drift of the z piezo), so
+    nothing is assumed of its parabola, and the noise within it is white plus 1/f, with covariance C and Q = C^-1. The
+    rest of a row f after the nuisance B = [1, x, x²] is fitted in this metric, f - B (B'QB)^-1 B'Q f, carries all
+    information of the row (Frisch and Waugh, Econometrica 1, 387, 1933; Aitken, Proc. R. Soc. Edinb. 55, 42, 1936).
 
     Args:
         columns: [y, column, x].
@@ -186,13 +189,12 @@ def seen(
 
 @cache
 def _parabolas(width: int) -> Array:
-    """Orthonormal 1, x, x² of a row, (x, 3)."""
     x = np.linspace(-1.0, 1.0, width)
     return np.linalg.qr(np.stack([np.ones(width), x, x**2], axis=1))[0]
 
 
 def _seen(columns: NDArray[Real], weight: Array, metric: NDArray[Real] | None) -> NDArray[Real]:
-    """Of rows that fit into the processor's cache, which halves the time."""
+    # rows in blocks that fit into the processor's cache: half the time
     root = np.sqrt(weight).astype(columns.dtype)[:, None, :]
     x = np.linspace(-1.0, 1.0, columns.shape[2], dtype=columns.dtype)
     rows, lines = columns * root, np.concatenate([root, root * x, root * x**2], axis=1)
@@ -206,12 +208,11 @@ def _seen(columns: NDArray[Real], weight: Array, metric: NDArray[Real] | None) -
 
 
 def _along_rows(columns: NDArray[Real], metric: NDArray[Real]) -> NDArray[Real]:
-    """Q f of each column: one large product takes a quarter of the time of one for each row."""
+    # one large product takes a quarter of the time of one for each row
     return (columns.reshape(-1, metric.shape[0]) @ metric).reshape(columns.shape)
 
 
 def _less_lines(rows: NDArray[Real], root: NDArray[Real]) -> NDArray[Real]:
-    """Rows less their parabolas, both times the root of the weight."""
     x = np.linspace(-1.0, 1.0, rows.shape[2], dtype=rows.dtype)
     lines = np.concatenate([root, root * x, root * x**2], axis=1)
     gram = lines @ lines.transpose(0, 2, 1) + 1e-5 * np.eye(3, dtype=rows.dtype)
@@ -220,24 +221,25 @@ def _less_lines(rows: NDArray[Real], root: NDArray[Real]) -> NDArray[Real]:
 
 
 def without_lines(values: Array, known: NDArray[np.bool_], crossing: CrossingLines | None = None) -> Array:
-    """Each row, [y, x], less the parabola fitted to it, and the crossing lines less theirs; 0 where nothing is
+    """Subtract from each row, [y, x], the parabola fitted to it, and from crossing lines theirs; 0 where nothing is
     known."""
     return seen(values[:, None], known.astype(np.float64), None, crossing)[:, 0]
 
 
 def products(one: NDArray[Real], two: NDArray[Real]) -> Array:
-    """Sums of the products of columns, [y, column, x] each, over blocks of rows: (block, columns of one, columns
-    of two). Where `one` is `seen` of something the lines of `two` cancel, but in whole rows only."""
+    """Return the sums of products of columns, [y, column, x], over blocks of rows: (block, columns of one, of two).
+
+    Where `one` is `seen`, the lines of `two` cancel, but only in whole rows.
+    """
     starts = np.arange(0, one.shape[0], min(max(one.shape[0] // BLOCKS, 2), BLOCK_ROWS))
     sums: Array = np.add.reduceat(one @ two.transpose(0, 2, 1), starts, axis=0, dtype=np.float64)
     return sums
 
 
 def noise_metric(residual: Array, known: NDArray[np.bool_], seen_through: FineFilter) -> Array | None:
-    """Q of white and 1/f noise, N(f) = a + b / f, fitted to the spectra of the rows of a residual (median over rows),
-    after what the filter has done to them.
+    """Return Q of white and 1/f noise, N(f) = a + b / f; None if it is as good as white (b W <= 0.3 a).
 
-    None: it is as good as white (b W <= 0.3 a).
+    N is fitted to the spectra of the rows of a residual (median over rows), as the filter has changed them.
     """
     from scipy.linalg import inv, toeplitz
     from scipy.optimize import nnls
@@ -254,7 +256,7 @@ def noise_metric(residual: Array, known: NDArray[np.bool_], seen_through: FineFi
         return None
     model = np.stack([np.ones(used.sum()), 1.0 / f[used]], axis=1)
     expected = power
-    for _ in range(3):  # the scatter of a spectrum is in proportion to what is expected of it
+    for _ in range(3):  # the scatter of a spectrum is proportional to its expectation
         (a, b), _ = nnls(model / expected[:, None], power / expected)
         expected = np.maximum(model @ (a, b), 1e-3 * power.max())
     if not b * width > 0.3 * a:
@@ -274,7 +276,7 @@ CERTAIN = 9.0  # times its noise power must a coefficient have to be kept for it
 
 
 def denoised(image: Array, noise: Array) -> tuple[Array, Array]:
-    """An image with the coefficients of its patches' cosine transforms shrunk by what noise has in them.
+    """Shrink the coefficients of the cosine transforms of an image's patches by their noise.
 
     Where a surface is flat its gradient is noise. Multiplied with the noise of the residual it blurs the estimate and
     makes it look certain, the more the less of the image is edges; a bound knows the true gradient and has no such
@@ -292,7 +294,7 @@ def denoised(image: Array, noise: Array) -> tuple[Array, Array]:
         with a noise of one's own: Ramani, Blu and Unser, IEEE Trans. Image Process. 17, 1540, 2008).
     """
     c, n = _coefficients(image), _coefficients(noise)  # in 32 bits: half the time, and precise enough for a weight
-    # those that don't overlap hold as much, and of many some tell as much of all
+    # patches without overlap hold as much information, and some of many are enough
     apart = max(PATCH_PX // STEP_PX, math.isqrt(c[..., 0].size // ENOUGH_PATCHES))
     power = _typical(n[::apart, ::apart] ** 2) + TINY
     texture = np.maximum(_typical(c[::apart, ::apart] ** 2) - power, 0.0)
@@ -303,14 +305,13 @@ def denoised(image: Array, noise: Array) -> tuple[Array, Array]:
 
 
 def _typical(squares: Small) -> Small:
-    """Variance of each coefficient, from the median over the patches."""
+    # variance from the median over the patches
     by_coefficient = np.ascontiguousarray(squares.reshape(-1, squares.shape[2]).T)
     return np.asarray(np.median(by_coefficient, axis=1, overwrite_input=True) / MEDIAN_POWER, dtype=np.float32)
 
 
 @cache
 def _basis() -> Small:
-    """Of the cosine transform of a patch, in a line each: orthonormal."""
     from scipy.fft import dct
 
     one = dct(np.eye(PATCH_PX), norm="ortho", axis=0)
@@ -320,7 +321,6 @@ def _basis() -> Small:
 
 
 def _coefficients(image: Array) -> Small:
-    """[row of patches, column of patches, coefficient], of the image mirrored at its borders."""
     padded = np.pad(image.astype(np.float32), [(PATCH_PX, PATCH_PX + STEP_PX)] * 2, mode="reflect")
     windows = np.lib.stride_tricks.sliding_window_view(padded, (PATCH_PX, PATCH_PX))[::STEP_PX, ::STEP_PX]
     found: Small = windows.reshape(*windows.shape[:2], -1) @ _basis().T
@@ -328,7 +328,6 @@ def _coefficients(image: Array) -> Small:
 
 
 def _image(coefficients: Small, shape: tuple[int, ...]) -> Array:
-    """The inverse: the mean of all patches that cover a pixel."""
     ny, nx = coefficients.shape[:2]
     times = PATCH_PX // STEP_PX
     patches = (coefficients @ _basis()).reshape(ny, nx, times, STEP_PX, times, STEP_PX)

@@ -32,7 +32,7 @@ NONE: Final = 1e-3  # px, or px over ten: so little is nothing
 
 @dataclass(frozen=True, eq=False)
 class Shear:
-    """What is known of the linear map by which drift during the scans shears one against the other.
+    """Knowledge of the linear map by which drift during the scans shears one against the other.
 
     Attributes:
         aspect: height of a pixel over its width.
@@ -75,7 +75,6 @@ def _log_det(matrices: Array) -> Array:
 
 
 def _models(precision: Array, shear: Shear) -> tuple[Array, Array]:
-    """(model,) how likely each is before the images are seen, and (model, n, n) its inverse covariance of theta."""
     weights, priors = [], []
     to_px = np.diag([1.0, shear.aspect, 1.0 / shear.aspect, 1.0])
     stretched, turned = np.diag([1.0, 0.0, 0.0, 1.0]), np.outer((0, 1, -1, 0), (0, 1, -1, 0))

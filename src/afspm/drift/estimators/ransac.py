@@ -29,7 +29,7 @@ class Transform:
         return mapped
 
     def shift_at(self, point: Array) -> Array:
-        """The displacement of one point."""
+        """Return the displacement of one point."""
         moved: Array = self(point[None])[0] - point
         return moved
 
@@ -52,7 +52,7 @@ def _translation(a: Array, b: Array) -> Array | None:
 
 
 def _euclidean(a: Array, b: Array) -> Array | None:
-    """The nearest rotation (Kabsch 1976), in two dimensions."""
+    # the nearest rotation (Kabsch 1976)
     sine, cosine = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()
     length = math.hypot(sine, cosine)
     if length <= 1e-12 * max((a * a).sum(), 1e-300):
@@ -62,7 +62,7 @@ def _euclidean(a: Array, b: Array) -> Array | None:
 
 
 def _similarity(a: Array, b: Array) -> Array | None:
-    """The nearest rotation with a scale (Umeyama 1991), in two dimensions."""
+    # the nearest rotation with a scale (Umeyama 1991)
     square = (a * a).sum()
     if square == 0.0:
         return None
@@ -166,7 +166,7 @@ def consensus(a: Array, b: Array, transform: Transform | None, radius: float) ->
 def tightened(
     a: Array, b: Array, start: Consensus, form: Form, *, least: float, most: float, bend_max: float
 ) -> Consensus:
-    """The fit to those that lie as near as most of the inliers do: three robust standard deviations, from `least` to
+    """Fit to the pairs as near as most inliers: three robust standard deviations, from `least` to
     `most`, until nothing changes. A wide radius lets mismatches in, and each of them pulls."""
     best = start
     for _ in range(10):

@@ -34,32 +34,31 @@ class ExpectedShift:
         return cls(grid.shift_px(prior.mean_m), inverse @ prior.covariance_m2 @ inverse.T)
 
     def chi2(self, shift_px: Array) -> Array:
-        """Of shifts, shape (..., 2)."""
+        """Return chi² of shifts, shape (..., 2)."""
         off = shift_px - self.mean
         chi2: Array = np.einsum("...i,ij,...j", off, np.linalg.inv(self.covariance), off)
         return chi2
 
     @property
     def area_px2(self) -> float:
-        """The area in which a match is looked for."""
+        """Area of the search."""
         return float(GATE * math.pi * np.sqrt(np.linalg.det(self.covariance)))
 
     def surprise(self, shift_px: Array, covariance: Array) -> float:
-        """chi² of an estimate, which has a covariance too."""
+        """Return chi² of an estimate with a covariance of its own."""
         off = shift_px - self.mean
         return float(off @ np.linalg.solve(self.covariance + covariance, off))
 
     def on_smaller(self, factor: int, offset_px: Array) -> ExpectedShift:
-        """On images of which each pixel is `factor` pixels, with their centres moved apart by `offset_px`."""
+        """Return the same on images with pixels `factor` times as large and centres moved apart by `offset_px`."""
         mean: Array = (self.mean - offset_px) / factor
         return ExpectedShift(mean, self.covariance / factor**2 + 0.3 * np.eye(2))
 
 
 def shear_by_drift(prior: Prior | None, reference: DriftScan, scan: DriftScan) -> tuple[Array, float | None]:
-    """By how much each row of the scan is displaced against that of the reference, and the standard deviation of it, in
-    metres per metre along the slow axis.
+    """Return the displacement of rows by drift, in m per m along the slow axis, and its standard deviation.
 
-    What drift does while a scan is taken is v t, and t runs along its slow axis. Nothing can be said (zero, None)
+    Drift displaces a row by v t, and t runs along the slow axis. The result is unknown (zero, None)
     unless both scans have been taken alike: the prior knows the difference of two velocities, and that alone.
     """
     nothing = np.zeros(2), None
@@ -81,7 +80,7 @@ APART_PX = 1.5  # nearer peaks are one
 
 
 def candidates(scene: Scene, prior: ExpectedShift | None) -> list[Array]:
-    """Shifts (x, y) px worth a closer look, the best first, and the one that is expected."""
+    """Return the expected shift, if any, and the best shifts (x, y) px by correlation, best first."""
     correlation = MaskedCorrelation(scene.first.known, scene.second.known)
     peaks: list[tuple[float, Array]] = []
     for one, two in (scene.smooth, scene.band):
@@ -120,7 +119,7 @@ class MaskedCorrelation:
         self._spectra = exact[0].astype(np.complex64), exact[1].astype(np.complex64)
 
     def of(self, one: Array, two: Array) -> Array:
-        """[y, x] coefficients; see `shifts_px`."""
+        """Return the coefficients [y, x]; `shifts_px` gives their shifts."""
         m1, m2 = self._masks
         one, two = (one - one[m1 > 0].mean()) * m1, (two - two[m2 > 0].mean()) * m2
         f1, f2 = self._transform(one), self._transform(two)
@@ -136,12 +135,12 @@ class MaskedCorrelation:
         return np.clip(coefficient, -0.9999, 0.9999)
 
     def shifts_px(self, index: Array) -> Array:
-        """Shifts (x, y) between centres that pixels (y, x) of the coefficients stand for, shape (n, 2)."""
+        """Return the shifts (x, y) between centres at pixels (y, x) of the coefficients, shape (n, 2)."""
         shifts: Array = (index - self.origin)[..., ::-1] - self._center
         return shifts
 
     def peaks(self, one: Array, two: Array, prior: ExpectedShift | None) -> list[tuple[float, Array]]:
-        """The highest, by atanh(c) sqrt(n), which has the same variance for every overlap n (Fisher)."""
+        """Return the highest peaks by atanh(c) sqrt(n), which has the same variance for every overlap n (Fisher)."""
         from scipy.ndimage import maximum_filter
 
         enough = self.overlap >= LEAST_OVERLAP * min(mask.sum() for mask in self._masks)
@@ -156,13 +155,13 @@ class MaskedCorrelation:
         return list(zip(height[top][best].tolist(), shifts, strict=True))
 
     def _transform(self, values: Array) -> Spectrum:
-        """In 32 bits: half the time, and a coefficient is known to five digits."""
+        # 32 bits: half the time, and a coefficient is known to five digits
         from scipy.fft import rfft2
 
         return rfft2(values.astype(np.float32), self._fft)
 
     def _correlate(self, first: Spectrum, second: Spectrum) -> Array:
-        """sum over p of first(p) second(p + s), s from minus the size of the first up."""
+        # sum over p of first(p) second(p + s), s from minus the size of the first up
         from scipy.fft import irfft2
 
         product = irfft2(np.conj(first) * second, self._fft)
@@ -194,7 +193,7 @@ class Scorer:
         ]
 
     def best(self, shifts: list[Array]) -> tuple[Scored, float] | None:
-        """The likeliest, and the likelihood of the best of the others; None: they all overlap too little."""
+        """Return the likeliest shift and the likelihood of the best rival; None if all overlap too little."""
         scored = [s for s in map(self._score, shifts) if s is not None]
         if not scored:
             return None
@@ -219,6 +218,5 @@ class Scorer:
 
 
 def _correlated(one: Array, two: Array) -> float:
-    """Pearson's coefficient."""
     a, b = one - one.mean(), two - two.mean()
     return float(a @ b / max(np.sqrt((a @ a) * (b @ b)), 1e-300))

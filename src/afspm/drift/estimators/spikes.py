@@ -73,7 +73,6 @@ def _unscarred(image: Image, other: Image, theta: Array) -> Image:
 
 
 def _along(values: Array) -> Array:
-    """Mean of the pixels of a row about each."""
     from scipy.ndimage import uniform_filter1d
 
     mean: Array = uniform_filter1d(values, SCAR_PX, axis=1)
@@ -110,7 +109,6 @@ def _mended(image: Image, other: Image, theta: Array) -> Image:
 
 
 def _there(image: Image, other: Image, theta: Array, rows: Index, columns: Index) -> tuple[Index, Index]:
-    """The nearest pixels, (row, column), of the other image, though they may lie outside of it."""
     (ny, nx), (there_ny, there_nx) = image.values.shape, other.values.shape
     x, y = columns - (nx - 1) / 2, rows - (ny - 1) / 2
     dx, dy = theta[:2, None] + theta[LINEAR].reshape(2, 2) @ np.stack([x, y])
@@ -118,7 +116,6 @@ def _there(image: Image, other: Image, theta: Array, rows: Index, columns: Index
 
 
 def _most_there(values: Array, at: tuple[Index, Index], wide: int) -> Array:
-    """How far an image stands out of its rows, by so many pixels, at these or beside them; infinite outside of it."""
     rows, columns = at
     ny, nx = values.shape
     inside = (rows >= 1) & (rows < ny - 1) & (columns >= 1 + wide) & (columns < nx - 1 - wide)

@@ -22,7 +22,7 @@ class Spline:
     """An image as cubic splines, evaluated at pixel coordinates (x, y) from its centre.
 
     Attributes:
-        known: where it is more than two pixels from what is not known, and not made up; None: everywhere.
+        known: more than two pixels from unknown pixels, and not made up; None: everywhere.
     """
 
     coefficients: Array
@@ -30,7 +30,7 @@ class Spline:
 
     @classmethod
     def of(cls, values: Array, known: Mask, made_up: Mask | None = None) -> Spline:
-        """Its values are met exactly at the pixels."""
+        """Interpolate values exactly at the pixels."""
         from scipy.ndimage import binary_erosion, spline_filter
 
         inner = None if known.all() else binary_erosion(known, iterations=2, border_value=1)
@@ -39,7 +39,7 @@ class Spline:
         return cls(spline_filter(values, mode="mirror"), inner)
 
     def at(self, x: Array, y: Array) -> tuple[Array, Mask]:
-        """The values, and where they are known, at points."""
+        """Return values at points, and where they are known."""
         from scipy.ndimage import map_coordinates
 
         ny, nx = self.coefficients.shape
@@ -52,7 +52,7 @@ class Spline:
         return values, known
 
     def on_grid(self, x: Array, y: Array) -> tuple[Array, Mask]:
-        """The same on a grid of one pixel, x and y its axes: row by row and column by column it is much faster."""
+        """Return the same on a grid of one pixel with axes x and y, much faster: row by row and column by column."""
         values, known = self.coefficients, np.ones((y.size, x.size), dtype=bool)
         picked = []
         for axis, at in enumerate((y, x)):
@@ -68,13 +68,12 @@ class Spline:
 
 
 def _basis(t: float) -> Array:
-    """Cubic B-splines at four neighbours, t from 0 to 1 beyond the second."""
+    # cubic B-splines at four neighbours, t from 0 to 1 beyond the second
     u = 1.0 - t
     return np.array([u**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * u**2 + 3.0 * u**3, t**3]) / 6.0
 
 
 def _combined(values: Array, axis: int, first: int, count: int, weights: Array) -> Array:
-    """Sums of so many neighbours along an axis as there are weights: of those from `first` on, from the next on, …"""
     last, size = first + count + len(weights) - 1, values.shape[axis]
     if first >= 0 and last <= size:
         near = values[first:last] if axis == 0 else values[:, first:last]
@@ -88,7 +87,6 @@ def _combined(values: Array, axis: int, first: int, count: int, weights: Array) 
 
 
 def _mirrored(index: NDArray[np.intp], size: int) -> NDArray[np.intp]:
-    """Reflected about the first and the last pixel."""
     period = 2 * (size - 1)
     folded: NDArray[np.intp] = (index % period).astype(np.intp)
     return np.where(folded < size, folded, period - folded)
@@ -103,7 +101,7 @@ class OverlapBox:
 
     @classmethod
     def of_overlap(cls, shape1: tuple[int, int], shape2: tuple[int, int], shift_px: Array) -> OverlapBox | None:
-        """None: there is less than 8 x 8 pixels of it."""
+        """Return the box of two shifted images; None if it has less than 8 x 8 pixels."""
         axes = []
         for axis, shift in ((1, shift_px[0]), (0, shift_px[1])):
             half1, half2 = (shape1[axis] - 1) / 2, (shape2[axis] - 1) / 2
@@ -113,7 +111,7 @@ class OverlapBox:
         return cls(*axes) if min(axis.size for axis in axes) >= 8 else None
 
     def without_border(self, width: int) -> OverlapBox:
-        """Less so many pixels on each side: the centre remains."""
+        """Remove `width` pixels on each side; the centre stays."""
         return OverlapBox(self.x[width:-width], self.y[width:-width])
 
     @property
@@ -122,11 +120,11 @@ class OverlapBox:
 
     @property
     def center(self) -> Array:
-        """(2,)"""
+        """Centre, (2,)."""
         return np.array([self.x.mean(), self.y.mean()])
 
 
-LEAST_SEARCHED_PX = 32  # of a side of the smaller image: what is left of fewer may be too little to be compared
+LEAST_SEARCHED_PX = 32  # of a side of the smaller image: the rest of a smaller one may be too little to compare
 CREEP_PX = (4.0, 9.0)  # within which what a line starts with is gone to 1/e
 LINEAR = slice(2, 6)  # the linear map among the parameters theta of a pair
 CREEP = slice(6, 6 + 2 * len(CREEP_PX))  # from the left and from the right, for each length
@@ -144,7 +142,7 @@ class WarpedPair:
     as z + h z² / 2: feedback and tip do that to edges).
 
     Attributes:
-        shift_px: (2,) about u: by which the lines of both start at different places of the box.
+        shift_px: (2,) about u: the distance between the starts of the lines of both on the box.
         own_px: width of a pixel of each scan, in pixels of the grid: lines creep for some of their own pixels, which in
             a zoom is next to nothing. 0: its lines don't lie along the rows of the grid, so there is no model.
         crossing: the lines of the second scan, where they don't.
@@ -158,7 +156,7 @@ class WarpedPair:
     crossing: CrossingLines | None = None
 
     def warped(self, theta: Array) -> tuple[Array, Array, Mask]:
-        """I1(q - d/2) and I2(q + d/2), each with half of the other's contrast, and where both are known.
+        """Return I1(q - d/2) and I2(q + d/2), each with half of the other's contrast, and where both are known.
 
         Both are moved by half: so both carry equal interpolation noise, the gradient of their mean is not correlated
         with the noise of their difference, and the shift is not pulled towards whole pixels.
@@ -181,8 +179,8 @@ class WarpedPair:
 
     @cached_property
     def _creep(self) -> Array:
-        """(creep, x): what creep of a pixel at the start of all lines adds to the displacement along them; nothing at
-        the centre of the box."""
+        # (creep, x): the displacement along the lines by creep of one pixel at their start, zero at the centre of the
+        # box
         found = []
         at = np.append(self.box.x, self.box.center[0])
         for side in (1.0, -1.0):
@@ -202,17 +200,18 @@ class WarpedPair:
     def columns(
         self, gx: Array, gy: Array, mean: Array, residual: Array, free: Iterable[int] = range(COUNT)
     ) -> Columns:
-        """[y, column, x]: the derivatives of the residual by what is free of theta, given the gradient of the mean; and
-        the residual. In 32 bits: most of the time goes into their products, and those are exact to a millionth."""
+        """Return the derivatives of the residual by the free part of theta, and the residual, [y, column, x].
+
+        They have 32 bits: their products take most of the time and are exact to a millionth.
+        """
         by = (*self._by_slopes(gx, gy), -mean, (mean, -mean / 2))
         return np.stack([*(_product(by[i]) for i in free), residual], axis=1, dtype=np.float32)
 
     def slopes(self, gx: Array, gy: Array) -> Columns:
-        """The first columns alone, that there is a gradient in."""
+        """Return only the columns that contain the gradient."""
         return np.stack([_product(column) for column in self._by_slopes(gx, gy)], axis=1, dtype=np.float32)
 
     def _by_slopes(self, gx: Array, gy: Array) -> tuple[Array | tuple[Array, Array], ...]:
-        """The columns that there is a gradient in, where they are products as their factors."""
         cx, cy = self.box.center
         x, y = self.box.x[None, :] - cx, self.box.y[:, None] - cy
         return gx, gy, (gx, x), (gx, y), (gy, x), (gy, y), *((gx, row) for row in self._creep)
@@ -226,8 +225,11 @@ NINE_POINTS = (672.0 / 840.0, -168.0 / 840.0, 32.0 / 840.0, -3.0 / 840.0)  # of 
 
 
 def derivative(values: Array, axis: int) -> Array:
-    """Per pixel, from nine points: with five, waves of less than six pixels weighed too little. Beyond its borders the
-    image is taken to go on as it does before them."""
+    """Return the derivative per pixel, from nine points.
+
+    With five points waves of less than six pixels weighed too little. The image is continued linearly beyond its
+    borders.
+    """
 
     def part(start: int | None, stop: int | None, step: int = 1, of: Array = values) -> Array:
         cut = slice(start, stop, step)
@@ -254,12 +256,12 @@ class Scene:
 
     @cached_property
     def smooth(self) -> Both:
-        """Without most of the noise."""
+        """Images without most of the noise."""
         return self._filtered(1.0)
 
     @cached_property
     def band(self) -> Both:
-        """Edges rather than areas."""
+        """Images of edges rather than areas."""
         fine, coarse = self._filtered(0.8), self._filtered(3.0)
         return fine[0] - coarse[0], fine[1] - coarse[1]
 
@@ -272,7 +274,7 @@ class Scene:
         return self.splines(self.band)
 
     def splines(self, values: Both) -> tuple[Spline, Spline]:
-        """Of values that are known where the images are."""
+        """Return splines of values known where the images are."""
         one, two = (
             Spline.of(each, image.known, image.made_up)
             for each, image in zip(values, (self.first, self.second), strict=True)
@@ -280,12 +282,12 @@ class Scene:
         return one, two
 
     def box(self, shift_px: Array) -> OverlapBox | None:
-        """Where they overlap; see `OverlapBox.of_overlap`."""
+        """Return the overlap at a shift; see `OverlapBox.of_overlap`."""
         return OverlapBox.of_overlap(self.first.values.shape, self.second.values.shape, shift_px)
 
     @property
     def least_known(self) -> int:
-        """Pixels of that of which less is known."""
+        """Number of known pixels, of the image with fewer."""
         return min(int(self.first.known.sum()), int(self.second.known.sum()))
 
     def _filtered(self, sigma_px: float) -> Both:
@@ -295,8 +297,10 @@ class Scene:
         return one, two
 
     def smaller(self) -> tuple[Scene, int, Array]:
-        """For the search: with `factor` times larger pixels where the images are large, that factor, and by how much,
-        px, the centres have been moved apart (only whole blocks of pixels are kept)."""
+        """Return the scene of the search, its decimation, and the shift of its centres, px.
+
+        Large images are decimated. Only whole blocks of pixels are kept, which moves the centres apart.
+        """
         sides = *self.first.values.shape, *self.second.values.shape
         factor = 1 if max(sides) <= 160 else 2 if max(sides) <= 640 else 4
         while factor > 1 and min(sides) < LEAST_SEARCHED_PX * factor:  # a zoom in its overview
@@ -308,7 +312,6 @@ class Scene:
 
 
 def _decimated(image: Image, factor: int) -> Image:
-    """Means of `factor` x `factor` pixels."""
     ny, nx = (n // factor for n in image.values.shape)
     kept, blocks = np.s_[: ny * factor, : nx * factor], (ny, factor, nx, factor)
     known = np.asarray(image.known[kept].reshape(blocks).all(axis=(1, 3)))

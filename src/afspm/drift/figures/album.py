@@ -57,7 +57,7 @@ class DriftRun:
         record: of the tracker.
         parts: one after the other.
         matched: a registration of two scans (indices) that rests on features, if there is one.
-        truth_m: (n, 2) what the drift really was, where somebody knows.
+        truth_m: (n, 2) true drift, where it is known.
     """
 
     scans: Sequence[DriftScan]
@@ -68,7 +68,7 @@ class DriftRun:
 
     @property
     def switched_on_s(self) -> float | None:
-        """When correction was switched on: the second of two parts begins."""
+        """Time at which correction was switched on, the start of the second of two parts."""
         return float(self.record.time_s[self.parts[1].start]) if len(self.parts) > 1 else None
 
 
@@ -113,7 +113,6 @@ def _left_over(run: DriftRun, part: RunPart) -> Array | None:
 
 
 def _pairs(run: DriftRun, part: RunPart) -> list[ScanPair]:
-    """Some of a part, about two hours apart."""
     record, scans = run.record[part.start : part.stop], run.scans[part.start : part.stop]
     moved = record.misplacement_m
     return [

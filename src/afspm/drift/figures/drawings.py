@@ -41,7 +41,7 @@ def draw_offsets(
 
     Args:
         record: of the run.
-        truth_m: (n, 2) what the drift really was, from any zero on, where somebody knows.
+        truth_m: (n, 2) true drift from any zero, where it is known.
         switched_on_s: when drift correction was switched on.
     """
     with styled():
@@ -112,7 +112,7 @@ def draw_pairs(pairs: Sequence[ScanPair]) -> Figure:
 
 
 def _arrow(ax: Axes, pair: ScanPair) -> None:
-    """From the middle of the frame to where that feature is now; a dot, where that is less than a pixel away."""
+    # from the middle of the frame to the feature's place now; a dot below one pixel
     start = 1e6 * np.asarray(pair.second.region.center_m)
     end = start + 1e6 * pair.moved_m
     if np.hypot(*pair.moved_m) > max(pair.second.pixel_m):
@@ -126,7 +126,7 @@ def draw_estimates(record: DriftRecord, *, title: str = "", truth_m: Array | Non
 
     Args:
         record: of the pairs; `matched` says which were accepted.
-        truth_m: (n, 2) what it really was, where somebody knows.
+        truth_m: (n, 2) true values, where known.
     """
     with styled():
         made = figure(WIDTH_IN, 2.6)
@@ -244,7 +244,7 @@ def draw_features(reference: DriftScan, scan: DriftScan, matches: Matches | None
 
 
 def _in_frame(scan: DriftScan, xy_m: Array) -> Array:
-    """Positions in the frame before it is turned, in which scans are drawn, in µm."""
+    # positions in the frame before it is turned, µm
     angle = scan.region.angle_rad
     cos, sin = np.cos(angle), np.sin(angle)
     center = np.asarray(scan.region.center_m)
@@ -253,7 +253,7 @@ def _in_frame(scan: DriftScan, xy_m: Array) -> Array:
 
 
 def _join(made: Figure, axes: Array, points: list[Array], which: NDArray[np.bool_], colours: str | None) -> None:
-    """Lines between the two scans; of many, some evenly chosen: all would hide the scans."""
+    # of many lines some are drawn, evenly chosen: all would hide the scans
     from matplotlib import colormaps
 
     chosen = np.flatnonzero(which)
@@ -297,7 +297,7 @@ def draw_errors(record: DriftRecord, truth_m: Array, *, switched_on_s: float | N
 
 def _misplaced(ax: Axes, off_m: Array, hours: Array) -> None:
     distance_m = np.hypot(*off_m.T)
-    distance_m[distance_m == 0.0] = np.nan  # that of the first scan has no place on a logarithmic axis
+    distance_m[distance_m == 0.0] = np.nan  # the zero of the first scan has no place on a logarithmic axis
     ax.semilogy(hours, distance_m * 1e9, "o-", color="black", markersize=2.5, linewidth=0.6)
     ax.set_ylabel("position error of the scan / nm")
 

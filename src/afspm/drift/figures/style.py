@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 WIDTH_IN = 7.2  # two columns of a journal
 ORANGE, BLUE, GREEN, MAGENTA, GREY = "#EE7733", "#0077BB", "#009988", "#EE3377", "#999999"  # P. Tol's vibrant scheme
-TIME_COLOURS = "viridis"  # of even lightness: also told apart in grey
+TIME_COLOURS = "viridis"  # of even lightness: distinct in grey, too
 DPI = 200
 LAYOUT: Literal["constrained"] | None = "constrained"
 HOUR_S = 3600.0
@@ -41,7 +41,7 @@ _STYLE: Plain = {
 
 
 def styled() -> Any:
-    """The context in which a figure is made: our style, whatever the user's is."""
+    """Return the context for making a figure in afspm's style instead of the user's."""
     return matplotlib.style.context(["default", _STYLE])
 
 

@@ -30,7 +30,7 @@ _FORECASTS: Table[str, type[BankForecast] | type[PaperForecast]] = {
 
 
 def tracker(spec: str | PlainMapping = DEFAULT, estimator: Estimator | None = None) -> Tracker:
-    """The tracker that is meant.
+    """Return a tracker by name.
 
     Args:
         spec: a name that a package declares or "module.Name", or a table with that as its `class` and its settings.
@@ -48,7 +48,7 @@ def tracker(spec: str | PlainMapping = DEFAULT, estimator: Estimator | None = No
 
 
 def forecast_from_dict(table: PlainMapping) -> Forecast:
-    """Return the forecast that `Forecast.to_dict` was asked of, of any of our trackers.
+    """Return the forecast of one of afspm's trackers from the result of its `to_dict`.
 
     Raises:
         InvalidValue: something else.

@@ -29,7 +29,7 @@ _LIKE = 1.2  # a second surprise may differ from the first by so much of it: a n
 
 @dataclass(eq=False)
 class BankState:
-    """The knowledge of a tracker from scan to scan: all that is saved.
+    """The state of a tracker from scan to scan: all that is saved.
 
     Attributes:
         filters: None before the first scan.
@@ -61,25 +61,25 @@ class BankState:
 class BankTracker:
     """Filters that each expect drift to move differently, weighted by how well they foresaw it.
 
-    A scan is registered with several earlier ones: with an anchor, the scan that first showed its part of the sample,
-    for as long as it can be recognised, and with recent ones. Each result is a measurement of the difference of two
-    positions, and the positions of all scans that are kept are part of the filters' state, so what is known of each
-    stays consistent and nothing is counted twice. Positions are those at the middle of a scan; where the overlap lies
-    elsewhere, the time that its rows were taken at counts.
+    A scan is registered with several earlier ones: with recent ones, and with an anchor, the scan that first showed its
+    part of the sample, for as long as that can be recognised. Each result measures the difference of two positions. The
+    positions of all stored scans are part of the filters' state, so they stay consistent and nothing is counted twice.
+    A position holds for the middle of a scan; where the overlap lies elsewhere, the time of its rows counts.
 
-    A result far from all that was expected is believed only if that of the next scan is too. A scan that nothing could
-    be registered with is adrift: kept where it was predicted, but it proves nothing, and neither do those that are
-    known by it alone; how they lie to each other is still followed. Several scans in a row without a place of their own
-    mean that all of them may lie anywhere: it is lost, as it is when one has no place while the standard deviation of
-    its position is more than half of what a scan may be misplaced and still be compared. It then looks everywhere, and
-    is found again when a scan has a place; those adrift are then put right with it. A scan that can be compared with
-    none, a zoom too fine for the overview, begins a row of its own. A zoom is looked for in an overview only where it
-    is expected, and is not lost because the overview does not show it clearly: a particle looks like the next.
+    A result far from every prediction is believed only if the next scan confirms it. A scan that matches no other is
+    adrift: it is stored at its predicted place, and proves nothing; neither do scans that match only scans adrift.
+    Their places relative to each other are still followed. After several such scans in a row the tracker is lost, as it
+    is after one if the standard deviation of its position exceeds half of the misplacement at which scans can still be
+    compared. A lost tracker searches everywhere. The first scan with a place ends that, and corrects the scans adrift.
+
+    A scan that can be compared with no other, such as a zoom too fine for the overview, starts a series of its own. A
+    zoom is searched in an overview only where it is expected, and the tracker is not lost because an overview does not
+    show it clearly: one particle looks like the next.
 
     With the transform "similarity", scans are straightened before all that: see `Similarity`.
 
     Args:
-        estimator: gets what is expected as prior.
+        estimator: gets the prediction as prior.
         settings: fields of `BankSettings` and `Choice`.
 
     Raises:
@@ -145,7 +145,7 @@ class BankTracker:
         )
 
     def set_velocity(self, time_s: float, velocity_m_s: ArrayLike, covariance: ArrayLike) -> None:
-        """Take in a drift velocity (2,) that was measured otherwise, in tip coordinates, with its covariance (2, 2).
+        """Take in a drift velocity (2,) in tip coordinates from another measurement, with its covariance (2, 2).
 
         Raises:
             InvalidValue: before the first scan.
@@ -158,10 +158,10 @@ class BankTracker:
         state.filters = state.filters.with_velocity(time_s, velocity, noise, rarest=self._settings.rarest)
 
     def compensated(self, time_s: float, velocity_m_s: ArrayLike) -> None:
-        """From a time on, the controller moves tip coordinates along with a velocity (2,) by itself.
+        """Note that the controller moves tip coordinates with a velocity (2,) from a time on.
 
         Raises:
-            InvalidValue: before the middle of the newest scan: its position has been told already.
+            InvalidValue: before the middle of the newest scan: its position has been published already.
         """
         state = self._state
         if state.newest_s is not None and time_s < state.newest_s:
@@ -190,7 +190,7 @@ class BankTracker:
         )
 
     def _turned(self, filters: Filters, scan: DriftScan) -> Filters:
-        """With the velocity that shows in the shear against the scan before, if that was scanned the other way."""
+        # with the velocity from the shear against the scan before, if that was scanned the other way
         last = self._references.kept[-1].scan
         if last.upwards is None or scan.upwards is None or last.upwards == scan.upwards:
             return filters
@@ -204,21 +204,18 @@ class BankTracker:
         return filters.with_velocity(found.time_s, velocity, found.by_shear_covariance, rarest=self._settings.rarest)
 
     def _should_have_matched(self, scan: DriftScan, tried: Table[int, Registration]) -> bool:
-        """True if an unmatched scan means that the sample may be gone.
-
-        A zoom that is not recognised in an overview does not, and neither does an error of the estimator.
-        """
+        # an unmatched scan means that the sample may be gone; not so a zoom that an overview does not show, nor an
+        # error of the estimator
         return any(self._references.is_alike(number, scan) for number, one in tried.items() if not one.failure)
 
     def _is_blind(self, newest: NewestScan) -> bool:
-        """True if it is too uncertain where to look, against each of the scans that it can be compared with."""
+        # too uncertain where to look, against each of the scans that it can be compared with
         kept = self._references.kept
         comparable = self._references.candidates(newest.scan, *_drifts(newest.filters), anywhere=True)
         spreads = (newest.expected(number, kept[number])[1] for number in comparable)
         return min((np.linalg.eigvalsh(one)[-1] for one in spreads), default=0.0) > self._limit_m(newest.scan) ** 2
 
     def _tried(self, newest: NewestScan, *, anywhere: bool) -> dict[int, Registration]:
-        """Return what the estimator says of the scan and each reference, by its number, the best first."""
         kept, filters = self._references.kept, newest.filters
         widening = self._settings.widening * 4.0 ** min(self._state.unmatched, self._settings.lost_after)
         tried = {}
@@ -238,8 +235,7 @@ class BankTracker:
         return tried
 
     def _compared(self, newest: NewestScan, tried: Table[int, Registration]) -> Comparison | None:
-        """Return what was found, by the references that agree; those adrift count only where there is no other, and
-        coarse results only where there is no exact one."""
+        # references adrift count only without others, and coarse results only without exact ones
         kept, inflation = self._references.kept, self._settings.inflation
         measured = [
             PairMeasurement.of(newest, number, kept[number], found, inflation)
@@ -251,7 +247,7 @@ class BankTracker:
         return Comparison(agreeing(exact, newest.filters), newest.filters) if measured else None
 
     def _believed(self, newest: NewestScan, found: Comparison | None, *, anywhere: bool) -> Comparison | None:
-        """Return what is believed of that: a surprise only where everything is possible, or after another like it."""
+        # a surprise is believed only where everything is possible, or after another like it
         state = self._state
         before, state.doubted_m = state.doubted_m, None
         if found is None or found.surprise <= self._settings.doubt:
@@ -267,7 +263,6 @@ class BankTracker:
     def _learn(
         self, newest: NewestScan, used: Comparison | None, tried: Table[int, Registration], *, placed: bool
     ) -> None:
-        """Take in what is believed; keep the scan, unless it is in doubt, and let go of what there is too much of."""
         state = self._state
         settings, references, scan = self._settings, self._references, newest.scan
         filters = newest.filters if used is None else used.filters
@@ -301,7 +296,6 @@ class BankTracker:
             self._drop(number)
 
     def _straightened(self, similarity: Similarity, scan: DriftScan, used: Comparison | None) -> Similarity:
-        """With a scan, and with what its registration with the best reference tells of rotation and scale."""
         best = None if used is None else used.measured[0]
         if best is None or best.found.linear_seen is None:
             return similarity.with_scan()
@@ -311,16 +305,16 @@ class BankTracker:
         return learned.straight_about(best.found.center_m + best.found.displacement_m)
 
     def _cut_off(self, filters: Filters, scan: DriftScan) -> Filters:
-        """With the present and all that is adrift anywhere, and together: what lies between them is known still."""
+        # the present and all scans adrift may be anywhere, but together: their places relative to each other are still
+        # known
         adrift = [number for number, one in enumerate(self._references) if one.adrift]
         return filters.widened(self._limit_m(scan), self._settings.start_velocity_sd_m_s, scans=adrift)
 
     def _proves(self, number: int) -> bool:
-        """True if what is registered with a reference has a place by that."""
         return not (self._state.proven and self._references.kept[number].adrift)
 
     def _vouch(self, newest: NewestScan, found: Table[int, Registration]) -> None:
-        """Those adrift that the newest scan, the last in the state, finds where they are thought to be are known."""
+        # clear the adrift flag of references found at their predicted position
         state = self._state
         assert state.filters is not None
         kept, states = self._references.kept, state.filters.mean.shape[1]
@@ -348,7 +342,7 @@ class BankTracker:
         return self._forecast_of(filters).at(filters.time_s)
 
     def _limit_m(self, scan: DriftScan) -> float:
-        """Half of how far a scan may be off and still be compared."""
+        # half of how far a scan may be off and still be compared
         return (1.0 - self._references.choice.overlap_min) * min(scan.region.size_m) / 2
 
     def state(self) -> Plain:
@@ -369,7 +363,6 @@ class BankTracker:
 
 
 def _drifts(filters: Filters) -> tuple[Array, Array]:
-    """The expected displacement (2,) of now, and those (n, 2) that the scans show."""
     return (filters.weight @ filters.mean)[:2], filters.scan_drifts_m()
 
 
@@ -386,6 +379,5 @@ def _why_not(tried: Table[int, Registration], found: Comparison | None, *, adrif
 
 
 def _coarsely(tried: Table[int, Registration]) -> str:
-    """Return the error for which a matched scan is known only coarsely; empty if it is known well."""
     failures = [one.failure for one in tried.values() if one.accepted]
     return failures[0] if failures and all(failures) else ""

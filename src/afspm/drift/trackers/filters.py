@@ -2,8 +2,8 @@
 
 The state of each is (x, y, v_x, v_y), the displacement of the sample and its velocity, followed by four of the same for
 each scan that is kept: the displacement at which it shows the sample, and the velocity during it. These stay correlated
-with each other and with the drift, so a scan that is compared many times is not taken for many, and what is learned
-later counts (as landmarks in simultaneous localisation and mapping: Smith, Self and Cheeseman 1990).
+with each other and with the drift, so a scan that is compared many times does not count as many, and later knowledge
+counts (as landmarks in simultaneous localisation and mapping: Smith, Self and Cheeseman 1990).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _SHORT = 1e-2  # of the fading time: below, differences of exponentials lose the
 
 @dataclass(frozen=True, eq=False)
 class Models:
-    """n kinds of motion.
+    """Models of motion, n of them.
 
     Attributes:
         density_m2_s3: (n,) q, spectral density of the acceleration.
@@ -34,12 +34,15 @@ class Models:
     walk_m2_s: Array
 
     def wandered_m2(self, duration_s: float) -> Array:
-        """(n,) variance between where a scan shows the sample, the mean over its rows, and where it is in its middle:
-        what a walk and a random acceleration integrate to."""
+        """Return the (n,) variance between the mean position over the rows of a scan and that in its middle.
+
+        It is the integral of a walk and a random acceleration.
+        """
         return np.asarray(self.walk_m2_s * duration_s / 12 + self.density_m2_s3 * duration_s**3 / 320)
 
     def over(self, step_s: float) -> tuple[Array, Array]:
-        """Return what a time does to a state (x, y, v_x, v_y): transition (n, 4, 4) and covariance gained (n, 4, 4).
+        """Return the effect of a time on a state (x, y, v_x, v_y): transition (n, 4, 4) and covariance gained (n, 4,
+        4).
 
         A negative time goes back in a straight line, and gains as much.
         """
@@ -59,7 +62,7 @@ class Models:
 
 
 def _gained(a: Array, t: float) -> tuple[Array, Array, Array]:
-    """Variance of position, covariance with and variance of velocity after a time, for q = 1."""
+    # variance of position, covariance with and variance of velocity after a time, for q = 1
     x = a * t
     short = x < _SHORT
     b = np.where(short, 1.0, a)
@@ -73,7 +76,6 @@ def _gained(a: Array, t: float) -> tuple[Array, Array, Array]:
 
 
 def _both_axes(one: Array) -> Array:
-    """(n, 2, 2) of (position, velocity) as (n, 4, 4) of (x, y, v_x, v_y)."""
     both = np.zeros((len(one), 4, 4))
     both[:, 0::2, 0::2] = one
     both[:, 1::2, 1::2] = one
@@ -82,7 +84,7 @@ def _both_axes(one: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Filters:
-    """n filters with s states each; nothing is changed in place.
+    """Filters, n of them with s states each; immutable.
 
     Attributes:
         models: how each moves.
@@ -102,7 +104,7 @@ class Filters:
     def start(
         cls, models: Models, time_s: float, position_sd_m: float, velocity_sd_m_s: float, duration_s: float
     ) -> Filters:
-        """With the first scan, from which positions are counted: what it shows is where it is, exactly.
+        """Return the filters after the first scan, from which positions are counted.
 
         Args:
             position_sd_m: of where the sample is when the scan shows it at zero: its location error.
@@ -119,12 +121,12 @@ class Filters:
 
     @property
     def weight(self) -> Array:
-        """(n,) probabilities of the filters, sum 1."""
+        """Probabilities of the filters, (n,), sum 1."""
         weight = np.exp(self.log_weight - self.log_weight.max())
         return np.asarray(weight / weight.sum())
 
     def moved(self, time_s: float, followed_m: Array) -> Filters:
-        """At a later time, in tip coordinates that have moved along by (2,)."""
+        """Return the filters at a later time, in tip coordinates that have moved by `followed_m` (2,)."""
         step_s = time_s - self.time_s
         transition, gained = self.models.over(step_s)
         mean, covariance = self.mean.copy(), self.covariance.copy()
@@ -136,7 +138,7 @@ class Filters:
         return replace(self, time_s=time_s, mean=mean, covariance=covariance)
 
     def widened(self, position_sd_m: float, velocity_sd_m_s: float, scans: Sequence[int] = ()) -> Filters:
-        """Knowing less of the present, and of where the given scans lie: all of them by the same unknown distance."""
+        """Return the filters with a less certain present; the given scans move by the same unknown distance."""
         covariance = self.covariance.copy()
         for axis in range(2):
             together = [axis, *(4 + 4 * number + axis for number in scans)]
@@ -146,8 +148,7 @@ class Filters:
         return replace(self, covariance=covariance)
 
     def with_scan(self, noise_m2: Array, duration_s: float) -> Filters:
-        """With a scan of now that shows the sample where it is, but for a location error of a covariance (2, 2) and for
-        what it wandered while it was scanned."""
+        """Add a scan of now, with a location error (2, 2) and the sample's wandering during the scan."""
         mean = np.concatenate([self.mean, self.mean[:, :4]], axis=1)
         rows = np.concatenate([self.covariance, self.covariance[:, :4, :]], axis=1)
         covariance = np.concatenate([rows, rows[:, :, :4]], axis=2)
@@ -155,36 +156,37 @@ class Filters:
         return replace(self, mean=mean, covariance=covariance)
 
     def without_scan(self, number: int) -> Filters:
-        """Without one of the scans that are kept."""
+        """Remove one of the stored scans."""
         kept = np.delete(np.arange(self.mean.shape[1]), range(4 + 4 * number, 8 + 4 * number))
         return replace(self, mean=self.mean[:, kept], covariance=self.covariance[:, kept][:, :, kept])
 
     def scan_drifts_m(self) -> Array:
-        """(scans, 2) the displacement that each scan shows, as all filters together expect it."""
+        """Return the (scans, 2) displacement that each scan shows, by all filters together."""
         mean: Array = (self.weight @ self.mean)[4:].reshape(-1, 4)[:, :2]
         return mean
 
     def velocity(self, number: int | None = None) -> tuple[Array, Array]:
-        """(2,) and (2, 2) of the velocity during a scan, or now."""
+        """Return mean (2,) and covariance (2, 2) of the velocity during a scan, or now."""
         return self.mixed(self.velocity_rows(number))
 
     def velocity_rows(self, number: int | None = None) -> Array:
-        """(2, s) whose product with the state is the velocity during a scan, or now."""
+        """Return the (2, s) rows whose product with the state is the velocity during a scan, or now."""
         first = 2 if number is None else 6 + 4 * number
         return np.eye(self.mean.shape[1])[first : first + 2]
 
     def mixed(self, rows: Array) -> tuple[Array, Array]:
-        """Mean (m,) and covariance (m, m) of `rows` (m, s) @ state over all filters."""
+        """Return mean (m,) and covariance (m, m) of `rows` (m, s) @ state over all filters."""
         return mixed(self.weight, self.mean @ rows.T, rows @ self.covariance @ rows.T)
 
     def with_velocity(self, time_s: float, velocity_m_s: Array, covariance: Array, *, rarest: float) -> Filters:
-        """After a velocity of the sample itself that was measured at about the time of the filters."""
+        """Update by a measured velocity of the sample at about the time of the filters."""
         elsewhen = self.models.over(abs(self.time_s - time_s))[1][:, 2:, 2:]
         return self.updated(self.velocity_rows(), velocity_m_s, covariance + elsewhen, forget=1.0, rarest=rarest)
 
     def updated(self, rows: Array, measured: Array, noise: Array, *, forget: float, rarest: float) -> Filters:
-        """After `measured` (m,) = `rows` (m, s) @ state + noise of a covariance (m, m), or one for
-        each filter (n, m, m).
+        """Update by `measured` (m,) = `rows` (m, s) @ state + noise.
+
+        `noise` is a covariance (m, m), or one for each filter (n, m, m).
 
         Args:
             forget: share of the logarithm of the old weights that is kept.
@@ -207,7 +209,7 @@ class Filters:
 
 
 def mixed(weight: Array, mean: Array, covariance: Array) -> tuple[Array, Array]:
-    """Mean (m,) and covariance (m, m) of a mixture of weights (n,), means (n, m) and covariances (n, m, m)."""
+    """Return mean (m,) and covariance (m, m) of a mixture of weights (n,), means (n, m) and covariances (n, m, m)."""
     total = weight @ mean
     apart = mean - total
     spread = np.einsum("n,nij->ij", weight, covariance) + np.einsum("n,ni,nj->ij", weight, apart, apart)

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Compensation:
-    """A velocity that changes in steps; none at all to begin with.
+    """A velocity that changes in steps; zero at the start.
 
     Attributes:
         changes: (since when in s, v_x, v_y in m/s), in the order of time.
@@ -29,7 +29,7 @@ class Compensation:
     changes: tuple[tuple[float, float, float], ...] = ()
 
     def velocity_m_s(self, time_s: float) -> Array:
-        """(2,) at a time."""
+        """Return the velocity (2,) at a time."""
         velocity = (0.0, 0.0)
         for since_s, x, y in self.changes:
             if since_s <= time_s:
@@ -37,7 +37,7 @@ class Compensation:
         return np.array(velocity)
 
     def followed_m(self, from_s: float, to_s: float) -> Array:
-        """(2,) by how much tip coordinates have moved between two times, negative if they are exchanged."""
+        """Return the (2,) movement of tip coordinates between two times, negative if the first is later."""
         start_s, end_s = min(from_s, to_s), max(from_s, to_s)
         edges = [start_s, *(since_s for since_s, _, _ in self.changes if start_s < since_s < end_s), end_s]
         parts = [self.velocity_m_s(a) * (b - a) for a, b in itertools.pairwise(edges)]
@@ -45,7 +45,7 @@ class Compensation:
         return followed
 
     def changed(self, since_s: float, velocity_m_s: Array, *, needed_s: float) -> Compensation:
-        """With another velocity from a time on, and without what nobody asks for who asks about `needed_s` or later."""
+        """Return the same with another velocity from a time on, without changes older than `needed_s` needs."""
         before = [change for change in self.changes if change[0] < since_s]
         while len(before) > 1 and before[1][0] <= needed_s:
             del before[0]
@@ -81,7 +81,7 @@ class BankForecast:
 
     @classmethod
     def at_start(cls) -> BankForecast:
-        """Before the first scan: it will be what positions are counted from."""
+        """Return the forecast before the first scan, from which positions will be counted."""
         nothing = Models(np.zeros(1), np.zeros(1), np.zeros(1))
         return cls(0.0, nothing, np.ones(1), np.zeros((1, 4)), np.zeros((1, 4, 4)), Compensation())
 

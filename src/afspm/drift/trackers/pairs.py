@@ -28,7 +28,7 @@ _ALIKE = 0.05  # by which part the courses of two scans may differ if drift is t
 
 @dataclass(frozen=True, eq=False)
 class ObservationModel:
-    """The observation model: how d depends on the state.
+    """How d depends on the state.
 
     Attributes:
         number: of the reference.
@@ -44,7 +44,8 @@ class ObservationModel:
     noise_m2: Array
 
     def rows(self, states: int, scan_at: int) -> Array:
-        """(2, states) whose product with the state is d - offset; the scan's own position is at `scan_at`."""
+        """Return the (2, states) rows whose product with the state is d - offset; `scan_at` is the scan's own
+        position."""
         rows, first = np.zeros((2, states)), 4 + 4 * self.number
         for axis in range(2):
             rows[axis, scan_at + axis] = 1.0
@@ -56,7 +57,7 @@ class ObservationModel:
 
 @dataclass(frozen=True, eq=False)
 class NewestScan:
-    """The scan that is being compared, and what is known when it is.
+    """The scan under comparison, and the knowledge at that time.
 
     Attributes:
         compensated_m_s: (2,) velocity with which tip coordinates follow the sample; the state's is more by that.
@@ -69,7 +70,7 @@ class NewestScan:
     similarity: Similarity | None = None
 
     def link(self, number: int, reference: ReferenceScan, center_m: Array, displacement_m: Array) -> ObservationModel:
-        """For an overlap about a position of the reference."""
+        """Return the observation model of an overlap about a position of the reference."""
         ours_s, theirs_s = row_delay_s(self.scan, center_m + displacement_m), row_delay_s(reference.scan, center_m)
         offset, noise = np.zeros(2), np.zeros((2, 2))
         if ours_s is None:
@@ -85,14 +86,14 @@ class NewestScan:
         return ObservationModel(number, ours_s or 0.0, theirs_s or 0.0, offset, noise)
 
     def _either_way(self, scan: DriftScan, position_m: Array, number: int | None, compensated_m_s: Array) -> Array:
-        """(2, 2) of the displacement between a scan's middle and a position, with its direction not known."""
+        # (2, 2) of the displacement between a scan's middle and a position, with its direction unknown
         delay_s = row_delay_s(replace(scan, upwards=True), position_m) or 0.0  # as much later as earlier
         velocity, covariance = self.filters.velocity(number)
         velocity = velocity - compensated_m_s
         return np.asarray(delay_s**2 * (np.outer(velocity, velocity) + covariance))
 
     def expected(self, number: int, reference: ReferenceScan) -> tuple[Array, Array]:
-        """d (2,) as it is expected, and its covariance (2, 2)."""
+        """Return the expected d (2,) and its covariance (2, 2)."""
         states = self.filters.mean.shape[1]
         middle = ObservationModel(number, 0.0, 0.0, np.zeros(2), np.zeros((2, 2)))
         displacement_m, _ = self.filters.mixed(middle.rows(states, 0))
@@ -104,7 +105,7 @@ class NewestScan:
         return mean + link.offset_m, covariance + link.noise_m2
 
     def prior(self, number: int, reference: ReferenceScan, widening: float) -> Prior:
-        """Return what an estimator is told to expect: half a pixel wider, so that it looks around."""
+        """Return the prior for an estimator, widened by half a pixel, so that it looks around."""
         mean, covariance = self.expected(number, reference)
         half_px_m = max(*self.scan.pixel_m, *reference.scan.pixel_m) / 2
         covariance = widening * covariance + np.eye(2) * half_px_m**2
@@ -117,7 +118,7 @@ class NewestScan:
 
 
 def _sheared_alike(first: DriftScan, second: DriftScan) -> bool:
-    """True if the same drift shears both alike: rows in the same direction, at about the same pace."""
+    # rows in the same direction, at about the same pace
     one, other = delay_per_length_s_m(first), delay_per_length_s_m(second)
     if one is None or other is None:
         return False
@@ -142,20 +143,24 @@ class PairMeasurement:
     def of(
         cls, newest: NewestScan, number: int, reference: ReferenceScan, found: Registration, inflation: float
     ) -> PairMeasurement:
-        """An efficient estimator's error is one location error for each of the scans; inflation is the pair's."""
+        """Make a measurement of a registration.
+
+        The error of an efficient estimator is one location error for each of the scans; the inflation belongs to the
+        pair.
+        """
         link = newest.link(number, reference, found.center_m, found.displacement_m)
         pair_noise = (inflation - 1.0) * found.covariance_m2 + link.noise_m2
         return cls(link, found, pair_noise, found.covariance_m2 / 2)
 
     @property
     def value_m(self) -> Array:
-        """(2,) what the state tells of the displacement."""
+        """Displacement (2,) as a function of the state alone."""
         value: Array = self.found.displacement_m - self.link.offset_m
         return value
 
 
 def agreeing(measured: list[PairMeasurement], filters: Filters) -> list[PairMeasurement]:
-    """The largest group of results that fit together; of equally large ones that with the best reference."""
+    """Return the largest group of results that fit together; of equally large ones the group of the best reference."""
     if len(measured) < 2:
         return measured
     states = filters.mean.shape[1]
@@ -176,24 +181,24 @@ def agreeing(measured: list[PairMeasurement], filters: Filters) -> list[PairMeas
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Several results for one scan as one measurement, and the filters that are to learn from it."""
+    """Several results for one scan as one measurement, and the filters to update."""
 
     measured: list[PairMeasurement]
     filters: Filters
 
     @property
     def scan_noise_m2(self) -> Array:
-        """(2, 2) of the scan's own location error."""
+        """Covariance (2, 2) of the scan's own location error."""
         return np.asarray(np.mean([one.scan_noise_m2 for one in self.measured], axis=0))
 
     @cached_property
     def apart_m(self) -> Array:
-        """(2,) how far the best reference's result is from what all filters together expect."""
+        """Distance (2,) of the best reference's result from the expectation of all filters."""
         return self._apart[0]
 
     @cached_property
     def surprise(self) -> float:
-        """chi2 (2 degrees of freedom) of that."""
+        """chi² of `apart_m`, 2 degrees of freedom."""
         apart, covariance = self._apart
         return float(apart @ np.linalg.solve(covariance, apart))
 
@@ -204,7 +209,7 @@ class Comparison:
         return best.value_m - expected, covariance + best.pair_noise_m2 + self.scan_noise_m2
 
     def rows(self, states: int) -> tuple[Array, Array, Array]:
-        """Rows (m, states), values (m,) and noise (m, m); the scan is the last one in the state."""
+        """Return rows (m, states), values (m,) and noise (m, m); the scan is the last one in the state."""
         rows = np.concatenate([one.link.rows(states, states - 4) for one in self.measured])
         values = np.concatenate([one.value_m for one in self.measured])
         noise = np.zeros((len(values), len(values)))

@@ -28,14 +28,14 @@ TRANSFORMS = ("translation", "euclidean", "similarity", "affine")
 
 
 def transform_between(found: Registration, form: str) -> Mapping:
-    """From tip coordinates during the reference to those during the scan, in the nearest transform of a form."""
+    """Return the transform from tip coordinates during the reference to those during the scan, of the nearest form."""
     linear = _of_form(np.eye(2) + found.linear, form)
     center = found.center_m if form != "translation" else np.zeros(2)
     return Mapping.of(linear, center + found.displacement_m - linear @ center)
 
 
 def _of_form(linear: Array, form: str) -> Array:
-    """The 2 x 2 matrix of a form that is nearest (least squares of its elements)."""
+    # the nearest 2 x 2 matrix of a form, by least squares of its elements
     if form == "translation":
         return np.eye(2)
     if form == "affine":
@@ -49,7 +49,7 @@ def _of_form(linear: Array, form: str) -> Array:
 
 
 def logarithm(matrix: Array) -> Array:
-    """The real X with exp X = matrix, 3 x 3; of a translation exactly."""
+    """Return the real X with exp X = matrix, 3 x 3; exact for a translation."""
     if np.array_equal(matrix[:2, :2], np.eye(2)):
         return np.asarray(matrix - np.eye(3))
     from scipy.linalg import logm
@@ -58,7 +58,7 @@ def logarithm(matrix: Array) -> Array:
 
 
 def exponential(matrix: Array) -> Array:
-    """exp X with the last row 0 0 1, 3 x 3; of a translation's logarithm exactly."""
+    """Return exp X with the last row 0 0 1, 3 x 3; exact for a translation."""
     if not matrix[:2, :2].any():
         return np.asarray(np.eye(3) + matrix)
     from scipy.linalg import expm
@@ -113,7 +113,7 @@ class PaperForecast:
 
 @dataclass(frozen=True, eq=False)
 class PlacedScan:
-    """A scan of the queue C and the mapping M_j that it was found to have."""
+    """A scan of the queue C and its mapping M_j."""
 
     scan: DriftScan
     mapping: Mapping
@@ -121,7 +121,7 @@ class PlacedScan:
 
 @dataclass(eq=False)
 class PaperState:
-    """The knowledge of a tracker from scan to scan.
+    """The state of a tracker from scan to scan.
 
     Attributes:
         forecast: with the newest scan.
@@ -219,7 +219,7 @@ class PaperTracker:
         )
 
     def _match(self, scan: DriftScan, predicted: Mapping) -> tuple[Mapping | None, dict[str, Registration], str]:
-        """M_k from the oldest scan of D for which estimation succeeds; what was tried; why there is none."""
+        # M_k from the oldest scan of D whose estimation succeeds, all tries, and the reason for none
         region = predicted.to_sample(scan.region)
         tried: dict[str, Registration] = {}
         for old in self._state.queue:
@@ -237,14 +237,14 @@ class PaperTracker:
         return None, tried, "no scan of the queue overlaps enough with it"
 
     def _averaged(self, predicted: Mapping, estimated: Mapping) -> Mapping:
-        """M'_k dM~_k, with dM~_k shortened to the share that is believed."""
+        # M'_k dM~_k, with dM~_k shortened to the believed share
         if self._w_update == 1.0:
             return estimated
         residual = predicted.inverse @ estimated
         return predicted @ Mapping(exponential(self._w_update * logarithm(residual.matrix)))
 
     def _step(self, scan: DriftScan, before: Prediction, mapping: Mapping, used: list[Registration]) -> None:
-        """dM_k = dM^_k dM~_k makes the next rate."""
+        # dM_k = dM^_k dM~_k makes the next rate
         state = self._state
         since_s = 0.0 if state.newest_s is None else scan.mid_s - state.newest_s
         rate, covariance = state.forecast.rate, before.covariance_m2

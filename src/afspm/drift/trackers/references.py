@@ -19,12 +19,12 @@ _LIKE = 0.5  # least ratio of the resolutions of scans of one kind
 
 @dataclass(frozen=True, eq=False)
 class ReferenceScan:
-    """A scan that is kept.
+    """A stored scan.
 
     Attributes:
         compensated_m_s: (2,) velocity with which tip coordinates followed the sample then.
-        anchor: it stands for its part of the sample from now on.
-        adrift: it could not be compared with any that was not, so where it is was predicted and not seen.
+        anchor: whether it stands for its part of the sample.
+        adrift: no scan with a place matched it, so its place is a prediction.
         refusals: how often in a row it could not be registered while another one could.
         used: number of the scan that was last registered with it.
     """
@@ -39,7 +39,7 @@ class ReferenceScan:
 
 @dataclass(frozen=True)
 class Choice:
-    """The settings by which references are kept and chosen.
+    """The settings by which references are stored and chosen.
 
     Attributes:
         compared: at most so many references for each scan.
@@ -63,7 +63,7 @@ class Choice:
 
 
 class ReferenceScans:
-    """The scans that are kept, in the order of time. All displacements (…, 2) are those of the sample, in m."""
+    """The stored scans, in the order of time. Displacements (…, 2) are those of the sample, in m."""
 
     def __init__(self, choice: Choice) -> None:
         self.choice = choice
@@ -76,7 +76,10 @@ class ReferenceScans:
         return iter(self.kept)
 
     def candidates(self, scan: DriftScan, drift_m: Array, drifts_m: Array, *, anywhere: bool) -> list[int]:
-        """Numbers of those that a scan is to be compared with, the best first.
+        """Return the numbers of the references to compare with a scan, best first.
+
+        Scans adrift, which prove nothing, come last. Anchors of the same resolution come first, then the newest, which
+        show recent changes.
 
         Those adrift, which prove nothing, come last. Anchors of the same resolution come first, then the newest: the
         others show what may have changed since.
@@ -104,11 +107,11 @@ class ReferenceScans:
         return [number for _, number in sorted(fitting)][: self.choice.compared]
 
     def is_alike(self, number: int, scan: DriftScan) -> bool:
-        """Return whether a reference has about the resolution of a scan, not that of an overview of it."""
+        """True if a reference has about the resolution of a scan, not that of an overview of it."""
         return _alike(self.kept[number].scan, scan) >= _LIKE
 
     def judged(self, tried: Table[int, bool], step: int) -> None:
-        """Remember which could be registered with the newest scan."""
+        """Count which references could be registered with the newest scan."""
         for number, succeeded in tried.items():
             kept = self.kept[number]
             if succeeded:
@@ -117,12 +120,12 @@ class ReferenceScans:
                 self.kept[number] = replace(kept, refusals=kept.refusals + 1)
 
     def known(self, numbers: Iterable[int]) -> None:
-        """These are not adrift any more."""
+        """Clear the adrift flag of references."""
         for number in numbers:
             self.kept[number] = replace(self.kept[number], adrift=False)
 
     def needs_anchor(self, scan: DriftScan, drift_m: Array, drifts_m: Array) -> bool:
-        """True if no anchor stands for what a scan has seen."""
+        """True if no anchor stands for the area of a scan."""
         return not any(
             kept.anchor
             and self.is_alike(number, scan)
@@ -131,7 +134,7 @@ class ReferenceScans:
         )
 
     def superfluous(self) -> int | None:
-        """The number of one that must go; None if all may stay. The newest always may."""
+        """Return the number of a reference to remove; None if all may stay. The newest always stays."""
         old = list(enumerate(self.kept))[:-1]
         stale = [n for n, one in old if one.anchor and one.refusals >= self.choice.stale_after]
         if stale:

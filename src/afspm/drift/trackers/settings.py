@@ -28,8 +28,8 @@ class BankSettings:
         fadings_s: after which a velocity is gone to 1/e; inf for one that stays.
         walks_m2_s: variance that positions gain in a second besides. There is a filter for each density, fading and
             walk.
-        jitter_m: standard deviation of the position of a scan that no registration sees.
-        start_velocity_sd_m_s: what may be before anything is known.
+        jitter_m: standard deviation of a scan's position that no registration can measure.
+        start_velocity_sd_m_s: standard deviation of the velocity at the start.
         start_px: standard deviation of where the sample is found in the first scan, in its pixels.
         forget: share of the logarithm of the weights of the filters that is kept from one scan to the next.
         rarest: least weight of a filter, beside the largest.
@@ -37,8 +37,8 @@ class BankSettings:
             to each of its scans.
         widening: of the covariance of an expected displacement, where the estimator is told to search.
         doubt: chi2 above which a result is not believed before the next scan says so too.
-        second_looks: references that are searched without an expectation where none was found where it was expected.
-        lost_after: scans in a row that should have matched something and did not.
+        second_looks: references that are searched without a prediction after none was found with it.
+        lost_after: scans in a row that should have matched and did not.
         transform: "translation"; or "similarity": rotation and scale are estimated as well.
         linear_walk_per_s: variance that the angle (rad) and the logarithm of the scale gain in a second.
     """
@@ -79,7 +79,7 @@ class BankSettings:
 
     @classmethod
     def split(cls, settings: Plain) -> tuple[BankSettings, Choice]:
-        """Those of the bank and those of its references.
+        """Split settings into those of the bank and those of its references.
 
         Raises:
             ConfigError: a name that neither has, or a value without a meaning.
@@ -100,11 +100,11 @@ class BankSettings:
             raise ConfigError(f"the settings of the tracker: {error}") from error
 
     def models(self) -> Models:
-        """How a filter moves for each density, fading and walk."""
+        """Return a model of motion for each density, fading and walk."""
         densities, fadings, walks = np.meshgrid(self.densities_m2_s3, self.fadings_s, self.walks_m2_s, indexing="ij")
         return Models(densities.ravel(), 1.0 / fadings.ravel(), walks.ravel())
 
     def filters(self, first: DriftScan) -> Filters:
-        """All filters with the first scan."""
+        """Return all filters after the first scan."""
         position_sd_m = self.start_px * min(first.pixel_m)
         return Filters.start(self.models(), first.mid_s, position_sd_m, self.start_velocity_sd_m_s, first.duration_s)

@@ -27,7 +27,10 @@ _OF_SCALE, _OF_ANGLE = np.array([1.0, 0.0, 0.0, 1.0]), np.array([0.0, -1.0, 1.0,
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """Rotation and scale with their uncertainty; nothing is changed in place.
+    """Rotation and scale with their uncertainty; immutable.
+
+    Scans are registered straightened, with the known rotation and scale of their time undone. In these coordinates, u =
+    straight(x_tip), the sample is only displaced, x_sample = u - drift.
 
     Scans are registered straightened: with the rotation and scale undone that are known of their time. In these
     coordinates, u = straight(x_tip), the sample is only displaced, x_sample = u - drift.
@@ -48,7 +51,7 @@ class Similarity:
 
     @classmethod
     def at_start(cls, scan: DriftScan) -> Similarity:
-        """With the first scan, which is neither turned nor stretched by definition."""
+        """Return the state after the first scan, which is neither turned nor stretched by definition."""
         return cls(Mapping.identity(), np.array(scan.region.center_m), np.zeros(2, complex), np.zeros((2, 2)))
 
     @property
@@ -57,23 +60,23 @@ class Similarity:
         return float(np.sqrt(self.covariance[0, 0]))
 
     def straightened(self, scan: DriftScan) -> DriftScan:
-        """The scan with its region in straightened coordinates."""
+        """Return the scan with its region in straightened coordinates."""
         return replace(scan, region=replace(self.straight.to_sample(scan.region), frame=Frame.TIP))
 
     def moved(self, variance: float) -> Similarity:
-        """Later, when the present may have changed by a variance."""
+        """Return the state later, when the present may have changed by a variance."""
         covariance = self.covariance.copy()
         covariance[0, 0] += variance
         return replace(self, covariance=covariance)
 
     def lever_m2(self, number: int, position_m: Array) -> Array:
-        """(2, 2) covariance of a displacement between a reference and now, by the uncertain turn about the pivot."""
+        """Return the (2, 2) covariance of a displacement from a reference by the uncertain turn about the pivot."""
         row = self._row(number)
         far_m = position_m - self.pivot_m
         return np.asarray(np.eye(2) * (row @ self.covariance @ row) * (far_m @ far_m))
 
     def learned(self, number: int, seen: SimilarityMeasurement) -> Similarity:
-        """After a registration with a reference."""
+        """Update by a registration with a reference."""
         row = self._row(number)
         crossed = self.covariance @ row
         expected = float(row @ crossed) + seen.variance
@@ -87,24 +90,24 @@ class Similarity:
         return replace(self, error=error, covariance=(covariance + covariance.T) / 2, doubted=False)
 
     def straight_about(self, position_m: Array) -> Similarity:
-        """With what error is expected taken out about a place (2,): there, displacements stay what they were."""
+        """Take the expected error out about a place (2,), where displacements stay the same."""
         error = self.error.copy()
         undone = _turned_about(position_m, -error[0])
         error[0] = 0.0
         return replace(self, straight=undone @ self.straight, pivot_m=position_m, error=error)
 
     def with_scan(self) -> Similarity:
-        """With a scan of now, straightened as it was registered, among the references."""
+        """Add a scan of now, straightened as it was registered."""
         now = [*range(len(self.error)), 0]
         return replace(self, error=self.error[now], covariance=self.covariance[np.ix_(now, now)])
 
     def without_scan(self, number: int) -> Similarity:
-        """Without one of the references."""
+        """Remove one of the references."""
         kept = np.delete(np.arange(len(self.error)), 1 + number)
         return replace(self, error=self.error[kept], covariance=self.covariance[np.ix_(kept, kept)])
 
     def _row(self, number: int) -> Array:
-        """(1 + n,) whose product with the state is what a registration with a reference shows."""
+        # (1 + n,) whose product with the state is the value in a registration with a reference
         row = np.zeros(len(self.error))
         row[0], row[1 + number] = 1.0, -1.0
         return row
@@ -124,7 +127,10 @@ class SimilarityMeasurement:
 
     @classmethod
     def of(cls, seen: LinearSeen, scans: tuple[DriftScan, DriftScan], inflation: float) -> SimilarityMeasurement:
-        """The generalised least squares fit to what was seen, beside a shear by drift during either scan.
+        """Fit rotation and scale to a linear part by generalised least squares, beside a shear by drift during either
+        scan.
+
+        Such a shear displaces whole rows, so changes along a row carry most of the information.
 
         Such a shear displaces rows as a whole, so what depends on the position along a row tells the most.
         """
