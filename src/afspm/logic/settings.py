@@ -46,8 +46,6 @@ class ControlSettings:
         retract: whether to retract the tip when control ends in a dangerous state, if the microscope can.
         dangerous: list of those states: `MOVING`, `SCANNING`, `COARSE_MOTOR`, `BUSY_PARAM`, `SPEC`, `feedback-off`;
             without the key `COARSE_MOTOR` and `feedback-off`.
-        spectra_by_variable: whether the translator sends the values of a spectrum variable by variable, contrary to the
-            schema, as the published translators for Nanonis and Asylum do.
         request_timeout_s: real time after which a request counts as unanswered.
         request_retries: how often an unanswered request is sent again; it is never executed twice.
         adjustable: parameters that a person sets in AUTOMATED as well, beside the component in control: any of
@@ -67,7 +65,6 @@ class ControlSettings:
     stop_scan_on_manual: Switch = True
     retract: Switch = True
     dangerous: tuple[DangerousState, ...] | None = None
-    spectra_by_variable: Switch = False
     request_timeout_s: PositiveDuration = 5.0
     request_retries: WholeNumber = 3
     adjustable: tuple[AdjustableParameter, ...] = ()

@@ -101,8 +101,8 @@ class Faults:
         self._start_s = start_s
         self._kept: Plain = {} if kept is None else kept
         given = list(faults)
-        for fault in given:
-            self._check(fault.kind)
+        for number, fault in enumerate(given):
+            self._check(fault.kind, f"faults[{number}].kind")
         left = [Fault(**one) for one in self._kept["left"]] if "left" in self._kept else given
         self._left = sorted(left, key=lambda fault: fault.at_s)
         self._keep()
@@ -143,8 +143,8 @@ class Faults:
     def _keep(self) -> None:
         self._kept["left"] = [asdict(fault) for fault in self._left]
 
-    def _check(self, kind: str) -> None:
+    def _check(self, kind: str, where: str = "faults") -> None:
         if kind not in self._known:
             near = difflib.get_close_matches(kind, self._known, n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(self._known)}"
-            raise ConfigError(f"there is no fault {kind!r}", where="faults", hint=hint)
+            raise ConfigError(f"there is no fault {kind!r}", where=where, hint=hint)

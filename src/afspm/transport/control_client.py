@@ -30,11 +30,8 @@ class ControlClient:
         self._connected = self._has_asked = False
         self._unanswered = b""
         self._name, self._token = name, ""
-        # a scheduler of version 1, which has no keys, takes the whole identity for the name
-        self._is_bare = network.keys is None
-        self._moving: list[Sequence[bytes]] | None = None  # what waits for the connection by another identity
         self.socket = network.socket(zmq.DEALER)
-        self.socket.setsockopt(zmq.ROUTING_ID, name.encode() if self._is_bare else routing_id(name))
+        self.socket.setsockopt(zmq.ROUTING_ID, routing_id(name))
         self.monitor = Monitor(network, self.socket, CONNECTED | DISCONNECTED)
         network.connect(self.socket, address)
 
@@ -44,9 +41,6 @@ class ControlClient:
         A request repeated without an answer in between makes the connection anew: a connection that stands but leads
         nowhere (cut off, or its identity was taken by another process) would never lead anywhere again.
         """
-        if self._moving is not None:
-            self._moving.append(frames)
-            return
         if not self._connected:
             return
         asked = frames[2] if len(frames) > 2 else b""
@@ -86,13 +80,6 @@ class ControlClient:
                 self._greet()
             found.append(ControlConnected() if self._connected else ControlDisconnected())
         return found
-
-    def _moved(self, kind: int) -> None:
-        """Take in the connection by the new identity, which nobody else needs to know of."""
-        if kind == CONNECTED:
-            waiting, self._moving, self._connected = self._moving or [], None, True
-            for frames in waiting:
-                self._send(frames)
 
     def _interpret(self, frames: list[bytes]) -> list[Incoming]:
         if len(frames) < 2 or frames[0]:

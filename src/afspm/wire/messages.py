@@ -74,7 +74,6 @@ class MessageDeclaration:
         set_by: the request that sets what it says.
         event: its kind among the events of the gateway; empty: it is not streamed.
         in_past: an overview of an earlier part of a run needs all of its packets, not the newest alone.
-        in_version_1: a cache of version 1 knows it, which ends over any other.
         name: of the message, with which its envelopes begin.
     """
 
@@ -89,7 +88,6 @@ class MessageDeclaration:
     set_by: ControlRequest | None = None
     event: str = ""
     in_past: bool = False
-    in_version_1: bool = False
     name: str = field(init=False)
 
     def __post_init__(self) -> None:
@@ -118,7 +116,6 @@ SCAN: Final = MessageDeclaration(
     handler="on_scan",
     event="scan",
     in_past=True,
-    in_version_1=True,
 )
 SPECTRUM: Final = MessageDeclaration(
     type=spectroscopy_pb2.Spec1d,
@@ -129,7 +126,6 @@ SPECTRUM: Final = MessageDeclaration(
     handler="on_spectrum",
     event="spectrum",
     in_past=True,
-    in_version_1=True,
 )
 SCAN_LINES: Final = MessageDeclaration(
     type=lines_pb2.ScanLines, kind=MessageKind.LINES, source=Role.TRANSLATOR, always=False, history=0
@@ -143,7 +139,6 @@ SCOPE_STATE: Final = MessageDeclaration(
     attribute="status",
     event="state",
     in_past=True,
-    in_version_1=True,
 )
 CONTROL_STATE: Final = MessageDeclaration(
     type=control_pb2.ControlState,
@@ -153,7 +148,6 @@ CONTROL_STATE: Final = MessageDeclaration(
     attribute="control",
     event="control",
     in_past=True,
-    in_version_1=True,
 )
 SCAN_PARAMETERS: Final = MessageDeclaration(
     type=ScanParameters2d,
@@ -164,7 +158,6 @@ SCAN_PARAMETERS: Final = MessageDeclaration(
     set_by=ControlRequest.SET_SCAN_PARAMS,
     event="scan-parameters",
     in_past=True,
-    in_version_1=True,
 )
 FEEDBACK: Final = MessageDeclaration(
     type=ZCtrlParameters,
@@ -175,7 +168,6 @@ FEEDBACK: Final = MessageDeclaration(
     set_by=ControlRequest.SET_ZCTRL_PARAMS,
     event="feedback",
     in_past=True,
-    in_version_1=True,
 )
 PROBE_POSITION: Final = MessageDeclaration(
     type=ProbePosition,
@@ -185,7 +177,6 @@ PROBE_POSITION: Final = MessageDeclaration(
     attribute="probe_position",
     set_by=ControlRequest.SET_PROBE_POS,
     event="probe-position",
-    in_version_1=True,
 )
 JOURNAL: Final = MessageDeclaration(
     type=journal_pb2.JournalEntries,
@@ -233,14 +224,12 @@ REGIONS: Final = MessageDeclaration(
     kind=MessageKind.RESULT,
     source=Role.COMPONENT,
     always=False,
-    in_version_1=True,
 )
 POINTS: Final = MessageDeclaration(
     type=analysis_pb2.SpatialPointWithScoreList,
     kind=MessageKind.RESULT,
     source=Role.COMPONENT,
     always=False,
-    in_version_1=True,
 )
 FEEDBACK_ANALYSIS: Final = MessageDeclaration(
     type=feedback_pb2.FeedbackAnalysis, kind=MessageKind.RESULT, source=Role.COMPONENT, always=False

@@ -2,94 +2,17 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zmq
-from scheduler_rig import Component, Rig
+from bridged_rig import Bridge, BridgedRig
 from version_1 import Router
 
-from afspm.launch import Launch, Sockets
+from afspm.launch import Sockets
 from afspm.supervisor.ports import FreePorts
-
-PACKAGE = "afspm.plugins.published"
-
-
-class Bridge:
-    """A process of the bridge."""
-
-    def __init__(self, class_: str, sockets: Sockets, settings: dict[str, Any], folder: Path, keys: Any = None) -> None:
-        launch = Launch("bridge", f"{PACKAGE}.{class_}", settings, sockets, state_dir=str(folder / "state"), keys=keys)
-        self.process = subprocess.Popen([sys.executable, "-m", "afspm.process.host"], stdin=subprocess.PIPE)
-        assert self.process.stdin is not None
-        self.process.stdin.write(launch.to_json().encode() + b"\n")
-        self.process.stdin.flush()
-
-    def close(self) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        self.process.wait()
-
-
-class BridgedRig(Rig):
-    """A rig whose addresses are those that their programs know. Ours have others, behind the bridge."""
-
-    def __init__(self, folder: Path, keys_folder: Path | None = None) -> None:
-        super().__init__(folder, keys_folder)
-        ports = FreePorts()
-        self.inside = Sockets(ports.address(), (ports.address(),), ports.address(), ports.address())
-        self.bridges: list[Bridge] = []
-        self.translator_settings: dict[str, Any] = {}
-
-    def launch(self) -> Launch:
-        launch = super().launch()
-        source = self.source if self.translator is not None else (self.inside.subscribe[0], str(self.inside.control))
-        sockets = Sockets(self.inside.publish, (source[0],), self.inside.serve, source[1])
-        return replace(launch, sockets=sockets)
-
-    def start(self) -> None:
-        """Their translator is there if ours is not."""
-        super().start()
-        inside = self.inside
-        sockets = Sockets(subscribe=(str(inside.publish),), control=inside.serve)
-        self.bridge("peers.PublishedPeers", sockets, serve=self.serve, publish=self.publish)
-        if self.translator is None:
-            sockets = Sockets(publish=inside.subscribe[0], serve=inside.control)
-            settings = self.translator_settings
-            self.bridge(
-                "translator.PublishedTranslator", sockets, serve=self.source[1], publish=self.source[0], **settings
-            )
-
-    def component(self, name: str, envelopes: list[str] | None = None, owner: str = "") -> Component:
-        """Their scheduler is there if ours is not."""
-        inside = self.inside
-        if self.process is None:
-            sockets = Sockets(publish=inside.publish, serve=inside.serve)
-            self.bridge("scheduler.PublishedScheduler", sockets, serve=self.serve, publish=self.publish)
-        outside = self.publish, self.serve
-        self.publish, self.serve = str(inside.publish), str(inside.serve)
-        try:
-            component = Component(self, name, envelopes, owner)
-        finally:
-            self.publish, self.serve = outside
-        self.components.append(component)
-        self.until(component.connected)
-        return component
-
-    def bridge(self, class_: str, sockets: Sockets, **settings: Any) -> None:
-        addresses = (*sockets.subscribe, str(sockets.control))
-        keys = self._keys_folder and {"folder": str(self._keys_folder), **dict.fromkeys(addresses, "scheduler")}
-        self.bridges.append(Bridge(class_, sockets, settings, self._folder, keys))
-
-    def close(self) -> None:
-        super().close()
-        for bridge in self.bridges:
-            bridge.close()
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
+from bridged_rig import BridgedRig
 from version_1 import REQUEST, Client, Subscriber
 
 from afspm import wire
@@ -18,7 +19,6 @@ from afspm.model import ControlRequest, ControlResponse, Region, Request, Respon
 from afspm.supervisor.ports import FreePorts
 from afspm.transport import keys
 from afspm.wire.generated import control_pb2
-from conftest import BridgedRig
 
 SUCCESS = int(ControlResponse.SUCCESS)
 PAUSE_S = 0.4

@@ -13,10 +13,10 @@ surface = { kind = "steps", stepp_m = 1.0 }
 initial = { scan-sped = "1 um/s" }
 
 [[microscope.faults]]
-kind = "slow"
+kind = "late-reply"
 
 [[microscope.faults]]
-kind = "slwo"
+kind = "late-repyl"
 
 [[microscope.panel]]
 at_s = 4
@@ -28,7 +28,7 @@ EACH = [
     ("noise.whit_m", "noise ="),
     ("surface.stepp_m", "surface ="),
     ("initial.scan-sped", "initial ="),
-    ("faults[1].kind", 'kind = "slwo"'),
+    ("faults[1].kind", 'kind = "late-repyl"'),
     ("panel[0].set.scan-angle", "set ="),
 ]
 

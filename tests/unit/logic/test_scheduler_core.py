@@ -24,7 +24,6 @@ from afspm.logic.events import (
     Tick,
     TranslatorCaughtUp,
     TranslatorDown,
-    TranslatorReply,
     TranslatorUp,
 )
 from afspm.logic.limits import ExperimentLimits, Limit
@@ -41,7 +40,6 @@ from afspm.model import (
     PacketHeader,
     Parameter,
     Request,
-    Response,
     ResponseDetail,
     ScopeState,
 )
@@ -461,18 +459,6 @@ def test_a_stop_that_was_due_in_the_kill_is_made_up_for(lab: Lab) -> None:
     after.step(TranslatorUp())
     after.answer(after.forwarded[-1])
     assert after.forwarded[-1].request.subject == "stop-scan"
-
-
-def test_an_action_sent_before_a_kill_is_not_sent_again_to_version_1() -> None:
-    lab = Lab()
-    lab.step(TranslatorUp())
-    lab.step(TranslatorReply(lab.forwarded.pop().number, Response(int(OK))))
-    lab.take_control("experiment")
-    lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
-    after = restarted(lab)
-    after.step(TranslatorUp())
-    after.step(TranslatorReply(after.forwarded.pop().number, Response(int(OK))))
-    assert after.says("experiment", ACTION, "x-pulse", "experiment/a/1") is NO_RESPONSE
 
 
 def test_the_end_is_saved_answered_and_then_told_to_all(lab: Lab) -> None:

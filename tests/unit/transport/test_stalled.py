@@ -12,7 +12,7 @@ from systems import not_on_wine
 from afspm.clock import ExperimentClock
 from afspm.transport import network
 from afspm.transport.late_joiners import PublishedHistory
-from afspm.transport.network import DISCONNECTED, Network
+from afspm.transport.network import DISCONNECTED, Monitor, Network
 from afspm.transport.port import PacketReceived
 from afspm.transport.publisher import Publisher
 from afspm.transport.zmq_port import ZmqPort
@@ -27,7 +27,7 @@ SOON_S = 6.0  # earlier than anything else disconnects it
 
 
 @pytest.fixture
-def publisher(monkeypatch: pytest.MonkeyPatch, open_: Any, gone: Any) -> Any:
+def publisher(monkeypatch: pytest.MonkeyPatch, open_: Any) -> Any:
     """One that waits for a peer for half a second and remembers its last packet alone."""
     monkeypatch.setattr(network, "_STALLED_MS", 500)
     published = PublishedHistory(CLOCK, most_packets=2 * SCANS, most_bytes=2 * SCANS * len(SCAN))
@@ -36,13 +36,13 @@ def publisher(monkeypatch: pytest.MonkeyPatch, open_: Any, gone: Any) -> Any:
         def __init__(self) -> None:
             self.network = Network()
             self.publisher = Publisher(self.network, ANY, published)
-            self._gone = gone(self.publisher)
+            self._monitor = Monitor(self.network, self.publisher.socket, DISCONNECTED)
             self.address = self.publisher.address
 
         def poll(self, timeout_s: float) -> list[int]:
             self.publisher.socket.poll(int(timeout_s * 1000))
             self.publisher.serve()
-            return self._gone.take()
+            return [event.kind for event in self._monitor.drain()]
 
         def publish(self, payload: bytes) -> None:
             self.publisher.publish(published.stamp("Scan2d", payload))
