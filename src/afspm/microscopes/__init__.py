@@ -1,1 +1,0 @@
-"""Drivers of microscopes: a package for each vendor's controller, and the simulated ones."""
