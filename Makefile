@@ -42,7 +42,7 @@ TESTS_AT_A_TIME ?= 8
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest
 COLLECTED := .venv/.tests-collected
 POWER_CUT := tests/system/record/test_power_cut.py
-QUICK := tests/unit tests/simulation tests/vendors tests/docs $(addprefix tests/system/,scheduler supervisor process)
+QUICK := tests/unit tests/simulation tests/plugins tests/docs $(addprefix tests/system/,scheduler supervisor process)
 test: $(COLLECTED)
 	@$(PYTEST) -n $(TESTS_AT_A_TIME) --dist worksteal -m "not slow" $(QUICK)
 
@@ -76,7 +76,7 @@ test-samples: $(TEST)
 coverage: $(TEST)
 	@$(PYTHON) tools/bootstrap.py coverage
 	@$(PYTEST) -n 2 --dist worksteal -m "not slow" --cov=afspm --cov-report=html:build/coverage --cov-report=term:skip-covered \
-	  tests/unit tests/simulation tests/vendors
+	  tests/unit tests/simulation tests/plugins
 
 ## the dashboard in a real browser (Debian's chromium, or another: AFSPM_CHROMIUM=/path); screenshots in build/screenshots
 test-ui: $(TEST)
@@ -88,7 +88,7 @@ test-gateway: $(TEST)
 	@AFSPM_SCHEMATHESIS_S=240 $(BIN)/pytest tests/system/gateway
 
 ## each base operation of every translator: the simulated microscope's, the image's, and those of emulated controllers
-TRANSLATORS ?= $(wildcard experiments/every_microscope/[is]*.toml src/afspm/microscopes/*/emulated.toml)
+TRANSLATORS ?= $(wildcard experiments/every_microscope/[is]*.toml src/afspm/plugins/*/emulated.toml)
 test-translators: $(TEST)
 	@printf '%s\n' $(TRANSLATORS) | xargs -P 4 -I FILE $(BIN)/afspm test-translator FILE \
 	  --frame "500 nm" --runs build/translators

@@ -27,8 +27,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from afspm.clock import ExperimentClock
-from afspm.process.memory import Memory
+from afspm.basics.clock import ExperimentClock
+from afspm.storage.memory import Memory
 
 SAMPLE = Path(__file__).parents[1] / "experiments" / "tip_repair" / "experiment.toml"
 OVER = """

@@ -15,9 +15,10 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
-from afspm import entry_points, wire
+from afspm import wire
+from afspm.basics import entry_points
 from afspm.model import ControlRequest, Parameter, Region, Request, ScanParameters, ScopeState, names
-from afspm.process.memory import Memory
+from afspm.storage.memory import Memory
 from afspm.translator.tcp import Receiver
 from afspm.translator.translator import Translator
 from afspm.translator.zmq_connection import ZmqConnection

@@ -21,7 +21,7 @@ from time import perf_counter
 import zmq
 
 import afspm
-from afspm.errors import RequestError
+from afspm.basics.errors import RequestError
 from afspm.supervisor.ports import FreePorts
 from benchmarks.effort import effort
 from benchmarks.rows import Row, measurement

@@ -11,8 +11,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from afspm.clock import ExperimentClock
-from afspm.launch import Launch, Sockets
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.launch import Launch, Sockets
 from afspm.storage.packet_log import expect_recorder, log_folder
 from afspm.supervisor.ports import FreePorts
 
@@ -81,7 +81,7 @@ class Roles(ExitStack):
         port = int(PORTS.address().rpartition(":")[2])
         launch = Launch(
             "dashboard",
-            "afspm.dashboard.dashboard.Dashboard",
+            "afspm.plugins.web.dashboard.dashboard.Dashboard",
             {"port": port},
             sockets=Sockets(subscribe=(publish,), control=serve),
             envelopes=("",),
@@ -94,7 +94,7 @@ class Roles(ExitStack):
 
     def microscope(self, **settings: Any) -> str:
         """The real translator of a simulated microscope; returns the address where it is asked."""
-        return self.translator("afspm.microscopes.simulator.Simulator", **settings)[1]
+        return self.translator("afspm.simulation.simulator.Simulator", **settings)[1]
 
     def translator(self, class_: str, **settings: Any) -> tuple[str, str]:
         """The real translator of a microscope; returns the addresses (publish, serve)."""
@@ -114,7 +114,7 @@ class Roles(ExitStack):
         return publish, serve
 
     def _host(self, launch: Launch) -> None:
-        process = subprocess.Popen([sys.executable, "-m", "afspm.process.host"], stdin=subprocess.PIPE)
+        process = subprocess.Popen([sys.executable, "-m", "afspm.supervisor.host"], stdin=subprocess.PIPE)
         self.processes.append(process)
         self.callback(_end, process)
         assert process.stdin is not None

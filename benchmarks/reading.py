@@ -12,9 +12,9 @@ from time import perf_counter
 import numpy as np
 
 import afspm
-from afspm.emulators.asylum import ibw
-from afspm.emulators.gxsm import files as gxsm
-from afspm.emulators.nanonis import files as nanonis
+from afspm.plugins.asylum.emulator import ibw
+from afspm.plugins.gxsm.emulator import files as gxsm
+from afspm.plugins.nanonis.emulator import files as nanonis
 from benchmarks.effort import effort
 from benchmarks.rows import Row, alternate, measurement
 

@@ -14,10 +14,10 @@ from typing import Any
 import zmq
 
 from afspm import wire
-from afspm.clock import ExperimentClock
-from afspm.emulators import registry
-from afspm.errors import WireError
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import WireError
 from afspm.model import Response
+from afspm.simulation.emulation import registry
 from afspm.transport.network import Network
 from afspm.transport.port import PacketReceived, RequestReceived
 from afspm.transport.zmq_port import ZmqPort

@@ -13,8 +13,8 @@ from time import perf_counter
 import numpy as np
 
 from afspm import wire
-from afspm.drift.registration import DriftScan, Prior, Registration
 from afspm.model import ScopeState, ScopeStatus
+from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 from afspm.transport.network import Network
 from afspm.transport.port import PacketReceived
 from afspm.transport.zmq_port import ZmqPort
@@ -81,7 +81,7 @@ def sample_scans() -> Iterator[Row]:
             source, _ = processes.scheduler(
                 str(translator.publish_address),
                 translator.serve_address,
-                class_="afspm.scheduler.drift.scheduler.DriftCompensatedScheduler",
+                class_="afspm.plugins.drift.scheduler.scheduler.DriftCompensatedScheduler",
                 drift=drift,
             )
             listener = ZmqPort(Network(), "Listener", CLOCK, subscribe=[source], envelopes=["Scan2d"])

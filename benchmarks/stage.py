@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm import wire
-from afspm.clock import ExperimentClock
-from afspm.launch import Launch, Sockets
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.launch import Launch, Sockets
 from afspm.model import ControlMode, ControlState, Region, Scan, ScopeState, ScopeStatus
 from afspm.transport.zmq_port import open_port
 
@@ -48,7 +48,7 @@ class Stage(ExitStack):
         assert address is not None
         launch = Launch(
             "dashboard",
-            "afspm.dashboard.dashboard.Dashboard",
+            "afspm.plugins.web.dashboard.dashboard.Dashboard",
             {"port": 0, **self._settings},
             sockets=Sockets(subscribe=(address,)),
             envelopes=("",),
@@ -57,7 +57,7 @@ class Stage(ExitStack):
             simulated=True,
         )
         self.process = subprocess.Popen(
-            (sys.executable, "-m", "afspm.process.host"), stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            (sys.executable, "-m", "afspm.supervisor.host"), stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         assert self.process.stdin is not None
         assert self.process.stderr is not None

@@ -45,7 +45,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         module = item.nodeid.partition("::")[0]
         is_slow = module.startswith(SLOW) and not module.startswith(QUICK)
-        if is_slow or (module.startswith("tests/vendors/") and module.endswith(SLOW_MODULES)):
+        if is_slow or (module.startswith("tests/plugins/") and module.endswith(SLOW_MODULES)):
             item.add_marker(pytest.mark.slow)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from afspm import entry_points
+from afspm.basics import entry_points
 from afspm.testing.commissioning.procedure import commission
 from afspm.testing.commissioning.report import InstrumentReport
 from afspm.testing.translators import CheckOptions

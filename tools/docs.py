@@ -16,22 +16,23 @@ from typing import Any
 
 import python_api
 
-from afspm import Component, entry_points, wire
-from afspm.logic import arbitration, diagram
-from afspm.logic.arbitration import RoleTable
-from afspm.logic.envelopes import CacheRule, CacheSettings
-from afspm.logic.limits import Limit
-from afspm.logic.settings import ControlSettings
-from afspm.microscopes.simulator import FAULT_KINDS, Simulator
-from afspm.microscopes.simulator.controller import PanelEvent
+from afspm import Component, wire
+from afspm.basics import entry_points
+from afspm.basics.units import Unit
 from afspm.model import Role
+from afspm.scheduler.control import arbitration, diagram
+from afspm.scheduler.control.arbitration import RoleTable
+from afspm.scheduler.publishing.envelopes import CacheRule, CacheSettings
+from afspm.scheduler.safety.limits import Limit
+from afspm.scheduler.settings import ControlSettings
 from afspm.simulation.drift import Relaxation
 from afspm.simulation.faults import Fault
+from afspm.simulation.simulator import FAULT_KINDS, Simulator
+from afspm.simulation.simulator.controller import PanelEvent
 from afspm.simulation.surfaces import KINDS
 from afspm.simulation.world import WorldSettings
 from afspm.testing.commissioning.report import TRIED_ON, InstrumentReport
 from afspm.testing.commissioning.steps import OPERATIONS
-from afspm.units import Unit
 
 ROOT = Path(__file__).resolve().parents[1]
 SET_BY_AFSPM = ("unit", "source")  # of a limit: no keys of the file

@@ -15,8 +15,9 @@ from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from afspm.drift.estimators import estimator
-from afspm.drift.figures.style import (
+from afspm.model import Region
+from afspm.plugins.drift.estimators import estimator
+from afspm.plugins.drift.figures.style import (
     BLUE,
     GREEN,
     GREY,
@@ -30,10 +31,9 @@ from afspm.drift.figures.style import (
     styled,
     time_axis,
 )  # fmt: skip
-from afspm.drift.registration import DriftScan
-from afspm.model import Region
+from afspm.plugins.drift.registration import DriftScan
+from afspm.plugins.drift.study import NightSettings, night
 from afspm.simulation import World
-from afspm.study import NightSettings, night
 
 Array = NDArray[np.float64]
 
@@ -144,8 +144,8 @@ def shear() -> Figure:
     up = taken(world, (0.0, 0.0), 0.0, 1e-6)
     at_m = np.zeros(2)
     down = taken(world, (0.0, 0.0), up.end_s + 2.0, 1e-6, direction="down")
-    from afspm.drift.shear import velocity_from_up_down
     from afspm.model.drift_removal import undistorted
+    from afspm.plugins.drift.shear import velocity_from_up_down
 
     told = velocity_from_up_down(up, down, estimator())
     v = (float(told.velocity_m_s[0]), float(told.velocity_m_s[1]))

@@ -15,14 +15,14 @@ from typing import Any
 
 GROUPS = {
     "Join, open, read": ["afspm.connect", "afspm.open_run", "afspm.find_runs", "afspm.read"],
-    "Write a component": ["afspm.Component", "afspm.process.memory.Memory"],
+    "Write a component": ["afspm.Component", "afspm.storage.memory.Memory"],
     "Use the microscope": ["afspm.Scope", "afspm.client.events.Events", "afspm.client.events.PublishedEvent"],
     "What is asked for and measured": [
         "afspm.Region",
         "afspm.Scan",
         "afspm.ScanSet",
         "afspm.Spectrum",
-        "afspm.files.FileContent",
+        "afspm.storage.formats.FileContent",
     ],
     "After the night": [
         "afspm.record.run.Run",
@@ -31,19 +31,19 @@ GROUPS = {
         *(f"afspm.record.tables.{name}" for name in ("ScanRow", "SpectrumRow", "NoteRow")),
     ],
     "Surveys": [
-        *(f"afspm.survey.{name}" for name in ("find_particles", "nearest", "lowest_beside", "Target")),
-        *(f"afspm.survey.{name}" for name in ("SurveyRecord", "Visit", "Outcome")),
+        *(f"afspm.components.surveying.{name}" for name in ("find_particles", "nearest", "lowest_beside", "Target")),
+        *(f"afspm.components.surveying.{name}" for name in ("SurveyRecord", "Visit", "Outcome")),
     ],
     "State": [
         *(f"afspm.{name}" for name in ("ScopeState", "ControlMode", "Problem")),
         *(f"afspm.model.{name}" for name in ("ControlState", "ScanParameters", "Feedback", "ProbePosition")),
         "afspm.model.ProblemNames",
     ],
-    "Units": [f"afspm.units.{name}" for name in ("si", "convert", "parse_quantity", "same_kind")],
+    "Units": [f"afspm.basics.units.{name}" for name in ("si", "convert", "parse_quantity", "same_kind")],
     "Errors": [
-        *(f"afspm.errors.{name}" for name in ("AfspmError", "Refused", "NoResponse", "MeasurementFailed")),
-        *(f"afspm.errors.{name}" for name in ("ControlLost", "ExperimentEnded", "InvalidValue")),
-        *(f"afspm.errors.{name}" for name in ("NoSuchItem", "UnitError", "FileError", "ConfigError")),
+        *(f"afspm.basics.errors.{name}" for name in ("AfspmError", "Refused", "NoResponse", "MeasurementFailed")),
+        *(f"afspm.basics.errors.{name}" for name in ("ControlLost", "ExperimentEnded", "InvalidValue")),
+        *(f"afspm.basics.errors.{name}" for name in ("NoSuchItem", "UnitError", "FileError", "ConfigError")),
     ],
 }
 """What users write with, by its full name."""

@@ -22,10 +22,10 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 from rich.console import Console
 from rich.table import Table
 
-from afspm import entry_points
-from afspm.drift.estimators import DEFAULT
-from afspm.drift.estimators import estimator as estimator_named
-from afspm.errors import ConfigError
+from afspm.basics import entry_points
+from afspm.basics.errors import ConfigError
+from afspm.plugins.drift.estimators import DEFAULT
+from afspm.plugins.drift.estimators import estimator as estimator_named
 from benchmarks.drift import sizes
 from benchmarks.drift.parts import Plan
 from benchmarks.drift.workers import done

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from afspm.drift.registration import DriftScan, Prior
-from afspm.files import read
 from afspm.model import Region
+from afspm.plugins.drift.registration import DriftScan, Prior
+from afspm.storage.formats import read
 from benchmarks.drift.conditions import Array, flattened, measured
 from benchmarks.drift.families import Half, drawn_condition, source
 from benchmarks.drift.pairs import HEIGHT_M, PIXEL_M, ROW_S, Frame, Sampling, Truth, framed, prior_of, truth_of

@@ -1,6 +1,6 @@
 """`python -m benchmarks.drift.fit`: fit the probabilities and the ellipses of the default estimator.
 
-On the fitted half of the families alone. Writes src/afspm/drift/estimators/coefficients.py, or with `--figure` a
+On the fitted half of the families alone. Writes plugins/drift/estimators/coefficients.py, or with `--figure` a
 reliability diagram of what is there, on both halves. The outcomes of all pairs are kept in build/ as they come: a run
 that was stopped goes on where it was, and one with more rounds adds to them. A change of the estimator asks for new
 ones: delete the file.
@@ -24,9 +24,9 @@ from scipy import sparse
 from scipy.optimize import linprog, minimize
 from scipy.stats import beta
 
-from afspm.drift.estimators import DEFAULT, acceptance
-from afspm.drift.estimators.acceptance import MatchEvidence
-from afspm.drift.estimators.coefficients import SPREAD
+from afspm.plugins.drift.estimators import DEFAULT, acceptance
+from afspm.plugins.drift.estimators.acceptance import MatchEvidence
+from afspm.plugins.drift.estimators.coefficients import SPREAD
 from benchmarks.drift.conditions import Array
 from benchmarks.drift.families import HALVES, Half
 from benchmarks.drift.trials import ELLIPSE_95, Outcome, Trial

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, linalg, ndimage, signal
 
-from afspm.drift.registration import DriftScan, Prior
 from afspm.model import Region
+from afspm.plugins.drift.registration import DriftScan, Prior
 
 Array = NDArray[np.float64]
 Random = np.random.Generator

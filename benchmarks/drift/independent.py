@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from rich.table import Table
 
-from afspm.drift.estimators.least_squares import LeastSquares
+from afspm.plugins.drift.estimators.least_squares import LeastSquares
 from benchmarks.drift.foreign_pairs import CELLS, PIXEL_M, SURFACES, ZOOMS, foreign_pair
 from benchmarks.drift.parts import Plan, Report
 from benchmarks.drift.trials import Cell, Outcome, geometric_mean

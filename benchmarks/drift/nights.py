@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from afspm.drift.registration import DriftScan, Prior, Registration
-from afspm.drift.shear import row_delay_s
-from afspm.drift.tracking import Tracker, Update
 from afspm.model import Region
+from afspm.plugins.drift.registration import DriftScan, Prior, Registration
+from afspm.plugins.drift.shear import row_delay_s
+from afspm.plugins.drift.tracking import Tracker, Update
 from benchmarks.drift.conditions import CONDITIONS, Array, Condition, measured
 from benchmarks.drift.families import Half, drawn_condition, drawn_surface, source
 from benchmarks.drift.pairs import HEIGHT_M, PIXEL_M, ROW_S, View

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage
 
-from afspm.drift.registration import DriftScan, Prior
 from afspm.model import Region
+from afspm.plugins.drift.registration import DriftScan, Prior
 from benchmarks.drift.conditions import CONDITIONS, Array, Condition, measured
 from benchmarks.drift.families import HALVES, Half, Relief, drawn_condition, drawn_surface, source
 from benchmarks.drift.surfaces import SURFACES, Grid, imaged
@@ -100,7 +100,7 @@ class Truth:
     """A feature at `x` of the reference is at `x + displacement_m + linear @ (x - center_m)` in the scan.
 
     Attributes:
-        displacement_m, linear, center_m: as in `afspm.drift.registration.Registration`; the centre is that of the
+        displacement_m, linear, center_m: as in `plugins.drift.registration.Registration`; the centre is that of the
             overlap.
         overlap: area in common over the smaller area.
     """

@@ -1,6 +1,6 @@
 """The paper's default estimator with the settings it was published with, to compare with; our own code.
 
-What distinguishes it from `afspm.drift.estimators.features.Brief`, where this is mended: scans are taken as they are,
+What distinguishes it from `plugins.drift.estimators.features.Brief`, where this is mended: scans are taken as they are,
 corners lie on pixels, all pairs within the RANSAC radius of 5 % of the scan count alike (9 px of 128, so mismatches do
 too), and what is asked of a result is that its inliers lie within that same radius: every result does.
 """
@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from afspm.drift.estimators.keypoints import Descriptors, matched
-from afspm.drift.estimators.ransac import FORMS, Search
-from afspm.drift.overlap import overlap_center_m
-from afspm.drift.registration import DriftScan, Prior, Registration
+from afspm.plugins.drift.estimators.keypoints import Descriptors, matched
+from afspm.plugins.drift.estimators.ransac import FORMS, Search
+from afspm.plugins.drift.overlap import overlap_center_m
+from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 from benchmarks.drift.conditions import Array
 
 THRESHOLD = 0.05  # of the diagonal: of RANSAC, and of the score
@@ -26,7 +26,7 @@ class PublishedBrief:
     """Harris corners, BRIEF, brute force with cross-check, and the mean displacement of the RANSAC inliers."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
-        """See `afspm.drift.registration.Estimator`; scans of one pixel size."""
+        """See `afspm.plugins.drift.registration.Estimator`; scans of one pixel size."""
         (a, first), (b, second) = (_described(each) for each in (reference, scan))
         pairs = matched(first, second)
         a, b = a[pairs[:, 0]], b[pairs[:, 1]]

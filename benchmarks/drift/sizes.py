@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 
 from rich.table import Table
 
-from afspm.drift.estimators import unguarded
+from afspm.plugins.drift.estimators import unguarded
 from benchmarks.drift.pairs import Sampling, pair
 from benchmarks.drift.parts import Plan, Report
 from benchmarks.drift.surfaces import SURFACES

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from afspm.drift.estimators import unguarded
-from afspm.drift.trackers import tracker
-from afspm.drift.tracking import Tracker
+from afspm.plugins.drift.estimators import unguarded
+from afspm.plugins.drift.trackers import tracker
+from afspm.plugins.drift.tracking import Tracker
 from benchmarks.drift.families import Half
 from benchmarks.drift.nights import Night, Oracle
 from benchmarks.drift.pairs import PIXEL_M

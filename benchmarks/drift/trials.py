@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from afspm.drift.estimators import unguarded
-from afspm.drift.registration import Registration
+from afspm.plugins.drift.estimators import unguarded
+from afspm.plugins.drift.registration import Registration
 from benchmarks.drift import cuts
 from benchmarks.drift.bounds import bounds
 from benchmarks.drift.conditions import Array

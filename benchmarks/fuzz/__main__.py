@@ -12,8 +12,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from afspm.emulators import registry
-from afspm.emulators.emulator import Emulator
+from afspm.simulation.emulation import registry
+from afspm.simulation.emulation.emulator import Emulator
 from benchmarks.fuzz.frame import Fuzzer, fuzz
 
 

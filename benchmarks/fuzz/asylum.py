@@ -8,8 +8,8 @@ from typing import Any, Final
 
 import zmq
 
-from afspm.emulators.asylum import AsylumEmulator
-from afspm.emulators.asylum.values import NUMBERS
+from afspm.plugins.asylum.emulator import AsylumEmulator
+from afspm.plugins.asylum.emulator.values import NUMBERS
 from benchmarks.fuzz.frame import Fuzzer, Unfit
 
 _WAITS_MS: Final = 300

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
-from afspm.clock import ExperimentClock
-from afspm.emulators.emulator import Emulator
+from afspm.basics.clock import ExperimentClock
+from afspm.simulation.emulation.emulator import Emulator
 
 CHECKED_EVERY: Final = 200
 _TOLD: Final = 40

@@ -19,11 +19,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from afspm.emulators.gxsm import GxsmEmulator
-from afspm.emulators.gxsm.signalled import CONTENT, LENGTH, SIZE, STATUS
-from afspm.microscopes.gxsm import bridge, bridge_client
-from afspm.microscopes.gxsm.errors import GxsmError
-from afspm.microscopes.gxsm.link import Address, Link, open_link
+from afspm.plugins.gxsm import bridge, bridge_client
+from afspm.plugins.gxsm.emulator import GxsmEmulator
+from afspm.plugins.gxsm.emulator.signalled import CONTENT, LENGTH, SIZE, STATUS
+from afspm.plugins.gxsm.errors import GxsmError
+from afspm.plugins.gxsm.link import Address, Link, open_link
 from afspm.translator.driver import ControllerLost
 from benchmarks.fuzz.frame import Fuzzer, Unfit
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any, Final
 
-from afspm.emulators.nanonis import NanonisEmulator, wire
+from afspm.plugins.nanonis.emulator import NanonisEmulator, wire
 from benchmarks.fuzz.frame import Fuzzer, Unfit
 
 _WAITS_S: Final = 0.1

@@ -7,8 +7,8 @@ import struct
 from collections.abc import Iterator
 from typing import Final
 
-from afspm.emulators.nanosurf import NanosurfEmulator
-from afspm.emulators.nanosurf.studio import PANEL
+from afspm.plugins.nanosurf.emulator import NanosurfEmulator
+from afspm.plugins.nanosurf.emulator.studio import PANEL
 from benchmarks.fuzz.frame import Fuzzer, Unfit
 
 _WAITS_S: Final = 0.3

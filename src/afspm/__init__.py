@@ -12,10 +12,10 @@ if TYPE_CHECKING:
     from afspm.client.component import Component
     from afspm.client.connect import connect
     from afspm.client.scope import Scope
-    from afspm.files import read
     from afspm.model import ControlMode, Problem, Region, Scan, ScanSet, ScopeState, Spectrum
     from afspm.record.catalogue import find_runs
     from afspm.record.run import open_run
+    from afspm.storage.formats import read
 
 __all__ = [
     "Component",
@@ -39,7 +39,7 @@ _HOMES = {
     "connect": "afspm.client.connect",
     "find_runs": "afspm.record.catalogue",
     "open_run": "afspm.record.run",
-    "read": "afspm.files",
+    "read": "afspm.storage.formats",
 }
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from afspm import entry_points
-from afspm.errors import FileError
+from afspm.basics import entry_points
+from afspm.basics.errors import FileError
 from afspm.testing.commissioning.progress import outcome_of
 from afspm.testing.commissioning.report import InstrumentReport
 from afspm.testing.commissioning.steps import OPERATIONS

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from afspm.microscopes import simulator
 from afspm.model import Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.simulation import simulator
 from afspm.translator import setting_groups
 from afspm.translator.driver import Driver, action
 from afspm.translator.parameters import Value

@@ -8,13 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from afspm.drift.mapping import Mapping
-from afspm.drift.trackers.paper import PaperForecast
-from afspm.logic.events import Delegate, Effect, Publish
-from afspm.logic.scheduler_core import SchedulerCore
 from afspm.model import Packet, Region, RegistrationOutcome, Scan, ScanParameters, ScopeState
 from afspm.model.geometry import XY
-from afspm.scheduler.drift.messages import (
+from afspm.plugins.drift.mapping import Mapping
+from afspm.plugins.drift.scheduler.messages import (
     Forecasted,
     Registered,
     RescanWanted,
@@ -23,8 +20,11 @@ from afspm.scheduler.drift.messages import (
     WorkerGone,
     WorkerReport,
 )
-from afspm.scheduler.drift.sample_frame import SampleFrame
-from afspm.scheduler.drift.settings import DriftCompensationSettings, RescanRule
+from afspm.plugins.drift.scheduler.sample_frame import SampleFrame
+from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings, RescanRule
+from afspm.plugins.drift.trackers.paper import PaperForecast
+from afspm.scheduler.events import Delegate, Effect, Publish
+from afspm.scheduler.scheduler_core import SchedulerCore
 from tests.simulation.codec import TableCodec
 from tests.simulation.invariants import InvariantViolated
 from tests.simulation.microscope import SHAPE, FakeMicroscope, FakeScan, Habits

@@ -1,6 +1,6 @@
 """Real components and the real translator as simulated processes: their own code, in-memory ports, a folder for a disk.
 
-`HostedComponent` runs a `Component` as the host of `afspm.process` does, `HostedTranslator` a `Driver` behind the
+`HostedComponent` runs a `Component` as `afspm.supervisor.host` does, `HostedTranslator` a `Driver` behind the
 real `Translator`. All of it speaks the real wire format.
 """
 
@@ -12,11 +12,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from afspm import wire
+from afspm.basics.launch import Launch, Sockets
 from afspm.client.component import Component
-from afspm.launch import Launch, Sockets
 from afspm.model import Packet, Request, Response
-from afspm.process.context import ProcessActivity, ProcessContext
-from afspm.process.memory import Memory
+from afspm.storage.memory import Memory
 from afspm.translator.driver import Driver
 from afspm.translator.translator import Translator
 from afspm.transport.late_joiners import PublishedHistory
@@ -32,6 +31,7 @@ from afspm.transport.port import (
     SubscriberJoined,
 )
 from afspm.transport.port import Killed as KillReceived
+from afspm.transport.process.context import ProcessActivity, ProcessContext
 from tests.simulation.baton import Baton
 from tests.simulation.network import ControlLine, Feed, Weather
 from tests.simulation.process import Process

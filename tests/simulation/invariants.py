@@ -7,22 +7,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 
-from afspm.errors import AfspmError
-from afspm.logic.arbitration import ArbitrationState
-from afspm.logic.events import (
-    Disconnected,
-    Effect,
-    Forward,
-    Input,
-    Publish,
-    Replay,
-    ReplayRequested,
-    Reply,
-    RequestIn,
-    SaveState,
-)
-from afspm.logic.saved_state import SavedState
-from afspm.logic.settings import SchedulerSettings
+from afspm.basics.errors import AfspmError
 from afspm.model import (
     ControlMode,
     ControlRequest,
@@ -34,6 +19,21 @@ from afspm.model import (
     ScopeState,
     names,
 )
+from afspm.scheduler.control.arbitration import ArbitrationState
+from afspm.scheduler.events import (
+    Disconnected,
+    Effect,
+    Forward,
+    Input,
+    Publish,
+    Replay,
+    ReplayRequested,
+    Reply,
+    RequestIn,
+    SaveState,
+)
+from afspm.scheduler.saved_state import SavedState
+from afspm.scheduler.settings import SchedulerSettings
 from tests.simulation.client import Client
 from tests.simulation.codec import TableCodec
 from tests.simulation.microscope import FakeMicroscope

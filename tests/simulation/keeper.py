@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from afspm.logic.supervision.child import (
+from afspm.model import ProcessCondition, ProcessState
+from afspm.supervisor.supervision.child import (
     ChildEffect,
     ChildPhase,
     ChildPolicy,
@@ -14,7 +15,6 @@ from afspm.logic.supervision.child import (
     KillChild,
     StartChild,
 )
-from afspm.model import ProcessCondition, ProcessState
 from tests.simulation.process import Process
 from tests.simulation.timeline import Timeline
 

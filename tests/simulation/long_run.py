@@ -9,7 +9,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from afspm.clock import ExperimentClock
+from afspm.basics.clock import ExperimentClock
 from tests.simulation.invariants import InvariantViolated
 from tests.simulation.night import Night, plan
 

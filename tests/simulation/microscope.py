@@ -6,7 +6,8 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from afspm.errors import InvalidValue
+from afspm.basics.errors import InvalidValue
+from afspm.basics.plain_data import Plain
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -24,7 +25,6 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
-from afspm.plain_data import Plain
 from afspm.translator.requests import RequestOutcomes
 from tests.simulation.codec import TableCodec
 from tests.simulation.network import ControlLine, Feed

@@ -6,16 +6,16 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Any
 
-from afspm.logic.arbitration import Cause, RoleTable, Rules
-from afspm.logic.envelopes import Envelopes
-from afspm.logic.limits import ExperimentLimits, Limit
-from afspm.logic.microscope_status import FEEDBACK_OFF
-from afspm.logic.settings import ControlSettings, SchedulerSettings
-from afspm.logic.supervision.child import ChildPolicy
-from afspm.logic.supervision.liveness import LivenessPolicy
-from afspm.logic.supervision.restart import RestartPolicy
-from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import Packet, PacketHeader, Region, ScopeState, names
+from afspm.model.microscope_status import FEEDBACK_OFF
+from afspm.scheduler.control.arbitration import Cause, RoleTable, Rules
+from afspm.scheduler.publishing.envelopes import Envelopes
+from afspm.scheduler.safety.limits import ExperimentLimits, Limit
+from afspm.scheduler.safety.watchdog import WatchdogSettings
+from afspm.scheduler.settings import ControlSettings, SchedulerSettings
+from afspm.supervisor.supervision.child import ChildPolicy
+from afspm.supervisor.supervision.liveness import LivenessPolicy
+from afspm.supervisor.supervision.restart import RestartPolicy
 from tests.simulation import behaviours
 from tests.simulation.client import Client
 from tests.simulation.codec import TableCodec

@@ -8,7 +8,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from afspm.logic.events import (
+from afspm.model import (
+    HAS_ENDED,
+    RELAY_REQUEST,
+    ControlResponse,
+    LoggedPacket,
+    Packet,
+    PacketHeader,
+    Request,
+    Response,
+    ResponseDetail,
+)
+from afspm.model.snapshot import restored, snapshot
+from afspm.scheduler.events import (
     Codec,
     Connected,
     Disconnected,
@@ -31,21 +43,9 @@ from afspm.logic.events import (
     TranslatorReply,
     TranslatorUp,
 )
-from afspm.logic.saved_state import KIND, VERSION, SavedState
-from afspm.logic.scheduler_core import SchedulerCore
-from afspm.logic.settings import SchedulerSettings
-from afspm.model import (
-    HAS_ENDED,
-    RELAY_REQUEST,
-    ControlResponse,
-    LoggedPacket,
-    Packet,
-    PacketHeader,
-    Request,
-    Response,
-    ResponseDetail,
-)
-from afspm.model.snapshot import restored, snapshot
+from afspm.scheduler.saved_state import KIND, VERSION, SavedState
+from afspm.scheduler.scheduler_core import SchedulerCore
+from afspm.scheduler.settings import SchedulerSettings
 from tests.simulation.network import ControlLine, ControlServer, Feed, Publisher, Weather
 from tests.simulation.process import Alarm, Process
 from tests.simulation.timeline import Timeline

@@ -13,15 +13,15 @@ from pathlib import Path
 import pytest
 
 from afspm import wire
+from afspm.basics.errors import ControlLost
+from afspm.basics.exit_codes import ExitCode
 from afspm.client.component import Component
-from afspm.errors import ControlLost
-from afspm.exit_codes import ExitCode
-from afspm.logic.settings import SchedulerSettings
-from afspm.logic.supervision.child import ChildPolicy
-from afspm.logic.supervision.liveness import LivenessPolicy
-from afspm.logic.supervision.restart import RestartPolicy
 from afspm.model import Problem, Region
+from afspm.scheduler.settings import SchedulerSettings
 from afspm.scheduler.wire_codec import WireCodec
+from afspm.supervisor.supervision.child import ChildPolicy
+from afspm.supervisor.supervision.liveness import LivenessPolicy
+from afspm.supervisor.supervision.restart import RestartPolicy
 from tests.simulation.bench import CHANNELS, BenchMicroscope
 from tests.simulation.hosted import HostedComponent, HostedTranslator
 from tests.simulation.keeper import Keeper

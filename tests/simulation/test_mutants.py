@@ -10,22 +10,25 @@ from typing import Any
 import pytest
 from rotation import rotated
 
-from afspm.logic import answers, arbitration, control_change, event_log, request_pipeline, scheduler_core
-from afspm.logic.arbitration import ArbitrationEvent, ControlChange, Transition
-from afspm.logic.cache import PacketCache
-from afspm.logic.coordinate_frame import MappedRequest
-from afspm.logic.event_log import EventLog
-from afspm.logic.events import Effect, RequestIn, SaveState
-from afspm.logic.forwarder import ForwardedRequest, Forwarder
-from afspm.logic.holder_timeout import HolderTimeout, Lease
-from afspm.logic.idempotency_cache import Floors, IdempotencyCache
-from afspm.logic.lifecycle import ExperimentEnd
-from afspm.logic.limit_checker import LimitChecker
-from afspm.logic.microscope_status import MicroscopeStatus
-from afspm.logic.sessions import Hearing, SessionTable
-from afspm.logic.state import SchedulerState, StateDraft
-from afspm.logic.watchdog import Watchdog
 from afspm.model import JournalEntries, JournalEntry
+from afspm.model.idempotency_cache import Floors, IdempotencyCache
+from afspm.model.microscope_status import MicroscopeStatus
+from afspm.model.sessions import Hearing, SessionTable
+from afspm.scheduler import scheduler_core
+from afspm.scheduler.control import arbitration, control_change
+from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlChange, Transition
+from afspm.scheduler.control.holder_timeout import HolderTimeout, Lease
+from afspm.scheduler.control.lifecycle import ExperimentEnd
+from afspm.scheduler.coordinate_frame import MappedRequest
+from afspm.scheduler.events import Effect, RequestIn, SaveState
+from afspm.scheduler.publishing import event_log
+from afspm.scheduler.publishing.cache import PacketCache
+from afspm.scheduler.publishing.event_log import EventLog
+from afspm.scheduler.requests import answers, request_pipeline
+from afspm.scheduler.requests.forwarder import ForwardedRequest, Forwarder
+from afspm.scheduler.safety.limit_checker import LimitChecker
+from afspm.scheduler.safety.watchdog import Watchdog
+from afspm.scheduler.state import SchedulerState, StateDraft
 from tests.simulation.drift_night import DriftNight
 from tests.simulation.invariants import InvariantViolated
 from tests.simulation.night import Fault, Night, Plan, plan

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from afspm.logic.arbitration import ArbitrationState
-from afspm.logic.event_log import SCHEDULER
-from afspm.logic.events import Effect, Input, Kill, Log, Reply, RequestIn
-from afspm.logic.settings import SchedulerSettings
 from afspm.model import ControlMode, ControlRequest, Parameter, Problem, Request, names
+from afspm.scheduler.control.arbitration import ArbitrationState
+from afspm.scheduler.events import Effect, Input, Kill, Log, Reply, RequestIn
+from afspm.scheduler.publishing.event_log import SCHEDULER
+from afspm.scheduler.settings import SchedulerSettings
 from tests.simulation.microscope import FakeMicroscope
 from tests.simulation.scheduler import SchedulerHost
 from tests.simulation.timeline import Timeline

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from afspm.logic.settings import SchedulerSettings
 from afspm.model import ControlRequest, Region, Request, names
+from afspm.scheduler.settings import SchedulerSettings
 from tests.simulation.microscope import FakeMicroscope
 from tests.simulation.timeline import Timeline
 

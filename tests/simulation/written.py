@@ -6,9 +6,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from afspm.logic.arbitration import ArbitrationState
-from afspm.logic.event_log import CONTROL, PERIOD_S, SCHEDULER
-from afspm.logic.events import Effect, Input, Publish, Reply
 from afspm.model import (
     ControlEvent,
     ControlMode,
@@ -23,6 +20,9 @@ from afspm.model import (
     names,
 )
 from afspm.model.events import SUPERVISOR
+from afspm.scheduler.control.arbitration import ArbitrationState
+from afspm.scheduler.events import Effect, Input, Publish, Reply
+from afspm.scheduler.publishing.event_log import CONTROL, PERIOD_S, SCHEDULER
 from afspm.wire.messages import JOURNAL
 from tests.simulation.codec import TableCodec
 from tests.simulation.scheduler import SchedulerHost

@@ -10,7 +10,7 @@ from typing import Any
 
 from scheduler_rig import Component, Rig
 
-from afspm.launch import Launch, Sockets
+from afspm.basics.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 
 PACKAGE = "afspm.plugins.published"
@@ -21,7 +21,7 @@ class Bridge:
 
     def __init__(self, class_: str, sockets: Sockets, settings: dict[str, Any], folder: Path, keys: Any = None) -> None:
         launch = Launch("bridge", f"{PACKAGE}.{class_}", settings, sockets, state_dir=str(folder / "state"), keys=keys)
-        self.process = subprocess.Popen([sys.executable, "-m", "afspm.process.host"], stdin=subprocess.PIPE)
+        self.process = subprocess.Popen([sys.executable, "-m", "afspm.supervisor.host"], stdin=subprocess.PIPE)
         assert self.process.stdin is not None
         self.process.stdin.write(launch.to_json().encode() + b"\n")
         self.process.stdin.flush()

@@ -7,7 +7,7 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-from afspm import entry_points
+from afspm.basics import entry_points
 from afspm.translator import Driver
 
 VENDORS = Path(__file__).parents[1] / "vendors"

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from afspm import wire
-from afspm.clock import ExperimentClock
-from afspm.launch import Launch, Sockets
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.launch import Launch, Sockets
 from afspm.model import ControlRequest, ControlResponse, Request, Response
 from afspm.supervisor.ports import FreePorts
 from afspm.transport import keys
@@ -105,7 +105,7 @@ class Rig:
 
     def start(self) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "afspm.process.host"], stdin=subprocess.PIPE, stderr=subprocess.DEVNULL
+            [sys.executable, "-m", "afspm.supervisor.host"], stdin=subprocess.PIPE, stderr=subprocess.DEVNULL
         )
         assert self.process.stdin is not None
         self.process.stdin.write(self.launch().to_json().encode() + b"\n")

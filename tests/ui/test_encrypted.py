@@ -12,7 +12,7 @@ import pytest
 from ui_lab import Night
 
 from afspm.model import ControlMode
-from afspm.web.passwords import hashed
+from afspm.plugins.web.passwords import hashed
 
 PASSWORD, COMMON = "a tip of gold", "lead for all"
 TLS = 'certificate = "lab.crt"\ncertificate_key = "lab.key"\n'

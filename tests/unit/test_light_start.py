@@ -14,7 +14,7 @@ import pytest
         "afspm.scheduler",
         "afspm.supervisor.run",
         "afspm.supervisor.reporter",
-        "afspm.process.host",
+        "afspm.supervisor.host",
         "afspm.client.connect",
         "afspm.components.planned_scans",
         "afspm.components.metadata",

@@ -8,8 +8,8 @@ import sys
 
 def main() -> None:
     """Entry point. An error of ours is told in its own words; a traceback is kept for what nobody foresaw."""
+    from afspm.basics.errors import AfspmError
     from afspm.cli.app import app
-    from afspm.errors import AfspmError
 
     for stream in (sys.stdout, sys.stderr):  # a terminal that lacks a character must not cost the line
         if isinstance(stream, io.TextIOWrapper):

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from afspm import entry_points
+from afspm.basics import entry_points
+from afspm.basics.errors import ConfigError
 from afspm.cli import (
     clients,
     commission,
@@ -26,7 +27,6 @@ from afspm.cli import (
     trace,
 )
 from afspm.cli.arguments import AFTERWARDS, BEFORE, MEANWHILE, MICROSCOPES, PLUGINS
-from afspm.errors import ConfigError
 
 if TYPE_CHECKING:
     from typer._click.core import Command

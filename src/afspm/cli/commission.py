@@ -39,11 +39,11 @@ def commission(
 
     Ends with a report for people and programs, and 0 if nothing was wrong.
     """
+    from afspm.basics.units import si
     from afspm.testing.commissioning.procedure import commission as walk
     from afspm.testing.commissioning.report import TRIED_ON
     from afspm.testing.translators import CheckOptions
     from afspm.testing.translators.session import is_simulated, prepare
-    from afspm.units import si
 
     options = CheckOptions(files, runs=runs, speed=speed, frame_m=si(frame, "m") if frame else None)
     simulated = is_simulated(prepare(options), options)

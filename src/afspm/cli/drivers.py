@@ -12,7 +12,7 @@ from afspm.cli.arguments import RUNS, CheckSpeed, Runs, WithinFrame, names_in, o
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from afspm.emulators.emulator import Emulator
+    from afspm.simulation.emulation.emulator import Emulator
     from afspm.testing.translators import CheckOptions
 
 _ASK = """This moves the probe, takes scans and spectra, changes gains and bias by a few percent, and switches the
@@ -54,9 +54,9 @@ def check_translator(
 
     from rich.console import Console
 
+    from afspm.basics.units import si
     from afspm.testing.translators import CheckOptions
     from afspm.testing.translators.translator_suite import TRANSLATOR_SUITE
-    from afspm.units import si
 
     if listed:
         for check in TRANSLATOR_SUITE.checks():
@@ -138,7 +138,7 @@ def emulate(
     to the vendor's usual port may expect a real controller there. A replay ends with 1 if something else was asked
     than what was recorded.
     """
-    from afspm.emulators.registry import emulator, names
+    from afspm.simulation.emulation.registry import emulator, names
 
     if replay is not None:
         _replay(replay, port, folder)
@@ -155,7 +155,7 @@ def emulate(
 
 
 def _replay(trace: Path, port: int, folder: Path | None) -> None:
-    from afspm.emulators.replay import TraceReplay
+    from afspm.simulation.emulation.replay import TraceReplay
 
     made = TraceReplay(trace=str(trace), port=port)
     made.check()
@@ -167,10 +167,10 @@ def _replay(trace: Path, port: int, folder: Path | None) -> None:
 def _emulate(emulator: Emulator, speed: float, folder: Path) -> None:
     import signal
 
-    from afspm.clock import ExperimentClock
-    from afspm.emulators.emulator import Crashed
-    from afspm.process import signals
-    from afspm.process.log import set_up
+    from afspm.basics.clock import ExperimentClock
+    from afspm.simulation.emulation.emulator import Crashed
+    from afspm.transport.process import signals
+    from afspm.transport.process.log import set_up
 
     log = set_up("emulate", "INFO")
 
@@ -200,7 +200,7 @@ def _settings(given: list[str]) -> dict[str, object]:
     """
     import tomllib
 
-    from afspm.errors import ConfigError
+    from afspm.basics.errors import ConfigError
 
     lines = []
     for one in given:

@@ -96,7 +96,7 @@ def graph(
     = None,
 ) -> None:  # fmt: skip
     """Draw the components, sockets and envelopes of an experiment as SVG."""
-    from afspm.errors import FileError
+    from afspm.basics.errors import FileError
     from afspm.experiment import load
     from afspm.experiment.graph import draw
 

@@ -108,8 +108,8 @@ def say_unreachable(folder: Path, computer: str) -> NoReturn:
 
 def _running(where: Path) -> Path:
     """Return the folder of the run that is meant, as far as it is not known to have ended."""
+    from afspm.basics.errors import FileError
     from afspm.client.connect import find_run
-    from afspm.errors import FileError
     from afspm.record.run_json import ENDED, read_run_json
 
     try:
@@ -124,7 +124,7 @@ def _running(where: Path) -> Path:
 
 @contextmanager
 def _only_if_running(folder: Path) -> Iterator[None]:
-    from afspm.errors import ExperimentEnded, NoResponse
+    from afspm.basics.errors import ExperimentEnded, NoResponse
     from afspm.record.run_json import run_json_or_empty
     from afspm.record.run_lock import cut_off_message, other_computer
 

@@ -39,7 +39,7 @@ def notify(
 
 
 def _message(experiment: Experiment) -> Notification:
-    from afspm.clock import ExperimentClock
+    from afspm.basics.clock import ExperimentClock
     from afspm.components.notifications import TEST, Notification
 
     now_ns = ExperimentClock.real().now_ns()
@@ -48,8 +48,8 @@ def _message(experiment: Experiment) -> Notification:
 
 def _arrives(targets: Targets, message: Notification, way: Way) -> bool:
     """Send a message once, and say whether it arrived."""
+    from afspm.basics.errors import ConfigError
     from afspm.components.notifications import NotDelivered
-    from afspm.errors import ConfigError
 
     try:
         targets.deliver(message, way)

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from afspm.basics.formatting import counted
 from afspm.cli.arguments import RUNS, RecordedRun, Where, names_in, opt
-from afspm.formatting import counted
 
 
 def report(where: Where = RUNS) -> None:

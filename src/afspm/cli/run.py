@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Protocol
 
 import typer
 
-from afspm import entry_points
+from afspm.basics import entry_points
+from afspm.basics.errors import ConfigError
 from afspm.cli.arguments import RUNS, OptionalFiles, Runs, Speed, names_in, opt
-from afspm.errors import ConfigError
 
 if TYPE_CHECKING:
+    from afspm.basics.plain_data import PlainMapping
     from afspm.experiment import Experiment, ProcessStart
-    from afspm.plain_data import PlainMapping
     from afspm.supervisor.resume import ResumableRun
     from afspm.supervisor.run import FinishedRun
 
@@ -122,7 +122,7 @@ def _stay(experiment: Experiment, ended: FinishedRun, wanted: bool | None) -> No
     """Keep the page of a dashboard that was started here, unless a person has stopped the run."""
     import sys
 
-    from afspm.logic.supervision.run_end import EndReason
+    from afspm.supervisor.supervision.run_end import EndReason
 
     started = [report.name for report in ended.outcome.reports if report.starts]
     if ended.outcome.why is EndReason.STOPPED or not (sys.stdout.isatty() if wanted is None else wanted):

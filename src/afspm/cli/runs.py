@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.formatting import day_and_time, duration_text
 from afspm.cli.arguments import RUNS, opt
-from afspm.clock import NS_PER_S
-from afspm.formatting import day_and_time, duration_text
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from afspm.clock import NS_PER_S, utc_time
-from afspm.formatting import area_text, day_and_time, duration_text, time_of_day
+from afspm.basics.clock import NS_PER_S, utc_time
+from afspm.basics.formatting import area_text, day_and_time, duration_text, time_of_day
 from afspm.model import LogLine, ProcessCondition, ProcessState, Region, ScopeState
 from afspm.record.overview import OLD_S, OVER, ROUTINE, Overview
 from afspm.record.timeline import Span

@@ -97,9 +97,9 @@ def note(
 
     It needs no control. After the end of a run the note is appended to its record, and the report is written again.
     """
+    from afspm.basics.clock import ExperimentClock
     from afspm.cli.joining import acting, person
     from afspm.client.connect import find_run
-    from afspm.clock import ExperimentClock
     from afspm.record.notes import append_note
     from afspm.record.report import REPORT_FILE, write
     from afspm.record.run import open_run
@@ -124,9 +124,9 @@ def note(
 
 
 def _list(where: Path) -> None:
+    from afspm.basics.clock import NS_PER_S
+    from afspm.basics.formatting import duration_text
     from afspm.cli.status_text import flagged
-    from afspm.clock import NS_PER_S
-    from afspm.formatting import duration_text
 
     with looking(where) as follower:
         now_ns, found = follower.clock.now_ns(), list(flagged(follower.overview))

@@ -46,7 +46,7 @@ def with_trace(files: list[Path]) -> Experiment:
     """
     import tempfile
 
-    from afspm.errors import ConfigError
+    from afspm.basics.errors import ConfigError
     from afspm.experiment import load
     from afspm.experiment.tracing import trace_overlay
 

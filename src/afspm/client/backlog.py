@@ -6,7 +6,7 @@ import tempfile
 from collections import deque
 from typing import IO
 
-from afspm.errors import FileError
+from afspm.basics.errors import FileError
 from afspm.model import LoggedPacket, Packet
 from afspm.storage.segment import head_of, read_packet
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from afspm.basics.errors import NoResponse, Refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
-from afspm.errors import NoResponse, Refused
 from afspm.model import (
     RELAY_REQUEST,
     ControlRequest,

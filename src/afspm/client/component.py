@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 if TYPE_CHECKING:
+    from afspm.basics.clock import Clock
     from afspm.client.scope import Scope
-    from afspm.clock import Clock
     from afspm.model import (
         ControlState,
         Feedback,
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
         ScopeStatus,
         Spectrum,
     )
-    from afspm.process.context import ProcessContext
-    from afspm.process.memory import Memory
+    from afspm.storage.memory import Memory
+    from afspm.transport.process.context import ProcessContext
 
 
 class Component:
@@ -166,7 +166,7 @@ class Component:
             raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
 
     def run_process(self, context: ProcessContext) -> int:
-        """Called by the host; see `afspm.process.context.ExperimentProcess`."""
+        """Called by the host; see `afspm.transport.process.context.ExperimentProcess`."""
         from afspm.client.loop import ComponentLoop
 
         return ComponentLoop(self, context).run()

@@ -9,18 +9,18 @@ import weakref
 from collections.abc import Sequence
 from pathlib import Path
 
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import ConfigError, FileError, NoResponse
+from afspm.basics.launch import Launch, Sockets
+from afspm.basics.plain_data import Plain
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
-from afspm.clock import ExperimentClock
-from afspm.errors import ConfigError, FileError, NoResponse
-from afspm.launch import Launch, Sockets
 from afspm.model import Frame, ProblemNames
-from afspm.plain_data import Plain
-from afspm.process.context import new_session
-from afspm.process.message_types import register_all
 from afspm.record.run_json import RUN_FILE, STATE_DIR, latest_run, read_run_json, run_json_or_empty
 from afspm.record.run_lock import cut_off_message
+from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import open_port
+from afspm.wire.message_types import register_all
 
 GUEST = "guest"
 GUEST_KEYS = "guest.keys"

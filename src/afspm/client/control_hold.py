@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 
+from afspm.basics.errors import ControlLost, ExperimentEnded, NoResponse, Refused
 from afspm.client.experiment_link import ExperimentLink
-from afspm.errors import ControlLost, ExperimentEnded, NoResponse, Refused
 from afspm.model import WAIT_FOR_CONTROL, ControlMode, ControlRequest, ControlResponse, Packet, Problem, ProblemNames
-from afspm.process.parent import StopRequested
+from afspm.transport.process.parent import StopRequested
 
 ASK_AGAIN_S = 10.0  # should a published control state ever not reach us
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from afspm import wire
-from afspm.errors import WireError
+from afspm.basics.errors import WireError
 from afspm.model import ControlState, Packet
 
 if TYPE_CHECKING:

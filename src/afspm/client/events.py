@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from afspm import wire
+from afspm.basics.errors import ExperimentEnded, WireError
 from afspm.client.backlog import PacketBacklog
 from afspm.client.experiment_link import ExperimentLink
-from afspm.errors import ExperimentEnded, WireError
 from afspm.model import Packet
 
 

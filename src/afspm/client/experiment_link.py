@@ -7,12 +7,12 @@ from collections.abc import Callable
 from typing import Any
 
 from afspm import wire
+from afspm.basics.clock import Clock
+from afspm.basics.errors import ConfigError, ExperimentEnded, NoResponse, WireError
+from afspm.basics.launch import Launch
 from afspm.client.interrupts import Interrupts
 from afspm.client.published_state import PublishedState
 from afspm.client.request_tracker import RequestTracker
-from afspm.clock import Clock
-from afspm.errors import ConfigError, ExperimentEnded, NoResponse, WireError
-from afspm.launch import Launch
 from afspm.model import (
     HAS_ENDED,
     OTHER_RUN_RESPONSE,
@@ -23,8 +23,6 @@ from afspm.model import (
     ResponseDetail,
     request_name,
 )
-from afspm.process.context import ProcessActivity
-from afspm.process.parent import StopRequested
 from afspm.transport.port import (
     CaughtUp,
     ControlConnected,
@@ -36,6 +34,8 @@ from afspm.transport.port import (
     Port,
     ReplyReceived,
 )
+from afspm.transport.process.context import ProcessActivity
+from afspm.transport.process.parent import StopRequested
 
 LONGER_THAN_THE_SCHEDULER = 1.2
 """Factor on the time that the scheduler waits for the microscope: what it says then is an answer, and a component that

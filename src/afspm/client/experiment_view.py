@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from numbers import Real
 
+from afspm.basics.errors import AfspmError, InvalidValue
 from afspm.client.events import Events
 from afspm.client.experiment_link import ExperimentLink
-from afspm.errors import AfspmError, InvalidValue
 from afspm.model import (
     ControlMode,
     ControlState,

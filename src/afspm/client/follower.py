@@ -6,17 +6,17 @@ import dataclasses
 from pathlib import Path
 
 from afspm import wire
+from afspm.basics.clock import Clock, ExperimentClock
+from afspm.basics.errors import ExperimentEnded, NoResponse, WireError
+from afspm.basics.launch import Launch
 from afspm.client.connect import guest_of
 from afspm.client.experiment_link import ExperimentLink
-from afspm.clock import Clock, ExperimentClock
-from afspm.errors import ExperimentEnded, NoResponse, WireError
-from afspm.launch import Launch
 from afspm.model import Packet, ProblemNames
-from afspm.process.context import new_session
-from afspm.process.message_types import register_all
 from afspm.record.overview import Overview
 from afspm.record.run_lock import cut_off_message
+from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import open_port
+from afspm.wire.message_types import register_all
 
 HEARD_WITHIN_S = 5.0
 

@@ -6,9 +6,9 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from afspm.errors import Interrupted
-from afspm.process import signals
+from afspm.basics.errors import Interrupted
 from afspm.transport.port import Port
+from afspm.transport.process import signals
 
 
 class Interrupts:

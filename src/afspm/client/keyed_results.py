@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from afspm import wire
-from afspm.errors import FileError, InvalidValue, WireError
+from afspm.basics.errors import FileError, InvalidValue, WireError
+from afspm.basics.plain_data import Plain
 from afspm.model import LoggedPacket, Packet, ScanSet, Spectrum
-from afspm.plain_data import Plain
-from afspm.process.memory import Memory
 from afspm.storage.atomic import OutageLog, write_atomic
 from afspm.storage.disk import is_full
+from afspm.storage.memory import Memory
 from afspm.storage.segment import head_of, read_packet
 
 _log = logging.getLogger("afspm.memory")

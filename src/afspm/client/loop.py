@@ -9,22 +9,22 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from afspm import wire
+from afspm.basics.clock import NS_PER_S, Clock
+from afspm.basics.errors import ConfigError, ExperimentEnded, MeasurementFailed, RequestError
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.own_fault import OwnFault
 from afspm.client.backlog import PacketBacklog
 from afspm.client.component import Component
 from afspm.client.dispatch import MessageDispatcher, overrides
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.keyed_results import kept_in
 from afspm.client.scope import Scope
-from afspm.clock import NS_PER_S, Clock
-from afspm.errors import ConfigError, ExperimentEnded, MeasurementFailed, RequestError
-from afspm.exit_codes import ExitCode
-from afspm.logic.supervision.own_fault import OwnFault
 from afspm.model import Frame, Packet, Problem
-from afspm.process import failure
-from afspm.process.context import ProcessContext
-from afspm.process.fault_file import write_fault
-from afspm.process.memory import Memory
-from afspm.process.parent import StopRequested
+from afspm.storage.memory import Memory
+from afspm.transport.process import failure
+from afspm.transport.process.context import ProcessContext
+from afspm.transport.process.fault_file import write_fault
+from afspm.transport.process.parent import StopRequested
 
 AFTER_THE_END_S = 30.0  # to handle what came before it
 AFTER_A_STOP_S = 0.5  # the parent that stops us kills us soon

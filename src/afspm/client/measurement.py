@@ -8,6 +8,8 @@ from datetime import UTC
 from typing import Any
 
 from afspm import wire
+from afspm.basics.errors import ExperimentEnded, MeasurementFailed, NoResponse, Refused, RequestError, WireError
+from afspm.basics.formatting import day_and_time
 from afspm.client.command_retry import NOT_IN_CONTROL, CommandRetry
 from afspm.client.control_hold import ControlHold
 from afspm.client.cycle import Cycle, CycleOutcome
@@ -15,10 +17,8 @@ from afspm.client.experiment_link import ExperimentLink
 from afspm.client.keyed_results import KeyedResults, MeasurementResult, check_key
 from afspm.client.measurement_setup import MeasurementSetup
 from afspm.client.targets import Target, target_from
-from afspm.errors import ExperimentEnded, MeasurementFailed, NoResponse, Refused, RequestError, WireError
-from afspm.formatting import day_and_time
-from afspm.logic.sessions import KEYED
 from afspm.model import ControlRequest, ControlResponse, Packet, Response, Scan
+from afspm.model.sessions import KEYED
 from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
 
 BEGUN_WITHIN_S = 2 * CUT_OFF_SHOWS_WITHIN_S

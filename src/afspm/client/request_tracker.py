@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from afspm import wire
-from afspm.logic.sessions import run_of
 from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, RelayedMessage, Request, Response
+from afspm.model.sessions import run_of
 
 Send = Callable[[Sequence[bytes]], None]
 

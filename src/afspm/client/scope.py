@@ -7,6 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from afspm import wire
+from afspm.basics.errors import ExperimentEnded, InvalidValue
 from afspm.client.command_retry import CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.events import Events, PublishedEvent
@@ -15,9 +16,8 @@ from afspm.client.experiment_view import ExperimentView
 from afspm.client.keyed_results import KeyedResults, check_key
 from afspm.client.measurement import MeasurementRunner
 from afspm.client.measurement_setup import MeasurementSetup
-from afspm.client.parameter_values import Value, to_parameter, value_in
+from afspm.client.parameter_text import Value, to_parameter, value_in
 from afspm.client.targets import ScanTarget, SpectrumTarget, xy_of
-from afspm.errors import ExperimentEnded, InvalidValue
 from afspm.model import (
     RELAY_REQUEST,
     RESTART_REQUEST,

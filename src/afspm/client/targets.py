@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-from afspm.errors import InvalidValue, UnitError
-from afspm.formatting import area_text, position_text
+from afspm.basics.errors import InvalidValue, UnitError
+from afspm.basics.formatting import area_text, position_text
+from afspm.basics.plain_data import Plain
+from afspm.basics.units import si_or_text
 from afspm.model import Frame, Region, Scan, ScanParameters, ScopeState, Spectrum, names
 from afspm.model.snapshot import from_plain, to_plain
-from afspm.plain_data import Plain
-from afspm.units import si_or_text
 
 XY = tuple[float, float]
 

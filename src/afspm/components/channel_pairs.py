@@ -6,9 +6,9 @@ import logging
 from collections.abc import Collection
 from dataclasses import dataclass
 
+from afspm.basics.units import convert
 from afspm.components.tip_judge import TipJudge, Verdict
 from afspm.model import Scan
-from afspm.units import convert
 
 ENOUGH_SCANS = 3  # before a channel counts as missing; the channels of one scan come one by one
 

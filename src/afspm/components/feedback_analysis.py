@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from afspm import wire
+from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.components.channel_pairs import ChannelPairing, MissingChannels
 from afspm.components.feedback_metrics import FeedbackError, FeedbackQuality
 from afspm.components.feedback_signal import FeedbackObserver
-from afspm.errors import ConfigError, InvalidValue
 from afspm.model import ControlState, Feedback, Problem, Scan
 
 MESSAGE = "FeedbackAnalysis"

@@ -10,7 +10,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.errors import InvalidValue
+from afspm.basics.errors import InvalidValue
 
 Array = NDArray[np.float64]
 

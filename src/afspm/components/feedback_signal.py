@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from afspm.basics.errors import ConfigError, InvalidValue, Refused, RequestError, UnitError
+from afspm.basics.units import Length, convert, same_kind
 from afspm.client.component import Component
 from afspm.client.scope import Scope
 from afspm.components.feedback_metrics import FeedbackError, FeedbackLimits, feedback_error, relative_error
-from afspm.errors import ConfigError, InvalidValue, Refused, RequestError, UnitError
 from afspm.model import Scan, names
-from afspm.units import Length, convert, same_kind
 
 ASKED_WITHIN_S = 5.0
 

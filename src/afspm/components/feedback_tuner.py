@@ -5,9 +5,9 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import Any, ClassVar
 
+from afspm.basics.errors import ConfigError, ControlLost, InvalidValue, Refused
 from afspm.components.feedback_metrics import FeedbackQuality, gain_search
 from afspm.components.feedback_signal import FeedbackObserver
-from afspm.errors import ConfigError, ControlLost, InvalidValue, Refused
 from afspm.model import Problem, names
 
 BACK_WITHIN_S = 60.0

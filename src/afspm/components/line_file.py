@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from afspm.errors import FileError
+from afspm.basics.errors import FileError
 from afspm.storage.atomic import OutageLog
 
 _log = logging.getLogger("afspm.records")

@@ -6,8 +6,8 @@ import logging
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from afspm.basics.clock import iso_utc
 from afspm.client.component import Component
-from afspm.clock import iso_utc
 from afspm.components.line_file import LineFile
 from afspm.model import LogLine, LogLines
 

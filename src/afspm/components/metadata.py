@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
 
+from afspm.basics.clock import iso_utc
 from afspm.client.component import Component
-from afspm.clock import iso_utc
 from afspm.components.line_file import LineFile, csv_line
 from afspm.model import ControlState, Note, Scan, ScopeState, ScopeStatus, Spectrum
 

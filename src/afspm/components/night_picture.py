@@ -8,11 +8,11 @@ import threading
 from pathlib import Path
 from typing import Any
 
+from afspm.basics.plain_data import Plain
 from afspm.client.component import Component
 from afspm.components import tip_verdict
 from afspm.components.line_file import LineFile
 from afspm.model import ControlState, RescanKind, Scan, ScopeState, ScopeStatus
-from afspm.plain_data import Plain
 from afspm.record.night_record import NightRecord, control_entry, mark_entry, scan_entry
 
 

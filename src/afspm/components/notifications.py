@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from afspm.clock import utc_time
-from afspm.errors import AfspmError, ConfigError
+from afspm.basics.clock import utc_time
+from afspm.basics.errors import AfspmError, ConfigError
 
 END: Final = "end"
 UNSOLVED: Final = "unsolved-problem"

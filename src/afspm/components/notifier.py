@@ -5,6 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from afspm.basics.errors import ConfigError
+from afspm.basics.formatting import duration_text
+from afspm.basics.plain_data import Plain
+from afspm.basics.units import Duration
 from afspm.client.component import Component
 from afspm.components import notifications
 from afspm.components.notifications import (
@@ -18,13 +22,9 @@ from afspm.components.notifications import (
     Notification,
     Targets,
 )
-from afspm.errors import ConfigError
-from afspm.formatting import duration_text
 from afspm.model import ControlState, LogLines, ProcessCondition, ProcessStates
 from afspm.model.events import LOGGED_AS
-from afspm.plain_data import Plain
 from afspm.record.run_json import experiment_name
-from afspm.units import Duration
 
 MOST_TOLD = 1000
 """So much is remembered as told; a component that says something else each time must not fill the memory."""

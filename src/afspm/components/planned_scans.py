@@ -9,15 +9,15 @@ from dataclasses import dataclass
 from datetime import UTC
 from typing import Any, Literal
 
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.errors import ConfigError, InvalidValue, RequestError, UnitError
+from afspm.basics.formatting import day_and_time
+from afspm.basics.units import Angle, Length, Period, convert
 from afspm.client.component import Component
-from afspm.client.parameter_values import to_parameter
-from afspm.clock import NS_PER_S
+from afspm.client.parameter_text import to_parameter
 from afspm.components.scan_plan import XY, PlanStep, RoundSchedule, ScanPlan, grid_centers, rounds_within
-from afspm.errors import ConfigError, InvalidValue, RequestError, UnitError
-from afspm.formatting import day_and_time
 from afspm.model import Region, names
 from afspm.model.names import BASE_PARAMETERS
-from afspm.units import Angle, Length, Period, convert
 
 Pixels = tuple[int, int]
 FRAME = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.SCAN_SIZE_X, names.SCAN_SIZE_Y)

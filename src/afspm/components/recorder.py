@@ -7,19 +7,19 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.plain_data import Plain
 from afspm.client.component import Component
-from afspm.exit_codes import ExitCode
 from afspm.model import Frame
-from afspm.plain_data import Plain
-from afspm.process.priority import step_back
 from afspm.record.run_json import EXPERIMENT_FILE, METADATA, experiment_name, run_json_or_empty
 from afspm.storage.packet_log import log_folder
 from afspm.storage.segment import segments
 from afspm.transport.port import Killed, PacketReceived, ParentGone
+from afspm.transport.process.priority import step_back
 
 if TYPE_CHECKING:
-    from afspm.process.context import ProcessContext
     from afspm.record.store import RecordSettings
+    from afspm.transport.process.context import ProcessContext
 
 REST_S = 0.5
 """Shortest time, real, to stay after the end of the experiment: for what components say on their way out."""

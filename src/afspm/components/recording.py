@@ -10,8 +10,8 @@ from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from afspm.clock import Clock
-from afspm.errors import FileError
+from afspm.basics.clock import Clock
+from afspm.basics.errors import FileError
 from afspm.model import Packet
 from afspm.record.journal import JOURNAL_FILE, SCHEDULER, damaged, is_damage
 from afspm.record.store import RecordSettings, RecordStore

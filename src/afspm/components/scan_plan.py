@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from afspm.errors import InvalidValue
-from afspm.formatting import lengths_text
+from afspm.basics.errors import InvalidValue
+from afspm.basics.formatting import lengths_text
 from afspm.model import Region
 
 XY = tuple[float, float]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 
+from afspm.basics.errors import ConfigError
+from afspm.basics.units import Angle, Length
 from afspm.client.component import Component
 from afspm.components.planned_scans import pair
 from afspm.components.scan_plan import grid_centers
-from afspm.errors import ConfigError
 from afspm.model import names
-from afspm.units import Angle, Length
 
 MOST_LINES = 20
 """In the log, on the progress of a grid; what looks on is told of each spectrum."""

@@ -8,22 +8,22 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from afspm.basics.errors import ConfigError, Refused
+from afspm.basics.formatting import area_text, counted, lengths_text, position_text
+from afspm.basics.units import Angle, Length
 from afspm.client.component import Component
 from afspm.client.events import Events
 from afspm.client.keyed_results import check_key
 from afspm.client.targets import xy_of
 from afspm.components.planned_scans import FRAME, Pixels, checked_parameters, pair, shape_of
 from afspm.components.scan_plan import ScanPlan
-from afspm.errors import ConfigError, Refused
-from afspm.formatting import area_text, counted, lengths_text, position_text
+from afspm.components.surveying.record import Outcome, SurveyRecord, Visit
+from afspm.components.surveying.targets import Target, find_particles, lowest_beside, nearest
 from afspm.model import Region, RegistrationOutcome, Scan, ScanSet, names, registration_summary
 from afspm.model.drift_mapping import drift_knowledge
 from afspm.model.geometry import XY
-from afspm.process.loading import find_object
 from afspm.storage.atomic import OutageLog
-from afspm.survey.record import Outcome, SurveyRecord, Visit
-from afspm.survey.targets import Target, find_particles, lowest_beside, nearest
-from afspm.units import Angle, Length
+from afspm.transport.process.loading import find_object
 
 MAPPING = "DriftMapping"
 LEAST_ZOOM_PX = 20
@@ -165,7 +165,7 @@ class Survey(Component):
             self.log.warning("no survey was taken: there is no table and no picture")
             return
         self._keep(self._record)
-        from afspm.survey.figure import draw_survey  # matplotlib: needed at the end alone
+        from afspm.components.surveying.figure import draw_survey  # matplotlib: needed at the end alone
 
         path = Path(self.run_dir) / f"{self.file}.png"
         draw_survey(self._record, path, title=self.name, simulated=self.simulated)

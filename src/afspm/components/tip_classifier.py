@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from afspm.basics.errors import UnitError
 from afspm.client.component import Component
 from afspm.components import tip_verdict
 from afspm.components.channel_pairs import ChannelPairing, HeightPair, MissingChannels
 from afspm.components.tip_judge import Opinion, TipJudge, TipTolerance, Verdict, VerdictCounter
-from afspm.errors import UnitError
 from afspm.model import ControlState, Scan
 
 _SCORES = {Opinion.GOOD: tip_verdict.GOOD, Opinion.BAD: tip_verdict.BAD, Opinion.UNCLEAR: tip_verdict.UNCLEAR}

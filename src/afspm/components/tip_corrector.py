@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar, Literal
 
+from afspm.basics.errors import AfspmError, ConfigError, ControlLost, FileError, NoResponse, Refused
+from afspm.basics.formatting import position_text
+from afspm.basics.units import Duration, Length, Speed, Voltage
 from afspm.client.component import Component
 from afspm.client.events import Events
 from afspm.components import tip_verdict
@@ -14,10 +17,7 @@ from afspm.components.tip_judge import Opinion, TipJudge
 from afspm.components.tip_treatments import treatments
 from afspm.components.tip_verdict import read_verdict
 from afspm.components.tip_workshop import DONE_ACTION, TipWorkshop
-from afspm.errors import AfspmError, ConfigError, ControlLost, FileError, NoResponse, Refused
-from afspm.formatting import position_text
 from afspm.model import Problem, Region, Scan, ScanSet, names
-from afspm.units import Duration, Length, Speed, Voltage
 
 Frame = list[list[float]]
 """Region and pixels in JSON's types: centre, size and angle; rows and columns."""

@@ -29,12 +29,12 @@ from enum import Enum
 
 import numpy as np
 
+from afspm.basics.errors import ConfigError, InvalidValue
+from afspm.basics.formatting import area_text
+from afspm.basics.plain_data import Plain
 from afspm.components.tip_metrics import LEAST_CONTRAST, Array, TipMetrics, autocorrelation, metrics, slopes
-from afspm.errors import ConfigError, InvalidValue
-from afspm.formatting import area_text
 from afspm.model import Region
 from afspm.model.snapshot import from_plain, to_plain
-from afspm.plain_data import Plain
 
 REACH_PX = 32  # how far beside the first the second apex of a double tip is looked for
 MAD_TO_SIGMA = 1.4826  # of normally distributed values

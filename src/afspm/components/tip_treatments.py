@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from afspm.errors import ConfigError
+from afspm.basics.errors import ConfigError
 from afspm.model import Region
 
 XY = tuple[float, float]

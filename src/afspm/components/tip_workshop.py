@@ -6,10 +6,10 @@ import math
 from dataclasses import replace
 
 from afspm import wire
+from afspm.basics.errors import ControlLost, FileError, NoResponse, Refused
+from afspm.basics.formatting import position_text
 from afspm.client.component import Component
 from afspm.components.tip_treatments import XY, Pulse, Treatment, clearance_m, fresh_place
-from afspm.errors import ControlLost, FileError, NoResponse, Refused
-from afspm.formatting import position_text
 from afspm.model import Region, ScopeState, names
 
 SETTLED_WITHIN_S = 2.0  # real time: a microscope that does not say that it is busy is taken to be ready then

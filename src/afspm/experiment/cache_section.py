@@ -13,13 +13,13 @@ history = 3
 from __future__ import annotations
 
 from afspm import wire
-from afspm.errors import AfspmError
+from afspm.basics.errors import AfspmError
 from afspm.experiment import class_loader
 from afspm.experiment.document import Document
 from afspm.experiment.sections import parse
 from afspm.experiment.toml_lines import Table
-from afspm.logic.envelopes import CacheSettings, Envelopes
 from afspm.model import PacketHeader, Role
+from afspm.scheduler.publishing.envelopes import CacheSettings, Envelopes
 
 STATE = wire.MessageKind.STATE
 _EXAMPLES = (

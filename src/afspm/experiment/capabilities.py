@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from afspm.errors import AfspmError, Refused
+from afspm.basics.errors import AfspmError, Refused
 from afspm.experiment.toml_lines import Table
 from afspm.model import Parameter, names
 

@@ -15,8 +15,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from afspm import entry_points
-from afspm.errors import ConfigError
+from afspm.basics import entry_points
+from afspm.basics.errors import ConfigError
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.parts import DECLARED_KEYS
 from afspm.experiment.toml_lines import Table

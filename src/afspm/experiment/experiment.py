@@ -8,15 +8,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from afspm.clock import ExperimentClock
-from afspm.errors import ConfigError
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import ConfigError
+from afspm.basics.launch import Launch
 from afspm.experiment import document as documents
 from afspm.experiment import forms
 from afspm.experiment import parts as sorting
 from afspm.experiment.findings import Finding, Findings
 from afspm.experiment.implied_parts import RECORDS
 from afspm.experiment.toml_lines import Table
-from afspm.launch import Launch
 from afspm.model import Role
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING, Protocol
 
-from afspm import entry_points
+from afspm.basics import entry_points
 from afspm.experiment.parts import Converter
 
 if TYPE_CHECKING:

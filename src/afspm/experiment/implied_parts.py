@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from afspm.basics.errors import ConfigError
 from afspm.components.notifications import END, OCCASIONS, Targets, address
-from afspm.errors import ConfigError
 from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.toml_lines import Settings
 from afspm.model import Role

@@ -26,16 +26,16 @@ from typing import Final
 
 import pydantic
 
-from afspm.errors import AfspmError
+from afspm.basics.errors import AfspmError
+from afspm.basics.plain_data import Count
+from afspm.basics.units import Angle, Length, parse_quantity, require_unit, si, si_unit
 from afspm.experiment.document import Document
 from afspm.experiment.findings import nearest
 from afspm.experiment.sections import Section, parse
 from afspm.experiment.toml_lines import Table
 from afspm.experiment.validation_messages import name_of, report
-from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.model import Parameter, Region, names
-from afspm.plain_data import Count
-from afspm.units import Angle, Length, parse_quantity, require_unit, si, si_unit
+from afspm.scheduler.safety.limits import ExperimentLimits, Limit
 
 Quantity = str | float
 _QUANTITIES: Final = ("min", "max", "step", "rate")

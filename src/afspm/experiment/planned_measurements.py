@@ -6,16 +6,16 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
-from afspm import entry_points
-from afspm.client.parameter_values import to_parameter
-from afspm.errors import AfspmError
+from afspm.basics import entry_points
+from afspm.basics.errors import AfspmError
+from afspm.basics.formatting import duration_text, lengths_text, quantity
+from afspm.basics.units import si
+from afspm.client.parameter_text import to_parameter
 from afspm.experiment.toml_lines import Table
-from afspm.formatting import duration_text, lengths_text, quantity
-from afspm.logic.limit_checker import LimitChecker
-from afspm.logic.limits import ExperimentLimits
 from afspm.model import ControlRequest, Parameter, ProbePosition, Region, Request, ScanParameters, names
 from afspm.model.geometry import XY
-from afspm.units import si
+from afspm.scheduler.safety.limit_checker import LimitChecker
+from afspm.scheduler.safety.limits import ExperimentLimits
 
 
 @dataclass(frozen=True)

@@ -7,19 +7,19 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from afspm.addresses import connectable, reaches
-from afspm.errors import ConfigError
+from afspm.basics.addresses import connectable, reaches
+from afspm.basics.errors import ConfigError
+from afspm.basics.launch import Launch, Sockets
+from afspm.basics.requirements import require
 from afspm.experiment.experiment import ProcessStart
 from afspm.experiment.findings import Finding, Level, nearest
 from afspm.experiment.implied_parts import RECORDS
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.toml_writer import SECRET
 from afspm.experiment.wiring import ProcessSockets
-from afspm.launch import Launch, Sockets
-from afspm.logic.microscope_status import FEEDBACK_OFF
 from afspm.model import Frame, Role
+from afspm.model.microscope_status import FEEDBACK_OFF
 from afspm.model.snapshot import to_plain
-from afspm.requirements import require
 
 if TYPE_CHECKING:
     from afspm.experiment.resolution import ResolvedExperiment, ResolvedProcess

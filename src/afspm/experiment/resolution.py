@@ -7,8 +7,8 @@ from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from afspm.basics.errors import AfspmError, InvalidValue, individual_errors
 from afspm.client.component import Component
-from afspm.errors import AfspmError, InvalidValue, individual_errors
 from afspm.experiment import (
     cache_section,
     capabilities,
@@ -29,9 +29,9 @@ from afspm.experiment.planned_measurements import PlannedMeasurements
 from afspm.experiment.sections import ExperimentSections, read_sections
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.wiring import BoundSocket, Wiring, WiringKeys
-from afspm.logic.envelopes import CacheSettings
-from afspm.logic.limits import ExperimentLimits
 from afspm.model import Parameter, ProblemNames, Role
+from afspm.scheduler.publishing.envelopes import CacheSettings
+from afspm.scheduler.safety.limits import ExperimentLimits
 
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 FROM_SECTIONS = ("control", "limits", "cache")

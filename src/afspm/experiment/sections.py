@@ -11,13 +11,13 @@ from typing import Annotated, ClassVar, Literal, TypeVar, get_args, get_origin, 
 import pydantic
 from pydantic import Field, StrictBool
 
+from afspm.basics.plain_data import file_key
+from afspm.basics.units import Duration, PositiveDuration
 from afspm.experiment.document import Document
 from afspm.experiment.run_metadata import Orcid
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.validation_messages import report
-from afspm.logic.settings import ControlSettings
-from afspm.plain_data import file_key
-from afspm.units import Duration, PositiveDuration
+from afspm.scheduler.settings import ControlSettings
 
 
 class Section(pydantic.BaseModel):

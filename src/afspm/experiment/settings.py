@@ -15,9 +15,9 @@ from typing import Any
 
 import pydantic
 
-from afspm import units
-from afspm.addresses import Listens
-from afspm.errors import UnitError
+from afspm.basics import units
+from afspm.basics.addresses import Listens
+from afspm.basics.errors import UnitError
 from afspm.experiment import class_loader
 from afspm.experiment.document import Document
 from afspm.experiment.findings import closest, nearest
@@ -54,7 +54,7 @@ def check(
             annotation = kinds.get(name, Any)
             if name not in kinds and _is_quantity(value):
                 what = f"[{'.'.join(path)}] {name} = {value!r} stays a text: the argument does not say what it is"
-                hint = f"e.g. `def __init__(self, {name}: Length)`, with Length from afspm.units"
+                hint = f"e.g. `def __init__(self, {name}: Length)`, with Length from afspm.basics.units"
                 document.warning(what, *path, name, hint=hint)
             errors = document.findings.errors
             checked[name] = _value(annotation, value, (*path, name), document)

@@ -8,8 +8,8 @@ from collections.abc import Callable, Collection, Iterator
 from typing import Final
 
 from afspm import wire
-from afspm.addresses import EXAMPLE, hint_on, is_address, reaches
-from afspm.errors import InvalidValue
+from afspm.basics.addresses import EXAMPLE, hint_on, is_address, reaches
+from afspm.basics.errors import InvalidValue
 from afspm.experiment import class_loader, wiring
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.handlers import check_handlers

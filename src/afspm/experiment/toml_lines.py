@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from itertools import count
 from typing import TypeAlias
 
-from afspm.plain_data import Plain, PlainMapping
+from afspm.basics.plain_data import Plain, PlainMapping
 
 Path: TypeAlias = tuple[str | int, ...]
 """A way into the parsed document: keys, and indices into arrays."""

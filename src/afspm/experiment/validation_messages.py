@@ -9,7 +9,7 @@ from typing import Any, Final
 import pydantic
 from pydantic_core import ErrorDetails
 
-from afspm.errors import AfspmError
+from afspm.basics.errors import AfspmError
 from afspm.experiment.document import Document
 from afspm.experiment.findings import closest, nearest
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from afspm.addresses import hint_on, is_address
+from afspm.basics.addresses import hint_on, is_address
 from afspm.experiment.document import Document
 from afspm.experiment.findings import SourceLocation
 from afspm.experiment.parts import ExperimentPart

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import Protocol
 
-from afspm.errors import InvalidValue
+from afspm.basics.errors import InvalidValue
 from afspm.model.requests import WAIT_FOR_CONTROL, ControlRequest, ControlResponse
 from afspm.model.state import ControlMode
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING
 
-from afspm.errors import InvalidValue, UnitError
-from afspm.formatting import area_text
-from afspm.units import si_or_text
+from afspm.basics.errors import InvalidValue, UnitError
+from afspm.basics.formatting import area_text
+from afspm.basics.units import si_or_text
 
 if TYPE_CHECKING:
     import numpy as np

@@ -13,9 +13,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.drawing import levelling as drawing
-from afspm.drawing.levelling import Levelling
-from afspm.errors import InvalidValue
+from afspm.basics.errors import InvalidValue
+from afspm.model import line_levelling as drawing
+from afspm.model.line_levelling import Levelling
 
 Floats = NDArray[np.float64]
 _MOST_PIXELS: Final = 4096

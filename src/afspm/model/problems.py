@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterator, Mapping
 from enum import IntEnum
 
-from afspm.errors import InvalidValue
+from afspm.basics.errors import InvalidValue
 
 HIGHEST_PROBLEM = 255  # a problem travels as one byte
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import TYPE_CHECKING
 
-from afspm.clock import utc_time
-from afspm.entry_points import DISPLAYS, required
-from afspm.errors import InvalidValue, NoSuchItem
+from afspm.basics.clock import utc_time
+from afspm.basics.entry_points import DISPLAYS, required
+from afspm.basics.errors import InvalidValue, NoSuchItem
 from afspm.model.geometry import XY, Region, RegionChange
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ class Scan:
 
         Args:
             velocity_m_s: (x, y) of the sample under the tip, e.g. from an up frame followed by a down frame
-                (`afspm.drift.shear`); constant during the scan.
+                (`afspm.plugins.drift.shear`); constant during the scan.
             duration_s: from the first to the last row.
             upwards: whether small y was scanned first.
 

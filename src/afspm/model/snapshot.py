@@ -16,8 +16,8 @@ from enum import Enum
 from functools import cache
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from afspm.errors import InvalidValue
-from afspm.plain_data import Plain
+from afspm.basics.errors import InvalidValue
+from afspm.basics.plain_data import Plain
 
 T = TypeVar("T")
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import TYPE_CHECKING
 
-from afspm.clock import utc_time
-from afspm.entry_points import DISPLAYS, required
-from afspm.errors import InvalidValue, NoSuchItem
+from afspm.basics.clock import utc_time
+from afspm.basics.entry_points import DISPLAYS, required
+from afspm.basics.errors import InvalidValue, NoSuchItem
+from afspm.basics.plain_data import Plain
 from afspm.model.geometry import XY, Frame
-from afspm.plain_data import Plain
 
 if TYPE_CHECKING:
     import numpy as np

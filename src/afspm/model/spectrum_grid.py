@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.errors import InvalidValue
+from afspm.basics.errors import InvalidValue
 from afspm.model.geometry import XY
 from afspm.model.spectrum import Spectrum
 

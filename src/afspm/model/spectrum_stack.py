@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.errors import InvalidValue
+from afspm.basics.errors import InvalidValue
 from afspm.model.geometry import Frame, Region
 from afspm.model.scan import Scan
 from afspm.model.spectrum import Spectrum

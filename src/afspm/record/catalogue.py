@@ -13,10 +13,10 @@ from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Final
 
-from afspm.clock import NS_PER_S
-from afspm.errors import FileError, InvalidValue
-from afspm.formatting import counted
-from afspm.plain_data import Plain
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.errors import FileError, InvalidValue
+from afspm.basics.formatting import counted
+from afspm.basics.plain_data import Plain
 from afspm.record.journal import not_a_table
 from afspm.record.run import Run, open_run
 from afspm.record.run_json import RUN_FILE

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import quote
 
-from afspm.drawing.image_html import data_url
-from afspm.errors import FileError
-from afspm.formatting import counted, period_text
+from afspm.basics.errors import FileError
+from afspm.basics.formatting import counted, period_text
 from afspm.record.catalogue import RunSummary
+from afspm.record.drawing.image_html import data_url
 from afspm.record.report import pictures
 from afspm.record.report.markup import section
 from afspm.record.report.style import CSS

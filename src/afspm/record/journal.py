@@ -12,7 +12,7 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path, PurePath
 
-from afspm.errors import FileError
+from afspm.basics.errors import FileError
 
 JOURNAL_FILE = "journal.sqlite"
 FORMAT = "afspm record 1"

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from afspm import wire
-from afspm.clock import iso_utc
+from afspm.basics.clock import iso_utc
 from afspm.model import Packet, ProblemNames, Scan, ScopeState
 from afspm.record import nexus, provenance
 from afspm.record.journal import SCHEDULER
@@ -135,7 +135,7 @@ class MeasuredFiles:
 
     def _add_channels(self, number: int, path: Path, new: Mapping[str, Scan]) -> None:
         """Add channels that came after the file was written, since the recorder was killed in between."""
-        from afspm.files import read
+        from afspm.storage.formats import read
 
         self._batch.finish()  # it may be one of these
         content = read(path)
@@ -233,7 +233,7 @@ def insert_packet(
 
 def header_of(filename: str, folder: Path) -> Mapping[str, object]:
     """Return the header of the controller's own file; empty if it is on another computer, or can't be read."""
-    from afspm.files import read
+    from afspm.storage.formats import read
 
     path = folder / filename if filename else folder
     try:

@@ -9,7 +9,7 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from afspm import wire
-from afspm.errors import NoSuchItem, WireError
+from afspm.basics.errors import NoSuchItem, WireError
 from afspm.model import Frame, Region, RegistrationOutcome, Spectrum, names
 from afspm.record.tables import ScanRow, SpectrumRow, Table
 

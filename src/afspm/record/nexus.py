@@ -23,13 +23,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.clock import iso_utc
-from afspm.files import hdf5
-from afspm.files.nexus import ABOUT, BIAS_SPECTRUM, DEFINITION, VENDOR, about_of
+from afspm.basics.clock import iso_utc
+from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.model import Scan, Spectrum
-from afspm.plain_data import Plain, PlainMapping
 from afspm.record import nxspm
 from afspm.record.nxspm import group, values
+from afspm.storage.formats import hdf5
+from afspm.storage.formats.nexus import ABOUT, BIAS_SPECTRUM, DEFINITION, VENDOR, about_of
 
 if TYPE_CHECKING:
     import h5py

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.clock import NS_PER_S
-from afspm.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM, UNMEASURED, colour_map
-from afspm.drawing.timeline import time_ticks
-from afspm.formatting import counted, period_text, time_of_day
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.formatting import counted, period_text, time_of_day
 from afspm.model import names
 from afspm.record.bad_scans import BAD
+from afspm.record.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM, UNMEASURED, colour_map
+from afspm.record.drawing.timeline import time_ticks
 from afspm.record.night_record import NightMark, NightRecord, Shot
 from afspm.record.timeline import Span
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.drawing.levelling import flattened
-from afspm.drawing.raster import indices, reduced, value_range
+from afspm.basics.plain_data import Plain
 from afspm.model import ControlMode, ControlState, Problem, Scan
-from afspm.plain_data import Plain
+from afspm.model.line_levelling import flattened
 from afspm.record.bad_scans import bad_scans
+from afspm.record.drawing.raster import indices, reduced, value_range
 from afspm.record.overview import SOON_NS
 from afspm.record.timeline import Span, Timeline
 

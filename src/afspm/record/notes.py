@@ -7,7 +7,7 @@ from contextlib import closing
 from pathlib import Path
 
 from afspm import wire
-from afspm.errors import FileError
+from afspm.basics.errors import FileError
 from afspm.model import Note, Packet
 from afspm.record.journal import SCHEDULER
 from afspm.record.run import open_run

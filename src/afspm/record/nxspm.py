@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.files.nexus import BIAS_SPECTRUM, DEFINITION
+from afspm.basics.plain_data import PlainMapping
 from afspm.model import Region, Scan, Spectrum
-from afspm.plain_data import PlainMapping
+from afspm.storage.formats.nexus import BIAS_SPECTRUM, DEFINITION
 
 if TYPE_CHECKING:
     import h5py

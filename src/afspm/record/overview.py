@@ -12,8 +12,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from afspm import wire
-from afspm.clock import NS_PER_S
-from afspm.errors import WireError
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.errors import WireError
+from afspm.basics.units import convert, same_kind
 from afspm.model import (
     ControlEvent,
     ControlMode,
@@ -49,7 +50,6 @@ from afspm.model.events import PERSON
 from afspm.model.geometry import XY
 from afspm.record.running_scan import DoneScan, RunningScan
 from afspm.record.timeline import Span, Timeline
-from afspm.units import convert, same_kind
 
 __all__ = [
     "ROUTINE",

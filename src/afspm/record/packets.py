@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from afspm import wire
-from afspm.errors import FileError, WireError
+from afspm.basics.errors import FileError, WireError
 from afspm.model import Frame, Packet, Scan, Spectrum
 from afspm.record.journal import SCHEDULER, measured_file
 from afspm.record.measured_tables import Row
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from afspm.files.content import FileContent
+    from afspm.storage.formats.content import FileContent
 
 Query = Callable[[str, Sequence[object]], list[Row]]
 """Asks the journal; raises FileError where it is damaged."""
@@ -151,7 +151,7 @@ class _Values:
         return values if first_row is None else values[first_row : first_row + (rows or 0)]
 
     def _content(self, table: str, number: int) -> FileContent:
-        from afspm.files import read
+        from afspm.storage.formats import read
 
         ((file,),) = self._query(f"SELECT file FROM {table} WHERE number = ?", (number,))
         if file not in self._kept:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from afspm import wire
-from afspm.errors import WireError
+from afspm.basics.errors import WireError
+from afspm.basics.plain_data import Plain
 from afspm.model import ControlState, Feedback, ProblemNames, ScopeState, ScopeStatus
 from afspm.model.drift_mapping import drift_knowledge
-from afspm.plain_data import Plain
 
 _BACK = 20
 """So many states are looked back through for the one in which a measurement began."""

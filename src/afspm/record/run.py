@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from afspm import wire
-from afspm.errors import FileError, InvalidValue, NoSuchItem, WireError
-from afspm.formatting import counted
+from afspm.basics.errors import FileError, InvalidValue, NoSuchItem, WireError
+from afspm.basics.formatting import counted
 from afspm.model import (
     ControlState,
     Frame,
@@ -45,8 +45,8 @@ from afspm.record.run_json import EXPERIMENT_FILE, METADATA, REPLAY_OF, latest_r
 from afspm.record.tables import ControlRow, NoteRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
 
 if TYPE_CHECKING:
-    from afspm.files.content import FileContent
     from afspm.record.overview import DriftPoint, Overview
+    from afspm.storage.formats.content import FileContent
 
 _SAME_SCAN_NS = 1_000_000_000
 
@@ -364,7 +364,7 @@ class Run:
         return made(found[0])
 
     def _content(self, file: str, what: str) -> FileContent:
-        from afspm.files import read
+        from afspm.storage.formats import read
 
         if not file:
             raise FileError(f"{what} was interrupted before anything of it was seen", where=str(self.folder))

@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 from typing import Final
 
-from afspm.errors import FileError
-from afspm.plain_data import Plain
+from afspm.basics.errors import FileError
+from afspm.basics.plain_data import Plain
 
 RUN_FILE: Final = "run.json"
 STATE_DIR: Final = "state"

@@ -9,8 +9,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path, PurePath
 
-from afspm.errors import FileError
-from afspm.file_lock import lock
+from afspm.basics.errors import FileError
+from afspm.basics.file_lock import lock
 from afspm.record.run_json import COMPUTER, ENDED, REPLAY_OF, STATE_DIR, run_json_or_empty
 
 LOCK_FILE = "running"

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from afspm import wire
-from afspm.errors import WireError
+from afspm.basics.errors import WireError
 from afspm.model import (
     ControlResponse,
     Frame,

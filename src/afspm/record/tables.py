@@ -11,8 +11,8 @@ from enum import Enum
 from html import escape
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar, overload
 
-from afspm.errors import FileError
-from afspm.formatting import day_and_time, scale
+from afspm.basics.errors import FileError
+from afspm.basics.formatting import day_and_time, scale
 from afspm.model import ControlState, Frame, ProcessCondition, Region, RegistrationOutcome
 from afspm.model.geometry import XY
 

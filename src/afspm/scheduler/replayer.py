@@ -8,8 +8,8 @@ from collections.abc import Callable
 from itertools import islice
 
 from afspm import wire
-from afspm.clock import NS_PER_S, ExperimentClock
-from afspm.errors import TransportError, WireError
+from afspm.basics.clock import NS_PER_S, ExperimentClock
+from afspm.basics.errors import TransportError, WireError
 from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlResponse, Packet, Response
 from afspm.record.packets import RecordPlayback
 from afspm.transport.late_joiners import PublishedHistory

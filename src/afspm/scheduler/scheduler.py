@@ -9,22 +9,22 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
-from afspm.errors import ConfigError, FileError, InvalidValue
-from afspm.exit_codes import ExitCode
-from afspm.logic.coordinate_frame import TIP_FRAME, CoordinateFrame
-from afspm.logic.envelopes import CacheSettings, EnvelopeMapping, Envelopes
-from afspm.logic.fencing import Epoch
-from afspm.logic.limits import ExperimentLimits
-from afspm.logic.scheduler_core import SchedulerCore
-from afspm.logic.settings import ControlSettings, RunFacts, SchedulerSettings
+from afspm.basics.errors import ConfigError, FileError, InvalidValue
+from afspm.basics.exit_codes import ExitCode
+from afspm.model.fencing import Epoch
 from afspm.model.snapshot import from_plain
-from afspm.process.context import ProcessContext
+from afspm.scheduler.coordinate_frame import TIP_FRAME, CoordinateFrame
+from afspm.scheduler.publishing.envelopes import CacheSettings, EnvelopeMapping, Envelopes
+from afspm.scheduler.safety.limits import ExperimentLimits
+from afspm.scheduler.scheduler_core import SchedulerCore
+from afspm.scheduler.settings import ControlSettings, RunFacts, SchedulerSettings
 from afspm.scheduler.shell import FrameWorker, SchedulerShell
 from afspm.scheduler.state_file import StateFile
 from afspm.scheduler.wire_codec import WireCodec
 from afspm.scheduler.write_ahead import WriteAhead
 from afspm.storage.packet_log import PacketLog, cached_packets, log_folder
 from afspm.transport.probe import versions_here
+from afspm.transport.process.context import ProcessContext
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.scheduler_sockets import SchedulerSockets
 

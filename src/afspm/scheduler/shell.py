@@ -8,8 +8,7 @@ from collections.abc import Callable, Hashable, Iterable
 from typing import TYPE_CHECKING, Protocol
 
 from afspm import wire
-from afspm.errors import WireError
-from afspm.logic import events
+from afspm.basics.errors import WireError
 from afspm.model import (
     HAS_ENDED,
     RELAY_REQUEST,
@@ -20,6 +19,7 @@ from afspm.model import (
     Response,
     ResponseDetail,
 )
+from afspm.scheduler import events
 from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
@@ -27,9 +27,9 @@ from afspm.transport.translator_link import LinkReply, LinkUp
 from afspm.wire.protocol import LONGEST_ID
 
 if TYPE_CHECKING:
-    from afspm.clock import Clock
-    from afspm.logic.saved_state import SavedState
-    from afspm.logic.scheduler_core import SchedulerCore
+    from afspm.basics.clock import Clock
+    from afspm.scheduler.saved_state import SavedState
+    from afspm.scheduler.scheduler_core import SchedulerCore
     from afspm.scheduler.write_ahead import WriteAhead
     from afspm.transport.rate_limited_log import RateLimitedLog
     from afspm.transport.scheduler_sockets import SchedulerSockets, Source

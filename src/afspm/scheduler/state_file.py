@@ -6,9 +6,9 @@ import json
 import logging
 from pathlib import Path
 
-from afspm.errors import InvalidValue
-from afspm.logic.saved_state import KIND, VERSION, SavedState
+from afspm.basics.errors import InvalidValue
 from afspm.model.snapshot import restored, snapshot
+from afspm.scheduler.saved_state import KIND, VERSION, SavedState
 from afspm.storage.atomic import CheckpointFile, OutageLog, load_checkpoint
 
 

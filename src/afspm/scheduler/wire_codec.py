@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from afspm import wire
-from afspm.errors import AfspmError
+from afspm.basics.errors import AfspmError
 from afspm.model import Parameter
 
 

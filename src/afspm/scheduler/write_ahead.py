@@ -6,8 +6,8 @@ import contextlib
 import logging
 from collections.abc import Callable, Iterable, Sequence
 
-from afspm.logic.saved_state import SavedState
 from afspm.model import LoggedPacket
+from afspm.scheduler.saved_state import SavedState
 from afspm.scheduler.state_file import StateFile
 from afspm.storage.atomic import OutageLog
 from afspm.storage.disk import DEADLINE_S, SYNCER, DiskBacklogFull, DiskThread

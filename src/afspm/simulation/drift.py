@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from afspm.errors import ConfigError, InvalidValue
+from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.simulation import chance
 from afspm.simulation.fields import Array
 from afspm.simulation.settings import check

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Final
 
-from afspm.errors import ConfigError
-from afspm.plain_data import Plain, PlainMapping
+from afspm.basics.errors import ConfigError
+from afspm.basics.plain_data import Plain, PlainMapping
 
 EVERY_TIME = 1_000_000_000
 INSTRUMENT_FAULTS: Final[Mapping[str, str]] = {

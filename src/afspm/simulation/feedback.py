@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.errors import ConfigError, InvalidValue
+from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.model import Feedback
 from afspm.simulation.fields import Array
 from afspm.simulation.settings import check, one_of

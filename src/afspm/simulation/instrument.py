@@ -26,10 +26,10 @@ from functools import cached_property
 
 import numpy as np
 
-from afspm.errors import AfspmError, InvalidValue
+from afspm.basics.errors import AfspmError, InvalidValue
+from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.model import Feedback, Region
 from afspm.model.snapshot import restored, snapshot
-from afspm.plain_data import Plain, PlainMapping
 from afspm.simulation.activities import RETRACE, Move, Occupied, ScanActivity, SpectrumActivity, noise_in_air
 from afspm.simulation.feedback import FeedbackSettings
 from afspm.simulation.measuring import Adjustment

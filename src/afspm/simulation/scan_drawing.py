@@ -6,7 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Mapping
 
-from afspm.errors import InvalidValue
+from afspm.basics.errors import InvalidValue
 from afspm.simulation.activities import NoValues, ScanActivity, ScanValues, ValuesInAir
 from afspm.simulation.feedback import Loop
 from afspm.simulation.world import World

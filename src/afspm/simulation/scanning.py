@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.errors import InvalidValue
+from afspm.basics.errors import InvalidValue
 from afspm.model import Frame, Region
 from afspm.simulation.fields import Array
 from afspm.simulation.noise import FLATTENINGS

@@ -13,7 +13,7 @@ import typing
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
-from afspm.errors import ConfigError, ErrorCollector, individual_errors
+from afspm.basics.errors import ConfigError, ErrorCollector, individual_errors
 
 T = TypeVar("T")
 

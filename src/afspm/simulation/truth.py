@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from afspm.plain_data import Plain
+from afspm.basics.plain_data import Plain
 from afspm.storage.disk import DiskThread, DiskTimeout
 
 

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from afspm.errors import ConfigError, ErrorCollector, InvalidValue
+from afspm.basics.errors import ConfigError, ErrorCollector, InvalidValue
 from afspm.model import Feedback, Region
 from afspm.model.snapshot import restored, snapshot
 from afspm.simulation import chance, spectra

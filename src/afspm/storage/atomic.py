@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
-from afspm.errors import FileError
+from afspm.basics.errors import FileError
 from afspm.storage.disk import SYNCER, DiskBacklogFull, DiskTask, DiskThread, DiskTimeout, sync_file, sync_folder
 
 T = TypeVar("T")

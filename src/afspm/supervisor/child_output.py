@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from afspm.clock import ExperimentClock
+from afspm.basics.clock import ExperimentClock
 
 AT_ONCE = 500_000
 BYTES_PER_S = 5_000

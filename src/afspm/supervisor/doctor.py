@@ -13,25 +13,25 @@ from pathlib import Path
 
 import psutil
 
-from afspm import entry_points, wire
-from afspm.addresses import connectable
+from afspm import wire
+from afspm.basics import entry_points
+from afspm.basics.addresses import connectable
+from afspm.basics.clock import NS_PER_S, ExperimentClock
+from afspm.basics.errors import AfspmError
+from afspm.basics.launch import Launch, Sockets
+from afspm.basics.plain_data import Plain
 from afspm.client.connect import find_run, guest_of
-from afspm.clock import NS_PER_S, ExperimentClock
-from afspm.errors import AfspmError
 from afspm.experiment import Experiment, Role
-from afspm.launch import Launch, Sockets
-from afspm.logic import diagnosis
-from afspm.logic.diagnosis import Diagnosis, Handshake, Heard, Reach, Severity, Versions
 from afspm.model import CLOCK_REQUEST, ProcessCondition, ProcessStates, Request
 from afspm.model.events import SUPERVISOR
-from afspm.plain_data import Plain
-from afspm.process.message_types import register_all
 from afspm.record.run_lock import goes_on
 from afspm.supervisor.reporter import computer_name
-from afspm.transport import keys, probe
+from afspm.transport import diagnosis, keys, probe
+from afspm.transport.diagnosis import Diagnosis, Handshake, Heard, Reach, Severity, Versions
 from afspm.transport.network import Network
 from afspm.transport.port import CaughtUp, ControlConnected, PacketReceived, ReplyReceived
 from afspm.transport.zmq_port import open_port
+from afspm.wire.message_types import register_all
 
 _PROBE_BYTES = 16 << 20
 _ASKED_AS = (SUPERVISOR, "terminal")

@@ -9,10 +9,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from afspm.addresses import connectable, reaches
+from afspm.basics.addresses import connectable, reaches
+from afspm.basics.launch import Sockets
 from afspm.client.connect import GUEST_KEYS
 from afspm.experiment import Experiment, ProcessStart, Role
-from afspm.launch import Sockets
 from afspm.model.events import SUPERVISOR
 from afspm.record.run_json import STATE_DIR
 from afspm.storage.atomic import replace_file

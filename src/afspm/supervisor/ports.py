@@ -21,8 +21,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from afspm.addresses import LOOPBACK
-from afspm.errors import ConfigError
+from afspm.basics.addresses import LOOPBACK
+from afspm.basics.errors import ConfigError
 from afspm.transport.network import HAS_PRIVATE_SOCKETS
 
 # Below the range from which systems take the ports of outgoing connections (Linux from 32768, Windows and macOS from

@@ -12,19 +12,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from afspm.clock import Clock
+from afspm.basics.clock import Clock
+from afspm.basics.errors import ConfigError, FileError
+from afspm.basics.formatting import duration_text
+from afspm.basics.interpreter import python_command, python_environment
 from afspm.components import notifications
 from afspm.components.notifications import END, GIVEN_UP, NotDelivered, Notification, Targets, Way
-from afspm.errors import ConfigError, FileError
 from afspm.experiment import Role, implied_parts
-from afspm.formatting import duration_text
-from afspm.interpreter import python_command, python_environment
-from afspm.logic.supervision.run_end import EndReason
 from afspm.model.events import LOGGED_AS
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.run import open_run
 from afspm.record.run_lock import resume_command
 from afspm.storage.disk import DiskTimeout, run_bounded
+from afspm.supervisor.supervision.run_end import EndReason
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -13,13 +13,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
-from afspm.errors import AfspmError
+from afspm.basics.errors import AfspmError
+from afspm.basics.interpreter import python_command, python_environment
+from afspm.basics.launch import Launch
 from afspm.experiment import ProcessStart
-from afspm.interpreter import python_command, python_environment
-from afspm.launch import Launch
-from afspm.logic.supervision.supervisor_events import Exited
 from afspm.model import Role
 from afspm.supervisor.child_output import ChildOutput, OutputDropped, OutputLine, Stream
+from afspm.supervisor.supervision.supervisor_events import Exited
 from afspm.supervisor.windows_job import WindowsJob
 
 LONGEST_LINE = 1 << 16  # a child that prints without end of line must not fill our memory
@@ -27,8 +27,8 @@ FED_S = 0.2  # a pipe takes a launch line at once, unless it is long and the chi
 LAST_WORDS_S = 3.0  # how long its output may still be read after an exit; a grandchild that left can hold the pipe open
 
 ChildEvent = OutputLine | OutputDropped | Exited
-HOST = "afspm.process.host"
-GUARD = "afspm.process.foreign"
+HOST = "afspm.supervisor.host"
+GUARD = "afspm.supervisor.foreign"
 
 
 @dataclass(frozen=True)

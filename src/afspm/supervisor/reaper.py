@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 if __name__ != "__main__":  # else it is run by itself, without the packages that would have to be loaded first
-    from afspm.process.parent import END_WITHIN_S, TIP_WITHIN_S
+    from afspm.transport.process.parent import END_WITHIN_S, TIP_WITHIN_S
 
 GRACE_S = 1.0
 """Beyond the time that a process has to end by itself."""

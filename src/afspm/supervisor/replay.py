@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from afspm import wire
-from afspm.addresses import is_address
+from afspm.basics.addresses import is_address
+from afspm.basics.clock import NS_PER_S, ExperimentClock
+from afspm.basics.errors import ConfigError, FileError
+from afspm.basics.launch import Launch, Sockets
 from afspm.client.connect import GUEST
-from afspm.clock import NS_PER_S, ExperimentClock
-from afspm.errors import ConfigError, FileError
-from afspm.launch import Launch, Sockets
 from afspm.model import Frame
-from afspm.process import signals
 from afspm.record.packets import RecordPlayback
 from afspm.record.run import Run, open_run
 from afspm.record.run_json import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR
@@ -26,6 +25,7 @@ from afspm.scheduler.replayer import Replayer
 from afspm.supervisor import run_folder
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.run import now
+from afspm.transport.process import signals
 from afspm.transport.rate_limited_log import RateLimitedLog
 
 BEFORE_S = 1.0

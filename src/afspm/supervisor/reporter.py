@@ -17,19 +17,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from afspm import wire
-from afspm.addresses import connectable
-from afspm.clock import Clock, ExperimentClock
-from afspm.errors import AfspmError, WireError
+from afspm.basics.addresses import connectable
+from afspm.basics.clock import Clock, ExperimentClock
+from afspm.basics.errors import AfspmError, WireError
+from afspm.basics.launch import Launch, Sockets
 from afspm.experiment import Experiment, ProcessStart, Role
-from afspm.launch import Launch, Sockets
-from afspm.logic.supervision.supervisor_events import (
-    AskUse,
-    EndExperiment,
-    EndRefused,
-    RestartOrdered,
-    SchedulerAnswered,
-    UseReported,
-)
 from afspm.model import (
     CLOCK_REQUEST,
     OTHER_RUN_RESPONSE,
@@ -45,8 +37,16 @@ from afspm.model import (
     Response,
 )
 from afspm.model.events import LONGEST_ANNOUNCEMENT, SUPERVISOR
-from afspm.process.context import new_session
+from afspm.supervisor.supervision.supervisor_events import (
+    AskUse,
+    EndExperiment,
+    EndRefused,
+    RestartOrdered,
+    SchedulerAnswered,
+    UseReported,
+)
 from afspm.transport.port import ControlConnected, ControlDisconnected, Incoming, ReplyReceived
+from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import ZmqPort, open_port
 
 STATES_PERIOD_S = 2.0

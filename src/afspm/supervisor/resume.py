@@ -14,12 +14,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TextIO
 
+from afspm.basics.clock import NS_PER_S, ExperimentClock
+from afspm.basics.errors import ConfigError, FileError
+from afspm.basics.plain_data import Plain
 from afspm.client.connect import find_run
-from afspm.clock import NS_PER_S, ExperimentClock
-from afspm.errors import ConfigError, FileError
 from afspm.experiment import Experiment, load, load_expanded
-from afspm.logic.supervision.run_end import EndReason
-from afspm.plain_data import Plain
 from afspm.record.journal import open_to_read
 from afspm.record.run_json import EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, read_run_json
 from afspm.record.run_lock import lock_run, quoted, resume_command
@@ -29,6 +28,7 @@ from afspm.supervisor import run as running
 from afspm.supervisor.ports import require_free
 from afspm.supervisor.run import FILES, HOMES, HOW, ONLY, RUN, WITHOUT, FinishedRun, RunOptions
 from afspm.supervisor.run_identity import RunIdentity, new_identity
+from afspm.supervisor.supervision.run_end import EndReason
 
 _OVER = {reason.name.lower() for reason in EndReason if reason.is_final}
 _LOOPBACK = re.compile(r"tcp://(127\.0\.0\.1|localhost|\*|0\.0\.0\.0):(\d+)")

@@ -11,16 +11,13 @@ from datetime import datetime
 from pathlib import Path
 from typing import TextIO
 
-from afspm.addresses import connectable
+from afspm.basics.addresses import connectable
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import ConfigError
+from afspm.basics.formatting import counted
+from afspm.basics.launch import Launch, Sockets
 from afspm.client.connect import GUEST, guest_facts
-from afspm.clock import ExperimentClock
-from afspm.errors import ConfigError
 from afspm.experiment import Experiment, ProcessStart, Role, run_metadata
-from afspm.formatting import counted
-from afspm.launch import Launch, Sockets
-from afspm.logic.supervision.child import ChildPolicy
-from afspm.logic.supervision.liveness import LivenessPolicy
-from afspm.logic.supervision.restart import RestartPolicy
 from afspm.model.events import LOGGED_AS
 from afspm.record.run_json import COMPUTER, ENDED, METADATA, REAL_S, STATE_DIR, run_json_or_empty
 from afspm.record.run_lock import lock_run
@@ -33,6 +30,9 @@ from afspm.supervisor.post_run import EndedRun
 from afspm.supervisor.process import from_start
 from afspm.supervisor.reporter import reporter_of
 from afspm.supervisor.run_identity import RunIdentity
+from afspm.supervisor.supervision.child import ChildPolicy
+from afspm.supervisor.supervision.liveness import LivenessPolicy
+from afspm.supervisor.supervision.restart import RestartPolicy
 from afspm.supervisor.supervisor import RunOutcome, Supervisor
 from afspm.transport.heartbeat import HeartbeatListener
 

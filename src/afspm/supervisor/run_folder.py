@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
-from afspm.errors import FileError
+from afspm.basics.errors import FileError
 from afspm.record.run_json import EXPERIMENT_FILE, LATEST_FILE, LATEST_LINK, RUN_FILE, STATE_DIR
 from afspm.storage.atomic import replace_file
 from afspm.storage.disk import sync_folder

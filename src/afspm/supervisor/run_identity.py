@@ -9,9 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from afspm import wire
-from afspm.clock import NS_PER_S, ExperimentClock
-from afspm.errors import ConfigError, WireError
-from afspm.launch import Launch
+from afspm.basics.clock import NS_PER_S, ExperimentClock
+from afspm.basics.errors import ConfigError, WireError
+from afspm.basics.launch import Launch
 from afspm.model import CLOCK_REQUEST, ControlResponse, Request, Response
 from afspm.transport.port import ControlConnected, ReplyReceived
 from afspm.transport.zmq_port import open_port

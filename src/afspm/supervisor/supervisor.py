@@ -14,16 +14,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from afspm.clock import ExperimentClock
-from afspm.errors import AfspmError
-from afspm.exit_codes import ExitCode
-from afspm.formatting import duration_text
-from afspm.logic.supervision.child import ChildPolicy
-from afspm.logic.supervision.process_status import ProcessStatus
-from afspm.logic.supervision.run_end import EndReason
-from afspm.logic.supervision.supervised_child import ChildSpec, ProcessReport
-from afspm.logic.supervision.supervisor_core import SupervisorCore
-from afspm.logic.supervision.supervisor_events import (
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import AfspmError
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.formatting import duration_text
+from afspm.model import Role
+from afspm.model.events import LOGGED_AS
+from afspm.supervisor.activity_monitor import ActivityMonitor
+from afspm.supervisor.child_output import OutputDropped, OutputLine
+from afspm.supervisor.log import LineReader, RunLog
+from afspm.supervisor.process import ChildEvent, ChildProcess, Task
+from afspm.supervisor.reaper import Reaper
+from afspm.supervisor.reporter import Reporter, ReporterEvent, ReportFailed
+from afspm.supervisor.supervision.child import ChildPolicy
+from afspm.supervisor.supervision.process_status import ProcessStatus
+from afspm.supervisor.supervision.run_end import EndReason
+from afspm.supervisor.supervision.supervised_child import ChildSpec, ProcessReport
+from afspm.supervisor.supervision.supervisor_core import SupervisorCore
+from afspm.supervisor.supervision.supervisor_events import (
     ActivitySeen,
     AskUse,
     Beaten,
@@ -44,19 +52,11 @@ from afspm.logic.supervision.supervisor_events import (
     UseReported,
     WriteLog,
 )
-from afspm.model import Role
-from afspm.model.events import LOGGED_AS
-from afspm.process import signals
-from afspm.process.fault_file import take_fault
-from afspm.supervisor.activity_monitor import ActivityMonitor
-from afspm.supervisor.child_output import OutputDropped, OutputLine
-from afspm.supervisor.log import LineReader, RunLog
-from afspm.supervisor.process import ChildEvent, ChildProcess, Task
-from afspm.supervisor.reaper import Reaper
-from afspm.supervisor.reporter import Reporter, ReporterEvent, ReportFailed
 from afspm.transport import keys
 from afspm.transport.heartbeat import HeartbeatListener
 from afspm.transport.polling import WakeUp
+from afspm.transport.process import signals
+from afspm.transport.process.fault_file import take_fault
 
 REPORT_PERIOD_S = 0.1
 """Real time between two looks at the states of processes, for the reporter."""

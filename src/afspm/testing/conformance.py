@@ -32,8 +32,8 @@ from xml.etree import ElementTree
 from rich.console import Console
 from rich.text import Text
 
-from afspm.clock import Clock, ExperimentClock
-from afspm.errors import ConfigError
+from afspm.basics.clock import Clock, ExperimentClock
+from afspm.basics.errors import ConfigError
 
 NAME_WIDTH = 29
 REPORT_FILE = "report.json"

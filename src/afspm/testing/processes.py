@@ -8,12 +8,12 @@ import threading
 from collections.abc import Callable, Sequence
 from queue import Empty, SimpleQueue
 
-from afspm.clock import Clock
+from afspm.basics.clock import Clock
 from afspm.experiment import ProcessStart
-from afspm.logic.supervision.supervisor_events import Exited, describe_exit
 from afspm.supervisor.child_output import OutputLine
 from afspm.supervisor.log import LineReader, RunLog
 from afspm.supervisor.process import ChildEvent, ChildProcess, from_start
+from afspm.supervisor.supervision.supervisor_events import Exited, describe_exit
 
 ASKED_S, KILLED_S = 5.0, 3.0
 

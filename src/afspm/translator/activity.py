@@ -23,10 +23,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import ClassVar
 
-from afspm.clock import Clock
-from afspm.errors import AfspmError, Refused
+from afspm.basics.clock import Clock
+from afspm.basics.errors import AfspmError, Refused
+from afspm.basics.plain_data import Plain
 from afspm.model import ControlResponse, ScopeState, ScopeStatus
-from afspm.plain_data import Plain
 from afspm.translator.long_call import LongCall
 from afspm.translator.result_files import SCAN, ResultFiles
 

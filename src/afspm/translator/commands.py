@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from afspm import units
-from afspm.errors import AfspmError, ConfigError, Refused
+from afspm.basics import units
+from afspm.basics.errors import AfspmError, ConfigError, Refused
+from afspm.basics.plain_data import PlainMapping
 from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, request_name
-from afspm.plain_data import PlainMapping
 from afspm.translator.driver import LOST, Action, Driver
 from afspm.translator.parameters import Value
 from afspm.translator.sequence import SequenceStep, StatusSequence

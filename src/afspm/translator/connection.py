@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from afspm.clock import Clock
-from afspm.errors import AfspmError, ConfigError
+from afspm.basics.clock import Clock
+from afspm.basics.errors import AfspmError, ConfigError
 from afspm.translator.driver import LOST, ControllerLost, Driver
 from afspm.translator.emulated_controller import EmulatedController
 

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, cast
 
-from afspm.errors import AfspmError
-from afspm.file_lock import lock
+from afspm.basics.errors import AfspmError
+from afspm.basics.file_lock import lock
 
 _LOCKED_BYTES = 1  # where a lock covers what is read (Windows), who holds it is told behind it
 

@@ -11,17 +11,17 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
-from afspm.clock import Clock
-from afspm.errors import AfspmError, ConfigError, InvalidValue, Refused
+from afspm.basics.clock import Clock
+from afspm.basics.errors import AfspmError, ConfigError, InvalidValue, Refused
+from afspm.basics.plain_data import Plain, PlainMapping
+from afspm.basics.units import Duration, PollPeriod
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
-from afspm.plain_data import Plain, PlainMapping
 from afspm.translator.parameters import ParameterTable, Value
 from afspm.translator.polling import EAGER_S
 from afspm.translator.setting_groups import SettingsGroup
-from afspm.units import Duration, PollPeriod
 
 if TYPE_CHECKING:
-    from afspm.process.context import ProcessContext
+    from afspm.transport.process.context import ProcessContext
 
 MEASURING = frozenset({ScopeState.SCANNING, ScopeState.SPEC})
 

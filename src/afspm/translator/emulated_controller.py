@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
-from afspm.errors import ConfigError
-from afspm.file_lock import lock
+from afspm.basics.errors import ConfigError
+from afspm.basics.file_lock import lock
 from afspm.translator.driver import ControllerLost
 
 if TYPE_CHECKING:
-    from afspm.launch import Launch
+    from afspm.basics.launch import Launch
     from afspm.translator.driver import Driver
 
 _LOCKED_BYTES = 1

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from afspm.errors import AfspmError, FileError
+from afspm.basics.errors import AfspmError, FileError
+from afspm.basics.plain_data import PlainMapping
 from afspm.model import Scan, Spectrum
-from afspm.plain_data import PlainMapping
 from afspm.translator.result_files import (
     SCAN,
     Content,

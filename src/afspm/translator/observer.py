@@ -9,8 +9,8 @@ from contextlib import nullcontext
 from dataclasses import replace
 
 from afspm import wire
-from afspm.clock import NS_PER_S
-from afspm.errors import AfspmError
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.errors import AfspmError
 from afspm.model import ScopeState, ScopeStatus, names
 from afspm.storage.disk import is_full
 from afspm.translator import setting_groups

@@ -10,9 +10,9 @@ import logging
 from collections.abc import Callable
 from typing import NamedTuple
 
-from afspm.errors import AfspmError
+from afspm.basics.errors import AfspmError
+from afspm.basics.plain_data import Plain
 from afspm.model import Scan, Spectrum
-from afspm.plain_data import Plain
 from afspm.translator.driver import Driver
 from afspm.wire import encode
 

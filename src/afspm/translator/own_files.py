@@ -1,6 +1,6 @@
 """Files that afspm writes where a controller saves none: one per scan with all its channels, one per spectrum.
 
-The simulated microscope saves them, and drivers save what they fetched. `afspm.files.simulator` reads them.
+The simulated microscope saves them, and drivers save what they fetched. `afspm.storage.formats.simulator` reads them.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from afspm.clock import utc_time
-from afspm.files import netcdf, simulator
-from afspm.files.netcdf import Attributes, Variable
+from afspm.basics.clock import utc_time
 from afspm.model import Region, Spectrum
+from afspm.storage.formats import netcdf, simulator
+from afspm.storage.formats.netcdf import Attributes, Variable
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
-from afspm import units
-from afspm.errors import AfspmError, ConfigError, ErrorCollector, Refused, UnitError
-from afspm.formatting import unit_text
+from afspm.basics import units
+from afspm.basics.errors import AfspmError, ConfigError, ErrorCollector, Refused, UnitError
+from afspm.basics.formatting import unit_text
+from afspm.basics.plain_data import PlainMapping
 from afspm.model import ControlResponse, names
-from afspm.plain_data import PlainMapping
 
 Value = bool | int | float | str
 

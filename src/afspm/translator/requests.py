@@ -9,10 +9,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from afspm import wire
-from afspm.errors import WireError
-from afspm.logic.fencing import Epoch, SchedulerFence
-from afspm.logic.idempotency_cache import TOO_OLD, Floors
-from afspm.logic.sessions import number_of, run_of
+from afspm.basics.errors import WireError
+from afspm.basics.plain_data import Plain
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -23,7 +21,9 @@ from afspm.model import (
     names,
     request_name,
 )
-from afspm.plain_data import Plain
+from afspm.model.fencing import Epoch, SchedulerFence
+from afspm.model.idempotency_cache import TOO_OLD, Floors
+from afspm.model.sessions import number_of, run_of
 from afspm.translator.commands import Commands
 from afspm.translator.connection import Connection
 from afspm.translator.driver import LOST, Driver

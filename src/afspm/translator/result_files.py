@@ -15,10 +15,10 @@ from typing import Final
 
 import numpy as np
 
-from afspm.errors import FileError
-from afspm.files import FileContent, read
+from afspm.basics.errors import FileError
+from afspm.basics.plain_data import Plain
 from afspm.model import Region, Scan, Spectrum
-from afspm.plain_data import Plain
+from afspm.storage.formats import FileContent, read
 from afspm.translator.trace import TRACE
 
 SCAN: Final = "scan"

@@ -6,9 +6,9 @@ import contextlib
 import logging
 from collections.abc import Callable
 
-from afspm.clock import Clock
-from afspm.logic.microscope_status import feedback_of
+from afspm.basics.clock import Clock
 from afspm.model import ControlRequest, Request, Response, ScopeState, names
+from afspm.model.microscope_status import feedback_of
 from afspm.translator.connection import RETRY_S, Connection
 from afspm.translator.driver import LOST
 from afspm.translator.state import Kept, TranslatorState

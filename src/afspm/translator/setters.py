@@ -8,8 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Final
 
-from afspm.errors import Refused
-from afspm.logic.positions import scan_values
+from afspm.basics.errors import Refused
 from afspm.model import (
     ControlResponse,
     Feedback,
@@ -19,6 +18,7 @@ from afspm.model import (
     Request,
     ScanParameters,
 )
+from afspm.model.positions import scan_values
 from afspm.translator.driver import LOST, Driver
 from afspm.translator.parameters import ParameterSpec, Value, refuse_value
 from afspm.translator.setting_groups import FEEDBACK, FRAME, POSITION, check_together

@@ -6,9 +6,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
 from typing import Final
 
-from afspm.errors import InvalidValue, Refused
+from afspm.basics.errors import InvalidValue, Refused
+from afspm.basics.plain_data import Plain
 from afspm.model import ControlResponse, Feedback, ProbePosition, Region, ScanParameters, names
-from afspm.plain_data import Plain
 from afspm.translator.parameters import FEEDBACK_ON, ParameterTable, Value, refuse_value
 from afspm.wire.messages import FEEDBACK as FEEDBACK_STATE
 from afspm.wire.messages import PROBE_POSITION, SCAN_PARAMETERS

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from afspm.clock import Clock
+from afspm.basics.clock import Clock
+from afspm.basics.plain_data import Plain
 from afspm.model import ScopeState, ScopeStatus
-from afspm.plain_data import Plain
-from afspm.process.memory import Memory
+from afspm.storage.memory import Memory
 from afspm.translator.sequence import StatusSequence
 
 Kept = Plain

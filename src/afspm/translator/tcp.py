@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Final, TypeVar
 
-from afspm.errors import ConfigError
+from afspm.basics.errors import ConfigError
 from afspm.translator.driver import ControllerLost
 from afspm.translator.trace import TCP, TRACE, TracedAnswer
 

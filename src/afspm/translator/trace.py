@@ -17,9 +17,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Final
 
-from afspm.clock import NS_PER_S, Clock, ExperimentClock
-from afspm.errors import FileError
-from afspm.plain_data import Plain
+from afspm.basics.clock import NS_PER_S, Clock, ExperimentClock
+from afspm.basics.errors import FileError
+from afspm.basics.plain_data import Plain
 
 FILE: Final = "controller.trace.jsonl"
 FORMAT: Final = 1

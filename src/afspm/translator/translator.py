@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from afspm import wire
-from afspm.exit_codes import ExitCode
-from afspm.logic.fencing import SchedulerFence
+from afspm.basics.exit_codes import ExitCode
 from afspm.model import ControlResponse, Response, ScopeState, ScopeStatus
-from afspm.process.memory import Memory
+from afspm.model.fencing import SchedulerFence
+from afspm.storage.memory import Memory
 from afspm.translator.connection import Connection
 from afspm.translator.controller_lock import ControllerTaken, commanding
 from afspm.translator.driver import Driver
@@ -35,7 +35,7 @@ from afspm.translator.trace import FILE, TRACE, TraceHeader
 from afspm.transport.port import ParentGone, RequestReceived, ServerPort, SubscriberJoined
 
 if TYPE_CHECKING:
-    from afspm.process.context import ProcessContext
+    from afspm.transport.process.context import ProcessContext
 
 
 class Translator:

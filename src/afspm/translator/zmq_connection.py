@@ -9,7 +9,7 @@ from typing import Final, TypeVar
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from afspm.errors import ConfigError
+from afspm.basics.errors import ConfigError
 from afspm.translator.driver import ControllerLost
 from afspm.translator.trace import TRACE, ZEROMQ, TracedAnswer
 

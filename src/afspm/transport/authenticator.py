@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import zmq
 from zmq.utils import z85
 
-from afspm.errors import ConfigError
+from afspm.basics.errors import ConfigError
 from afspm.transport.keys import Keys, public_keys
 from afspm.transport.polling import WakeUp
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import zmq
 
 from afspm import wire
-from afspm.errors import WireError
-from afspm.logic.sessions import token_of
+from afspm.basics.errors import WireError
 from afspm.model import CLOCK_REQUEST, Request
+from afspm.model.sessions import token_of
 from afspm.transport.frames import receive_frames, send_frames
 from afspm.transport.keys import routing_id
 from afspm.transport.network import CONNECTED, DISCONNECTED, Monitor, Network

@@ -19,9 +19,9 @@ from pathlib import Path
 
 import zmq
 
-from afspm.errors import ConfigError
+from afspm.basics.errors import ConfigError
+from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.model import component_of
-from afspm.plain_data import Plain, PlainMapping
 
 GUEST = "guest"
 """The owner of the key that notebooks and terminal commands use where keys are made for a run; good for other names."""

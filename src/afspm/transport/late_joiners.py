@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Hashable, Iterable
 from typing import NamedTuple
 
-from afspm.clock import Clock
+from afspm.basics.clock import Clock
 from afspm.model import Packet
 from afspm.wire import Buffer
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import zmq
 
-from afspm.errors import ConfigError, TransportError
+from afspm.basics.errors import ConfigError, TransportError
 from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from afspm.clock import Clock
+from afspm.basics.clock import Clock
 from afspm.model import Packet, Response
 
 CUT_OFF_SHOWS_WITHIN_S = 10.0

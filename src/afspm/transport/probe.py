@@ -9,8 +9,8 @@ from importlib.metadata import version
 
 import zmq
 
-from afspm.clock import ExperimentClock
-from afspm.logic.diagnosis import Handshake, Reach, Versions
+from afspm.basics.clock import ExperimentClock
+from afspm.transport.diagnosis import Handshake, Reach, Versions
 from afspm.transport.network import CONNECTED, REFUSED, Monitor, Network
 
 WITHIN_S = 5.0

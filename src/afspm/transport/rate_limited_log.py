@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 
-from afspm.clock import Clock
+from afspm.basics.clock import Clock
 
 _BURST = 5
 _PERIOD_S = 10.0

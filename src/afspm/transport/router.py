@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import zmq
 
-from afspm.clock import Clock
+from afspm.basics.clock import Clock
 from afspm.transport.frames import descriptor_of, property_of, receive_frames, send_frames, user_of
 from afspm.transport.keys import MARK
 from afspm.transport.network import DISCONNECTED, REFUSED, Monitor, Network

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 
-from afspm.clock import Clock
-from afspm.errors import ConfigError
-from afspm.launch import Launch
+from afspm.basics.clock import Clock
+from afspm.basics.errors import ConfigError
+from afspm.basics.launch import Launch
 from afspm.model import Packet
 from afspm.transport.network import Monitor, Network
 from afspm.transport.polling import Poller, WakeUp

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import zmq
 
 from afspm import wire
-from afspm.errors import ConfigError, WireError
+from afspm.basics.errors import ConfigError, WireError
 from afspm.transport.frames import contents, receive_frames
 from afspm.transport.late_joiners import LONGEST, Marker, topic
 from afspm.transport.network import CONNECTED, MAX_PACKET_BYTES, Monitor, Network

@@ -6,9 +6,9 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import Generic, TypeVar
 
-from afspm.clock import Clock
-from afspm.errors import ConfigError
-from afspm.launch import Launch
+from afspm.basics.clock import Clock
+from afspm.basics.errors import ConfigError
+from afspm.basics.launch import Launch
 from afspm.transport.control_client import ControlClient
 from afspm.transport.late_joiners import PublishedHistory
 from afspm.transport.network import Network

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import zmq
 
-from afspm.clock import Clock
-from afspm.errors import ConfigError
-from afspm.launch import Launch
+from afspm.basics.clock import Clock
+from afspm.basics.errors import ConfigError
+from afspm.basics.launch import Launch
 from afspm.transport.frames import receive_frames, send_frames, user_of
 from afspm.transport.network import Network
 from afspm.transport.port import RequestReceived, Served, SubscriberJoined

@@ -9,8 +9,8 @@ from typing import Any
 from google.protobuf.message import Message
 
 from afspm import model
-from afspm.errors import AfspmError, InvalidValue, UnitError, WireError
-from afspm.units import convert as convert_unit
+from afspm.basics.errors import AfspmError, InvalidValue, UnitError, WireError
+from afspm.basics.units import convert as convert_unit
 from afspm.wire import convert
 from afspm.wire.generated import analysis_pb2, lines_pb2, scan_pb2, spectroscopy_pb2
 from afspm.wire.mapping import MAPPINGS, MessageMapping, time_ns, timestamp

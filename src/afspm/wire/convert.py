@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 
 from afspm import model
-from afspm.errors import InvalidValue
-from afspm.units import convert
+from afspm.basics.errors import InvalidValue
+from afspm.basics.units import convert
 from afspm.wire.generated import control_pb2, scan_pb2, spectroscopy_pb2
 
 LENGTH_UNIT = "m"

@@ -14,8 +14,8 @@ from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from afspm import model
-from afspm.clock import NS_PER_S
-from afspm.errors import InvalidValue
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.errors import InvalidValue
 from afspm.wire.generated import control_pb2, feedback_pb2, journal_pb2
 from afspm.wire.messages import parse
 from afspm.wire.split import Buffer

@@ -23,7 +23,7 @@ from typing import Final, TypeVar
 
 from google.protobuf.message import DecodeError, Message
 
-from afspm.errors import InvalidValue, WireError
+from afspm.basics.errors import InvalidValue, WireError
 from afspm.model import ControlRequest, Role
 from afspm.wire.generated import (
     analysis_pb2,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from afspm.errors import WireError
+from afspm.basics.errors import WireError
 
 if TYPE_CHECKING:
     import numpy as np

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from google.protobuf.message import Message
 
-from afspm.errors import WireError
+from afspm.basics.errors import WireError
 from afspm.model import ProbePosition, Region
 from afspm.wire import convert
 from afspm.wire.generated import lines_pb2, scan_pb2, spectroscopy_pb2

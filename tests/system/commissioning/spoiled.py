@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from afspm import entry_points
-from afspm.emulators.nanonis import NanonisEmulator
+from afspm.basics import entry_points
 from afspm.model import Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.plugins.nanonis.emulator import NanonisEmulator
 from afspm.translator import Driver
 
 LATE_S = 120.0

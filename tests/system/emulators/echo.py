@@ -7,7 +7,7 @@ import socket
 import threading
 from typing import Any, ClassVar
 
-from afspm.emulators.emulator import LOOPBACK, Crashed, Emulator
+from afspm.simulation.emulation.emulator import LOOPBACK, Crashed, Emulator
 
 
 class Echo(Emulator):

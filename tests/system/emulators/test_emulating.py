@@ -15,9 +15,9 @@ import zmq
 from makers import MAKERS
 from systems import PATIENCE, can_interrupt, interrupt
 
-from afspm.clock import ExperimentClock
-from afspm.exit_codes import ExitCode
-from afspm.launch import Launch, Sockets
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.launch import Launch, Sockets
 
 DEADLINE_S = 30.0 * PATIENCE
 HERE = Path(__file__).parent
@@ -112,7 +112,7 @@ def beginning(
     with zmq.Context() as context, context.socket(zmq.XPUB) as scheduler:
         scheduler.setsockopt(zmq.LINGER, 0)
         port = scheduler.bind_to_random_port("tcp://127.0.0.1")
-        with started("afspm.process.host", cwd=tmp_path) as process:
+        with started("afspm.supervisor.host", cwd=tmp_path) as process:
             assert process.stdin is not None
             process.stdin.write(launched(settings, f"tcp://127.0.0.1:{port}", tmp_path, class_))
             process.stdin.flush()

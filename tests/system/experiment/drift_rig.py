@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from experiment_lab import AfspmRun
 
-from afspm.files import read
+from afspm.storage.formats import read
 
 EXPERIMENT = """
 [clock]
@@ -61,7 +61,7 @@ from pathlib import Path
 import numpy as np
 
 from afspm import Component, Region
-from afspm.drift.registration import Registration
+from afspm.plugins.drift.registration import Registration
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))
 FEATURE_M = (0.2e-6, 0.1e-6)

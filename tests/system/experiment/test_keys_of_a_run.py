@@ -10,8 +10,8 @@ from experiment_lab import Run, require_each_once
 
 import afspm
 from afspm import wire
+from afspm.basics.errors import AfspmError
 from afspm.client.connect import guest_of
-from afspm.errors import AfspmError
 from afspm.model import ControlRequest, Request
 
 THIEF = """

@@ -10,7 +10,7 @@ import pytest
 from experiment_lab import AfspmRun, require_each_once
 from systems import can_interrupt, interrupt, wait_until_gone
 
-from afspm.process.memory import Memory
+from afspm.storage.memory import Memory
 
 MODULE = """
 import os

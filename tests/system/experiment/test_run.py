@@ -12,7 +12,7 @@ from experiment_lab import Run, require_each_once, require_recorded_once
 from systems import can_interrupt, interrupt, wait_until_gone
 
 import afspm
-from afspm.errors import ExperimentEnded
+from afspm.basics.errors import ExperimentEnded
 from afspm.record.run_json import latest_run
 from afspm.supervisor.ports import FreePorts
 

@@ -15,8 +15,8 @@ import pytest
 from experiment_lab import AfspmRun, Run
 
 import afspm
-from afspm.errors import ExperimentEnded
-from afspm.survey import find_particles, nearest
+from afspm.basics.errors import ExperimentEnded
+from afspm.components.surveying import find_particles, nearest
 
 pytest.importorskip("skimage")
 ROOT = Path(__file__).parents[3]

@@ -11,7 +11,7 @@ import pytest
 from experiment_lab import AfspmRun, Run
 
 import afspm
-from afspm.errors import ConfigError
+from afspm.basics.errors import ConfigError
 from afspm.supervisor.ports import FreePorts
 
 ADDRESSES = """

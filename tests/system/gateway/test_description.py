@@ -14,7 +14,7 @@ from urllib.request import urlopen
 import pytest
 from gateway_lab import SERIES, GatewayRun
 
-from afspm.web.passwords import hashed
+from afspm.plugins.web.passwords import hashed
 
 Started = Callable[..., GatewayRun]
 LEFT_OUT = ("/v1/end", "/v1/events")

@@ -23,8 +23,8 @@ from afspm_process import DEADLINE_S
 from gateway_lab import EXPERIMENT, REGION, SERIES, Client, Event, GatewayRun
 
 import afspm
-from afspm.gateway.stream import MOST_STREAMS
-from afspm.web.passwords import hashed
+from afspm.plugins.web.gateway.stream import MOST_STREAMS
+from afspm.plugins.web.passwords import hashed
 
 Started = Callable[..., GatewayRun]
 
@@ -164,7 +164,7 @@ def test_spectra_from_before_a_restart_are_served_from_the_record(started: Start
 
 def test_a_reader_that_stalls_is_dropped_and_goes_on_without_loss(started: Started, tmp_path: Path) -> None:
     (tmp_path / "impatient.py").write_text(
-        "from afspm.gateway.gateway import Gateway\n\n\nclass Impatient(Gateway):\n    stalled_s = 1.0\n",
+        "from afspm.plugins.web.gateway.gateway import Gateway\n\n\nclass Impatient(Gateway):\n    stalled_s = 1.0\n",
         encoding="utf-8",
     )
     file = tmp_path / "experiment.toml"

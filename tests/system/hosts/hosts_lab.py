@@ -105,10 +105,10 @@ import time
 from pathlib import Path
 
 from afspm import Component, Region
-from afspm.microscopes.simulator import Simulator
+from afspm.simulation.simulator import Simulator
 from afspm.model import names
 from afspm.translator.driver import action
-from afspm.units import Length
+from afspm.basics.units import Length
 
 
 def note(file, *said):

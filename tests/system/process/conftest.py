@@ -12,11 +12,11 @@ from queue import Empty, Queue
 import pytest
 from systems import PATIENCE
 
-from afspm.launch import Launch
+from afspm.basics.launch import Launch
 
 HERE = Path(__file__).parent
 PATIENCE_S = 20.0 * PATIENCE
-HOST = [sys.executable, "-m", "afspm.process.host"]
+HOST = [sys.executable, "-m", "afspm.supervisor.host"]
 
 
 class Child:

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from afspm.exit_codes import ExitCode
+from afspm.basics.exit_codes import ExitCode
 
-GUARD = [sys.executable, "-m", "afspm.process.foreign"]
+GUARD = [sys.executable, "-m", "afspm.supervisor.foreign"]
 
 # other languages have no Python: these use nothing of ours
 ECHO = "import sys; print(sys.stdin.readline().strip(), flush=True); print('eof', repr(sys.stdin.read()), flush=True)"
@@ -53,7 +53,7 @@ def test_a_guard_that_is_terminated_takes_its_command_along(start: Any) -> None:
 
 TERMINATED_AT_ONCE = """
 import os, signal, subprocess, sys
-from afspm.process import foreign
+from afspm.transport.process import foreign
 
 class Popen(subprocess.Popen):
     def __init__(self, *args, **settings):

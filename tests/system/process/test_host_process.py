@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from afspm.clock import ExperimentClock
-from afspm.exit_codes import ExitCode
-from afspm.launch import Launch, Sockets
-from afspm.process.host import MOST_FILES
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.launch import Launch, Sockets
+from afspm.supervisor.host import MOST_FILES
 from afspm.transport.heartbeat import Heartbeat, HeartbeatListener
 
 Host = Callable[[Launch], Any]
@@ -99,7 +99,7 @@ def test_settings_that_can_not_work_are_told_and_not_tried_again(host: Host, lau
 
 @pytest.mark.parametrize("line", ["", "{", "5", '{"name": "x", "setings": {}}'])
 def test_a_line_that_is_none_is_told(start: Any, line: str) -> None:
-    child = start([sys.executable, "-m", "afspm.process.host"], line)
+    child = start([sys.executable, "-m", "afspm.supervisor.host"], line)
     assert child.exit_code() == ExitCode.CONFIG
     assert child.error_text.startswith("ERROR ")
 

@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 
 import afspm
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import ControlLost, ExperimentEnded, FileError, NoResponse, Refused
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.launch import Launch, Sockets
 from afspm.client import connect
 from afspm.client.connect import guest_facts
-from afspm.clock import ExperimentClock
-from afspm.errors import ControlLost, ExperimentEnded, FileError, NoResponse, Refused
-from afspm.exit_codes import ExitCode
-from afspm.launch import Launch, Sockets
 from afspm.model import ControlMode, Region, ScopeState
 from afspm.supervisor.ports import FreePorts
 
@@ -57,7 +57,7 @@ class Experiment:
         self.translator = self._host(
             Launch(
                 "translator",
-                "afspm.microscopes.simulator.Simulator",
+                "afspm.simulation.simulator.Simulator",
                 sockets=Sockets(publish=self.translator_pub, serve=self.server),
                 **self._common,
             )

@@ -14,7 +14,7 @@ import afspm
 
 STARTS = """
 import os, subprocess, sys
-from afspm.interpreter import python_command, python_environment
+from afspm.basics.interpreter import python_command, python_environment
 environment = {**os.environ, **python_environment()}
 child = subprocess.Popen(python_command("tells"), env=environment, stdout=subprocess.PIPE, encoding="utf-8")
 print(child.pid, sys.prefix)

@@ -11,7 +11,7 @@ import zmq
 from bridged_rig import Bridge, BridgedRig
 from version_1 import Router
 
-from afspm.launch import Sockets
+from afspm.basics.launch import Sockets
 from afspm.supervisor.ports import FreePorts
 
 

@@ -14,7 +14,7 @@ from bridged_rig import BridgedRig
 from version_1 import REQUEST, Client, Subscriber
 
 from afspm import wire
-from afspm.launch import Sockets
+from afspm.basics.launch import Sockets
 from afspm.model import ControlRequest, ControlResponse, Region, Request, Response, Scan, ScopeState, ScopeStatus
 from afspm.supervisor.ports import FreePorts
 from afspm.transport import keys

@@ -13,9 +13,9 @@ import zmq
 from version_1 import END, PARAM, RELEASE, REQUEST, Client, Router, Server, Subscriber
 
 from afspm import wire
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.launch import Launch, Sockets
 from afspm.client.experiment_link import ExperimentLink
-from afspm.clock import ExperimentClock
-from afspm.launch import Launch, Sockets
 from afspm.model import (
     RELAY_REQUEST,
     ControlRequest,

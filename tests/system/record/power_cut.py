@@ -30,8 +30,8 @@ from typing import Any
 
 import afspm
 from afspm import wire
+from afspm.basics.clock import ExperimentClock
 from afspm.client.connect import connect
-from afspm.clock import ExperimentClock
 from afspm.model import ControlMode, Packet, ScopeState
 from afspm.wire import KILL, decode_packet
 

@@ -15,9 +15,9 @@ from systems import WINDOWS, can_interrupt, interrupt
 
 import afspm
 from afspm import wire
+from afspm.basics.errors import ConfigError, RequestError, TransportError
+from afspm.basics.launch import Launch
 from afspm.client.follower import Follower
-from afspm.errors import ConfigError, RequestError, TransportError
-from afspm.launch import Launch
 from afspm.model import ControlMode, ControlState, Packet, Region, Scan, ScopeState, ScopeStatus
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.supervisor import replay as replay_module

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from systems import PATIENCE
 
-from afspm.cli.dashboard import resumed_with_page
-from afspm.clock import NS_PER_S
-from afspm.errors import ConfigError, FileError
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.errors import ConfigError, FileError
+from afspm.plugins.web.commands import resumed_with_page
 from afspm.record.run_json import STATE_DIR
 from afspm.record.run_lock import lock_run
 from afspm.supervisor import resume

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from afspm.clock import ExperimentClock
+from afspm.basics.clock import ExperimentClock
 from afspm.transport.network import Network
 from afspm.transport.port import PacketReceived
 from afspm.transport.zmq_port import ZmqPort

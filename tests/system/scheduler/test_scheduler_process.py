@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from afspm import wire
-from afspm.launch import Sockets
+from afspm.basics.launch import Sockets
 from afspm.model import (
     ControlMode,
     ControlRequest,

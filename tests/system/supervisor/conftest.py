@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from supervisor_lab import DEADLINE_S, QUICK, Running, RunTasks, Terminal
 
-from afspm.clock import ExperimentClock
-from afspm.logic.supervision.child import ChildPolicy
+from afspm.basics.clock import ExperimentClock
 from afspm.supervisor.log import RunLog
 from afspm.supervisor.process import Task
 from afspm.supervisor.reporter import Reporter
+from afspm.supervisor.supervision.child import ChildPolicy
 from afspm.supervisor.supervisor import RunOutcome, Supervisor
 
 

@@ -10,8 +10,8 @@ import threading
 import time
 from pathlib import Path
 
-from afspm.clock import ExperimentClock
-from afspm.launch import Launch
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.launch import Launch
 from afspm.transport.heartbeat import HeartbeatSender
 
 

@@ -12,12 +12,12 @@ from typing import Any
 
 from systems import PATIENCE
 
+from afspm.basics.launch import Launch
 from afspm.experiment import Role
-from afspm.launch import Launch
-from afspm.logic.supervision.child import ChildPolicy
-from afspm.logic.supervision.liveness import LivenessPolicy
-from afspm.logic.supervision.restart import RestartPolicy
 from afspm.supervisor.process import Task
+from afspm.supervisor.supervision.child import ChildPolicy
+from afspm.supervisor.supervision.liveness import LivenessPolicy
+from afspm.supervisor.supervision.restart import RestartPolicy
 from afspm.supervisor.supervisor import RunOutcome, Supervisor
 
 DEADLINE_S = 20.0 * PATIENCE

@@ -13,11 +13,11 @@ from queue import Queue
 import pytest
 from systems import KILLED, PATIENCE, freeze, not_on_wine
 
-from afspm.errors import AfspmError
-from afspm.launch import Launch
-from afspm.logic.supervision.supervisor_events import Exited
+from afspm.basics.errors import AfspmError
+from afspm.basics.launch import Launch
 from afspm.supervisor.child_output import OutputDropped, OutputLine
 from afspm.supervisor.process import ChildEvent, ChildProcess, Task
+from afspm.supervisor.supervision.supervisor_events import Exited
 
 DEADLINE_S = 15.0 * PATIENCE
 Start = Callable[[str], ChildProcess]
@@ -153,7 +153,7 @@ def test_a_secret_of_others_is_not_in_its_environment(
 
 KILLED_SUPERVISOR = """
 import os, sys, threading
-from afspm.launch import Launch
+from afspm.basics.launch import Launch
 from afspm.supervisor.process import ChildProcess
 from afspm.supervisor.reaper import Reaper
 from afspm.supervisor.process import Task

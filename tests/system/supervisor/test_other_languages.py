@@ -12,9 +12,9 @@ import pytest
 from supervisor_lab import DEADLINE_S
 from systems import KILLED_FROM_OUTSIDE, WINDOWS, kill
 
-from afspm.launch import Launch
-from afspm.logic.supervision.supervisor_events import Exited
+from afspm.basics.launch import Launch
 from afspm.supervisor.process import GUARD, ChildEvent, ChildProcess, Task
+from afspm.supervisor.supervision.supervisor_events import Exited
 
 # a command that listens to nobody, with a child of its own that doesn't either; each calls us for as long as it lives
 DEAF = "import socket; socket.create_connection(('127.0.0.1', {port})).recv(1)"

@@ -12,10 +12,9 @@ from supervisor_lab import BEAT_S, DEADLINE_S, Running, RunTasks, peer
 from systems import KILLED_FROM_OUTSIDE, kill
 
 from afspm import wire
-from afspm.clock import ExperimentClock
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.launch import Launch, Sockets
 from afspm.experiment import Role
-from afspm.launch import Launch, Sockets
-from afspm.logic.supervision.supervisor_events import describe_exit
 from afspm.model import (
     RESTART_REQUEST,
     ControlRequest,
@@ -30,6 +29,7 @@ from afspm.model import (
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.process import HOST, Task
 from afspm.supervisor.reporter import Reporter
+from afspm.supervisor.supervision.supervisor_events import describe_exit
 from afspm.transport import keys
 from afspm.transport.network import Network
 from afspm.transport.port import ControlConnected, PacketReceived, ReplyReceived, RequestReceived

@@ -10,12 +10,12 @@ import pytest
 from supervisor_lab import DEADLINE_S, QUICK, RunTasks, peer
 from systems import KILLED_FROM_OUTSIDE, WINE, freeze, kill, not_on_wine
 
-from afspm.clock import ExperimentClock
-from afspm.exit_codes import ExitCode
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.exit_codes import ExitCode
 from afspm.experiment import Role
-from afspm.logic.supervision.run_end import EndReason
-from afspm.logic.supervision.supervisor_events import describe_exit
 from afspm.supervisor.process import Task
+from afspm.supervisor.supervision.run_end import EndReason
+from afspm.supervisor.supervision.supervisor_events import describe_exit
 
 look_only = pytest.mark.skipif(
     WINE or sys.platform == "darwin", reason="the system does not tell the processor time of another process"

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 import zmq
 
-from afspm.clock import ExperimentClock
-from afspm.launch import Launch, Sockets
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 
@@ -128,7 +128,7 @@ class Running:
         self.clock = ExperimentClock.starting_now(start_s=1_767_225_600.0, speed=speed)
         self._launch = Launch(
             "translator",
-            "afspm.microscopes.simulator.Simulator",
+            "afspm.simulation.simulator.Simulator",
             settings,
             Sockets(publish=self.publish, serve=self.serve),
             clock=self.clock.as_dict(),
@@ -144,7 +144,7 @@ class Running:
         # into a file: a pipe that nobody reads fills up and holds the process
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "afspm.process.host"], stdin=subprocess.PIPE, stderr=log
+                [sys.executable, "-m", "afspm.supervisor.host"], stdin=subprocess.PIPE, stderr=log
             )
         assert self.process.stdin is not None
         self.process.stdin.write(self._launch.to_json().encode() + b"\n")

@@ -13,8 +13,8 @@ import pytest
 import zmq
 
 from afspm import wire
-from afspm.logic.fencing import Epoch
 from afspm.model import ControlRequest, Request, Response, names
+from afspm.model.fencing import Epoch
 
 OURS, THEIRS = "0123456789abcdef", "fedcba9876543210"
 START = Request(ControlRequest.ACTION, names.START_SCAN)

@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from afspm.errors import FileError, Refused
-from afspm.microscopes.simulator import Simulator
+from afspm.basics.errors import FileError, Refused
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.simulation.simulator import Simulator
 from afspm.translator import commands, parameters, sequence, setting_groups
 from afspm.translator.driver import Action, action
 from afspm.translator.observer import Observer

@@ -14,8 +14,8 @@ import pytest
 from afspm_process import AFSPM
 from systems import can_interrupt, interrupt
 
-from afspm.errors import ConfigError
-from afspm.process.memory import Memory
+from afspm.basics.errors import ConfigError
+from afspm.storage.memory import Memory
 from afspm.supervisor.ports import FreePorts
 from afspm.testing.translators import CheckOptions, CheckOutcome, CheckReport, client, run
 from afspm.testing.translators.translator_suite import TRANSLATOR_SUITE
@@ -108,7 +108,7 @@ def test_the_report_lists_what_is_supported_and_what_is_not(file: Path) -> None:
 def test_what_is_not_supported_is_skipped_and_listed(tmp_path: Path) -> None:
     module = tmp_path / "poor.py"
     module.write_text(
-        "from afspm.microscopes.simulator import Simulator\n\n\n"
+        "from afspm.simulation.simulator import Simulator\n\n\n"
         "class Poor(Simulator):\n"
         "    def __init__(self, **settings):\n"
         "        super().__init__(**settings)\n"
@@ -219,7 +219,7 @@ def test_a_translator_that_does_not_find_its_controller_is_said_to_with_what_it_
 ) -> None:
     monkeypatch.setattr(client, "STARTED_S", 8.0)
     (tmp_path / "deaf.py").write_text(
-        "from afspm.microscopes.simulator import Simulator\n\n\n"
+        "from afspm.simulation.simulator import Simulator\n\n\n"
         "class Deaf(Simulator):\n"
         "    def connect(self):\n"
         '        raise ConnectionError("nobody is at home")\n',

@@ -14,7 +14,7 @@ import pytest
 from afspm_process import AFSPM
 from makers import MAKERS
 
-from afspm.emulators import registry
+from afspm.simulation.emulation import registry
 
 DEADLINE_S = 90.0
 
@@ -52,9 +52,9 @@ def test_no_byte_reaches_who_has_the_vendors_usual_port(
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Gxsm4's shared memory is there on Linux alone")
 def test_no_call_reaches_the_shared_memory_of_a_gxsm_that_is_not_the_emulated_one(tmp_path: Path) -> None:
-    from afspm.clock import ExperimentClock
-    from afspm.emulators.gxsm import GxsmEmulator
-    from afspm.emulators.gxsm.block import SharedMemoryBlock
+    from afspm.basics.clock import ExperimentClock
+    from afspm.plugins.gxsm.emulator import GxsmEmulator
+    from afspm.plugins.gxsm.emulator.block import SharedMemoryBlock
     from afspm.simulation.faults import Faults
 
     name = GxsmEmulator.usual["block"]

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import typer
 
+from afspm.basics.errors import NoResponse
 from afspm.cli.joining import NOT_RUNNING, acting, looking, plain_console
-from afspm.errors import NoResponse
 from afspm.record.run_lock import cut_off_message, describe_state, lock_run
 
 

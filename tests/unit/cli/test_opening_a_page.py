@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from afspm.cli import dashboard as command
+from afspm.plugins.web import commands as command
 
 
 def test_the_run_is_named_before_the_page_is_loaded(

@@ -14,9 +14,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from afspm import wire
+from afspm.basics.launch import Launch, Sockets
 from afspm.client.component import Component
-from afspm.launch import Launch, Sockets
-from afspm.logic import arbitration as a
 from afspm.model import (
     RELAY_REQUEST,
     ControlRequest,
@@ -37,7 +36,7 @@ from afspm.model import (
     ScopeStatus,
     Spectrum,
 )
-from afspm.process.context import ProcessActivity, ProcessContext
+from afspm.scheduler.control import arbitration as a
 from afspm.transport.port import (
     CaughtUp,
     ControlConnected,
@@ -48,6 +47,7 @@ from afspm.transport.port import (
     ParentGone,
     ReplyReceived,
 )
+from afspm.transport.process.context import ProcessActivity, ProcessContext
 
 T = TypeVar("T")
 SOURCE = "memory://scheduler"

@@ -8,9 +8,9 @@ import pytest
 from client_lab import OTHER_REGION, REGION, SOURCE, Lab, LabPort
 
 from afspm import model
+from afspm.basics.errors import NoResponse
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
-from afspm.errors import NoResponse
 from afspm.model import ControlRequest
 
 

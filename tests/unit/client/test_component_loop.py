@@ -10,11 +10,11 @@ import pytest
 from client_lab import EPOCH_S, OTHER_REGION, REGION, Lab, Nothing, context_of, run
 
 from afspm import model, wire
+from afspm.basics.errors import ConfigError, ExperimentEnded, NoResponse, Refused
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.launch import Launch
+from afspm.basics.own_fault import OwnFault
 from afspm.client.component import Component
-from afspm.errors import ConfigError, ExperimentEnded, NoResponse, Refused
-from afspm.exit_codes import ExitCode
-from afspm.launch import Launch
-from afspm.logic.supervision.own_fault import OwnFault
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -25,7 +25,7 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
-from afspm.process.fault_file import take_fault
+from afspm.transport.process.fault_file import take_fault
 from afspm.wire.generated.analysis_pb2 import SpatialPointWithScoreList
 from afspm.wire.generated.feedback_pb2 import FeedbackAnalysis
 
@@ -433,7 +433,7 @@ def test_packets_of_other_publishers_are_handled_and_are_no_state_of_the_microsc
 
 
 def test_control_of_an_earlier_life_is_given_back_when_it_is_not_needed() -> None:
-    from afspm.logic.arbitration import ArbitrationEvent
+    from afspm.scheduler.control.arbitration import ArbitrationEvent
 
     lab = Lab("corrector")
     lab.does(ArbitrationEvent.REQUEST_CONTROL, "corrector")

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 import afspm
+from afspm.basics.clock import Clock, ExperimentClock
+from afspm.basics.errors import FileError
+from afspm.basics.launch import Launch, Sockets
 from afspm.client import connect
 from afspm.client.connect import GUEST, find_run, guest_facts
-from afspm.clock import Clock, ExperimentClock
-from afspm.errors import FileError
-from afspm.launch import Launch, Sockets
 from afspm.transport.port import CaughtUp, ControlConnected, Incoming
 
 PUBLISHER = "tcp://127.0.0.1:1"

@@ -11,11 +11,11 @@ from client_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, LabPort
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from afspm.basics.errors import InvalidValue, NoResponse, Refused
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
-from afspm.errors import InvalidValue, NoResponse, Refused
-from afspm.logic.arbitration import ArbitrationEvent
 from afspm.model import ControlRequest, ControlResponse, Problem, Request, Response, ScanSet
+from afspm.scheduler.control.arbitration import ArbitrationEvent
 
 TILES = [REGION.moved_to((i * 2e-6, 0.0)) for i in range(3)]
 

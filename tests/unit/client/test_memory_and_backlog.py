@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from afspm.basics.errors import FileError, InvalidValue
 from afspm.client.backlog import PacketBacklog
-from afspm.errors import FileError, InvalidValue
 from afspm.model import Packet
-from afspm.process.memory import Memory
+from afspm.storage.memory import Memory
 
 
 def test_what_is_saved_is_there_after_a_restart(tmp_path: Path) -> None:

@@ -10,9 +10,17 @@ import pytest
 from client_lab import OTHER_REGION, REGION, SCAN_S, SOURCE, Lab, LabPort
 
 from afspm import model, wire
+from afspm.basics.errors import (
+    ControlLost,
+    ExperimentEnded,
+    InvalidValue,
+    MeasurementFailed,
+    NoResponse,
+    Refused,
+    UnitError,
+)
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
-from afspm.errors import ControlLost, ExperimentEnded, InvalidValue, MeasurementFailed, NoResponse, Refused, UnitError
 from afspm.model import (
     ControlMode,
     ControlRequest,
@@ -25,8 +33,8 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
-from afspm.process.parent import StopRequested
 from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S, CaughtUp
+from afspm.transport.process.parent import StopRequested
 
 TIP = Problem.TIP_SHAPE_CHANGED
 
@@ -108,7 +116,7 @@ def test_a_scan_asked_for_while_a_problem_is_flagged_waits_without_asking_again_
 
 
 def test_another_solver_in_control_is_waited_for(lab: Lab, scope: Scope) -> None:
-    from afspm.logic.arbitration import ArbitrationEvent
+    from afspm.scheduler.control.arbitration import ArbitrationEvent
 
     lab.does(ArbitrationEvent.REQUEST_CONTROL, "other")
     lab.at(7.0, lambda: lab.does(ArbitrationEvent.RELEASE_CONTROL, "other"))
@@ -521,7 +529,7 @@ def test_solving_what_is_not_flagged_is_refused_at_once(lab: Lab, scope: Scope) 
 
 
 def test_a_solver_that_waits_is_told_when_another_has_solved_it(lab: Lab, scope: Scope) -> None:
-    from afspm.logic.arbitration import ArbitrationEvent
+    from afspm.scheduler.control.arbitration import ArbitrationEvent
 
     lab.flag(TIP)
     lab.does(ArbitrationEvent.REQUEST_CONTROL, "other", TIP)

@@ -6,8 +6,8 @@ import pytest
 from client_lab import REGION, Lab
 
 from afspm import model
+from afspm.basics.errors import ControlLost, NoResponse
 from afspm.client.scope import Scope
-from afspm.errors import ControlLost, NoResponse
 from afspm.model import ControlMode, ControlResponse, Problem, Response
 
 TIP = Problem.TIP_SHAPE_CHANGED

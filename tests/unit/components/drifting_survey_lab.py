@@ -11,15 +11,15 @@ from client_lab import Lab
 
 from afspm import wire
 from afspm.components.survey import Survey
-from afspm.drift.estimators import PairFailure, unguarded
-from afspm.drift.registration import DriftScan, Estimator
-from afspm.drift.trackers import tracker
 from afspm.experiment import load
 from afspm.model import Frame, Region, Scan
-from afspm.scheduler.drift.estimation import Estimation
-from afspm.scheduler.drift.messages import Registered
-from afspm.scheduler.drift.scheduler import DriftWireCodec
-from afspm.scheduler.drift.settings import RescanRule
+from afspm.plugins.drift.estimators import PairFailure, unguarded
+from afspm.plugins.drift.registration import DriftScan, Estimator
+from afspm.plugins.drift.scheduler.estimation import Estimation
+from afspm.plugins.drift.scheduler.messages import Registered
+from afspm.plugins.drift.scheduler.scheduler import DriftWireCodec
+from afspm.plugins.drift.scheduler.settings import RescanRule
+from afspm.plugins.drift.trackers import tracker
 from afspm.simulation import World
 
 TUTORIAL = Path(__file__).parents[3] / "docs" / "tutorials" / "particle-survey.md"

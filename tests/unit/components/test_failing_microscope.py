@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from client_lab import OTHER_REGION, Lab, run
 
+from afspm.basics.errors import MeasurementFailed
+from afspm.basics.exit_codes import ExitCode
 from afspm.components.planned_scans import ScanSeries
-from afspm.errors import MeasurementFailed
-from afspm.exit_codes import ExitCode
 from afspm.model import Problem, Region, Scan
 
 SIZE = (1e-6, 1e-6)

@@ -7,10 +7,10 @@ import pytest
 from client_lab import Lab, run
 
 from afspm import wire
+from afspm.basics.exit_codes import ExitCode
 from afspm.components.feedback_analysis import MESSAGE, FeedbackAnalysis
-from afspm.exit_codes import ExitCode
-from afspm.logic import arbitration as a
 from afspm.model import Feedback, Problem, Region, Scan, names
+from afspm.scheduler.control import arbitration as a
 
 SETPOINT = 0.5
 HERE = Region((0.0, 0.0), (1e-6, 1e-6))

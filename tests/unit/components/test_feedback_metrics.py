@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from afspm.basics.errors import ConfigError
 from afspm.components.feedback_metrics import (
     FeedbackError,
     FeedbackLimits,
@@ -21,7 +22,6 @@ from afspm.components.feedback_metrics import (
     relative_error,
 )
 from afspm.components.feedback_signal import FeedbackSignal
-from afspm.errors import ConfigError
 from afspm.model import Feedback, Region, Scan
 from afspm.simulation import World
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from client_lab import Lab, run
 
+from afspm.basics.exit_codes import ExitCode
 from afspm.components.feedback_tuner import FeedbackTuner
-from afspm.exit_codes import ExitCode
 from afspm.model import (
     ControlRequest,
     ControlResponse,

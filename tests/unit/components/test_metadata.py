@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from client_lab import REGION, Lab, Nothing, context_of, run
 
-from afspm.clock import iso_utc
+from afspm.basics.clock import iso_utc
+from afspm.basics.exit_codes import ExitCode
 from afspm.components.line_file import LineFile
 from afspm.components.metadata import COLUMNS, Metadata
-from afspm.exit_codes import ExitCode
-from afspm.logic import arbitration as a
 from afspm.model import ControlMode, ControlState, Note, Problem, Scan, ScopeState, ScopeStatus, Spectrum
+from afspm.scheduler.control import arbitration as a
 
 
 def rows(folder: Path) -> list[dict[str, str]]:

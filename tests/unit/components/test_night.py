@@ -12,11 +12,11 @@ import pytest
 from client_lab import REGION, Lab, context_of, run
 
 from afspm import wire
+from afspm.basics.exit_codes import ExitCode
 from afspm.components.night_picture import NightPicture
 from afspm.components.tip_verdict import BAD, MESSAGE, verdict_message
-from afspm.drawing.palette import LEVELS, UNMEASURED
-from afspm.exit_codes import ExitCode
 from afspm.model import ControlMode, ControlState, Problem, Region, RescanKind, Scan, ScopeState, ScopeStatus
+from afspm.record.drawing.palette import LEVELS, UNMEASURED
 from afspm.record.night_record import (
     THUMBNAIL_PX,
     NightRecord,

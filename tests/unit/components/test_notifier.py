@@ -15,13 +15,13 @@ from client_lab import FakeClock
 from typer.testing import CliRunner
 
 from afspm import model
+from afspm.basics.errors import ConfigError
 from afspm.cli.app import app
 from afspm.components import notifications, notifier
 from afspm.components.notifications import NotDelivered, Notification, Targets
 from afspm.components.notifier import Notifier
-from afspm.errors import ConfigError
 from afspm.model import ControlMode, ControlState, ProblemNames, ProcessCondition
-from afspm.process.memory import Memory
+from afspm.storage.memory import Memory
 
 SECRET = "T0PSECRET"
 NOTICE = Notification(

@@ -10,11 +10,11 @@ import pytest
 from client_lab import SCAN_S, Kill9, Lab, LabPort, context_of, run
 
 from afspm import wire
+from afspm.basics.errors import ConfigError
+from afspm.basics.exit_codes import ExitCode
 from afspm.client.component import Component
 from afspm.components.planned_scans import ScanList, ScanSeries
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
-from afspm.errors import ConfigError
-from afspm.exit_codes import ExitCode
 from afspm.model import RELAY_REQUEST, ControlRequest, Note, Problem, Progress, Request
 
 

@@ -19,18 +19,18 @@ import pytest
 
 import afspm
 from afspm import wire
-from afspm.clock import ExperimentClock
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import FileError
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.launch import Launch
 from afspm.components import recorder, recording
 from afspm.components.recording import RecordWriter
-from afspm.errors import FileError
-from afspm.exit_codes import ExitCode
-from afspm.launch import Launch
 from afspm.model import ControlMode, ControlState, LoggedPacket, Packet, Region, ScanLines
-from afspm.process.context import ProcessActivity, ProcessContext
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.storage.packet_log import LogReader, PacketLog, committed, expect_recorder
 from afspm.transport.port import Incoming, ParentGone
+from afspm.transport.process.context import ProcessActivity, ProcessContext
 
 DEADLINE_S = 20.0
 LOSSY = Path(__file__).parents[2] / "support" / "lossy_disk"

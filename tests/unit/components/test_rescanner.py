@@ -9,9 +9,8 @@ import pytest
 from client_lab import REGION, Lab, run
 
 from afspm import wire
-from afspm.components.rescanner import Rescanner
-from afspm.errors import ConfigError
-from afspm.exit_codes import ExitCode
+from afspm.basics.errors import ConfigError
+from afspm.basics.exit_codes import ExitCode
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -23,6 +22,7 @@ from afspm.model import (
     ScanParameters,
     names,
 )
+from afspm.plugins.drift.rescanner import Rescanner
 from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
 from afspm.wire.generated.scan_pb2 import ScanParameters2d
 

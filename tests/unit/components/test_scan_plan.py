@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.components.planned_scans import RegionGrid, ScanList, ScanSeries
 from afspm.components.scan_plan import RoundSchedule, ScanPlan, grid_centers, rounds_within
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
-from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Region
 
 HERE = Region((0.0, 0.0), (1e-6, 1e-6))

@@ -11,9 +11,9 @@ import pytest
 from client_lab import Kill9, LabPort, context_of, run
 from survey_lab import PARTICLES, ParticleLab
 
+from afspm.basics.errors import ConfigError
+from afspm.basics.exit_codes import ExitCode
 from afspm.components.survey import Survey
-from afspm.errors import ConfigError
-from afspm.exit_codes import ExitCode
 from afspm.model import ControlRequest, Problem, Scan
 
 pytest.importorskip("skimage")

@@ -12,10 +12,10 @@ from client_lab import run
 from drifting_survey_lab import DriftingLab
 from rotation import rotated
 
-from afspm.drift.estimators import PairFailure, estimator, unguarded
-from afspm.drift.registration import DriftScan, Prior, Registration
-from afspm.exit_codes import ExitCode
+from afspm.basics.exit_codes import ExitCode
 from afspm.model import RegistrationOutcome
+from afspm.plugins.drift.estimators import PairFailure, estimator, unguarded
+from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 
 pytestmark = pytest.mark.slow
 
@@ -65,7 +65,7 @@ class Fails:
 def test_positions_without_a_registration_are_marked_in_the_table_with_their_uncertainty(
     surveyed: Surveyed, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("afspm.drift.estimators.guarded.Correlation.register", _refuses)
+    monkeypatch.setattr("afspm.plugins.drift.estimators.guarded.Correlation.register", _refuses)
     failures: list[PairFailure] = []
     lab = DriftingLab(tmp_path, 0, estimator(Fails(every=1), failures.append), failures)
     caplog.set_level("INFO")

@@ -10,11 +10,11 @@ from client_lab import Lab, run
 from tip_scans_lab import channels
 
 from afspm import wire
+from afspm.basics.exit_codes import ExitCode
 from afspm.components.tip_classifier import TipClassifier
 from afspm.components.tip_verdict import BAD, GOOD, MESSAGE, UNCLEAR, read_verdict
-from afspm.exit_codes import ExitCode
-from afspm.logic.arbitration import ArbitrationEvent
 from afspm.model import ControlRequest, Problem, Region, Scan
+from afspm.scheduler.control.arbitration import ArbitrationEvent
 
 TIP = Problem.TIP_SHAPE_CHANGED
 

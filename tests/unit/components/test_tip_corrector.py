@@ -15,11 +15,11 @@ from client_lab import REGION, Kill9, Lab, LabPort, context_of, run
 from tip_scans_lab import HOME, channels
 
 from afspm import wire
+from afspm.basics.errors import ConfigError
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.formatting import position_text
 from afspm.components.tip_corrector import TipCorrector
 from afspm.components.tip_verdict import BAD, GOOD, MESSAGE, UNCLEAR, verdict_message
-from afspm.errors import ConfigError
-from afspm.exit_codes import ExitCode
-from afspm.formatting import position_text
 from afspm.model import (
     ControlMode,
     ControlRequest,

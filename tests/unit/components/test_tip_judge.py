@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from tip_scans_lab import ELSEWHERE, HOME, PIXELS, channels
 
+from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.components.tip_judge import Opinion, TipJudge, TipTolerance, Verdict, VerdictCounter
 from afspm.components.tip_metrics import autocorrelation, ghost, slopes
-from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Region, Scan
 
 LEARN = 3

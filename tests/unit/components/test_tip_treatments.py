@@ -7,8 +7,8 @@ import math
 
 import pytest
 
+from afspm.basics.errors import ConfigError
 from afspm.components.tip_treatments import Crash, Pulse, clearance_m, fresh_place, treatments
-from afspm.errors import ConfigError
 from afspm.model import Region
 
 

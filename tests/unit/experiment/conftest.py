@@ -17,10 +17,10 @@ from __future__ import annotations
 from enum import Enum
 from pathlib import Path
 
-from afspm.addresses import ListeningAddress
+from afspm.basics.addresses import ListeningAddress
 from afspm.translator.driver import Driver
 from afspm.client.component import Component
-from afspm.units import Angle, Duration, Length, Voltage
+from afspm.basics.units import Angle, Duration, Length, Voltage
 
 
 class Style(Enum):

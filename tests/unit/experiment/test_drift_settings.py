@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from afspm.scheduler.drift.scheduler import DriftCompensatedScheduler
+from afspm.plugins.drift.scheduler.scheduler import DriftCompensatedScheduler
 
 from .conftest import Write, errors, only_error
 
@@ -34,7 +34,7 @@ def launched(write: Write, text: str) -> dict[str, Any]:
 def test_settings_reach_the_scheduler_in_si_and_a_table_with_a_class_is_left_to_it(write: Write) -> None:
     drift = 'correct_after = "2 h", tracker = { class = "paper", queue = 3 }, rescan = { tolerance = "20 nm" }'
     launch = launched(write, experiment(drift))["scheduler"]
-    from afspm.process.loading import load
+    from afspm.transport.process.loading import load
 
     made = load(launch)
     assert isinstance(made, DriftCompensatedScheduler)

@@ -7,10 +7,10 @@ import math
 
 import pytest
 
-from afspm.logic.limit_checker import LimitChecker
-from afspm.logic.limits import ExperimentLimits
 from afspm.model import ControlRequest, Feedback, Parameter, Request
 from afspm.model.snapshot import from_plain, to_plain
+from afspm.scheduler.safety.limit_checker import LimitChecker
+from afspm.scheduler.safety.limits import ExperimentLimits
 
 from .conftest import Write, errors, line_of, only_error
 

@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
-from afspm.dashboard.access import PASSWORD
 from afspm.experiment import Experiment
 from afspm.experiment.process_starts import DASHBOARD_PASSWORD
+from afspm.plugins.web.dashboard.access import PASSWORD
 
 from .conftest import Write, errors, only_error
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from afspm.errors import ConfigError
+from afspm.basics.errors import ConfigError
+from afspm.basics.launch import Launch
 from afspm.experiment import Experiment, ProcessStart, Role, load
-from afspm.launch import Launch
 from afspm.transport.keys import generate
 
 from .conftest import FRAME, PYTHON, Write, errors, only_error

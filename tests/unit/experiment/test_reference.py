@@ -9,9 +9,9 @@ import pytest
 from afspm.experiment import limits_section, sections
 from afspm.experiment.parts import DECLARED_KEYS, OWN_KEYS, SECTIONS
 from afspm.experiment.wiring_classes import WIRE_KEYS, WIRE_SETTINGS, WiringClass
-from afspm.logic.arbitration import RoleTable
-from afspm.logic.envelopes import CacheRule, CacheSettings
-from afspm.logic.settings import ControlSettings
+from afspm.scheduler.control.arbitration import RoleTable
+from afspm.scheduler.publishing.envelopes import CacheRule, CacheSettings
+from afspm.scheduler.settings import ControlSettings
 
 PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "experiment-file.md").read_text(encoding="utf-8")
 MODELS = [

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
+from afspm.basics.launch import Launch
 from afspm.experiment import class_loader, load
-from afspm.launch import Launch
-from afspm.process import loading
+from afspm.transport.process import loading
 
 from .conftest import Write, errors, line_of, only_error
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from afspm.errors import InvalidValue, UnitError
+from afspm.basics.errors import InvalidValue, UnitError
 from afspm.model import Region, RegionChange, ScanParameters
 
 lengths = st.floats(-1e-4, 1e-4)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from afspm.errors import InvalidValue
+from afspm.basics.errors import InvalidValue
 from afspm.model import ProblemNames, Region, Scan, ScanParameters, ScanSet, Spectrum
 
 REGION = Region.from_top_left((0.0, 1e-6), (3e-6, 2e-6))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from afspm.errors import InvalidValue
+from afspm.basics.errors import InvalidValue
 from afspm.model import Spectrum
 from afspm.model.spectrum_grid import grid
 from afspm.model.spectrum_stack import stacked

@@ -12,8 +12,8 @@ import pytest
 from record_lab import ABOUT, Night
 from typer.testing import CliRunner
 
+from afspm.basics.errors import FileError, InvalidValue
 from afspm.cli.app import app
-from afspm.errors import FileError, InvalidValue
 from afspm.record import catalogue
 from afspm.record.catalogue import INDEX_FILE, find_runs
 from afspm.record.run_json import RUN_FILE

@@ -13,7 +13,7 @@ import pytest
 from record_lab import REGION, Night
 
 import afspm
-from afspm.errors import FileError, InvalidValue
+from afspm.basics.errors import FileError, InvalidValue
 from afspm.model import ScopeState, Spectrum
 from afspm.record.export import chosen, export
 from afspm.record.run import Run

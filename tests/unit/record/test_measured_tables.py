@@ -10,7 +10,7 @@ import pytest
 from record_lab import Given, Night
 
 import afspm
-from afspm.errors import InvalidValue
+from afspm.basics.errors import InvalidValue
 from afspm.model import ControlResponse, JournalEntries, JournalEntry, names
 from afspm.record.export import export
 from afspm.record.store import RecordStore

@@ -10,7 +10,7 @@ import pytest
 from record_lab import Night
 
 import afspm
-from afspm.errors import FileError, InvalidValue
+from afspm.basics.errors import FileError, InvalidValue
 from afspm.model import JournalEntry, Note
 from afspm.record.export import export
 from afspm.record.notes import append_note

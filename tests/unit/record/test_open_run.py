@@ -17,7 +17,7 @@ from record_lab import ABOUT, Night
 
 import afspm
 from afspm import wire
-from afspm.errors import FileError
+from afspm.basics.errors import FileError
 from afspm.model import Problem, RegistrationOutcome, RescanKind, ScopeState, Spectrum
 from afspm.record.journal import JOURNAL_FILE, open_to_write, read_only
 from afspm.record.run import Run

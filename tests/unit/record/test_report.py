@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from afspm import model, wire
-from afspm.errors import FileError
+from afspm.basics.errors import FileError
 from afspm.model import ControlMode, ControlState, ProcessCondition, RegistrationOutcome, ScopeState
 from afspm.record.bad_scans import BAD, VERDICT_MESSAGE
 from afspm.record.report import REPORT_FILE, page, pictures, story, write

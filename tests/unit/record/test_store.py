@@ -14,8 +14,7 @@ from record_lab import ABOUT, REGION, START_NS, Night, same
 
 import afspm
 from afspm import wire
-from afspm.errors import FileError
-from afspm.files import read
+from afspm.basics.errors import FileError
 from afspm.model import (
     Frame,
     JournalEntries,
@@ -31,6 +30,7 @@ from afspm.model import (
     ScopeState,
 )
 from afspm.record.store import _PROCESS, RecordSettings, RecordStore
+from afspm.storage.formats import read
 
 
 def test_a_scan_is_one_file_with_all_channels_and_the_circumstances(

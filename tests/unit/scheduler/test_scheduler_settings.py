@@ -9,16 +9,16 @@ from typing import Any
 import pydantic
 import pytest
 
-from afspm.errors import ConfigError
+from afspm.basics.errors import ConfigError
 from afspm.experiment.sections import keys_of
-from afspm.logic.arbitration import Cause, RoleTable
-from afspm.logic.envelopes import CacheRule, CacheSettings
-from afspm.logic.limits import ExperimentLimits, Limit
-from afspm.logic.settings import ControlSettings
 from afspm.model import Parameter, ProblemNames, Region
 from afspm.model.events import SUPERVISOR
 from afspm.model.snapshot import from_plain, to_plain
+from afspm.scheduler.control.arbitration import Cause, RoleTable
+from afspm.scheduler.publishing.envelopes import CacheRule, CacheSettings
+from afspm.scheduler.safety.limits import ExperimentLimits, Limit
 from afspm.scheduler.scheduler import Scheduler
+from afspm.scheduler.settings import ControlSettings
 
 CONTROL = ControlSettings(
     lease_s=600.0,

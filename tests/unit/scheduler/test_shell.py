@@ -11,8 +11,6 @@ from unittest.mock import MagicMock
 from fake_clock import FakeClock
 
 from afspm import wire
-from afspm.logic.scheduler_core import SchedulerCore
-from afspm.logic.settings import SchedulerSettings
 from afspm.model import (
     RELAY_REQUEST,
     ControlRequest,
@@ -22,6 +20,8 @@ from afspm.model import (
     RelayedMessage,
     Request,
 )
+from afspm.scheduler.scheduler_core import SchedulerCore
+from afspm.scheduler.settings import SchedulerSettings
 from afspm.scheduler.shell import SchedulerShell
 from afspm.scheduler.state_file import StateFile
 from afspm.scheduler.wire_codec import WireCodec

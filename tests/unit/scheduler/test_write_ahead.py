@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from afspm.clock import ExperimentClock
-from afspm.logic.saved_state import SavedState
+from afspm.basics.clock import ExperimentClock
 from afspm.model import LoggedPacket, Packet
+from afspm.scheduler.saved_state import SavedState
 from afspm.scheduler.state_file import StateFile
 from afspm.scheduler.write_ahead import WriteAhead
 from afspm.storage import atomic, disk, packet_log

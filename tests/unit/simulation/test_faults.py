@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from afspm.errors import ConfigError
+from afspm.basics.errors import ConfigError
 from afspm.simulation.faults import EVERY_TIME, Fault, Faults
 
 KNOWN = {"no-reply": "", "modal-dialog": "", "crash": ""}

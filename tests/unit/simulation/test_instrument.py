@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm.errors import InvalidValue
+from afspm.basics.errors import InvalidValue
 from afspm.model import Region
-from afspm.process.background import in_background
 from afspm.simulation import World
 from afspm.simulation.instrument import Instrument, InstrumentBusy
 from afspm.simulation.scan_drawing import run_at_once
+from afspm.transport.process.background import in_background
 
 
 def test_a_scan_takes_its_time_and_its_lines_come_one_by_one(rig: Instrument, clock: Any) -> None:

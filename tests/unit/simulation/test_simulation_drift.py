@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from afspm.errors import InvalidValue
+from afspm.basics.errors import InvalidValue
 from afspm.simulation.drift import Drift, DriftSettings, Relaxation, ScannerCompensation, random_walk
 
 START = 1.75e9

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm.errors import ConfigError, InvalidValue
+from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.model import Frame, Region
 from afspm.simulation import World
 

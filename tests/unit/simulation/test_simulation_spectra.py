@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm.errors import InvalidValue
+from afspm.basics.errors import InvalidValue
 from afspm.model import Feedback
 from afspm.simulation import TipShape, World
 from afspm.simulation.feedback import FeedbackSettings, Loop

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from afspm.errors import ConfigError, FileError
+from afspm.basics.errors import ConfigError, FileError
 from afspm.simulation.surfaces import surface_from
 from afspm.simulation.surfaces.patterns import _frame_edges
 from afspm.simulation.surfaces.picture import read

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm.errors import ConfigError, ConfigErrors, InvalidValue
+from afspm.basics.errors import ConfigError, ConfigErrors, InvalidValue
 from afspm.model import Feedback, Region
 from afspm.simulation import World
 from afspm.simulation.measuring import Adjustment

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from afspm.errors import FileError
-from afspm.logic.arbitration import ArbitrationState
-from afspm.logic.saved_state import SavedState
+from afspm.basics.errors import FileError
 from afspm.model import ControlMode
-from afspm.process.memory import Memory
+from afspm.scheduler.control.arbitration import ArbitrationState
+from afspm.scheduler.saved_state import SavedState
 from afspm.scheduler.state_file import StateFile
 from afspm.storage import atomic
 from afspm.storage.atomic import SLOW_S, CheckpointFile, OutageLog, load_checkpoint, previous_generation
 from afspm.storage.disk import SYNCER, DiskBacklogFull, DiskTimeout
+from afspm.storage.memory import Memory
 
 CUT = [b"", b"\0" * 40, b'{"control": {"mo']
 """What a power cut may leave of a file that was not synced."""
@@ -91,7 +91,7 @@ def test_on_a_full_disk_what_was_saved_before_is_still_the_last(tmp_path: Path) 
     script = """
 import resource, signal, sys
 from pathlib import Path
-from afspm.errors import FileError
+from afspm.basics.errors import FileError
 from afspm.storage.atomic import CheckpointFile, load_checkpoint
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))

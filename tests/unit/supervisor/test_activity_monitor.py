@@ -10,7 +10,7 @@ from collections.abc import Callable
 import psutil
 import pytest
 
-from afspm.clock import ExperimentClock
+from afspm.basics.clock import ExperimentClock
 from afspm.supervisor.activity_monitor import LEAST_SHARE, ActivityMonitor, ActivitySample, of_process
 
 LATELY_S = 1.5

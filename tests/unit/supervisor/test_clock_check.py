@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from afspm.clock import ExperimentClock
+from afspm.basics.clock import ExperimentClock
 from afspm.supervisor.supervisor import TOLERANCE_S, ClockCheck
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from afspm.errors import ConfigError
+from afspm.basics.errors import ConfigError
 from afspm.experiment import load
 from afspm.supervisor import resume
 from afspm.supervisor.resume import differing

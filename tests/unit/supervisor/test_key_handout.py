@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
+from afspm.basics.errors import ConfigError
 from afspm.client.connect import GUEST_KEYS, _keys_in
-from afspm.errors import ConfigError
 from afspm.experiment import Experiment, load
 from afspm.supervisor.key_handout import KeyHandout, hand_over
 from afspm.transport.keys import Keys, from_launch, generate

@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from afspm.clock import ExperimentClock
+from afspm.basics.clock import ExperimentClock
 from afspm.components import notifications
 from afspm.components.notifications import OCCASIONS, Targets
 from afspm.experiment import load
-from afspm.logic.supervision.run_end import EndReason
 from afspm.record.report import REPORT_FILE
 from afspm.record.store import RecordStore
 from afspm.supervisor import post_run
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.post_run import EndedRun
+from afspm.supervisor.supervision.run_end import EndReason
 from afspm.supervisor.supervisor import ProcessReport, RunOutcome
 
 

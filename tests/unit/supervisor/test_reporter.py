@@ -6,13 +6,13 @@ import logging
 
 import pytest
 
-from afspm.clock import ExperimentClock
-from afspm.launch import Launch
-from afspm.logic.supervision.supervisor_events import EndRefused, UseReported
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.launch import Launch
 from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlRequest, ControlResponse, LogLines, Response
 from afspm.model.events import LONGEST_ANNOUNCEMENT
 from afspm.supervisor import reporter as reporting
 from afspm.supervisor.reporter import Reporter
+from afspm.supervisor.supervision.supervisor_events import EndRefused, UseReported
 from afspm.wire import encode
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from afspm.clock import ExperimentClock
+from afspm.basics.clock import ExperimentClock
 from afspm.experiment import Experiment, ProcessStart, load
 from afspm.supervisor.reporter import Reporter, reporter_of
 from afspm.transport.keys import generate

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from afspm.clock import ExperimentClock
-from afspm.errors import ConfigError
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import ConfigError
 from afspm.experiment import Role, load
 from afspm.experiment.experiment import load_expanded
 from afspm.supervisor import run as running

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from afspm.basics.clock import ExperimentClock
 from afspm.client.connect import guest_of
-from afspm.clock import ExperimentClock
 from afspm.experiment import load
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.run import run_facts

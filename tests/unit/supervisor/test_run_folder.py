@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from afspm.errors import FileError
+from afspm.basics.errors import FileError
 from afspm.record.run_json import latest_run
 from afspm.supervisor import run_folder
 

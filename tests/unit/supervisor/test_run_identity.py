@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from afspm.clock import NS_PER_S, ExperimentClock
-from afspm.errors import ConfigError, WireError
+from afspm.basics.clock import NS_PER_S, ExperimentClock
+from afspm.basics.errors import ConfigError, WireError
 from afspm.model import ControlResponse, Response
 from afspm.supervisor.run_identity import RunIdentity, _read
 

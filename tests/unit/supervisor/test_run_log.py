@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from afspm.clock import ExperimentClock
+from afspm.basics.clock import ExperimentClock
 from afspm.storage import disk
 from afspm.supervisor.log import COLOURS, LineReader, RunLog, colour_of
 

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from afspm import wire
-from afspm.logic.supervision.run_end import EndReason
 from afspm.model import Packet, Region, Scan, ScopeState, ScopeStatus, Spectrum
 from afspm.record.journal import SCHEDULER
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.supervisor.post_run import summary
+from afspm.supervisor.supervision.run_end import EndReason
 from afspm.supervisor.supervisor import ProcessReport, RunOutcome
 
 REPORTS = (

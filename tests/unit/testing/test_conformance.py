@@ -11,8 +11,8 @@ from xml.etree import ElementTree
 import pytest
 from rich.console import Console
 
-from afspm.clock import Clock, ExperimentClock
-from afspm.errors import ConfigError
+from afspm.basics.clock import Clock, ExperimentClock
+from afspm.basics.errors import ConfigError
 from afspm.testing.conformance import (
     REPORT_FILE,
     Check,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from afspm.errors import ConfigError, FileError
+from afspm.basics.errors import ConfigError, FileError
 from afspm.experiment import load
 from afspm.testing.skeletons import write
 

@@ -13,8 +13,8 @@ import pytest
 from fake_clock import FakeClock
 
 from afspm import wire
-from afspm.errors import FileError, Refused
-from afspm.exit_codes import ExitCode
+from afspm.basics.errors import FileError, Refused
+from afspm.basics.exit_codes import ExitCode
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -27,7 +27,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
-from afspm.process.memory import Memory
+from afspm.storage.memory import Memory
 from afspm.translator import Driver, Value, action
 from afspm.translator.translator import Translator
 from afspm.transport.port import RequestReceived, Served

@@ -13,17 +13,17 @@ from typing import BinaryIO
 
 import pytest
 
-from afspm.clock import ExperimentClock
-from afspm.exit_codes import ExitCode
-from afspm.launch import Launch, Sockets
-from afspm.microscopes.asylum import Asylum
-from afspm.microscopes.gxsm import Gxsm
-from afspm.microscopes.nanonis import Nanonis
-from afspm.microscopes.simulator import Simulator
-from afspm.process.context import ProcessActivity, ProcessContext
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.launch import Launch, Sockets
+from afspm.plugins.asylum import Asylum
+from afspm.plugins.gxsm import Gxsm
+from afspm.plugins.nanonis import Nanonis
+from afspm.simulation.simulator import Simulator
 from afspm.translator import controller_lock
 from afspm.translator.controller_lock import ControllerTaken, commanding
 from afspm.translator.translator import run_translator
+from afspm.transport.process.context import ProcessActivity, ProcessContext
 
 DIES_HOLDING = """
 import os, sys

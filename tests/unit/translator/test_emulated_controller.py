@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from afspm.errors import ConfigError
-from afspm.launch import Launch
+from afspm.basics.errors import ConfigError
+from afspm.basics.launch import Launch
 from afspm.translator.driver import ControllerLost
 from afspm.translator.emulated_controller import AddressNotice, EmulatedController, notice_file, wired_to
 

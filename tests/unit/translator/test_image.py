@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm.errors import ConfigError, FileError
-from afspm.microscopes.image import ImageMicroscope
+from afspm.basics.errors import ConfigError, FileError
 from afspm.model import Scan, ScopeState
+from afspm.plugins.image import ImageMicroscope
 
 SIZE_M = (2e-6, 1.5e-6)
 

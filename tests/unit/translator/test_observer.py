@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm.clock import ExperimentClock
-from afspm.errors import ConfigError
-from afspm.microscopes.simulator import Simulator
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import ConfigError
 from afspm.model import ControlRequest, Region, ScanLines, ScopeState, names
+from afspm.simulation.simulator import Simulator
 from afspm.translator.observer import LiveLines
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from afspm.errors import ConfigError, Refused
-from afspm.microscopes.asylum import Asylum
-from afspm.microscopes.gxsm import Gxsm
-from afspm.microscopes.nanonis import Nanonis
-from afspm.microscopes.simulator import FAULT_KINDS, Simulator
+from afspm.basics.errors import ConfigError, Refused
 from afspm.model import names
+from afspm.plugins.asylum import Asylum
+from afspm.plugins.gxsm import Gxsm
+from afspm.plugins.nanonis import Nanonis
+from afspm.simulation.simulator import FAULT_KINDS, Simulator
 from afspm.translator import Driver, ParameterSpec, ParameterTable, Value
 
 TABLE = ParameterTable({}).extended(

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from afspm.errors import Refused
-from afspm.microscopes.simulator import Simulator
+from afspm.basics.errors import Refused
 from afspm.model import ScopeState
+from afspm.simulation.simulator import Simulator
 from afspm.translator.driver import ControllerLost
 
 FREE, SCANNING, COARSE = ScopeState.FREE, ScopeState.SCANNING, ScopeState.COARSE_MOTOR

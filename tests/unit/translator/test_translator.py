@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from afspm import wire
+from afspm.basics.errors import ConfigError, WireError
+from afspm.basics.exit_codes import ExitCode
 from afspm.client.cycle import Cycle, CycleOutcome
-from afspm.errors import ConfigError, WireError
-from afspm.exit_codes import ExitCode
 from afspm.model import (
     CLOCK_REQUEST,
     ControlRequest,
@@ -30,9 +30,9 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
-from afspm.process.memory import Memory
-from afspm.process.parent import TIP_WITHIN_S
+from afspm.storage.memory import Memory
 from afspm.transport.port import ParentGone, RequestReceived, SubscriberJoined
+from afspm.transport.process.parent import TIP_WITHIN_S
 from afspm.wire.generated import feedback_pb2, scan_pb2
 
 ACTION, PARAM, SUPPORT = ControlRequest.ACTION, ControlRequest.PARAM, ControlRequest.ACTION_SUPPORT

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 import zmq
 
-from afspm.errors import ConfigError
+from afspm.basics.errors import ConfigError
 from afspm.translator.driver import ControllerLost
 from afspm.translator.zmq_connection import ZmqConnection
 

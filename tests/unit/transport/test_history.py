@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import zmq
 
-from afspm.clock import ExperimentClock
+from afspm.basics.clock import ExperimentClock
 from afspm.model import Packet
 from afspm.transport import late_joiners
 from afspm.transport.late_joiners import Marker, PublishedHistory

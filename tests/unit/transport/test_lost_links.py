@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import zmq
 
-from afspm.errors import TransportError
+from afspm.basics.errors import TransportError
 from afspm.transport import network
 from afspm.transport.network import Monitor, Network
 

@@ -10,7 +10,7 @@ import pytest
 import zmq
 
 from afspm import wire
-from afspm.clock import ExperimentClock
+from afspm.basics.clock import ExperimentClock
 from afspm.transport.network import Network
 from afspm.transport.port import CaughtUp, ControlConnected, Killed, PacketReceived, ReplyReceived
 from afspm.transport.zmq_port import ZmqPort

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from afspm.clock import ExperimentClock
-from afspm.errors import ConfigError
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import ConfigError
 from afspm.transport.network import Network
 from afspm.transport.port import (
     CaughtUp,

@@ -11,7 +11,7 @@ import pytest
 import zmq
 
 from afspm import wire
-from afspm.clock import ExperimentClock
+from afspm.basics.clock import ExperimentClock
 from afspm.model import CLOCK_REQUEST, Request, Response
 from afspm.transport.keys import GUEST, Keys, pair
 from afspm.transport.network import MAX_REQUEST_BYTES, Network

@@ -11,8 +11,8 @@ import pytest
 import zmq
 from zmq.utils import z85
 
-from afspm.clock import ExperimentClock
-from afspm.errors import ConfigError, TransportError
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import ConfigError, TransportError
 from afspm.transport import keys
 from afspm.transport.authenticator import Authenticator
 from afspm.transport.network import Network, is_local

@@ -9,7 +9,7 @@ import pytest
 import zmq
 from systems import not_on_wine
 
-from afspm.clock import ExperimentClock
+from afspm.basics.clock import ExperimentClock
 from afspm.transport import network
 from afspm.transport.late_joiners import PublishedHistory
 from afspm.transport.network import DISCONNECTED, Monitor, Network

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from afspm import wire
-from afspm.errors import InvalidValue, WireError
+from afspm.basics.errors import InvalidValue, WireError
 from afspm.model import (
     LEASE_REQUEST,
     ControlRequest,

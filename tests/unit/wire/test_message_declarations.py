@@ -15,20 +15,20 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 import afspm
 from afspm import wire
+from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.client.component import Component
 from afspm.client.dispatch import MessageDispatcher
 from afspm.client.published_state import PublishedState
-from afspm.errors import ConfigError, InvalidValue
-from afspm.gateway.events import EventHistory
-from afspm.gateway.models import event_kinds
-from afspm.logic.cache import PacketCache
 from afspm.model import Packet, PacketHeader, ProblemNames, Role
-from afspm.process.message_types import register_all
+from afspm.plugins.web.gateway.events import EventHistory
+from afspm.plugins.web.gateway.models import event_kinds
 from afspm.record.journal import SCHEDULER
 from afspm.record.overview import Overview
 from afspm.record.run import open_run
 from afspm.record.store import RecordSettings, RecordStore
+from afspm.scheduler.publishing.cache import PacketCache
 from afspm.wire import MessageDeclaration, MessageKind, messages
+from afspm.wire.message_types import register_all
 
 SOURCES = Path(afspm.__file__).parent
 FEWEST = 3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from afspm import wire
-from afspm.errors import WireError
+from afspm.basics.errors import WireError
 from afspm.model import ProbePosition, Region, Scan, ScanParameters, Spectrum
 from afspm.wire.generated.scan_pb2 import Scan2d
 

@@ -6,15 +6,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from afspm import units
-from afspm.errors import AfspmError, InvalidValue
+from afspm.basics import units
+from afspm.basics.errors import AfspmError, InvalidValue
 from afspm.experiment.document import Document
 from afspm.experiment.parts import ExperimentParts
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.toml_writer import value as toml
 from afspm.experiment.wiring_classes import WIRE_KEYS
-from afspm.logic.envelopes import default_envelope
 from afspm.model import PacketHeader
+from afspm.scheduler.publishing.envelopes import default_envelope
 
 COMPONENTS: Final = "afspm.components."
 """Where the published implementation has its components. Their modules moved between its versions."""

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, ClassVar, Final
 import zmq
 
 from afspm import wire
-from afspm.errors import ConfigError, WireError
-from afspm.exit_codes import ExitCode
-from afspm.launch import Launch
+from afspm.basics.errors import ConfigError, WireError
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.launch import Launch
 from afspm.model import ControlRequest, ControlResponse, Packet, Response, ScopeState
 from afspm.model.events import PERSON
 from afspm.plugins.published import version_1
@@ -30,8 +30,8 @@ from afspm.transport.zmq_port import BasePort
 from afspm.wire.messages import CONTROL_STATE, SCOPE_STATE
 
 if TYPE_CHECKING:
-    from afspm.clock import Clock
-    from afspm.process.context import ProcessContext
+    from afspm.basics.clock import Clock
+    from afspm.transport.process.context import ProcessContext
 
 SETTLED_S: Final = 0.05
 """After a subscription others of the same peer follow: it is replayed to once all are there, since it drops what is

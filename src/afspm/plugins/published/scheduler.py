@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, ClassVar, Final
 import zmq
 
 from afspm import wire
-from afspm.errors import ConfigError, WireError
-from afspm.exit_codes import ExitCode
+from afspm.basics.errors import ConfigError, WireError
+from afspm.basics.exit_codes import ExitCode
 from afspm.model import ControlRequest, ControlResponse, Request, Response, ResponseDetail, Role, component_of
 from afspm.plugins.published import version_1
 from afspm.transport.frames import receive_frames, send_frames
@@ -24,7 +24,7 @@ from afspm.transport.zmq_port import BasePort
 from afspm.wire.messages import CONTROL_STATE
 
 if TYPE_CHECKING:
-    from afspm.process.context import ProcessContext
+    from afspm.transport.process.context import ProcessContext
 
 CACHE_WITHIN_S: Final = 2.0
 """Real time in which a scheduler of version 1 has sent its cache. It does not say when it is done."""

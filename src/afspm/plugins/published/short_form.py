@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, Final
 
-from afspm import units
-from afspm.addresses import is_address
-from afspm.errors import UnitError
+from afspm.basics import units
+from afspm.basics.addresses import is_address
+from afspm.basics.errors import UnitError
 from afspm.experiment.findings import SourceLocation
 from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.toml_lines import Settings, Table

@@ -16,12 +16,10 @@ from typing import TYPE_CHECKING, ClassVar, Final
 import zmq
 
 from afspm import wire
-from afspm.errors import ConfigError, WireError
-from afspm.exit_codes import ExitCode
-from afspm.interpreter import python_command
-from afspm.launch import Launch, Sockets
-from afspm.logic.fencing import Epoch, SchedulerFence
-from afspm.logic.sessions import run_of
+from afspm.basics.errors import ConfigError, WireError
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.interpreter import python_command
+from afspm.basics.launch import Launch, Sockets
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -32,9 +30,11 @@ from afspm.model import (
     Role,
     ScopeState,
 )
+from afspm.model.fencing import Epoch, SchedulerFence
 from afspm.model.names import STOP_SCAN, STOP_SPEC
+from afspm.model.sessions import run_of
 from afspm.plugins.published import version_1
-from afspm.process.memory import Memory
+from afspm.storage.memory import Memory
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.process import GUARD
 from afspm.translator.requests import RequestOutcomes
@@ -47,7 +47,7 @@ from afspm.transport.zmq_server import ZmqServerPort
 from afspm.wire.messages import SCOPE_STATE, SPECTRUM
 
 if TYPE_CHECKING:
-    from afspm.process.context import ProcessContext
+    from afspm.transport.process.context import ProcessContext
 
 STOPPED_WITHIN_S: Final = 2.0
 """Real time that their translator has to stop its measurement when the experiment ends."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from afspm.launch import Launch
+from afspm.basics.launch import Launch
 from afspm.model import ControlRequest, ControlResponse, Request, Response
 from afspm.transport.network import Network
 from afspm.wire import KILL, encode_response, encode_subject

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from afspm import entry_points
-from afspm.errors import FileError, InvalidValue
+from afspm.basics import entry_points
+from afspm.basics.errors import FileError, InvalidValue
 from afspm.model import Spectrum
 from afspm.model.spectrum_stack import SpectrumStack, stacked
 from afspm.record.measured_files import write_synced

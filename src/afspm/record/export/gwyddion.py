@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.basics.plain_data import PlainMapping
 from afspm.model import Scan, Spectrum
 from afspm.model.spectrum_stack import SpectrumStack, mean_over_repeats
-from afspm.plain_data import PlainMapping
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 

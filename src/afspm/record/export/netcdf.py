@@ -7,11 +7,11 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from afspm.files.netcdf import Attributes, Variable, encoded
 from afspm.model import ScanSet, Spectrum
 from afspm.record.nexus import field_names
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
+from afspm.storage.formats.netcdf import Attributes, Variable, encoded
 
 _RENAMED = {"mode": "control_mode", "filename": "controller_file"}
 """scipy's reader, which xarray uses, has attributes of its own by these names."""

@@ -9,14 +9,14 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from afspm.clock import iso_utc
-from afspm.files.nexus import ABOUT, GRID
+from afspm.basics.clock import iso_utc
 from afspm.model.spectrum_stack import SpectrumStack, mean_over_repeats
 from afspm.record.journal import measured_file
 from afspm.record.nexus import field_names
 from afspm.record.nxspm import group, values
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
+from afspm.storage.formats.nexus import ABOUT, GRID
 
 
 def grid_file(stack: SpectrumStack, metadata: Mapping[str, str]) -> bytes:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from afspm.clock import iso_utc
+from afspm.basics.clock import iso_utc
 from afspm.model import Scan, Spectrum
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow

@@ -7,7 +7,7 @@ import io
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from afspm.clock import iso_utc
+from afspm.basics.clock import iso_utc
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow, Table
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from afspm.errors import FileError
+from afspm.basics.errors import FileError
 from afspm.record.report import curves, page, pictures, story
 from afspm.record.run import open_run
 from afspm.storage.atomic import replace_file

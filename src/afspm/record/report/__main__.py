@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from afspm.errors import AfspmError
+from afspm.basics.errors import AfspmError
 from afspm.record.report import write
 
 try:

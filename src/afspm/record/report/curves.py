@@ -10,12 +10,12 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.drawing.chart import BACKWARD, Axis, Band, Curve, chart
-from afspm.errors import AfspmError, InvalidValue
-from afspm.formatting import typeset_position
+from afspm.basics.errors import AfspmError, InvalidValue
+from afspm.basics.formatting import typeset_position
 from afspm.model import Spectrum
 from afspm.model.geometry import XY
 from afspm.model.spectrum_grid import at, common_sweep, grid, ways
+from afspm.record.drawing.chart import BACKWARD, Axis, Band, Curve, chart
 from afspm.record.report import markup
 from afspm.record.report.markup import PageTimes
 from afspm.record.run import Run

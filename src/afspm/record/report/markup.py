@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC
 from html import escape
 
-from afspm.clock import NS_PER_S, utc_time
-from afspm.formatting import day, day_and_time, period_text, time_of_day
+from afspm.basics.clock import NS_PER_S, utc_time
+from afspm.basics.formatting import day, day_and_time, period_text, time_of_day
 
 _DAY_NS = 86_400 * NS_PER_S
 

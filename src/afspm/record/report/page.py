@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from datetime import UTC
 from html import escape
 
-from afspm.clock import NS_PER_S
-from afspm.drawing import timeline
-from afspm.drawing.image_html import data_url
-from afspm.formatting import counted, day, duration_text, quantity
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.formatting import counted, day, duration_text, quantity
 from afspm.model import component_of
 from afspm.model.events import SUPERVISOR
+from afspm.record.drawing import timeline
+from afspm.record.drawing.image_html import data_url
 from afspm.record.overview import ROUTINE
 from afspm.record.report import curves, markup, sample
 from afspm.record.report.curves import SpectrumGroup

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import entry_points
-from afspm.drawing.image_html import Shown, shown
-from afspm.drawing.levelling import flattened
-from afspm.errors import AfspmError
+from afspm.basics import entry_points
+from afspm.basics.errors import AfspmError
 from afspm.model import ControlMode, ControlState, ScanSet, names
+from afspm.model.line_levelling import flattened
 from afspm.record.bad_scans import bad_scans
+from afspm.record.drawing.image_html import Shown, shown
 from afspm.record.night_record import NightMark, NightRecord, Shot, thumbnail
 from afspm.record.report.story import RunStory
 from afspm.record.run import Run

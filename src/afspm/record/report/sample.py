@@ -9,12 +9,12 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.clock import NS_PER_S
-from afspm.drawing.curves import round_ticks
-from afspm.drawing.image_html import data_url, scale_bar
-from afspm.formatting import duration_text, quantity, scale, typeset_area, typeset_position
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.formatting import duration_text, quantity, scale, typeset_area, typeset_position
 from afspm.model import Frame, RegistrationOutcome
 from afspm.model.geometry import XY
+from afspm.record.drawing.curves import round_ticks
+from afspm.record.drawing.image_html import data_url, scale_bar
 from afspm.record.report import markup
 from afspm.record.report.markup import PageTimes
 from afspm.record.report.pictures import TopographyPicture

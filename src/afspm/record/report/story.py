@@ -7,8 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from afspm.drawing.timeline import TimelineRow
-from afspm.formatting import counted
+from afspm.basics.formatting import counted
 from afspm.model import (
     ControlEvent,
     ControlRequest,
@@ -19,6 +18,7 @@ from afspm.model import (
     ScopeState,
     names,
 )
+from afspm.record.drawing.timeline import TimelineRow
 from afspm.record.overview import Overview, ProcessRestart
 from afspm.record.run import Run
 from afspm.record.run_json import REAL_S

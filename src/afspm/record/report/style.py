@@ -1,6 +1,6 @@
 """The style sheet of the report: light and dark, narrow and wide, on paper."""
 
-from afspm.drawing import timeline
+from afspm.record.drawing import timeline
 
 # P. Tol's bright scheme: told apart by everybody, red kept for problems
 CSS = (

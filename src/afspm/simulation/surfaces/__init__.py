@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from afspm.errors import ConfigError
+from afspm.basics.errors import ConfigError
 from afspm.simulation.settings import build, one_of
 from afspm.simulation.surfaces.ground import Flat, Particles, Rough, Steps
 from afspm.simulation.surfaces.patterns import Lattice, Stamper

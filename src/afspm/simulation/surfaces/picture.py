@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from afspm import files
-from afspm.errors import ConfigError, FileError
+from afspm.basics.errors import ConfigError, FileError
 from afspm.simulation.fields import Array, is_separable
 from afspm.simulation.settings import check
 from afspm.simulation.surfaces.relief import Relief
+from afspm.storage import formats as files
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from typing import Any
 
 import zmq
 
-from afspm.clock import Clock, ExperimentClock
-from afspm.errors import AfspmError, ConfigError
-from afspm.launch import Launch, Sockets
+from afspm.basics.clock import Clock, ExperimentClock
+from afspm.basics.errors import AfspmError, ConfigError
+from afspm.basics.launch import Launch, Sockets
 from afspm.supervisor import run_identity
 from afspm.supervisor.ports import FreePorts
 from afspm.testing.clients.experiment import CLIENT, JUDGE, KEYS, SCHEDULER, JudgedExperiment, Security

@@ -8,14 +8,13 @@ from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
 
+from afspm.basics.clock import Clock
+from afspm.basics.errors import ExperimentEnded
 from afspm.client.component import Component
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
-from afspm.clock import Clock
-from afspm.errors import ExperimentEnded
 from afspm.experiment import load
 from afspm.model import Packet
-from afspm.process.context import new_session
 from afspm.record.run_json import STATE_DIR
 from afspm.supervisor import run_identity
 from afspm.supervisor.key_handout import hand_over
@@ -24,6 +23,7 @@ from afspm.supervisor.ports import FreePorts
 from afspm.testing.conformance import Lost
 from afspm.testing.processes import Processes
 from afspm.transport import keys
+from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import open_port
 
 CLIENT, JUDGE, SCHEDULER, TRANSLATOR = "client", "judge", "scheduler", "microscope"

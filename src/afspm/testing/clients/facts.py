@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm import wire
+from afspm.basics.plain_data import Plain
 from afspm.model import Packet, Scan, ScanLines, Spectrum
-from afspm.plain_data import Plain
 from afspm.testing.conformance import Failed, near
 
 EXACT = 1e-9

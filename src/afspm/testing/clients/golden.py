@@ -7,7 +7,7 @@ from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
-from afspm.plain_data import Plain
+from afspm.basics.plain_data import Plain
 
 FILE = "golden.json"
 

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import zmq
 
-from afspm.clock import Clock
+from afspm.basics.clock import Clock
 from afspm.transport.frames import receive_frames
 from afspm.transport.network import Network
 from afspm.transport.polling import WakeUp

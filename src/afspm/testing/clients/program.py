@@ -14,9 +14,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Any, Protocol
 
-from afspm.errors import ConfigError
-from afspm.launch import Launch
-from afspm.plain_data import Plain
+from afspm.basics.errors import ConfigError
+from afspm.basics.launch import Launch
+from afspm.basics.plain_data import Plain
 from afspm.testing.conformance import Failed, expect
 
 ANSWER_S = 30.0

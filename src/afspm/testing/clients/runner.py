@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from afspm.clock import ExperimentClock
+from afspm.basics.clock import ExperimentClock
 from afspm.supervisor import run_folder
 from afspm.testing.clients.bench import ClientBench
 from afspm.testing.clients.client_suite import CLIENT_SUITE

@@ -9,7 +9,7 @@ from functools import partial
 
 import zmq
 
-from afspm.clock import Clock
+from afspm.basics.clock import Clock
 from afspm.model import CLOCK_REQUEST, ControlResponse
 from afspm.transport.frames import receive_frames
 from afspm.transport.keys import Keys

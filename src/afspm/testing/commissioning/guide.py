@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from afspm.clock import Clock
-from afspm.errors import UnitError
+from afspm.basics.clock import Clock
+from afspm.basics.errors import UnitError
+from afspm.basics.units import convert, parse_quantity
 from afspm.testing.commissioning.progress import CommissioningStep
 from afspm.testing.conformance import Declined, Failed, Lost, Skipped, Unsupported, near
 from afspm.testing.translators.measuring import CheckMeasurements
-from afspm.units import convert, parse_quantity
 
 
 class Prompts(Protocol):

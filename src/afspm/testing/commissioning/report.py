@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Final
 
-from afspm.errors import FileError
+from afspm.basics.errors import FileError
+from afspm.basics.plain_data import Plain
 from afspm.experiment.toml_writer import dumps
-from afspm.plain_data import Plain
 from afspm.storage.atomic import write_atomic
 from afspm.testing.commissioning.progress import CommissioningProgress, outcome_of, outcome_word
 from afspm.testing.conformance import CheckResult

@@ -12,8 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from afspm.drawing import raster
 from afspm.model import ControlRequest, Feedback, RegionChange, Scan, ScanParameters, ScopeState, names
+from afspm.record.drawing import raster
 from afspm.testing.commissioning.guide import Guide
 from afspm.testing.commissioning.progress import CommissioningStep
 from afspm.testing.conformance import Declined, Skipped, expect

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from afspm import wire
+from afspm.basics.clock import Clock
+from afspm.basics.errors import ExperimentEnded, NoResponse, WireError
 from afspm.client.experiment_link import ExperimentLink
-from afspm.clock import Clock
-from afspm.errors import ExperimentEnded, NoResponse, WireError
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -24,8 +24,8 @@ from afspm.model import (
     Spectrum,
     names,
 )
-from afspm.process.parent import StopRequested
 from afspm.testing.conformance import Failed, Lost, expect
+from afspm.transport.process.parent import StopRequested
 
 T = TypeVar("T")
 

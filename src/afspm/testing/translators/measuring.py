@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TypeVar
 
-from afspm.clock import Clock
+from afspm.basics.clock import Clock
+from afspm.basics.units import convert
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -25,7 +26,6 @@ from afspm.model import (
 from afspm.testing.conformance import Check, Failed, Skipped, expect
 from afspm.testing.translators.client import CheckClient, Observation, answer_in_words, scans, spectra, told
 from afspm.testing.translators.support import Support
-from afspm.units import convert
 
 NEAR = 1e-3
 """Of a frame's size: closer than that is the same. Half a pixel of the largest frame here is more."""

@@ -12,16 +12,15 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
-from afspm.addresses import connectable
+from afspm.basics.addresses import connectable
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import ConfigError
+from afspm.basics.launch import Launch, Sockets
 from afspm.client.component import Component
 from afspm.client.experiment_link import ExperimentLink
-from afspm.clock import ExperimentClock
-from afspm.errors import ConfigError
 from afspm.experiment import Experiment, ProcessStart, Role, load
-from afspm.launch import Launch, Sockets
 from afspm.model import Frame
 from afspm.model.events import LOGGED_AS
-from afspm.process.context import new_session
 from afspm.record.run_json import STATE_DIR
 from afspm.supervisor import run_folder, run_identity
 from afspm.supervisor.log import RunLog
@@ -34,6 +33,7 @@ from afspm.testing.translators.client import CheckClient
 from afspm.testing.translators.support import Support, find_out
 from afspm.translator import Driver
 from afspm.transport.port import ParentGone, Port
+from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import open_port
 
 NAME = "translator_test"

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from afspm.errors import FileError
-from afspm.files import FileContent, OtherFormat, netcdf
+from afspm.basics.errors import FileError
 from afspm.model import Region, Scan
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
+from afspm.storage.formats import FileContent, OtherFormat, netcdf
 
 
 def packed(scans: Iterable[Scan]) -> bytes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from afspm.microscopes.simulator import Simulator
+from afspm.simulation.simulator import Simulator
 
 
 class ExampleScope(Simulator):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from afspm.drift.registration import DriftScan, Prior, Registration
+from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 
 
 class Standstill:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from afspm.plain_data import Plain
+from afspm.basics.plain_data import Plain
+from afspm.basics.units import si
 from afspm.testing.clients.bench import ClientBench
 from afspm.testing.clients.checks.launch import require_beats
 from afspm.testing.clients.client_suite import client_check
@@ -12,7 +13,6 @@ from afspm.testing.clients.experiment import JudgedExperiment
 from afspm.testing.clients.facts import compare
 from afspm.testing.clients.program import Answer
 from afspm.testing.conformance import Failed, expect, near
-from afspm.units import si
 
 SCAN_S = 120.0
 CHANNELS = 2

@@ -7,8 +7,8 @@ import binascii
 
 from google.protobuf import json_format
 
+from afspm.basics.plain_data import Plain
 from afspm.model import ControlRequest, ControlResponse, Packet, ScopeState
-from afspm.plain_data import Plain
 from afspm.testing.clients.bench import ClientBench, ScriptedRun
 from afspm.testing.clients.client_suite import client_check
 from afspm.testing.clients.facts import compare

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from afspm.basics.units import convert
 from afspm.model import ControlRequest, ControlResponse, Parameter, Response, names
 from afspm.testing.conformance import Skipped, expect, near
 from afspm.testing.translators.client import answer_in_words, value_in
 from afspm.testing.translators.measuring import CheckMeasurements, number
 from afspm.testing.translators.translator_suite import check
-from afspm.units import convert
 
 _SMALLER = {"m": "nm", "m/s": "nm/s", "V": "mV", "deg": "rad", "A": "pA"}
 """A peer may give and ask for a value in any unit of its kind."""

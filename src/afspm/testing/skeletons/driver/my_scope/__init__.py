@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from afspm.clock import Clock
-from afspm.errors import FileError
+from afspm.basics.clock import Clock
+from afspm.basics.errors import FileError
 from afspm.model import Region, Scan, ScopeState, ScopeStatus, Spectrum, names
 from afspm.translator import Driver, Value, action
 

@@ -1,0 +1,280 @@
+"""The one clock of a run: experiment time, which in a simulation may begin anywhere and pass faster than real time.
+
+All time that means something in the experiment (timestamps, scan durations, periods) comes from here. Heartbeats,
+request timeouts and whatever else is about processes stays in real time: `monotonic_s`.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import sys
+import threading
+import time
+import weakref
+import zlib
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Protocol
+
+from afspm.basics.errors import ConfigError
+from afspm.basics.file_lock import locked
+from afspm.basics.plain_data import PlainMapping
+
+NS_PER_S = 1_000_000_000
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def utc_time(time_ns: int) -> datetime:
+    """Return a time, ns since the Unix epoch, to the microsecond. Python's own refuses those before it on Windows."""
+    return _EPOCH + timedelta(microseconds=time_ns // 1000)
+
+
+def iso_utc(time_ns: int | None) -> str:
+    """Return a time, ns since the Unix epoch, as ISO 8601 in UTC, to the microsecond; empty for none."""
+    if time_ns is None:
+        return ""
+    return f"{utc_time(time_ns):%Y-%m-%dT%H:%M:%S.%f}Z"
+
+
+class Clock(Protocol):
+    """A source of time."""
+
+    def now_ns(self) -> int:
+        """Experiment time, ns since the Unix epoch."""
+        ...
+
+    def now_s(self) -> float:
+        """Experiment time, s since the Unix epoch."""
+        ...
+
+    def monotonic_s(self) -> float:
+        """Real time in s that never jumps, from an arbitrary zero: for timeouts and heartbeats."""
+        ...
+
+    def real_s(self, experiment_s: float) -> float:
+        """Return how long `experiment_s` of the experiment last in real time, in s."""
+        ...
+
+    def late(self) -> AbstractContextManager[None]:
+        """Let a simulated time wait, within bounds, for what is done in the block."""
+        ...
+
+
+def _anchor_s() -> float:
+    """Wall-clock time at the zero of time.monotonic(), so that a corrected system clock never jumps a run."""
+    return time.time() - time.monotonic()
+
+
+_BOOT = Path("/proc/sys/kernel/random/boot_id")
+
+
+@cache
+def monotonic_id() -> str:
+    """Return what tells apart computers, boots of one computer, and clocks of one boot, by which time.monotonic() goes.
+
+    In one boot all processes count from one zero: the function is "system-wide" by Python's documentation (since 3.5;
+    on macOS since 3.10), but which of Windows' clocks it reads depends on the version of Python. Elsewhere than on
+    Linux a boot has no name here: what is handed on by a run has no use after it.
+    """
+    boot = ""
+    if sys.platform == "linux":  # under Wine, too, there may be such a file, for those who are on its drive
+        with suppress(OSError):
+            boot = _BOOT.read_text(encoding="ascii").strip()
+    if not boot:
+        import platform
+
+        boot = platform.node()
+    return f"{boot} {time.get_clock_info('monotonic').implementation}"
+
+
+LONGEST_LATE_S = 10.0  # real time: who is killed while it is late must not slow the rest of the night
+_LOOKS = 1000  # while somebody writes; whoever was killed just then leaves the time as it was before
+_MOST_LATE = 16  # at the same time; more are not waited for
+_SHARED = struct.Struct(f"<{2 + _MOST_LATE}q")  # real time, experiment time then, until when each is waited for; ns
+_CHECKSUM = struct.Struct("<I")
+
+
+class SharedSimulationTime:
+    """The time of a simulated run, which waits for those who are late; shared by its processes in a small file.
+
+    Since a moment of real time it has gone at the speed of real time until another, and at full speed from then on. Who
+    is late writes both anew.
+
+    Args:
+        path: of the file, which is there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = path.open("r+b")  # stays open: a disk that hangs then hangs nobody who is late
+        weakref.finalize(self, self._file.close)
+        self._turn = threading.Lock()  # of this process, whose threads share the lock of the file
+        self._map = mmap.mmap(self._file.fileno(), _SHARED.size + _CHECKSUM.size)
+        self._last: tuple[int, ...] = (0,) * (2 + _MOST_LATE)
+
+    def now_ns(self, real_ns: int, speed: float) -> int:
+        """Experiment time at a moment of real time, by `time.monotonic_ns`."""
+        return _shown_ns(self._read(), real_ns, speed)
+
+    @contextmanager
+    def late(self, speed: float) -> Iterator[None]:
+        """See `ExperimentClock.late`."""
+        mine_ns = time.monotonic_ns() + int(LONGEST_LATE_S * NS_PER_S)
+        self._change(0, mine_ns, speed)
+        try:
+            yield
+        finally:
+            self._change(mine_ns, 0, speed)
+
+    def _change(self, before_ns: int, after_ns: int, speed: float) -> None:
+        """Write one of the times until which somebody is waited for instead of another, and the time that it is now."""
+        with self._turn, locked(self._file):
+            real_ns, (since_ns, shown_ns, *until_ns) = time.monotonic_ns(), self._read()
+            shown_ns = _shown_ns((since_ns, shown_ns, *until_ns), real_ns, speed)
+            until_ns = [until if until > real_ns else 0 for until in until_ns]
+            if before_ns in until_ns:
+                until_ns[until_ns.index(before_ns)] = after_ns
+            self._map[:] = _shared_bytes(real_ns, shown_ns, *until_ns)
+
+    def _read(self) -> tuple[int, ...]:
+        for _ in range(_LOOKS):
+            found = self._map[:]
+            if _CHECKSUM.unpack_from(found, _SHARED.size)[0] == zlib.crc32(found[: _SHARED.size]):
+                self._last = _SHARED.unpack_from(found)
+                break
+        return self._last
+
+
+def _shown_ns(told: tuple[int, ...], real_ns: int, speed: float) -> int:
+    since_ns, shown_ns, *until_ns = told
+    real_ns = max(real_ns, since_ns)
+    fast_since_ns = min(max(since_ns, *until_ns), real_ns)
+    return shown_ns + fast_since_ns - since_ns + int((real_ns - fast_since_ns) * speed)
+
+
+def _shared_bytes(real_ns: int, shown_ns: int, *until_ns: int) -> bytes:
+    told = _SHARED.pack(real_ns, shown_ns, *until_ns)
+    return told + _CHECKSUM.pack(zlib.crc32(told))
+
+
+def _waiting_in(path: str | None) -> SharedSimulationTime | None:
+    """Return the time that is shared in a file; None where that is gone with its run, or was cut off."""
+    try:
+        return SharedSimulationTime(Path(path)) if path else None
+    except (OSError, ValueError):
+        return None
+
+
+@dataclass(frozen=True)
+class ExperimentClock:
+    """experiment time = start + (real time - origin) · speed.
+
+    Every process of a run is given the same origin, start and speed, and, on one computer, the same anchor of real
+    time: so all show the same time, whatever becomes of the clock on the wall and whenever they were started.
+
+    Attributes:
+        origin_s: real time, s since the Unix epoch, at which the run began.
+        start_s: experiment time at that moment, s since the Unix epoch.
+        speed: experiment seconds in a real second; 1 on a real microscope.
+    """
+
+    origin_s: float = 0.0
+    start_s: float = 0.0
+    speed: float = 1.0
+    _wall_at_zero_s: float = field(default_factory=_anchor_s, repr=False, compare=False)
+    _waiting: SharedSimulationTime | None = field(default=None, repr=False, compare=False)
+
+    @classmethod
+    def real(cls) -> ExperimentClock:
+        """Return the clock on the wall."""
+        return cls()
+
+    @classmethod
+    def starting_now(cls, start_s: float | None = None, speed: float = 1.0) -> ExperimentClock:
+        """Return a clock that shows `start_s` (default: the real time) now and goes at `speed` from here."""
+        origin_s = time.time()
+        return cls(origin_s, origin_s if start_s is None else start_s, speed)
+
+    @classmethod
+    def from_dict(cls, values: PlainMapping) -> ExperimentClock:
+        """Return the clock that `as_dict` told of; of nothing, the one on the wall."""
+        if not values:
+            return cls.real()
+        told = (float(values["origin_s"]), float(values["start_s"]), float(values["speed"]))
+        waits = values.get("waits")
+        if values.get("monotonic") != monotonic_id():  # another computer's: real time is what the wall here says
+            if waits:
+                raise ConfigError(
+                    "the simulated clock waits for those who are late, which it can do on one computer only",
+                    where="[clock]",
+                    hint="set waits = false where the scheduler is started",
+                )
+            return cls(*told)
+        return cls(*told, float(values["wall_at_zero_s"]), _waiting_in(waits))
+
+    def as_dict(self) -> dict[str, object]:
+        """As JSON has it, for the other processes of the run."""
+        return {
+            "origin_s": self.origin_s,
+            "start_s": self.start_s,
+            "speed": self.speed,
+            "wall_at_zero_s": self._wall_at_zero_s,
+            "monotonic": monotonic_id(),
+            **({"waits": str(self._waiting.path)} if self._waiting else {}),
+        }
+
+    def waiting_in(self, path: Path) -> ExperimentClock:
+        """Return this clock, which from now on waits for those who are late, if it goes faster than real time.
+
+        Args:
+            path: of the file by which the processes of the run share that.
+        """
+        if self.speed <= 1.0 or self._waiting is not None:
+            return self
+        path.write_bytes(_shared_bytes(time.monotonic_ns(), self.now_ns(), *[0] * _MOST_LATE))
+        return replace(self, _waiting=SharedSimulationTime(path))
+
+    def late(self) -> AbstractContextManager[None]:
+        """Let the experiment's time go no faster than real time in the block, at most for `LONGEST_LATE_S`.
+
+        For what takes no time in the experiment, and computers need time for: a scan that is due and not begun, one
+        that is finished and not yet registered. At a speed of one nothing changes.
+        """
+        return nullcontext() if self._waiting is None else self._waiting.late(self.speed)
+
+    def wall_ahead_s(self) -> float:
+        """By how much the clock on the wall is ahead, s: it was set since, or the computer was suspended."""
+        return _anchor_s() - self._wall_at_zero_s
+
+    def now_s(self) -> float:
+        if self._waiting is not None:
+            return self.now_ns() / NS_PER_S
+        return self.start_s + (self._wall_at_zero_s + time.monotonic() - self.origin_s) * self.speed
+
+    def now_ns(self) -> int:
+        if self._waiting is not None:
+            return self._waiting.now_ns(time.monotonic_ns(), self.speed)
+        real_ns = time.monotonic_ns() + self._since_origin_ns
+        return self._start_ns + (real_ns if self.speed == 1.0 else int(real_ns * self.speed))
+
+    # float64 would round the sum to a quarter of a microsecond: in whole nanoseconds, and reckoned once
+
+    @cached_property
+    def _since_origin_ns(self) -> int:
+        """The age of the run at the zero of time.monotonic()."""
+        return int(self._wall_at_zero_s * NS_PER_S) - int(self.origin_s * NS_PER_S)
+
+    @cached_property
+    def _start_ns(self) -> int:
+        return int(self.start_s * NS_PER_S)
+
+    def monotonic_s(self) -> float:
+        return time.monotonic()
+
+    def real_s(self, experiment_s: float) -> float:
+        return experiment_s / self.speed

@@ -1,0 +1,154 @@
+"""Durations, lengths, times and quantities as text: in logs, terminals, on pages and in reports alike."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from datetime import UTC, datetime, tzinfo
+
+from afspm.basics.clock import utc_time
+
+_PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"),
+             (1e-12, "p"), (1e-15, "f"))  # fmt: skip
+PREFIXABLE = frozenset(
+    {"m", "V", "A", "s", "N", "Hz", "W", "F", "m/s", "m/V", "V/m", "C", "S", "Pa", "Ohm", "Ω", "T", "g"}
+)
+_LENGTHS = ((1e-3, "mm"), (1e-6, "µm"), (1e-9, "nm"), (1e-12, "pm"))
+
+
+def duration_text(seconds: float) -> str:
+    """Return a duration, as exactly as it matters.
+
+    >>> [lasting(s) for s in (8.2, 200, 725, 7500, 300_000)]
+    ['8 s', '3 min 20 s', '12 min', '2 h 05 min', '3 d 11 h']
+    """
+    whole = max(0, round(seconds))
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 600:
+        return f"{whole // 60} min {whole % 60:02} s"
+    minutes = round(whole / 60)
+    if minutes < 60:
+        return f"{minutes} min"
+    if minutes < 48 * 60:
+        return f"{minutes // 60} h {minutes % 60:02} min"
+    hours = round(whole / 3600)
+    return f"{hours // 24} d {hours % 24} h"
+
+
+def lengths_text(values_m: Sequence[float], joined: str = ", ") -> str:
+    """Lengths in the unit that suits the largest of them, as they may be written in an experiment file, too.
+
+    >>> lengths([5e-7, 2.5e-7], " x ")
+    '500 x 250 nm'
+    """
+    largest_m = max(map(abs, values_m))
+    unit_m, unit = next(((size, name) for size, name in _LENGTHS if largest_m >= 0.99 * size), (1e-9, "nm"))
+    return joined.join(f"{value_m / unit_m:.5g}" for value_m in values_m) + f" {unit}"
+
+
+def area_text(size_m: Sequence[float]) -> str:
+    """(width, height) of a region.
+
+    >>> area((2e-6, 1e-6))
+    '2 x 1 µm'
+    """
+    return lengths_text(size_m, " x ")
+
+
+def position_text(xy_m: tuple[float, float]) -> str:
+    """(x, y).
+
+    >>> place((1.2e-6, -5e-7))
+    '(1.2, -0.5) µm'
+    """
+    numbers, unit = lengths_text(xy_m).rsplit(" ", 1)
+    return f"({numbers}) {unit}"
+
+
+def typeset(told: str) -> str:
+    """Return what `lengths`, `area` and `place` give, for pages.
+
+    >>> typeset("2 x 1 µm at (1.2, -0.5) µm")
+    '2 × 1 µm at (1.2, −0.5) µm'
+    """
+    return told.replace(" x ", " × ").replace("-", "−")
+
+
+def time_of_day(time_ns: int, zone: tzinfo | None = None, *, seconds: bool = True) -> str:
+    """ "22:04:31". Where no zone is given, that of this computer."""
+    return f"{_moment(time_ns, zone):{'%H:%M:%S' if seconds else '%H:%M'}}"
+
+
+def day_and_time(time_ns: int, zone: tzinfo | None = None, *, seconds: bool = True) -> str:
+    """ "2026-11-20 22:04:31", in UTC "2026-11-20 22:04:31 UTC"."""
+    return f"{_moment(time_ns, zone):{'%Y-%m-%d %H:%M:%S' if seconds else '%Y-%m-%d %H:%M'}}{_zone(zone)}"
+
+
+def day(time_ns: int, zone: tzinfo | None = None) -> str:
+    """ "2026-11-20"."""
+    return f"{_moment(time_ns, zone):%Y-%m-%d}"
+
+
+def period_text(begin_ns: int, end_ns: int, zone: tzinfo | None = None) -> str:
+    """ "2026-11-20 22:04 to 23:10 UTC"; the day of the end where it is another."""
+    same = day(begin_ns, zone) == day(end_ns, zone)
+    until = (
+        time_of_day(end_ns, zone, seconds=False) + _zone(zone) if same else day_and_time(end_ns, zone, seconds=False)
+    )
+    return f"{_moment(begin_ns, zone):%Y-%m-%d %H:%M} to {until}"
+
+
+def _zone(zone: tzinfo | None) -> str:
+    return " UTC" if zone is UTC else ""
+
+
+def _moment(time_ns: int, zone: tzinfo | None) -> datetime:
+    time = utc_time(time_ns)
+    try:
+        return time.astimezone(zone)
+    except OSError:  # Windows knows no local time before 1970
+        return time
+
+
+def scale(largest: float, unit: str) -> tuple[float, str]:
+    """Return (factor, unit with prefix) in which numbers up to `largest` read well: shown = value * factor."""
+    if unit not in PREFIXABLE or not math.isfinite(largest) or largest == 0.0:
+        return 1.0, unit
+    # what rounds up to a thousand belongs to the next prefix
+    size = abs(largest) * 1.0005
+    power, prefix = next(((p, name) for p, name in _PREFIXES if size >= p), _PREFIXES[-1])
+    return 1.0 / power, prefix + unit
+
+
+def quantity(value: float | None, unit: str, digits: int = 4) -> str:
+    """Return a number with its unit, "12.34 nm"; "–" if there is no number."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    factor, shown = scale(value, unit)
+    return f"{value * factor:.{digits}g} {shown}".strip()
+
+
+def typeset_position(xy_m: tuple[float, float]) -> str:
+    """Return a position for a page: "(1.2, −0.5) µm"."""
+    return typeset(position_text(xy_m))
+
+
+def typeset_area(size_m: Sequence[float]) -> str:
+    """Return a size for a page: "2 × 1 µm"."""
+    return typeset(area_text(size_m))
+
+
+def typeset_length(length_m: float) -> str:
+    """Return a length for a page: "200 nm"."""
+    return typeset(lengths_text([length_m]))
+
+
+def unit_text(unit: str) -> str:
+    """Return a unit as texts show it: "um/s" as "µm/s"."""
+    return f"µ{unit[1:]}" if unit.startswith("um") else unit
+
+
+def counted(count: int, one: str, many: str = "") -> str:
+    """Return (1, "scan") as "1 scan", (2, "scan") as "2 scans"; `many` where that is no s more."""
+    return f"{count} {one if count == 1 else many or f'{one}s'}"

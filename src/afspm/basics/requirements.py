@@ -1,0 +1,56 @@
+"""Packages that a class needs beyond a plain install of afspm: named in its attribute `requires`, as for `pip install`.
+
+    class Ridges(Component):
+        requires = ("afspm[features]", "torch>=2.4")
+
+What is missing is found before anything starts, and by `afspm check`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib import metadata
+
+from afspm.basics.errors import ConfigError
+
+ATTRIBUTE = "requires"
+
+
+def require(class_: object) -> None:
+    """Check that what a class requires is installed.
+
+    Raises:
+        ConfigError: a package is missing, or is of another version; the hint is the command that installs it.
+    """
+    wanted = getattr(class_, ATTRIBUTE, ())
+    require_installed(getattr(class_, "__name__", str(class_)), *((wanted,) if isinstance(wanted, str) else wanted))
+
+
+def require_installed(what: str, *requirements: str) -> None:
+    """Check that `what` has the packages that it requires. Raises as `require` does."""
+    lacking = {one: missing for one in requirements if (missing := list(_missing(one)))}
+    if lacking:
+        packages = ", ".join(dict.fromkeys(package for missing in lacking.values() for package in missing))
+        command = "pip install " + " ".join(f'"{one}"' for one in lacking)
+        raise ConfigError(f"{what} needs what is not installed: {packages}", hint=command)
+
+
+def _missing(requirement: str) -> Iterator[str]:
+    """Yield the packages that a requirement lacks, those of its extras too."""
+    from packaging.requirements import InvalidRequirement, Requirement  # imported late: few classes require anything
+
+    try:
+        wanted = Requirement(requirement)
+        version = metadata.version(wanted.name)
+    except InvalidRequirement as error:
+        raise ConfigError(f"requires: {requirement!r} is not a requirement", hint='e.g. "scipy>=1.13"') from error
+    except metadata.PackageNotFoundError:
+        yield wanted.name
+        return
+    if not wanted.specifier.contains(version, prereleases=True):
+        yield f"{wanted.name}{wanted.specifier} (there is {version})"
+    for text in metadata.requires(wanted.name) or () if wanted.extras else ():
+        of_extra = Requirement(text)
+        marker, of_extra.marker = of_extra.marker, None
+        if marker and any(marker.evaluate({"extra": extra}) for extra in wanted.extras):
+            yield from _missing(str(of_extra))

@@ -1,0 +1,71 @@
+"""Values of parameters, to and from the text on the wire."""
+
+from __future__ import annotations
+
+import math
+
+from afspm import wire
+from afspm.basics.errors import InvalidValue, UnitError
+from afspm.basics.units import convert, parse_quantity, require_unit
+from afspm.model import Parameter, Response
+from afspm.model.names import BASE_PARAMETERS
+
+Value = float | str | bool
+
+
+def to_parameter(name: str, value: Value, unit: str | None) -> Parameter:
+    """Return a value to set: a number with or without `unit` (SI without), a quantity as text ("2 um/s"), True, "on" …
+
+    Raises:
+        InvalidValue: a number that is none.
+        UnitError: a number without a unit that is too large to be meant in SI.
+    """
+    if isinstance(value, bool):
+        return Parameter(name, "true" if value else "false", unit)
+    if isinstance(value, str):
+        if unit is None and value[:1] in "+-.0123456789" and (quantity := _quantity(value)) is not None:
+            number, given = quantity
+            if not given:
+                require_unit(number, BASE_PARAMETERS.get(name) or "")
+            return Parameter(name, repr(number), given or BASE_PARAMETERS.get(name))
+        return Parameter(name, value, unit)
+    if not math.isfinite(value):
+        raise InvalidValue(f"{name} can't be set to {value}")
+    if unit is None:
+        require_unit(value, BASE_PARAMETERS.get(name) or "")
+    # a numpy number would write itself as "np.float64(…)"
+    text = repr(int(value)) if isinstance(value, int) else repr(float(value))
+    return Parameter(name, text, BASE_PARAMETERS.get(name) if unit is None else unit)
+
+
+def from_parameter(parameter: Parameter, unit: str | None) -> Value:
+    """Return the value in force, in `unit`; without one in SI for the base parameters, else as it came.
+
+    Text that is no number comes as True, False or text.
+
+    Raises:
+        UnitError: the microscope's unit can't be converted to `unit`.
+    """
+    text = (parameter.value or "").strip()
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    try:
+        number = float(text)
+    except ValueError:
+        return text
+    wanted = BASE_PARAMETERS.get(parameter.name) if unit is None else unit
+    if not parameter.unit or not wanted:
+        return number
+    return convert(number, parameter.unit, wanted)
+
+
+def value_in(response: Response, asked: Parameter, unit: str | None) -> Value:
+    """Return the value that a response reports; where a peer only says that it did it, the one that was asked for."""
+    return from_parameter(wire.decode_parameter(response.payload) if response.payload else asked, unit)
+
+
+def _quantity(text: str) -> tuple[float, str] | None:
+    try:
+        return parse_quantity(text)
+    except UnitError:
+        return None

@@ -1,0 +1,118 @@
+"""The record of a survey: its targets and what was measured at each, as a table and a picture."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+
+from afspm.components.surveying.targets import Target
+from afspm.model import RegistrationOutcome, Scan, Spectrum
+from afspm.model.geometry import XY
+from afspm.storage.atomic import write_atomic
+
+
+class Outcome(Enum):
+    """The fate of a target."""
+
+    MEASURED = "measured"
+    REFUSED = "refused"
+    """All of it or a part: the reason says why."""
+    INCOMPLETE = "incomplete"
+    """The survey ended before the last curve."""
+    NOT_REACHED = "not-reached"
+
+
+@dataclass(eq=False)
+class Visit:
+    """A target and what was measured at it.
+
+    Attributes:
+        number: counts from 1, in the order of the targets.
+        center_m: (x, y) that curves are taken relative to: where the survey shows the target, or its zoom.
+        zoom: None: it was not taken, or not yet.
+        curves: by their names.
+        refusals: why something was refused.
+        registration: how the position of the zoom on the sample is known, where drift is corrected; None: it is not.
+        position_sd_m: standard deviation of that position; None: not known.
+    """
+
+    number: int
+    target: Target
+    center_m: XY
+    zoom: Scan | None = None
+    curves: dict[str, Spectrum] = field(default_factory=dict)
+    refusals: list[str] = field(default_factory=list)
+    registration: RegistrationOutcome | None = None
+    position_sd_m: float | None = None
+
+
+class SurveyRecord:
+    """A wide scan, and a visit for each target in it.
+
+    Args:
+        survey: the wide scan.
+        targets: in the order in which they are visited.
+        curves: the names of the curves of each target.
+
+    Attributes:
+        visits: one for each target; fill them in as they are measured.
+    """
+
+    def __init__(self, survey: Scan, targets: Sequence[Target], curves: Sequence[str] = ()) -> None:
+        self.survey = survey
+        self.curves = tuple(curves)
+        self.visits = [Visit(number, target, target.position_m) for number, target in enumerate(targets, start=1)]
+
+    def outcome(self, visit: Visit) -> Outcome:
+        """Return what became of a target."""
+        if visit.refusals:
+            return Outcome.REFUSED
+        if visit.zoom is None:
+            return Outcome.NOT_REACHED
+        return Outcome.MEASURED if visit.curves.keys() >= set(self.curves) else Outcome.INCOMPLETE
+
+    def write(self, path: str | Path) -> None:
+        """Write the table: a row for each target, with the controller's files of its zoom and curves.
+
+        `registration` and `position_sd` say how its position is known, where drift is corrected: registered, coarse, or
+        by dead reckoning (refused, failed, new).
+
+        Files in the folder of the table, or below it, are named from there.
+
+        Raises:
+            OSError: the disk is full …
+        """
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows(self._rows(Path(path).absolute().parent))
+        write_atomic(Path(path), [text.getvalue().encode()])
+
+    def _rows(self, folder: Path) -> Iterator[list[str]]:
+        yield [
+            "number", "x", "y", "position_sd", "length_units", "registration", "height", "height_units", "outcome",
+            "reason", "zoom", *self.curves,
+        ]  # fmt: skip
+        for visit in self.visits:
+            height = visit.target.height
+            yield [
+                str(visit.number),
+                *(f"{value:.9g}" for value in visit.center_m),
+                "" if visit.position_sd_m is None else f"{visit.position_sd_m:.3g}",
+                "m",
+                visit.registration.label if visit.registration else "",
+                *(("", "") if height is None else (f"{height:.6g}", self.survey.unit)),
+                self.outcome(visit).value,
+                "; ".join(visit.refusals),
+                _within(visit.zoom, folder),
+                *(_within(visit.curves.get(name), folder) for name in self.curves),
+            ]
+
+
+def _within(measured: Scan | Spectrum | None, folder: Path) -> str:
+    if measured is None or not measured.filename:
+        return ""
+    file = Path(measured.filename)
+    return file.relative_to(folder).as_posix() if file.is_relative_to(folder) else measured.filename

@@ -1,7 +1,0 @@
-"""The experiment over HTTP, for programs in any language."""
-
-from __future__ import annotations
-
-from afspm.gateway.gateway import Gateway
-
-__all__ = ["Gateway"]

@@ -1,0 +1,170 @@
+"""Where the scan and the probe are, in tip coordinates, and the parameters that are a part of that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+
+from afspm.basics.errors import InvalidValue
+from afspm.basics.plain_data import Plain
+from afspm.model import PositionChange, ProbePosition, Region, RegionChange, ScanParameters, ShapeChange, names
+from afspm.model.geometry import XY
+
+SHAPE_CHANGES: dict[str, Callable[[int], ShapeChange]] = {
+    names.SCAN_RESOLUTION_X: lambda value: ShapeChange(columns=value),
+    names.SCAN_RESOLUTION_Y: lambda value: ShapeChange(rows=value),
+}
+PROBE_CHANGES: dict[str, Callable[[float], PositionChange]] = {
+    names.PROBE_POS_X: lambda value: PositionChange(x_m=value),
+    names.PROBE_POS_Y: lambda value: PositionChange(y_m=value),
+}
+REGION_CHANGES: dict[str, Callable[[float], RegionChange]] = {
+    names.SCAN_TOP_LEFT_X: lambda value: RegionChange(left_m=value),
+    names.SCAN_TOP_LEFT_Y: lambda value: RegionChange(low_m=value),
+    names.SCAN_SIZE_X: lambda value: RegionChange(width_m=value),
+    names.SCAN_SIZE_Y: lambda value: RegionChange(height_m=value),
+    names.SCAN_ANGLE: lambda value: RegionChange(angle_rad=value),
+}
+
+_CORNER_AND_SIZE = REGION_CHANGES.keys() - {names.SCAN_ANGLE}
+_ANYWHERE = Region((0.0, 0.0), (1.0, 1.0))
+"""A placeholder, every part of which is replaced at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class KnownPosition:
+    """The place of the scan and of the probe, as far as it was set or published.
+
+    Attributes:
+        region, shape: of the scan; the shape as (rows, columns).
+        probe_m: the probe position.
+    """
+
+    region: Region | None = None
+    shape: tuple[int, int] | None = None
+    probe_m: XY | None = None
+
+    def learn(self, subject: object) -> KnownPosition:
+        """Take a place, or a part of one, that was set or told."""
+        with suppress(InvalidValue):  # a part of a region that is not known yet
+            return self.onto(subject)
+        return self
+
+    def onto(self, subject: object) -> KnownPosition:
+        """Return the places after a place, or a part of one, was set.
+
+        Raises:
+            InvalidValue: a part of a region that is not known, or no region.
+        """
+        if isinstance(subject, ScanParameters):
+            scan = subject.onto(ScanParameters(self.region, self.shape))
+            region = scan.region if isinstance(scan.region, Region) else None
+            return replace(self, region=region, shape=scan.shape if isinstance(scan.shape, tuple) else None)
+        if isinstance(subject, ProbePosition):
+            return replace(self, probe_m=subject.xy_m)
+        if isinstance(subject, PositionChange) and self.probe_m is not None:
+            return replace(self, probe_m=moved(self.probe_m, subject))
+        return self
+
+    def learn_values(self, values: Iterable[tuple[str, float]]) -> KnownPosition:
+        """Take single parameters, by their names, in SI; what is no place is not learned."""
+        known = self
+        with suppress(InvalidValue):
+            for change in changes_by(values):
+                known = known.learn(change)
+        return known
+
+    def was_read(self, values: Mapping[str, float | None]) -> KnownPosition:
+        """Take the values of single parameters, read together; a parameter that is missing keeps its value.
+
+        A frame without an angle, on a microscope that has no such parameter, is not turned.
+
+        Args:
+            values: None where the microscope answered no number.
+        """
+        wrong = [name for name, value in values.items() if value is None]
+        known = self.without(wrong)
+        read = [(name, value) for name, value in values.items() if value is not None]
+        names_read = {name for name, _ in read}
+        if known.region is None and names_read >= _CORNER_AND_SIZE and names.SCAN_ANGLE not in wrong:
+            known = replace(known, region=_ANYWHERE)
+        if known.shape is None and names_read >= SHAPE_CHANGES.keys():
+            known = replace(known, shape=(1, 1))
+        if known.probe_m is None and names_read >= PROBE_CHANGES.keys():
+            known = replace(known, probe_m=(0.0, 0.0))
+        for place in (REGION_CHANGES, SHAPE_CHANGES, PROBE_CHANGES):
+            given = [(name, value) for name, value in read if name in place]
+            try:
+                for change in changes_by(given):
+                    known = known.onto(change)
+            except InvalidValue:  # a frame of no size, half a pixel: what the microscope answered is no place
+                known = known.without([name for name, _ in given])
+        return known
+
+    def without(self, names_: Collection[str]) -> KnownPosition:
+        """Forget the places of unknown parameters."""
+        return KnownPosition(
+            None if REGION_CHANGES.keys() & names_ else self.region,
+            None if SHAPE_CHANGES.keys() & names_ else self.shape,
+            None if PROBE_CHANGES.keys() & names_ else self.probe_m,
+        )
+
+
+def changes_by(values: Iterable[tuple[str, float]]) -> list[PositionChange | ScanParameters]:
+    """Return how single parameters, set together, move the probe and the scan.
+
+    Raises:
+        InvalidValue: a number of pixels that is none.
+    """
+    given: dict[type, Plain] = {}
+    for name, value in values:
+        change: PositionChange | RegionChange | ShapeChange
+        if name in SHAPE_CHANGES:
+            if value < 1 or value != int(value):
+                raise InvalidValue(f"{name} = {value:g}: pixels are counted from 1 in whole numbers")
+            change = SHAPE_CHANGES[name](int(value))
+        elif name in PROBE_CHANGES:
+            change = PROBE_CHANGES[name](value)
+        elif name in REGION_CHANGES:
+            change = REGION_CHANGES[name](value)
+        else:
+            continue
+        parts = given.setdefault(type(change), {})
+        parts.update((part, one) for part, one in asdict(change).items() if one is not None)
+    found: list[PositionChange | ScanParameters] = []
+    if PositionChange in given:
+        found.append(PositionChange(**given[PositionChange]))
+    if RegionChange in given or ShapeChange in given:
+        region = RegionChange(**given[RegionChange]) if RegionChange in given else None
+        shape = ShapeChange(**given[ShapeChange]) if ShapeChange in given else None
+        found.append(ScanParameters(region, shape))
+    return found
+
+
+def moved(xy_m: XY, change: PositionChange) -> XY:
+    """Where the probe is after it was moved along one axis, or both."""
+    return (xy_m[0] if change.x_m is None else change.x_m, xy_m[1] if change.y_m is None else change.y_m)
+
+
+def scan_values(wanted: ScanParameters) -> list[tuple[str, float]]:
+    """The parameters that a request for a scan sets, with their values in SI."""
+    region, values = wanted.region, list[tuple[str, float]]()
+    if isinstance(region, Region):
+        (left, low), (width, height) = region.top_left_m, region.size_m
+        region = RegionChange(left, low, width, height, region.angle_rad)
+    if region is not None:
+        given = (
+            (names.SCAN_TOP_LEFT_X, region.left_m),
+            (names.SCAN_TOP_LEFT_Y, region.low_m),
+            (names.SCAN_SIZE_X, region.width_m),
+            (names.SCAN_SIZE_Y, region.height_m),
+            (names.SCAN_ANGLE, region.angle_rad),
+        )
+        values += [(name, value) for name, value in given if value is not None]
+    shape = wanted.shape
+    if shape is not None:
+        change = shape if isinstance(shape, ShapeChange) else ShapeChange(*shape)
+        pixels = ((names.SCAN_RESOLUTION_X, change.columns), (names.SCAN_RESOLUTION_Y, change.rows))
+        values += [(name, value) for name, value in pixels if value is not None]
+    return values

@@ -1,0 +1,260 @@
+"""Asylum Research, over ZeroMQ-XOP in its Igor Pro. See the README beside this."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from afspm.basics.errors import ConfigError, Refused
+from afspm.basics.units import Duration, PollPeriod
+from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.plugins.asylum.activity import FORCE, AsylumActivity
+from afspm.plugins.asylum.link import Link
+from afspm.plugins.asylum.result_files import AsylumFiles
+from afspm.plugins.asylum.session import Session
+from afspm.plugins.asylum.settings import NAMES, FeedbackSwitch, FrameSettings, TipPlace
+from afspm.plugins.asylum.xop import XopError
+from afspm.translator.driver import ControllerLost, Driver, action
+from afspm.translator.parameters import FEEDBACK_ON, Value
+from afspm.translator.result_files import SCAN
+from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
+
+_AT_FIRST: Final[dict[str, Value]] = {
+    names.SCAN_DIRECTION: names.UP,
+    names.SPEC_KIND: FORCE,
+    names.PULSE_VOLTAGE: 4.0,
+    names.PULSE_DURATION: 0.1,
+}
+_SPOTS: Final = ("image", "scanner", "none")
+_NAME: Final = "[A-Za-z][A-Za-z0-9_]{0,16}"
+"""Of a wave of Igor's, with room for the number; it is a file's name, too."""
+
+
+class Asylum(Driver):
+    """The microscope behind Asylum Research's software.
+
+    Args:
+        address: that was given to `zeromq_server_bind`.
+        folders: beginnings of Asylum's folders as Igor writes them, "C:Users:Me:", and where those are seen from
+            here; without it: Asylum runs on this computer.
+        base_name: of the files that Asylum saves; left out: what its panel says.
+        spots: what SpotX and SpotY count from: the lower left corner of the last "image", along its axes; the middle
+            of the "scanner"; "none": the tip can't be sent anywhere.
+        move_s: the time that a move to a spot may take, which Asylum does not tell, in experiment time.
+        reply_timeout_s: how long Igor may take to answer, in real time.
+        poll_period_s, common: as for every microscope.
+    """
+
+    parameters_file = Path(__file__).with_name("parameters.toml")
+    translated = (*NAMES, *POSITION, *_AT_FIRST, FEEDBACK_ON, names.ENGAGED, names.CONTROLLER)
+    maker: ClassVar[str] = "Oxford Instruments Asylum Research"
+    software: ClassVar[str] = "Asylum Research in Igor Pro"
+    max_pixels: ClassVar[int] = 8192 * 8192
+    program_s: ClassVar[float] = 2.0
+    _activity: AsylumActivity
+
+    def __init__(
+        self,
+        *,
+        address: str = "tcp://127.0.0.1:5555",
+        folders: Mapping[str, str] | None = None,
+        base_name: str = "",
+        spots: str = "image",
+        move_s: Duration = 2.0,
+        reply_timeout_s: Duration = 5.0,
+        poll_period_s: PollPeriod = 0.25,
+        **common: Any,
+    ) -> None:
+        super().__init__(poll_period_s=poll_period_s, **common)
+        self.controller_at = address
+        self._folders = dict(folders or {})
+        self._base_name = _checked_name(base_name)
+        self._spots = spots
+        if spots not in _SPOTS:
+            raise ConfigError(f"{spots!r}", where="spots", hint=" or ".join(_SPOTS))
+        if spots == "none":
+            self.table = self.table.without(POSITION)
+        self._reply_timeout_s = reply_timeout_s
+        self._session: Session | None = None
+        self._kept = KeptSettings(_AT_FIRST)
+        image = (lambda: self._activity.image) if spots == "image" else None
+        self._place = TipPlace(self._igor, image, lambda: self._activity.moves(move_s))
+        frame_settings = FrameSettings(self._igor, lambda: self.in_force(NAMES))
+        feedback = FeedbackSwitch(self._igor, lambda holds: self.wait_for(holds, reply_timeout_s))
+        self.groups = (self._kept, frame_settings, self._place, feedback)
+
+    @classmethod
+    def technique(cls, settings: Mapping[str, object]) -> str:
+        return "AFM"
+
+    def connect(self) -> None:
+        self.close()
+        self._session = session = Session(Link(self.controller_at, self._reply_timeout_s, self.clock.monotonic_s))
+        self.prove()
+        self._kept.kept_in(self.memory)
+        self._files = AsylumFiles(self.memory, self.log)
+        self._activity = AsylumActivity(
+            session,
+            self._files,
+            self.memory,
+            self._folders,
+            self._frame_in_force,
+            self.clock,
+            self.log,
+            spot_m=None if self._spots == "none" else self._place.xy_m,
+            take_curve=self._take_curve,
+        )
+        session.doing()
+        if not session.at_once:
+            self.log.warning(
+                "Igor does not include afspm.ipf: values are read one by one, and the feedback can't be switched"
+            )
+        for what in (SCAN, FORCE):
+            self._activity.folder(what)
+        if self._spots != "none":
+            session.do("InitProbePos")
+            self._activity.find_image()
+        if self._base_name and session.text("GetBaseName") != self._base_name:
+            self._activity.call_files(self._base_name)
+
+    def close(self) -> None:
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    def _igor(self) -> Session:
+        if self._session is None:
+            raise ControllerLost("Igor is not connected", where=self.controller_at)
+        return self._session
+
+    def _frame_in_force(self) -> Region:
+        return frame(self.in_force(FRAME))[0]
+
+    def status(self) -> ScopeStatus:
+        return self._activity.status()
+
+    def next_change_s(self) -> float | None:
+        return self._activity.way.next_s
+
+    def get(self, vendor: str) -> Value:
+        if vendor == names.ENGAGED:
+            return self._igor().doing().engaged
+        if vendor == names.CONTROLLER:
+            return self._igor().controller()
+        if any(row.vendor == vendor and row.type == "text" for row in self.table.values()):
+            return self._igor().text("GS", vendor)
+        return self._igor().values([vendor])[vendor]
+
+    def set(self, values: Mapping[str, Value]) -> None:
+        for vendor, value in values.items():
+            self._igor().put(vendor, value)
+
+    def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
+        """Return values of the table, all numbers by one question."""
+        numbers = [name for name in wanted if self.table[name].type != "text" and name != names.ENGAGED]
+        values = self._igor().values([self.table[name].vendor for name in numbers]) if numbers else {}
+        found = {name: self.table[name].from_vendor(values[self.table[name].vendor]) for name in numbers}
+        return found | super().read_rows([name for name in wanted if name not in found])
+
+    def results(self) -> Sequence[str]:
+        return self._files.results(self.clock.now_ns())
+
+    def load(self, result: str) -> Sequence[Scan | Spectrum]:
+        return self._files.load(result)
+
+    # --- actions ---
+
+    @action(names.START_SCAN)
+    def start_scan(self) -> None:
+        """Scan the frame once, in the direction of `x-scan-direction`."""
+        self._activity.saves(SCAN)
+        probe_m = self._place.xy_m() if self._spots == "image" else None
+        self._activity.begin(SCAN)
+        up = self._kept[names.SCAN_DIRECTION] == names.UP
+        self._igor().put("LastScan", 1)
+        self._begin(SCAN, "DoScanFunc", "UpScan" if up else "DownScan")
+        self._igor().put("LastScan", 1)  # also where beginning to scan puts it back
+        self._activity.await_begin(SCAN)
+        if probe_m is not None:  # it stays where it is, on another image
+            try:
+                self._place.put(probe_m)
+            except (XopError, Refused) as error:
+                self.log.error("the scan runs, but the spot could not be put back: %s", error)
+
+    def _begin(self, what: str, function: str, button: str) -> None:
+        try:
+            accepted = self._igor().do(function, button)
+        except XopError:
+            self._activity.forget()
+            raise
+        if not accepted:
+            raise self._activity.refuse(what)
+
+    @action(names.STOP_SCAN)
+    def stop_scan(self) -> None:
+        """Break the scan off. Asylum withdraws the tip."""
+        self._igor().do("DoScanFunc", "StopScan")
+        self._activity.stopped()
+        self.log.warning("Asylum withdrew the tip, as it does whenever a scan is stopped")
+
+    @action(names.START_SPEC)
+    def start_spec(self) -> None:
+        """Take a force curve where the tip was sent, or else where it is."""
+        if self._igor().doing().bits is None:
+            reason = "Igor lacks ARGetStatus, without which the end of a force curve can't be detected"
+            raise Refused(ControlResponse.ACTION_ERROR, reason)
+        self._activity.saves(FORCE)
+        if self._activity.was_led_away:
+            self._place.go()
+            self._activity.curve_awaited = FORCE
+        else:
+            self._take_curve()
+
+    def _take_curve(self) -> None:
+        self._activity.begin_curve()
+        self._begin(FORCE, "DoForceFunc", "Single")
+        self._activity.await_begin(FORCE)
+
+    @action(names.STOP_SPEC)
+    def stop_spec(self) -> None:
+        self._igor().do("DoForceFunc", "Reset")
+        self._activity.stopped()
+
+    @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
+    def retract(self) -> None:
+        """Stop whatever is going on, feedback too, and withdraw the tip."""
+        self._igor().do("DoScanFunc", "StopScan")
+        self._activity.stopped()
+
+    @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
+    def engage(self) -> None:
+        """Bring the tip to the sample, as the button Engage does."""
+        if not self._igor().do("SimpleEngageMe", "SimpleEngageButton"):
+            raise Refused(ControlResponse.ACTION_ERROR, "Asylum refused to engage")
+
+    @action(names.PULSE, state=ScopeState.BUSY_PARAM)
+    def pulse(self) -> None:
+        self.pulse_bias()
+
+    def command(self, text: str) -> None:
+        """A function with its arguments as JSON: `DoScanFunc "DownScan"`, `PV "SaveImage", 2`."""
+        name, _, arguments = text.strip().partition(" ")
+        try:
+            parameters = json.loads(f"[{arguments}]")
+        except ValueError as error:
+            reason = f'{text!r}: arguments as in JSON, PV "SaveImage", 2: {error}'
+            raise Refused(ControlResponse.ACTION_ERROR, reason) from error
+        if not self._igor().do(name, *parameters):
+            raise Refused(ControlResponse.ACTION_ERROR, f"Asylum refused {name} (it returned 1)")
+
+
+def _checked_name(name: str) -> str:
+    """Return a base name that Asylum takes. Raises ConfigError."""
+    fits = not name or (re.fullmatch(_NAME, name) and "mask" not in name.lower())
+    if not fits:
+        hint = 'up to 17 letters, digits and "_", beginning with a letter, without "Mask"'
+        raise ConfigError(f"Asylum does not take {name!r}", where="base_name", hint=hint)
+    return name

@@ -1,0 +1,157 @@
+"""Asylum Research: Igor binary waves (.ibw), and what their notes mean.
+
+What is known of the note (from real files): XOffset and YOffset are the centre of the scan; images are [x, y, channel]
+with both axes ascending whichever way it was scanned, from first to last pixel FastScanSize; `Seconds` is local time
+since 1904, of saving; the units of a wave are those of its first channel alone.
+"""
+
+from __future__ import annotations
+
+import math
+from datetime import datetime, timedelta, tzinfo
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.errors import FileError
+from afspm.basics.plain_data import PlainMapping
+from afspm.model import Region, Scan, Spectrum
+from afspm.storage.formats import igor
+from afspm.storage.formats.content import FileContent, clock_ns
+
+Note = PlainMapping
+
+CONTROLLER = "Asylum"
+_IGOR_EPOCH = datetime(1904, 1, 1)  # noqa: DTZ001  (local time of the controller)
+# Of channels by what their names begin with, without the "Nap" of a second pass.
+_UNITS = {
+    "Height": "m", "ZSensor": "m", "RawZSensor": "m", "Amplitude": "m", "Deflection": "m", "Phase": "deg",
+    "Frequency": "Hz", "Current": "A", "UserIn": "V", "BackPackIn": "V", "Lateral": "V", "Potential": "V",
+}  # fmt: skip
+
+
+def read_igor(path: Path, zone: tzinfo | None) -> FileContent:
+    """An image with its channels, or a force curve. Raises FileError: neither, or broken."""
+    wave = igor.read_wave(path.read_bytes())
+    note = parsed_note(wave.note)
+    first = wave.dimension_units[0]
+    if wave.values.ndim in (2, 3) and first == wave.dimension_units[1] == "m":
+        return _image(wave, note, path, zone)
+    if wave.values.ndim == 2 and first == "s":
+        return _curve(wave, note, path, zone)
+    raise FileError(
+        f"an Igor wave that is neither an image over lengths nor a curve over time (shape {wave.values.shape})"
+    )
+
+
+def parsed_note(text: str) -> dict[str, str]:
+    """The lines `key: value` of a wave's note. Of keys that come twice the first counts."""
+    note: dict[str, str] = {}
+    for line in text.replace("\n", "\r").split("\r"):
+        key, colon, value = line.partition(":")
+        if colon:
+            note.setdefault(key.strip(), value.strip())
+    return note
+
+
+def center_and_angle(note: Note) -> tuple[tuple[float, float], float]:
+    """Of the scan: (x, y) in m, and radians counter-clockwise. Raises FileError if the note does not say where."""
+    center = (number(note, "XOffset"), number(note, "YOffset"))
+    if center[0] is None or center[1] is None:
+        raise FileError("its note lacks the position of the scan (XOffset, YOffset)")
+    return (center[0], center[1]), counter_clockwise(number(note, "ScanAngle") or 0.0)
+
+
+def counter_clockwise(scan_angle_deg: float) -> float:
+    """ScanAngle in radians as everybody else counts them: Asylum turns the fast axis to (cos, -sin) of it, clockwise,
+    about a centre that is not turned (so its software reckons where a scan begins, and where lithography goes)."""
+    return 0.0 - math.radians(scan_angle_deg)
+
+
+def clockwise(angle_rad: float) -> float:
+    """The reverse, in degrees."""
+    return 0.0 - math.degrees(angle_rad)
+
+
+def number(note: Note, key: str) -> float | None:
+    """A finite number of a note; None if there is none."""
+    try:
+        value = float(note[key])
+    except (KeyError, TypeError, ValueError):
+        return None
+    return value if math.isfinite(value) else None
+
+
+def upwards(note: Note) -> bool | None:
+    """Return True if small y was scanned first; None if that is not known."""
+    down = number(note, "ScanDown")
+    return None if down is None else down == 0.0
+
+
+def end_ns(note: Note, zone: tzinfo | None) -> int | None:
+    """When it was saved."""
+    seconds = number(note, "Seconds")
+    return None if seconds is None else clock_ns(_IGOR_EPOCH + timedelta(seconds=seconds), zone)
+
+
+def start_ns(note: Note, rows: int, zone: tzinfo | None) -> int | None:
+    """When its first row was begun: so many lines before it was saved; each twice if there was a second pass."""
+    rate_hz, end = number(note, "ScanRate"), end_ns(note, zone)
+    if end is None or rate_hz is None or rate_hz <= 0.0:
+        return None
+    passes = 2 if number(note, "NapMode") else 1
+    return end - round(passes * rows / rate_hz * NS_PER_S)
+
+
+def unit_of(channel: str) -> str:
+    """Of an image channel's values; empty where its name does not tell."""
+    name = channel.removeprefix("Nap")
+    return next((unit for start, unit in _UNITS.items() if name.startswith(start)), "")
+
+
+def _image(wave: igor.Wave, note: Note, path: Path, zone: tzinfo | None) -> FileContent:
+    layers = wave.values if wave.values.ndim == 3 else wave.values[:, :, None]
+    nx, ny, count = layers.shape
+    center_m, angle_rad = center_and_angle(note)
+    size_m = (wave.steps[0] * (nx - 1), wave.steps[1] * (ny - 1))
+    region = Region(center_m, size_m, angle_rad)
+    labels = wave.labels[2] if any(wave.labels[2]) else [wave.name] * count
+    if len(labels) != count:
+        raise FileError(f"{count} channels with {len(labels)} names")
+    end = end_ns(note, zone)
+    scans = tuple(
+        Scan(
+            region, label, unit_of(label) or (wave.unit if k == 0 else ""), _float64(layers[:, :, k].T), end, str(path)
+        )
+        for k, label in enumerate(labels)
+    )
+    return FileContent(
+        CONTROLLER, scans=scans, header=note, start_ns=start_ns(note, ny, zone), end_ns=end, upwards=upwards(note)
+    )
+
+
+def _curve(wave: igor.Wave, note: Note, path: Path, zone: tzinfo | None) -> FileContent:
+    """Its columns are lengths (raw z, deflection, z sensor), at equal steps of time, which is added as the last."""
+    points, count = wave.values.shape
+    if len(wave.labels[1]) != count:
+        raise FileError(f"{count} columns with {len(wave.labels[1])} names")
+    time_s = np.arange(points) * wave.steps[0]
+    x, y = number(note, "XLVDT"), number(note, "YLVDT")
+    end = end_ns(note, zone)
+    spectrum = Spectrum(
+        None if x is None or y is None else (x, y),
+        "force",
+        (*wave.labels[1], "Time"),
+        (*[wave.unit] * count, "s"),
+        np.column_stack([_float64(wave.values), time_s]),
+        end,
+        str(path),
+    )
+    start = None if end is None else end - round(points * wave.steps[0] * NS_PER_S)
+    return FileContent(CONTROLLER, spectra=(spectrum,), header=note, start_ns=start, end_ns=end)
+
+
+def _float64(values: np.ndarray) -> NDArray[np.float64]:
+    return np.ascontiguousarray(values, dtype=np.float64)

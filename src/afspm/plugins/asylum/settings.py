@@ -1,0 +1,177 @@
+"""The frame, the speed and the place of the tip as Asylum has them, and as everybody else; lengths in m.
+
+Asylum's XOffset and YOffset are the centre of the frame (seen in images that were zoomed into). ScanSize is its longer
+side, and how long the other one is, is told by two ratios; FastScanSize and SlowScanSize are what comes of it. Its
+angles are in degrees, clockwise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from afspm.basics.errors import InvalidValue, Refused
+from afspm.model import ControlResponse, Region, names
+from afspm.plugins.asylum.scan_files import clockwise, counter_clockwise
+from afspm.plugins.asylum.session import Session
+from afspm.translator.parameters import FEEDBACK_ON, Value
+from afspm.translator.setting_groups import FRAME, POSITION, SettingsGroup, frame, frame_values
+
+GLOBALS: Final = (
+    "XOffset", "YOffset", "FastScanSize", "SlowScanSize", "ScanAngle", "ScanPoints", "ScanLines", "ScanRate",
+)  # fmt: skip
+NAMES: Final = frozenset({*FRAME, names.SCAN_SPEED})
+
+_OUR_SPOT: Final = 1.0
+PATH_OF_A_LINE: Final = 2.5
+"""In widths of the frame: there and back, and round the ends (ScanSpeed / (FastScanSize · ScanRate) in all notes)."""
+
+
+def generic(found: Mapping[str, float]) -> dict[str, Value]:
+    """Of Asylum's `GLOBALS`, the generic parameters in SI."""
+    size_m = (found["FastScanSize"], found["SlowScanSize"])
+    region = Region((found["XOffset"], found["YOffset"]), size_m, counter_clockwise(found["ScanAngle"]))
+    shape = (round(found["ScanLines"]), round(found["ScanPoints"]))
+    speed_m_s = PATH_OF_A_LINE * found["FastScanSize"] * found["ScanRate"]
+    return {**frame_values(region, shape), names.SCAN_SPEED: speed_m_s}
+
+
+def asylums(wanted: Mapping[str, Value], before: Mapping[str, Value]) -> dict[str, float]:
+    """Return what to set at Asylum for generic parameters that are wanted, given all of `NAMES` as they were.
+
+    All that depends on each other is set, as PV does none of what the panel does. Asylum scans by its ScanRate, so
+    that is set to keep the speed when the width changes.
+
+    Raises:
+        InvalidValue: they describe no frame.
+    """
+    values = {**before, **wanted}
+    region, (rows, columns) = frame(values)
+    speed_m_s = float(values[names.SCAN_SPEED])
+    fast_m, slow_m = region.size_m
+    if speed_m_s <= 0.0:
+        raise InvalidValue(f"a scan at {speed_m_s} m/s never ends")
+    shorter_m = min(fast_m, slow_m)
+    return {
+        "XOffset": region.center_m[0],
+        "YOffset": region.center_m[1],
+        "ScanSize": max(fast_m, slow_m),
+        "FastRatio": fast_m / shorter_m,
+        "SlowRatio": slow_m / shorter_m,
+        "FastScanSize": fast_m,
+        "SlowScanSize": slow_m,
+        "ScanAngle": clockwise(region.angle_rad),
+        "ScanPoints": float(columns),
+        "ScanLines": float(rows),
+        "ScanRate": speed_m_s / (PATH_OF_A_LINE * fast_m),
+        "ScanSpeed": speed_m_s,
+    }
+
+
+def on_image(xy_m: tuple[float, float], image: Region) -> tuple[float, float]:
+    """A place of the tip as a spot of Asylum's: from the lower left corner of an image, along its axes."""
+    cos, sin = math.cos(image.angle_rad), math.sin(image.angle_rad)
+    dx, dy = xy_m[0] - image.center_m[0], xy_m[1] - image.center_m[1]
+    return cos * dx + sin * dy + image.size_m[0] / 2, cos * dy - sin * dx + image.size_m[1] / 2
+
+
+def from_image(spot_m: tuple[float, float], image: Region) -> tuple[float, float]:
+    """The reverse of `on_image`."""
+    cos, sin = math.cos(image.angle_rad), math.sin(image.angle_rad)
+    dx, dy = spot_m[0] - image.size_m[0] / 2, spot_m[1] - image.size_m[1] / 2
+    return image.center_m[0] + cos * dx - sin * dy, image.center_m[1] + cos * dy + sin * dx
+
+
+class FrameSettings(SettingsGroup):
+    """The frame and the speed.
+
+    Args:
+        igor: gives the session.
+        in_force: gives all of `NAMES` as they were set.
+    """
+
+    names = NAMES
+
+    def __init__(self, igor: Callable[[], Session], in_force: Callable[[], Mapping[str, Value]]) -> None:
+        self._igor = igor
+        self._in_force = in_force
+
+    def read(self) -> dict[str, Value]:
+        return generic(self._igor().values(GLOBALS))
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        wanted = asylums(values, self._in_force())
+        there = self._igor().values(list(wanted))
+        for name, value in wanted.items():
+            if there[name] != value:
+                self._igor().put(name, value)
+
+
+class TipPlace(SettingsGroup):
+    """The spot to which the tip is sent.
+
+    Args:
+        image: gives the frame of the last image, which spots are counted on; None: from the middle of the scanner.
+        on_move: called when the tip was sent away.
+    """
+
+    names = POSITION
+
+    def __init__(
+        self, igor: Callable[[], Session], image: Callable[[], Region] | None, on_move: Callable[[], None]
+    ) -> None:
+        self._igor = igor
+        self._image = image
+        self._on_move = on_move
+
+    def xy_m(self) -> tuple[float, float]:
+        """Return where the tip was sent, (x, y) in m."""
+        spot_m = (self._igor().number("GetProbePosX"), self._igor().number("GetProbePosY"))
+        return spot_m if self._image is None else from_image(spot_m, self._image())
+
+    def read(self) -> dict[str, Value]:
+        return dict(zip(POSITION, self.xy_m(), strict=True))
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        x, y = (float(values.get(name, was)) for name, was in zip(POSITION, self.xy_m(), strict=True))
+        self.put((x, y))
+        self.go()
+
+    def put(self, xy_m: tuple[float, float]) -> None:
+        """Put the spot somewhere. Raises Refused."""
+        x, y = xy_m if self._image is None else on_image(xy_m, self._image())
+        if not (self._igor().do("SetProbePosX", x) and self._igor().do("SetProbePosY", y)):
+            raise Refused(ControlResponse.PARAM_ERROR, "Asylum refused the spot")
+
+    def go(self) -> None:
+        """Send the tip to the spot. Raises Refused."""
+        self._igor().put("ForceSpotNumber", _OUR_SPOT)  # whatever is chosen at the panel
+        if not self._igor().do("DoForceFunc", "Go"):
+            raise Refused(ControlResponse.PARAM_ERROR, "Asylum refused to move the tip")
+        self._on_move()
+
+
+class FeedbackSwitch(SettingsGroup):
+    """The z feedback, on or off; it is switched where it is otherwise, and seen to be, as the tip may have a way to go.
+
+    Args:
+        wait_for: waits until a condition holds, but not for ever.
+    """
+
+    names = (FEEDBACK_ON,)
+
+    def __init__(self, igor: Callable[[], Session], wait_for: Callable[[Callable[[], bool]], bool]) -> None:
+        self._igor = igor
+        self._wait_for = wait_for
+
+    def read(self) -> dict[str, Value]:
+        return {FEEDBACK_ON: self._igor().feedback_on()}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        igor, on = self._igor(), bool(values[FEEDBACK_ON])
+        if igor.feedback_on() is on:
+            return
+        if not igor.do("AfspmFeedback", int(on)):
+            raise Refused(ControlResponse.PARAM_ERROR, "Asylum could not switch the feedback")
+        self._wait_for(lambda: igor.feedback_on() is on)

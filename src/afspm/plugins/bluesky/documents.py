@@ -1,0 +1,188 @@
+"""A run as documents of Bluesky's event model: start, and a descriptor with events for what was measured alike, stop.
+
+Values stay in the files of the record, to which StreamResource and StreamDatum point. Identifiers follow from the run,
+so that the same run always gives the same documents.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from uuid import NAMESPACE_URL, uuid5
+
+from afspm.basics.clock import NS_PER_S
+from afspm.record.journal import measured_file
+from afspm.record.nexus import field_names
+from afspm.record.run import Run
+from afspm.record.tables import ScanRow, SpectrumRow
+
+Document = tuple[str, dict[str, object]]
+"""Name and content."""
+DOCUMENTS_FILE = "documents.jsonl"
+_PLACE = {"center_x": "m", "center_y": "m", "width": "m", "height": "m", "angle": "rad"}
+
+
+def tables(run: Run, scans: Sequence[ScanRow], spectra: Sequence[SpectrumRow]) -> Iterator[tuple[str, bytes]]:
+    """Yield the file of all documents: a line for each, as JSON [name, document]."""
+    lines = (json.dumps(document, ensure_ascii=False) for document in documents(run, scans, spectra))
+    yield DOCUMENTS_FILE, "".join(f"{line}\n" for line in lines).encode()
+
+
+def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
+    """Yield nothing: the files of the record are what the documents point to."""
+    yield from ()
+
+
+def documents(run: Run, scans: Iterable[ScanRow], spectra: Iterable[SpectrumRow]) -> Iterator[Document]:
+    """Yield the documents of a run, in the order in which they came about."""
+    rows: list[ScanRow | SpectrumRow] = sorted([*scans, *spectra], key=lambda row: row.time_ns)
+    began_ns = rows[0].began_ns or rows[0].time_ns if rows else run.newest_ns
+    start = _uid(run, "start")
+    yield "start", _start(run, start, began_ns)
+    streams: dict[tuple[object, ...], _Stream] = {}
+    for row in rows:
+        stream = streams.get(_alike(row))
+        if stream is None:
+            count = sum(type(row) is type(one.first) for one in streams.values())
+            name = ("scans" if isinstance(row, ScanRow) else "spectra") + (f"_{count + 1}" if count else "")
+            stream = streams[_alike(row)] = _Stream(run, start, name, row)
+            yield "descriptor", stream.descriptor()
+        yield from stream.event(row)
+    counts = {stream.name: stream.count for stream in streams.values()}
+    yield "stop", _stop(run, start, counts)
+
+
+def _start(run: Run, uid: str, began_ns: int) -> dict[str, object]:
+    metadata = run.metadata
+    known = {"sample": metadata.get("sample"), "project": metadata.get("project"), "owner": metadata.get("person")}
+    return {
+        "uid": uid,
+        "time": began_ns / NS_PER_S,
+        "plan_name": run.name,
+        "afspm": {"run": run.folder.name, "simulated": run.simulated, **metadata},
+        **{name: value for name, value in known.items() if value},
+    }
+
+
+def _stop(run: Run, start: str, counts: Mapping[str, int]) -> dict[str, object]:
+    ended = run.facts.get("how") == "experiment_ended"
+    return {
+        "uid": _uid(run, "stop"),
+        "time": run.newest_ns / NS_PER_S,
+        "run_start": start,
+        "exit_status": "success" if ended else "abort",
+        "reason": str(run.facts.get("ended") or ""),
+        "num_events": dict(counts),
+    }
+
+
+def _alike(row: ScanRow | SpectrumRow) -> tuple[object, ...]:
+    """Return what measurements of one stream have in common: their arrays are of one shape."""
+    if isinstance(row, ScanRow):
+        return "scan", row.channels, row.shape
+    return "spectrum", row.kind, row.names, row.points
+
+
+@dataclass
+class _Stream:
+    """Measurements of one kind: one descriptor, and an event for each."""
+
+    run: Run
+    start: str
+    name: str
+    first: ScanRow | SpectrumRow
+    count: int = field(default=0)
+
+    @property
+    def uid(self) -> str:
+        return _uid(self.run, self.name)
+
+    def _arrays(self) -> Iterator[tuple[str, str, str, list[int]]]:
+        """Yield the field in the file, the name, unit and shape of each array."""
+        row = self.first
+        if isinstance(row, ScanRow):
+            names = [name for name, _ in row.channels]
+            for one, (name, unit) in zip(field_names(names, ("x", "y")), row.channels, strict=True):
+                yield one, name, unit, list(row.shape or ())
+        else:
+            for one, name, unit in zip(field_names(row.names), row.names, row.units, strict=True):
+                yield one, name, unit, [row.points]
+
+    def descriptor(self) -> dict[str, object]:
+        source = f"afspm:{self.run.folder.name}"
+        keys: dict[str, object] = {
+            one: {
+                "source": f"{source}/{name}", "dtype": "array", "dtype_numpy": "<f8", "shape": shape, "units": unit,
+                "external": "STREAM:",
+            }
+            for one, name, unit, shape in self._arrays()
+        }  # fmt: skip
+        keys |= {one: {"source": source, "dtype": "number", "shape": [], "units": unit} for one, unit in self._units()}
+        keys["key"] = {"source": source, "dtype": "string", "shape": []}
+        return {
+            "uid": self.uid,
+            "time": (self.first.began_ns or self.first.time_ns) / NS_PER_S,
+            "run_start": self.start,
+            "name": self.name,
+            "data_keys": keys,
+            "object_keys": {"microscope": list(keys)},
+            "configuration": {},
+            "hints": {"microscope": {"fields": [one for one, *_ in self._arrays()][:1]}},
+        }
+
+    def _units(self) -> Iterator[tuple[str, str]]:
+        yield from _PLACE.items() if isinstance(self.first, ScanRow) else (("x", "m"), ("y", "m"))
+
+    def event(self, row: ScanRow | SpectrumRow) -> Iterator[Document]:
+        number, self.count = self.count, self.count + 1
+        file = measured_file(self.run.folder, row.file)
+        for one, *_ in self._arrays():
+            resource = _uid(self.run, self.name, str(number), one)
+            yield (
+                "stream_resource",
+                {
+                    "uid": resource,
+                    "data_key": one,
+                    "mimetype": "application/x-hdf5",
+                    "uri": file.resolve().as_uri().replace("file:///", "file://localhost/"),
+                    "parameters": {"dataset": f"/entry/data/{one}", "chunk_shape": []},
+                    "run_start": self.start,
+                },
+            )
+            yield (
+                "stream_datum",
+                {
+                    "uid": f"{resource}/0",
+                    "stream_resource": resource,
+                    "descriptor": self.uid,
+                    "indices": {"start": number, "stop": number + 1},
+                    "seq_nums": {"start": number + 1, "stop": number + 2},
+                },
+            )
+        data = {**_place(row), "key": row.key}
+        time_s = row.time_ns / NS_PER_S
+        yield (
+            "event",
+            {
+                "uid": _uid(self.run, self.name, str(number)),
+                "time": time_s,
+                "seq_num": number + 1,
+                "descriptor": self.uid,
+                "data": data,
+                "timestamps": dict.fromkeys(data, time_s),
+                "filled": {},
+            },
+        )
+
+
+def _place(row: ScanRow | SpectrumRow) -> dict[str, float | None]:
+    if isinstance(row, SpectrumRow):
+        return dict(zip("xy", row.position_m or (None, None), strict=True))
+    if row.region is None:
+        return dict.fromkeys(_PLACE)
+    return dict(zip(_PLACE, (*row.region.center_m, *row.region.size_m, row.region.angle_rad), strict=True))
+
+
+def _uid(run: Run, *of: str) -> str:
+    return str(uuid5(NAMESPACE_URL, "/".join(("afspm", str(run.facts.get("run")), run.folder.name, *of))))

@@ -1,0 +1,104 @@
+"""`afspm drift`: what drift did in scans that were taken long ago, and which settings follow it best."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from afspm.cli.arguments import AFTERWARDS
+
+_FILES = "files"
+
+
+class FilesUnlessNamed(TyperGroup):
+    """`afspm drift a.sxm b.sxm` means `afspm drift files a.sxm b.sxm`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
+            args = [_FILES, *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(
+    cls=FilesUnlessNamed,
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    rich_help_panel=AFTERWARDS,
+    help="Follow drift in recorded scans (afspm drift FILE…; its options: afspm drift files --help), or study settings "
+    "in simulated nights (afspm drift study).",
+)
+Jobs = Annotated[
+    int | None,
+    typer.Option(
+        "--jobs",
+        "-j",
+        min=1,
+        help="Processes. Default: the cores, or for a few small scans this one alone.",
+        show_default=False,
+    ),
+]
+
+
+@app.command(_FILES)
+def files(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(metavar="FILE…", help="Scans, folders of them, or folders of runs.", show_default=False),
+    ],
+    channel: Annotated[
+        str, typer.Option(help="The channel to follow. Default: the topography.", show_default=False)
+    ] = "",
+    estimator: Annotated[str, typer.Option(help="How two scans are registered.")] = "least-squares",
+    tracker: Annotated[str, typer.Option(help="How drift is followed from scan to scan.")] = "bank",
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where to write.")] = Path("drift"),
+    jobs: Jobs = None,
+) -> None:
+    """Follow drift in recorded scans.
+
+    Prints a table, and writes it (drift.csv), figures, and the scans laid on top of each other over their common area
+    (drift_stack.nc). Files that can't be read are named, and the rest goes on. An estimator or tracker of your own,
+    module.Class, is looked for in this folder, too.
+    """
+    _one_thread_a_process()
+    from afspm.experiment.class_loader import importing_from
+    from afspm.plugins.drift import file_commands as drift_files
+
+    with importing_from([Path.cwd()]):
+        drift_files.run(paths, channel, estimator, tracker, output, jobs)
+
+
+@app.command("study")
+def study(
+    settings: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="NAME=VALUE,…",
+            help="Values to try: tracker=bank,paper paper.queue=3,5,10; or a TOML file of such names.",
+            show_default=False,
+        ),
+    ] = None,
+    nights: Annotated[int, typer.Option("--nights", "-n", min=1, help="Nights for each combination of settings.")] = 10,
+    seed: Annotated[int, typer.Option(help="Of the first night; every combination gets the same nights.")] = 1,
+    cluster: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="The scheduler of a Dask cluster to work on.", show_default=False)
+    ] = "",
+    jobs: Jobs = None,
+) -> None:
+    """Simulate many nights over a grid of settings, and say which are best and whether the defaults hold."""
+    _one_thread_a_process()
+    from afspm.experiment.class_loader import importing_from
+    from afspm.plugins.drift import study_commands as drift_study
+
+    with importing_from([Path.cwd()]):
+        drift_study.run(settings or [], nights, seed, cluster, jobs)
+
+
+def _one_thread_a_process() -> None:
+    """Registration works on small arrays, and there is a process for each core: threads of the linear algebra would
+    only wait for each other. Must come before numpy is loaded; processes started from here inherit it."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")

@@ -1,0 +1,230 @@
+"""`DriftPictures`: what drift did in the night, and how well it was followed, as figures."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, overload
+
+import numpy as np
+
+from afspm.basics.errors import AfspmError, FileError
+from afspm.basics.formatting import counted
+from afspm.plugins.drift.drift_table import DriftTable
+
+if TYPE_CHECKING:
+    from afspm.plugins.drift.figures.album import RunPart
+    from afspm.plugins.drift.record import DriftRecord
+    from afspm.plugins.drift.registration import DriftScan, Registration
+
+_ALBUM = "afspm.plugins.drift.figures.album"
+
+
+@dataclass(frozen=True)
+class TabledScan:
+    """A scan of the table: its file, and whether components had sample coordinates at its time."""
+
+    file: str
+    correcting: bool
+
+
+def parts(told: Sequence[TabledScan]) -> list[tuple[str, int, int]]:
+    """Name, start and stop of the scans without and with correction. The one that was taken while correction was
+    switched on, and may have been asked for before, is in neither."""
+    first_on = next((k for k, one in enumerate(told) if one.correcting), len(told))
+    found = [("off", 0, first_on), ("on", first_on + 1 if first_on else 0, len(told))]
+    return [part for part in found if part[2] > part[1]]
+
+
+class _AsSaved(Sequence["DriftScan"]):
+    # scans are read at each access: a night's worth may not fit into memory
+
+    def __init__(self, told: Sequence[TabledScan], read: Callable[[TabledScan], DriftScan]) -> None:
+        self._told, self._read = told, read
+
+    def __len__(self) -> int:
+        return len(self._told)
+
+    @overload
+    def __getitem__(self, which: int) -> DriftScan: ...
+
+    @overload
+    def __getitem__(self, which: slice) -> Sequence[DriftScan]: ...
+
+    def __getitem__(self, which: int | slice) -> DriftScan | Sequence[DriftScan]:
+        if isinstance(which, slice):
+            return _AsSaved(self._told[which], self._read)
+        return self._read(self._told[which])
+
+
+class DriftPictures(DriftTable):
+    """Writes the table of `DriftTable`, and when the experiment ends draws the figures of drift in the run folder.
+
+    While the experiment goes on, it compares each scan with the first by itself, once for the scans before correction
+    was switched on and once for those after: what is left of drift then, estimated apart from what the scheduler
+    follows. Where the microscope is simulated, the true errors are drawn too. It reads the files that the microscope
+    saves.
+
+    Args:
+        channel: of the scans that are compared.
+        estimator: that compares them.
+        features: an estimator of matched features, for the figure of those; by default "brief" where `afspm[features]`
+            is installed.
+        title: above the figure of the offset.
+        file: the table's name in the run folder.
+    """
+
+    longest_step_s: ClassVar[float] = 60.0
+    period_s = 2.0
+    period_time: Literal["experiment", "real"] = "real"
+
+    def __init__(
+        self,
+        channel: str = "Height",
+        estimator: str = "least-squares",
+        features: str | None = None,
+        title: str = "",
+        file: str = "drift_correction.csv",
+    ) -> None:
+        super().__init__(file)
+        if features is not None:
+            from afspm.plugins.drift import estimators
+
+            estimators.estimator(features)  # refused now, and not at the end of the night
+        self.channel, self.estimator, self.features, self.title = channel, estimator, features, title
+        self._pairs: dict[tuple[str, str], Registration] = {}
+        self._drawing_is_loaded = self._has_told = False
+
+    def on_start(self) -> None:
+        super().on_start()
+        told = self._told()
+        self._heard = {one.file: one for one in told}  # not only in the table, which may have to wait for room
+        self._again = deque((told[start], one) for _, start, stop in parts(told) for one in told[start + 1 : stop])
+
+    def on_tick(self) -> None:
+        if not self._drawing_is_loaded:
+            importlib.import_module(_ALBUM)  # now, when there is time: at the end all must be quick
+        self._drawing_is_loaded = True
+        if self._again:
+            self._compared(*self._again.popleft())  # before a restart it was, and at the end there is no time for it
+
+    def on_drift_mapping(self, message: Any) -> None:
+        super().on_drift_mapping(message)
+        self._heard.setdefault(message.filename, TabledScan(message.filename, message.correcting))
+        told, newest = list(self._heard.values()), list(self._heard).index(message.filename)
+        for _, start, stop in parts(told):
+            if start < newest < stop:
+                self._compared(told[start], told[newest])
+
+    def on_end(self) -> None:
+        told = self._told()
+        if len(told) < 2:
+            self.log.info("drift of %s, no pictures", counted(len(told), "scan"))
+        else:
+            self._draw(told)
+
+    def _draw(self, told: list[TabledScan]) -> None:
+        from afspm.plugins.drift.figures import album
+        from afspm.plugins.drift.record import DriftRecord
+        from afspm.plugins.drift.simulated_truth import true_drift
+
+        folder = Path(self.run_dir)
+        readable = {number: scan for number, one in enumerate(told) if (scan := self._frame_of(one)) is not None}
+        if len(readable) < 2:
+            self.log.error("no pictures: only %d of %d scans can be read", len(readable), len(told))
+            return
+        record = DriftRecord.read(folder / self.file).chosen(list(readable))
+        told, frames = [told[number] for number in readable], list(readable.values())
+        scans = _AsSaved(told, self._scan)
+        run = album.DriftRun(
+            scans=scans,
+            record=record,
+            parts=self._parts(told, record, frames),
+            matched=self._matched(told, scans),
+            truth_m=true_drift(folder, frames) if self.simulated else None,
+        )
+        title = f"{self.title} (simulated)".strip() if self.simulated else self.title
+        for path in album.write(run, folder, title=title):
+            self.log.info("drawn: %s", path)
+
+    def _parts(self, told: list[TabledScan], record: DriftRecord, frames: list[DriftScan]) -> list[RunPart]:
+        """With what was estimated off-line."""
+        from afspm.plugins.drift.figures.album import RunPart
+        from afspm.plugins.drift.offline import against_first
+
+        made = []
+        for name, start, stop in parts(told):
+            pairs = [self._compared(told[start], one) for one in told[start + 1 : stop]]
+            estimates = against_first(record[start:stop], frames[start:stop], pairs)
+            made.append(RunPart(name, f"correction {name}", start, stop, estimates))
+        return made
+
+    def _matched(self, told: list[TabledScan], scans: Sequence[DriftScan]) -> tuple[int, int, Registration] | None:
+        """The first scan and the last without correction that has features in common with it: drift is seen best."""
+        from afspm.plugins.drift.estimators import estimator
+
+        try:
+            by = estimator(self.features or "brief")
+        except AfspmError as error:
+            self.log.info("no picture of features: %s", error)
+            return None
+        without = [k for k, one in enumerate(told) if not one.correcting] or list(range(len(told)))
+        for second in reversed(without[1:]):
+            found = by.register(scans[without[0]], scans[second])
+            if found.accepted:
+                return without[0], second, found
+        return None
+
+    def _compared(self, first: TabledScan, other: TabledScan) -> Registration:
+        """Of two scans, which are compared only once."""
+        from afspm.plugins.drift.estimators import estimator
+        from afspm.plugins.drift.registration import Registration
+
+        pair = (first.file, other.file)
+        if pair not in self._pairs:
+            try:
+                comparing = estimator(self.estimator, lambda failure: self.log.error("%s", failure))
+                self._pairs[pair] = comparing.register(self._scan(first), self._scan(other))
+            except FileError as error:
+                self._tell(error)
+                self._pairs[pair] = Registration.refused(str(error))
+        return self._pairs[pair]
+
+    def _frame_of(self, told: TabledScan) -> DriftScan | None:
+        """Where and when it was taken, without the values, of a night's worth of which there may be too many to be
+        kept; None: it can't be had."""
+        try:
+            scan = self._scan(told)
+            return replace(scan, values=np.broadcast_to(np.nan, scan.values.shape))
+        except (AfspmError, OSError) as error:
+            self._tell(error)
+            return None
+
+    def _tell(self, error: Exception) -> None:
+        """Once in a night: of a channel that is not there each scan would say the same."""
+        if not self._has_told:
+            self.log.error("a scan is left out of the pictures: %s", error)
+        self._has_told = True
+
+    def _scan(self, told: TabledScan) -> DriftScan:
+        """As the microscope saved it, in tip coordinates."""
+        from afspm.plugins.drift.study.scan_series import drift_scan
+        from afspm.storage.formats import read
+
+        content = read(told.file)
+        for scan in content.scans:
+            if scan.channel == self.channel:
+                return drift_scan(scan, content)
+        raise FileError(f"has no channel {self.channel!r}", where=told.file)
+
+    def _told(self) -> list[TabledScan]:
+        """Return the scans of the table."""
+        path = Path(self.run_dir) / self.file
+        if not path.exists():
+            return []
+        with path.open(newline="", encoding="utf-8") as file:
+            return [TabledScan(row["filename"], row["correcting"] == "yes") for row in csv.DictReader(file)]

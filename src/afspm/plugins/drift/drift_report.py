@@ -1,0 +1,46 @@
+"""Drift against time, for the report of a run without a component that draws it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm import wire
+from afspm.model.drift_mapping import drift_at, drift_knowledge
+from afspm.plugins.drift.record import DriftRecord
+from afspm.record.report.pictures import OFFSET, OWN_OFFSET, is_ours
+from afspm.record.run import Run
+
+
+def draw(run: Run, title: str) -> None:
+    """Draw the figure into the folder of a run with two scans in sample coordinates or more."""
+    if not is_ours(run.folder, OWN_OFFSET, OFFSET) or len(record := drift_of(run)) < 2:
+        return
+    from afspm.plugins.drift.figures import style
+    from afspm.plugins.drift.figures.drawings import draw_offsets
+
+    style.save(draw_offsets(record, title=title), run.folder / OWN_OFFSET)
+
+
+def drift_of(run: Run) -> DriftRecord:
+    """Return the drift that the scheduler published."""
+    published = [wire.decode("DriftMapping", packet.payload) for packet in run.packets(messages=("DriftMapping",))]
+    published = [message for message in published if len(message.matrix) == 6 and len(message.center) == 2]
+
+    def square(values: Any) -> NDArray[np.float64]:
+        return np.array(values if len(values) == 4 else [np.nan] * 4, dtype=np.float64).reshape(2, 2)
+
+    return DriftRecord(
+        keys=tuple(message.filename for message in published),
+        time_s=np.array([message.timestamp.ToNanoseconds() * 1e-9 for message in published]),
+        center_m=np.array([tuple(message.center) for message in published]).reshape(-1, 2),
+        drift_m=np.array([drift_at(np.array(m.matrix).reshape(2, 3), m.center) for m in published]).reshape(-1, 2),
+        covariance_m2=np.array([square(message.covariance) for message in published]).reshape(-1, 2, 2),
+        rate_m_s=np.array([tuple(m.rate) if len(m.rate) == 2 else (0.0, 0.0) for m in published]).reshape(-1, 2),
+        matched=np.array([message.matched for message in published], dtype=bool),
+        reasons=tuple(message.reason for message in published),
+        outcomes=tuple(drift_knowledge(message)[0] for message in published),
+        failures=tuple(message.failures for message in published),
+    )

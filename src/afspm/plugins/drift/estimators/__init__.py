@@ -1,0 +1,58 @@
+"""Estimators by name, and users' own.
+
+estimator("least-squares")
+estimator({"class": "sift", "transform": "affine"})
+estimator({"class": "my_lab.Periodicity", "lattice_m": 2.5e-10})
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from afspm.basics.errors import ConfigError
+from afspm.basics.plain_data import PlainMapping
+from afspm.plugins.drift.estimators.guarded import Guarded, PairFailure, Report, log_failure
+from afspm.plugins.drift.naming import named
+from afspm.plugins.drift.registration import Estimator
+
+__all__ = ["DEFAULT", "Guarded", "PairFailure", "estimator", "unguarded"]
+
+DEFAULT = "least-squares"
+
+
+def estimator(spec: str | PlainMapping | Estimator = DEFAULT, report: Report = log_failure) -> Estimator:
+    """Return an estimator by name, guarded: its errors are reported, and bridged by a coarse estimate.
+
+    Args:
+        spec: a name that a package declares or "module.Name"; a table with that as its `class` and the settings of it
+            (only `class` names code); or an estimator.
+        report: called with each error over a pair; by default it is logged.
+
+    Raises:
+        ConfigError: no such name, class or setting, a setting without a meaning, or a library that is missing.
+    """
+    if isinstance(spec, Guarded):
+        return spec
+    return Guarded(*_made(spec), report)
+
+
+def unguarded(spec: str | PlainMapping | Estimator = DEFAULT) -> Estimator:
+    """Return an estimator by name without a guard, for tests and benchmarks, where an error has to show.
+
+    Raises:
+        ConfigError: as `estimator`.
+    """
+    return _made(spec)[0]
+
+
+def _made(spec: str | PlainMapping | Estimator) -> tuple[Estimator, str]:
+    made: object = spec
+    name = type(spec).__name__
+    if isinstance(spec, str | Mapping):
+        made, name = named("estimator", spec, DEFAULT)
+    if not callable(getattr(made, "register", None)):
+        raise ConfigError(
+            f"{name} is not an estimator",
+            hint="give it a method register(reference, scan, prior), see afspm.plugins.drift.registration",
+        )
+    return made, name  # type: ignore[return-value]

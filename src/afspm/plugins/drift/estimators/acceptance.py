@@ -1,0 +1,143 @@
+"""Acceptance of a match: an estimate is always found, also where the scans show different places.
+
+A logistic regression puts the evidence together to the probability that the match is wrong by more than a pixel. It is
+fitted by `python -m benchmarks.drift.fit`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.plugins.drift.estimators.coefficients import INTERCEPT, RIGHT, WEIGHTS
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+PARTS = 8  # of the overlap in each direction, at most
+PART_PX = 4  # smaller ones hold too little to correlate
+APART_PX = 4  # nearer than this a repetition is the match itself
+FEW = 10  # with fewer repetitions a surface doesn't repeat itself
+MOST_REPEATS = 30.0  # standard deviations: a place of its own
+WRONG_AT_MOST = 0.05
+"""The largest probability of being wrong with which a match is accepted. A choice, not fitted: wrong matches among the
+accepted are too few to count in a fit. Of the families, where a third of the pairs share nothing, 0.6 % of the accepted
+are wrong at this value, nearly all of them stampers without a prior."""
+
+
+@dataclass(frozen=True)
+class MatchEvidence:
+    """Figures of merit of a match.
+
+    Attributes:
+        overlap: part of the smaller scan.
+        sd_px: largest standard deviation of the shift.
+        gap: how much likelier, in nats, than any other shift.
+        rival: likelihood of another shift over the match's, in nats, both compared with no match. Where features of one
+            kind are far apart, one may fit another as well as itself, and only shows less.
+        agreement: share of the parts of the overlap with features that correlate.
+        above_repeats: standard deviations by which the match exceeds the sites about it that look the same. A prior
+            singles out one site, whether or not it is the right one. A wrong one is one of many, and as far from their
+            mean as chance has it; the right one alone has its defects in their places.
+        surprise: chi² of the shift, given the prior.
+        searched: share of the scan's area in which the prior lets the match be; 1 without one. The fewer places there
+            are, the fewer can fit by chance.
+    """
+
+    overlap: float
+    sd_px: float
+    gap: float
+    rival: float
+    agreement: float
+    above_repeats: float
+    surprise: float
+    searched: float
+
+    def features(self) -> dict[str, float]:
+        """Return the same on scales on which they add up, limited to the range of real matches."""
+        return {
+            "overlap": math.log(max(self.overlap, 0.05)),
+            "sd_px": math.log(min(max(self.sd_px, 1e-3), 10.0)),
+            "gap": math.log1p(max(self.gap, 0.0)),
+            "rival": -math.log(min(max(1.0 - self.rival, 0.01), 2.0)),
+            "agreement": self.agreement,
+            "above_repeats": math.log(min(max(self.above_repeats, 1.0), MOST_REPEATS)),
+            "surprise": math.log1p(min(max(self.surprise, 0.0), 100.0)),
+            "searched": math.log(min(max(self.searched, 1e-4), 1.0)),
+        }
+
+    def objections(self) -> dict[str, float]:
+        """Return the contribution of each figure to the log odds that the match is wrong, compared with a typical
+        match."""
+        return {name: WEIGHTS[name] * (value - RIGHT[name]) for name, value in self.features().items()}
+
+    @property
+    def wrong(self) -> float:
+        """Probability that the shift is wrong by more than a pixel."""
+        odds = INTERCEPT + sum(self.objections().values())
+        return 1.0 / (1.0 + math.exp(min(-odds, 700.0)))
+
+    def refusal(self, wrong_at_most: float) -> str:
+        """Return why a match is refused, in words; empty if it is accepted."""
+        if self.wrong <= wrong_at_most:
+            return ""
+        objections = self.objections()
+        why = _REASONS[max(objections, key=lambda name: objections[name])].format(**asdict(self))
+        return f"{why}; wrong with a probability of {self.wrong:.0%}, {wrong_at_most:.0%} is the most"
+
+
+_REASONS = {
+    "overlap": "the scans overlap by {overlap:.0%} only",
+    "sd_px": "too uncertain: {sd_px:.2f} px",
+    "gap": "ambiguous: another displacement is almost as likely ({gap:.1f} nats less)",
+    "rival": "ambiguous: another displacement explains {rival:.0%} as much",
+    "agreement": "no common features: {agreement:.0%} of the parts with features agree",
+    "above_repeats": "the surface repeats itself: a site like the others ({above_repeats:.1f} standard deviations)",
+    "surprise": "far from what was expected (chi² {surprise:.0f})",
+    "searched": "one of many places at which a match could be",
+}
+
+
+def agreement(one: Array, two: Array, known: Mask) -> float:
+    """Return the share of parts with features in which two aligned images correlate by more than 0.5.
+
+    The overlap is divided into up to 8 x 8 parts. A part has features if its power is twice what a typical part has
+    left.
+    """
+    n = np.maximum(_sums(known.astype(np.float64)), 1.0)
+    a, b = _sums(one * known) / n, _sums(two * known) / n
+    aa, bb, ab = (
+        _sums(u * v * known) / n - p * q for u, v, p, q in ((one, one, a, a), (two, two, b, b), (one, two, a, b))
+    )
+    features = np.maximum(aa, bb) > 2.0 * np.median(aa + bb - 2.0 * ab)
+    size = np.sqrt(np.maximum(aa, 0.0) * np.maximum(bb, 0.0))
+    return float(np.mean(ab[features] > 0.5 * size[features])) if features.any() else 0.0
+
+
+def _sums(values: Array) -> Array:
+    for axis in (0, 1):
+        parts = min(max(values.shape[axis] // PART_PX, 2), PARTS)
+        values = np.add.reduceat(values, np.arange(parts) * values.shape[axis] // parts, axis=axis)
+    return values
+
+
+def above_repeats(found: Array, overlap: Array, origin: Array) -> float:
+    """Return how far a match stands out of the sites at which the surface repeats itself, in standard deviations.
+
+    `found` holds the correlation of two aligned images, [y, x] with no shift at `origin`.
+
+    These are the peaks at least half as high, where at least half as much overlaps. Coefficients are compared as
+    Fisher does, by atanh. Infinite if there are next to no such peaks.
+    """
+    from scipy.ndimage import maximum_filter
+
+    cy, cx = origin
+    y, x = np.ogrid[: found.shape[0], : found.shape[1]]
+    peak = (found == maximum_filter(found, 3)) & (found > found[cy, cx] / 2) & (overlap >= overlap[cy, cx] / 2)
+    repeats = np.arctanh(found[peak & (np.hypot(y - cy, x - cx) >= APART_PX)])
+    if repeats.size < FEW:
+        return math.inf
+    return float((np.arctanh(found[cy, cx]) - repeats.mean()) / max(float(repeats.std()), 1e-12))

@@ -1,0 +1,264 @@
+"""Alignment of two images by Gauss-Newton steps, and its covariance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.plugins.drift.estimators.coefficients import SPREAD
+from afspm.plugins.drift.estimators.images import Unusable, flatten_rows
+from afspm.plugins.drift.estimators.noise import (
+    LEAST_NOISE,
+    CrossingLines,
+    FineFilter,
+    denoised,
+    noise_metric,
+    products,
+    seen,
+    without_lines,
+)
+from afspm.plugins.drift.estimators.warp import BEND, COUNT, GAIN, LINEAR, SLOPES, WarpedPair, derivative
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Both = tuple[Array, Array]
+
+SHIFT: Index = np.array([0, 1, GAIN], dtype=np.intp)  # of theta: the shift and the gain
+COARSE: Index = np.array([*range(LINEAR.stop), GAIN, BEND], dtype=np.intp)
+ALL: Index = np.arange(COUNT, dtype=np.intp)
+ROUNDS = 4
+SETTLED_PX = 1e-3
+DIGITS = 1e-6  # of products of columns of 32 bits
+LEAST_CURVATURE = 0.4
+"""The least curvature H'QJ, as a share of H'QH, in any direction. On the worst pairs (one bar in view) it is a fifth to
+two fifths: most of H'QH is noise there, and a fit that took it for the surface was up to five times too certain of
+stretch. With 0.2 hard pairs get worse, since the share itself is then hardly known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Believed:
+    """The prior of theta: its mean and inverse covariance, (n,) and (n, n)."""
+
+    mean: Array
+    precision: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The end of the iteration and the equations there, per block of rows and over the variance of the noise.
+
+    Attributes:
+        theta: (COUNT,), see `WarpedPair`.
+        curvature: (n, 8, 8), H'QJ with J the gradient without noise and H what of it is known.
+        spread: (n, 8, 8), H'QH, the covariance of `slope`.
+        slope: (n, 8), H'Qr.
+    """
+
+    theta: Array
+    curvature: Array
+    spread: Array
+    slope: Array
+
+    def information(self, believed: Believed) -> tuple[Array, Array]:
+        """Return the information M' S^-1 M of the slope on theta, and its product with the theta of the images alone.
+
+        M is the curvature and S the covariance of the slope (Godambe, Ann. Math. Stat. 31, 1208, 1960). M alone would
+        count the noise in H as a surface where M is less than S.
+        """
+        curvature = self.curvature.sum(axis=0)
+        # S alone is singular in small overlaps; a hundredth of the prior matters only where the images know less
+        spread = _symmetric(self.spread.sum(axis=0)) + 0.01 * believed.precision
+        back = np.linalg.solve(spread, curvature)
+        found = _symmetric(curvature.T @ back)
+        return found, found @ self.theta + back.T @ believed.precision @ (self.theta - believed.mean)
+
+
+def least_squares(pair: WarpedPair, theta: Array, believed: Believed, free: Index, steps: int) -> Array:
+    """Return theta after some steps with plain weights, for the coarse stages."""
+    theta = theta.copy()
+    for _ in range(steps):
+        one, two, known = pair.warped(theta)
+        mean = (one + two) / 2
+        columns = pair.columns(derivative(mean, 1), derivative(mean, 0), mean, two - one, free)
+        columns_q = seen(columns, known.astype(np.float64), None)
+        normal = np.tensordot(columns_q, columns, ((0, 2), (0, 2))).astype(np.float64)
+        normal *= max(known.sum(), 1) / max(normal[-1, -1], LEAST_NOISE * known.sum(), LEAST_NOISE)
+        theta, moved = _stepped(theta, normal[:-1, :-1], normal[:-1, -1], believed, free)
+        if moved < 0.01:
+            break
+    return theta
+
+
+def generalised_least_squares(pair: WarpedPair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
+    """Iterate theta by generalised least squares, in which scars count less.
+
+    Each round estimates gradient, noise and weights again, from the residual of the round before.
+    """
+    for _ in range(ROUNDS):
+        fit = _round(pair, theta, believed, seen_through)
+        moved = np.hypot(*(fit.theta - theta)[:2])
+        theta = fit.theta
+        if moved < SETTLED_PX:
+            break
+    return fit
+
+
+def _round(pair: WarpedPair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
+    # A Newton step to H'Q r + P (theta - mean) = 0 with H, the gradient J without most of its noise (see `denoised`).
+    # Noise moves with theta as the surface does, and so does the noise left in H; both cancel. The slope therefore
+    # changes by H'QJ with a J without noise, and the product of both noises is subtracted.
+    one, two, known = pair.warped(theta)
+    if not known.any():  # in a small overlap with next to no features a step may lead out of it
+        raise Unusable("without a displacement that fits")
+    mean, residual = (one + two) / 2, two - one
+    left = without_lines(residual, known, pair.crossing)
+    gradient = derivative(mean, 1), derivative(mean, 0)
+    signal, noise_through, noise = _signal(gradient, left / 2, known, pair.crossing)
+    weight = known * _row_weights(left, known)[:, None]
+    metric = noise_metric(left, known, seen_through)
+    columns = pair.columns(*signal, mean, residual)
+    columns_q = seen(columns, weight, metric, pair.crossing)
+    left_over = float(np.vdot(columns_q[:, -1], residual))
+    scale = max(weight.sum(), 1.0) / max(left_over, LEAST_NOISE * weight.sum(), LEAST_NOISE)
+    columns_q, columns = scale * columns_q[:, :-1], columns[:, :-1]
+    spread = products(columns_q, columns)
+    curvature = products(columns_q, pair.columns(*gradient, mean, residual)[:, :-1])
+    through_q = seen(pair.slopes(*noise_through), weight, metric, pair.crossing)
+    curvature[:, :SLOPES, :SLOPES] -= scale * products(through_q, pair.slopes(*noise))
+    curvature = _no_less(curvature, spread, believed.precision)
+    slope = products(columns_q, residual[:, None].astype(columns_q.dtype))[:, :, 0]
+    after, _ = _stepped(theta, curvature.sum(axis=0), slope.sum(axis=0), believed, ALL)
+    return Fit(after, curvature, spread, slope + curvature @ (after - theta))
+
+
+def _signal(
+    gradient: Both, noise: Array, known: NDArray[np.bool_], crossing: CrossingLines | None
+) -> tuple[Both, Both, Both]:
+    # Rows are flattened first: the step from one row to the next holds the offsets of both, and a patch can't
+    # distinguish them from a feature.
+    nx, ny = (without_lines(derivative(noise, axis), known, crossing) for axis in (1, 0))
+    flat = [
+        flatten_rows(each, known) if crossing is None else without_lines(each, known, crossing) for each in gradient
+    ]
+    x, through_x = denoised(flat[0], nx)
+    y, through_y = denoised(flat[1], ny)
+    return (x, y), (through_x, through_y), (nx, ny)
+
+
+def _no_less(curvature: Array, spread: Array, precision: Array) -> Array:
+    # H'QJ, but in no direction less than `LEAST_CURVATURE` of H'QH: where a direction is hardly visible, the difference
+    # that the curvature is may be noise alone. The precision of the prior is on both sides: in an overlap of some 10 px
+    # the nuisances act through one gradient and are nearly dependent, and products of columns of 32 bits are not
+    # definite any more. Scaled to a diagonal of 1, values below their digits count as nothing.
+    total, whole = (_symmetric(each.sum(axis=0)) for each in (curvature, spread))
+    if not (np.isfinite(total).all() and np.isfinite(whole).all()):
+        return curvature
+    least = whole + precision
+    size = 1.0 / np.sqrt(np.diag(least))
+    powers, axes = np.linalg.eigh(size[:, None] * least * size)
+    white = size[:, None] * axes / np.sqrt(np.maximum(powers, DIGITS))
+    values, turned = np.linalg.eigh(white.T @ (total + precision) @ white)
+    vectors = white @ turned
+    missing = np.maximum(LEAST_CURVATURE - values, 0.0)
+    raised: Array = curvature + (spread + precision / len(spread)) @ (vectors * missing) @ vectors.T @ least
+    return raised
+
+
+def _symmetric(matrix: Array) -> Array:
+    both: Array = (matrix + matrix.T) / 2
+    return both
+
+
+def _stepped(theta: Array, curvature: Array, slope: Array, believed: Believed, free: Index) -> tuple[Array, float]:
+    precision = believed.precision[np.ix_(free, free)]
+    pull = (believed.precision @ (theta - believed.mean))[free]
+    step = -np.linalg.solve(curvature + precision + 1e-9 * np.eye(free.size), slope + pull)
+    theta = theta.copy()
+    theta[free] += step
+    return theta, float(np.hypot(*step[:2]))
+
+
+def _row_weights(residual: Array, known: NDArray[np.bool_]) -> Array:
+    # 1 / (1 + 4 (e - 1.3)²), e the rms of a row over the median of rows: scars weigh little
+    count = known.sum(axis=1)
+    rms = np.sqrt((residual**2 * known).sum(axis=1) / np.maximum(count, 1))
+    typical = float(np.median(rms[count > 0])) if count.any() else 1.0
+    weight: Array = 1.0 / (1.0 + 4.0 * np.maximum(rms / max(typical, 1e-12) - 1.3, 0.0) ** 2)
+    return weight
+
+
+FLOOR_PX = 1e-3
+CLEAR_PX = 0.02  # a shift known better than this is as certain as its model says
+EVEN = 0.2  # a share of the information that one block of rows may well hold
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """The signs that a shift is less certain than the model of its noise says.
+
+    Attributes:
+        varied: its variance with blocks of the image left out in turn, over the model's.
+        shared: its standard deviation, over the one with the rest of theta known: unmodelled effects of shear, creep
+            and contrast act on the shift as well.
+        sd_px: the largest standard deviation by the model: the weaker the features, the more disturbances count.
+        leverage: the largest share of the information on the shift, in any direction, in one block of rows (MacKinnon,
+            Nielsen and Webb, J. Econometrics 235, 2001, 2023): a disturbance of these rows neither averages out nor
+            shows.
+    """
+
+    varied: float
+    shared: float
+    sd_px: float
+    leverage: float
+
+    def features(self) -> dict[str, float]:
+        """Return the same as logarithms, 0 for no doubt."""
+        return {
+            "varied": math.log(max(self.varied, 1.0)),
+            "shared": math.log(max(self.shared, 1.0)),
+            "unclear": math.log(max(self.sd_px / CLEAR_PX, 1.0)),
+            "leverage": math.log(max(self.leverage / EVEN, 1.0)),
+        }
+
+    @property
+    def spread(self) -> float:
+        """Factor by which the covariance is larger than its model, fitted by `python -m benchmarks.drift.fit`.
+
+        It is limited to the range of the fit: a power law means nothing beyond it.
+        """
+        factor = SPREAD["all"] * math.exp(sum(SPREAD[name] * value for name, value in self.features().items()))
+        return min(factor, SPREAD["most"])
+
+
+def covariance(fit: Fit, believed: Believed) -> tuple[Array, Doubt]:
+    """Return the covariance (COUNT, COUNT) of theta, enlarged by the spread of its doubt, and the doubt.
+
+    It is (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ (White, Econometrica 50, 1, 1982).
+
+    The variance of the shift with blocks left out is the cluster jackknife (CV3; MacKinnon, Nielsen and Webb,
+    J. Appl. Econom. 38, 671, 2023), which allows for noise that is correlated within a block. As few blocks hold most
+    of the features it scatters widely, so it is one sign among others.
+    """
+    if not np.isfinite(fit.theta).all():
+        raise Unusable("without a displacement that fits")
+    used = np.abs(fit.curvature).max(axis=(1, 2)) > 0.0
+    n = max(int(used.sum()), 1)
+    whole = fit.curvature.sum(axis=0) + believed.precision
+    inverse = np.linalg.inv(whole)
+    model = inverse @ (fit.spread.sum(axis=0) + believed.precision) @ inverse.T
+    change = np.linalg.solve(whole - fit.curvature[used], fit.slope[used][:, :, None])[:, :, 0]
+    varied = change.T @ change * (n - 1) / n + inverse @ believed.precision @ inverse.T
+    model = (model + model.T) / 2
+    shift, alone = model[:2, :2], whole[:2, :2]
+    doubt = Doubt(
+        varied=float(np.trace(np.linalg.solve(shift, varied[:2, :2]))) / 2,
+        shared=abs(float(np.linalg.det(shift) * np.linalg.det(alone))) ** 0.25,
+        sd_px=math.sqrt(float(np.linalg.eigvalsh(shift)[-1])),
+        leverage=float(np.linalg.eigvals(np.linalg.solve(alone, fit.curvature[:, :2, :2])).real.max()),
+    )
+    total: Array = doubt.spread * model
+    total[:2, :2] += FLOOR_PX**2 * np.eye(2)
+    return total, doubt

@@ -1,0 +1,164 @@
+"""Registration by plain cross-correlation: the shift at which what both scans know looks most alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.errors import ConfigError
+from afspm.plugins.drift.estimators.images import CommonGrid, Image, Unusable, onto_common_grid, prepare
+from afspm.plugins.drift.estimators.search import MaskedCorrelation
+from afspm.plugins.drift.overlap import overlap_center_m
+from afspm.plugins.drift.registration import DriftScan, Prior, Registration
+
+Array = NDArray[np.float64]
+
+_SMOOTH_PX = 1.0
+_APART_PX = 4.0  # from the highest peak: nearer ones belong to it
+# Edges of the overlap, and what the flattening of rows leaves around high features, pull by about this much at any
+# noise.
+_SYSTEMATIC_PX = 0.2
+_GATE = 25.0  # chi² from the expectation, the limit of the search
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Masked normalised cross-correlation (Padfield 2012), by FFT, its peak refined by a parabola. Translation only.
+
+    Attributes:
+        coefficient: least at the peak.
+        height: of the peak, in standard deviations of all other shifts.
+        rival: the highest of all other shifts, beside the peak, at most.
+        overlap: of the smaller scan, at least; two thirds of it are enough with a prior.
+
+    Raises:
+        ConfigError: a setting that makes no sense.
+    """
+
+    coefficient: float = 0.4
+    height: float = 5.0
+    rival: float = 0.8
+    overlap: float = 0.3
+
+    def __post_init__(self) -> None:
+        for name in ("coefficient", "rival", "overlap"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise ConfigError(f"{getattr(self, name)!r} must be above 0 and at most 1", where=name)
+        if not self.height > 0.0:
+            raise ConfigError(f"{self.height!r} must be above 0", where="height")
+
+    def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
+        """See `Estimator`."""
+        images: list[Image] = []
+        for name, one in (("reference", reference), ("scan", scan)):
+            try:
+                images.append(prepare(one.values))
+            except Unusable as error:
+                return Registration.refused(f"the {name}: {error}")
+        grid, first, second = onto_common_grid(reference, images[0], scan, images[1])
+        found = self._peak(first, second, grid, prior)
+        if found is None:
+            return Registration.refused("no shift leaves enough overlap")
+        displacement = grid.displacement_m(found.shift_px)
+        center = overlap_center_m(reference.region, scan.region, displacement)
+        if center is None:
+            return Registration.refused("at the best shift the scans have no features in common", found.quality)
+        reason = self._objection(found.quality)
+        covariance = grid.to_m @ _covariance_px2(first, found) @ grid.to_m.T
+        return Registration(
+            accepted=not reason,
+            reason=reason,
+            displacement_m=displacement,
+            covariance_m2=covariance,
+            linear=np.zeros((2, 2)),
+            center_m=center,
+            quality=found.quality,
+        )
+
+    def _peak(self, first: Image, second: Image, grid: CommonGrid, prior: Prior | None) -> _Peak | None:
+        coefficients = MaskedCorrelation(first.known, second.known)
+        c = coefficients.of(_smooth(first), _smooth(second))
+        index = np.moveaxis(np.indices(c.shape), 0, -1).astype(np.float64)
+        shifts = coefficients.shifts_px(index)
+        smaller = min(float(first.known.sum()), float(second.known.sum()))
+        least = self.overlap if prior is None else self.overlap * 2 / 3
+        enough = coefficients.overlap >= least * smaller
+        allowed = enough if prior is None else enough & (_deviations(shifts, grid, prior) < _GATE)
+        if not allowed.any():
+            return None
+        # Fisher's transform: the same spread for any overlap.
+        height = np.arctanh(c) * np.sqrt(coefficients.overlap)
+        at = np.unravel_index(int(np.where(allowed, height, -np.inf).argmax()), c.shape)
+        away = np.hypot(*np.moveaxis(shifts - shifts[at], -1, 0)) > _APART_PX
+        elsewhere = height[enough & away]
+        rivals = height[allowed & away]
+        quality = {
+            "correlation": float(c[at]),
+            "height": float(height[at] / max(np.sqrt(np.mean(elsewhere**2)), 1e-12)) if elsewhere.size else np.inf,
+            "rival": float(max(rivals.max(initial=0.0), 0.0) / max(height[at], 1e-12)),
+            "overlap": float(coefficients.overlap[at] / smaller),
+        }
+        return _Peak(shifts[at] + _top(c, at), quality)
+
+    def _objection(self, quality: dict[str, float]) -> str:
+        if quality["correlation"] < self.coefficient:
+            return f"the correlation is only {quality['correlation']:.2f}"
+        if quality["rival"] > self.rival:
+            return f"ambiguous: another shift reaches {quality['rival']:.0%} of the best"
+        if quality["height"] < self.height:
+            return f"the peak is only {quality['height']:.1f} standard deviations high"
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
+class _Peak:
+    shift_px: Array
+    quality: dict[str, float]
+
+
+def _smooth(image: Image) -> Array:
+    from scipy.ndimage import gaussian_filter
+
+    # only over what was measured: what gaps are filled with has edges of its own
+    known = image.known.astype(np.float64)
+    weight = gaussian_filter(known, _SMOOTH_PX, mode="nearest")
+    smooth: Array = gaussian_filter(image.values * known, _SMOOTH_PX, mode="nearest") / np.maximum(weight, 1e-9)
+    return smooth
+
+
+def _deviations(shifts_px: Array, grid: CommonGrid, prior: Prior) -> Array:
+    # half a pixel is added: the grid of shifts is that coarse
+    back = np.linalg.inv(grid.to_m)
+    inverse = np.linalg.inv(back @ prior.covariance_m2 @ back.T + 0.25 * np.eye(2))
+    off = shifts_px - grid.shift_px(prior.mean_m)
+    return np.asarray(np.einsum("...i,ij,...j", off, inverse, off))
+
+
+def _top(c: Array, at: tuple[np.intp, ...]) -> Array:
+    # the top of the parabola through a peak and its neighbours, (x, y)
+    offset = np.zeros(2)
+    for axis, size in enumerate(c.shape):
+        if not 0 < at[axis] < size - 1:
+            continue
+        step = np.eye(2, dtype=np.intp)[axis]
+        before, after = c[tuple(np.array(at) - step)], c[tuple(np.array(at) + step)]
+        bend = before - 2.0 * c[at] + after
+        if bend < 0.0:
+            offset[1 - axis] = np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
+    return offset
+
+
+def _covariance_px2(first: Image, found: _Peak) -> Array:
+    # Cramér-Rao bound for white noise of the size of the difference, times the area of the smoothing, plus errors that
+    # no noise explains
+    smooth = _smooth(first)
+    down, right = np.gradient(smooth)
+    slopes = np.stack([right, down])[:, first.known]
+    unlike = 2.0 * (1.0 - found.quality["correlation"]) * float(smooth[first.known].var())
+    together = 4.0 * np.pi * _SMOOTH_PX**2
+    information = slopes @ slopes.T * found.quality["overlap"]
+    information += 1e-9 * np.trace(information) * np.eye(2)
+    covariance: Array = together * unlike * np.linalg.inv(information) + np.eye(2) * _SYSTEMATIC_PX**2
+    return covariance

@@ -1,0 +1,227 @@
+"""Registration by generalised least squares over all pixels (an outline is in `LeastSquares`)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.errors import ConfigError
+from afspm.plugins.drift.estimators.acceptance import WRONG_AT_MOST, MatchEvidence, above_repeats, agreement
+from afspm.plugins.drift.estimators.alignment import (
+    COARSE,
+    FLOOR_PX,
+    SHIFT,
+    Believed,
+    Doubt,
+    covariance,
+    generalised_least_squares,
+    least_squares,
+)
+from afspm.plugins.drift.estimators.images import CommonGrid, Unusable, onto_common_grid, prepare
+from afspm.plugins.drift.estimators.noise import CrossingLines, FineFilter, without_lines
+from afspm.plugins.drift.estimators.nuisances import CREEP_SD_PX, Shear, averaged
+from afspm.plugins.drift.estimators.search import ExpectedShift, MaskedCorrelation, Scorer, candidates, shear_by_drift
+from afspm.plugins.drift.estimators.spikes import without_scars_of_one, without_spikes
+from afspm.plugins.drift.estimators.warp import COUNT, CREEP, LINEAR, SLOPES, OverlapBox, Scene, WarpedPair
+from afspm.plugins.drift.registration import DriftScan, LinearSeen, Prior, Registration
+
+Array = NDArray[np.float64]
+
+WIDEST = (0.01, 0.03)  # of what shear and turn are thought possible at first, by x and by y
+GAIN_SD = 1.0  # of the logarithm
+BEND_SD = 0.15
+BORDER_PX = 1  # where a filter and a spline have to guess what lies beyond
+FARTHEST_PX = 8.0  # from where the search has found it
+TURNED = 0.03  # radians by which the lines of two scans cross
+ELSEWHERE_PX = 32  # the farthest shift that a match is compared with
+EXPECTED = 2.0
+"""By which more doubt is allowed where a displacement is expected: nearly all wrong matches are of scans with nothing
+in common and no prior, and most right ones that are doubtful are zooms with one."""
+DISTRUST = 4.0
+"""By which the variance of the noise is taken for larger than its model says, where the images are weighed against what
+else displaces them. The factor of the ellipses, which grows with doubt, would let the images tell too little there."""
+
+
+class LeastSquares:
+    """Registers two scans as I2(q + d/2) e^(-g/2) = I1(q - d/2) e^(g/2) + noise with d = u + A q + creep of the lines.
+
+    1. `prepare`: rows flattened, outliers cut; scans that hold nothing refused. `grid`: a common pixel.
+    2. `search` and `score`: candidates by normalised cross-correlation, the likeliest of them.
+    3. `alignment`: Gauss-Newton, coarse to fine; the fine stage without `spikes`, through a filter and weighted by rows
+       as their `noise` asks.
+    4. `covariance`: what the noise leaves uncertain, and more where there is doubt; `nuisances`: averaged over what
+       shear, turn, calibration and creep there may be.
+    5. `acceptance`: is it a match at all?
+
+    Args:
+        wrong_at_most: the largest probability that a match which is accepted is wrong by more than a pixel; twice as
+            large where a displacement is expected.
+
+    Raises:
+        ConfigError: it is not between 0 and 1.
+    """
+
+    def __init__(self, wrong_at_most: float = WRONG_AT_MOST):
+        if isinstance(wrong_at_most, bool) or not 0.0 < wrong_at_most < 1.0:
+            raise ConfigError(f"{wrong_at_most!r} is not between 0 and 1", where="wrong_at_most")
+        self._wrong_at_most = wrong_at_most
+
+    def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
+        """See `afspm.plugins.drift.registration.Estimator`."""
+        images = []
+        for name, each in (("reference", reference), ("scan", scan)):
+            try:
+                images.append(prepare(each.values))
+            except Unusable as reason:
+                return Registration.refused(f"the {name} can't be registered: {reason}")
+        grid, *on_grid = onto_common_grid(reference, images[0], scan, images[1])
+        scene, expected = Scene(on_grid[0], on_grid[1]), None if prior is None else ExpectedShift.of(prior, grid)
+        start = _coarse(scene, expected)
+        box = None if start is None else scene.box(start[0][:2])
+        if start is None or box is None:
+            return Registration.refused("the scans overlap too little")
+        try:
+            shear = _expected_shear(prior, reference, scan, grid)
+            lines = _Lines.of(reference, scan, grid)
+            theta, total, seen, doubt = _fine(scene, box, start[0], lines, expected, shear)
+        except Unusable as reason:
+            rows, columns = box.shape
+            return Registration.refused(f"the overlap of {columns} x {rows} pixels is {reason}")
+        if not (np.isfinite(total).all() and np.hypot(*(theta - start[0])[:2]) < FARTHEST_PX):
+            return Registration.refused("no displacement fits: the scans have no features in common")
+        found = _evidence(scene, box, theta, total, start[1:], expected)
+        registration = self._registration(theta, total, box, grid, found)
+        quality = {**registration.quality, **doubt.features(), "spread": doubt.spread}
+        return replace(registration, linear_seen=_in_m(seen, grid), quality=quality)
+
+    def _registration(
+        self, theta: Array, total: Array, box: OverlapBox, grid: CommonGrid, found: MatchEvidence
+    ) -> Registration:
+        expected = found.searched < 1.0
+        reason = found.refusal(min(self._wrong_at_most * (EXPECTED if expected else 1.0), 0.99))
+        return Registration(
+            accepted=not reason,
+            reason=reason,
+            displacement_m=grid.displacement_m(theta[:2]),
+            covariance_m2=grid.to_m @ total[:2, :2] @ grid.to_m.T,
+            linear=grid.linear_m(_from_reference(theta[LINEAR].reshape(2, 2))),
+            center_m=grid.position_m(box.center - theta[:2] / 2),
+            quality={**asdict(found), "wrong": found.wrong},
+        )
+
+
+def _coarse(scene: Scene, expected: ExpectedShift | None) -> tuple[Array, float, float] | None:
+    # theta within a fraction of a pixel, its log-likelihood and the likelihood of the best rival
+    small, factor, offset = scene.smaller()
+    scaled = None if expected is None else expected.on_smaller(factor, offset)
+    best = Scorer(small, scaled).best(candidates(small, scaled))
+    box = None if best is None else small.box(best[0].shift_px)
+    if best is None or box is None:
+        return None
+    pair = WarpedPair(*small.smooth_splines, box)
+    theta = np.concatenate([best[0].shift_px, np.zeros(COUNT - 2)])
+    theta = least_squares(pair, theta, _believed(scaled), SHIFT, steps=4)
+    theta = least_squares(pair, theta, _believed(scaled), COARSE, steps=4)
+    theta[:2] = theta[:2] * factor + offset
+    return theta, best[0].likelihood, best[1]
+
+
+def _fine(
+    scene: Scene,
+    box: OverlapBox,
+    theta: Array,
+    lines: _Lines,
+    expected: ExpectedShift | None,
+    shear: Shear,
+) -> tuple[Array, Array, LinearSeen, Doubt]:
+    scene = without_spikes(without_scars_of_one(scene, theta), theta)
+    fine = FineFilter.of(scene.first.values, scene.second.values)
+    values = fine.applied(scene.first.values), fine.applied(scene.second.values)
+    inner = box.without_border(BORDER_PX)
+    pair = WarpedPair(*scene.splines(values), inner, theta[:2], lines.own_px, lines.crossing(inner, theta[:2]))
+    believed = _believed(expected or ExpectedShift(theta[:2], FARTHEST_PX**2 * np.eye(2)))
+    fit = generalised_least_squares(pair, theta, believed, fine)
+    spread, doubt = covariance(fit, believed)
+    seen = LinearSeen(fit.theta[LINEAR].reshape(2, 2), spread[LINEAR, LINEAR])
+    information, pull = (each / DISTRUST for each in fit.information(believed))
+    free = believed.precision.copy()
+    free[2:SLOPES] = 0.0
+    theta, total = averaged(information, pull + free @ believed.mean, free, shear)
+    total *= doubt.spread / DISTRUST
+    total[:2, :2] += FLOOR_PX**2 * np.eye(2)
+    return theta, total, seen, doubt
+
+
+def _in_m(seen: LinearSeen, grid: CommonGrid) -> LinearSeen:
+    to_m = np.kron(grid.to_m, np.linalg.inv(grid.to_m).T)
+    return LinearSeen(grid.linear_m(_from_reference(seen.linear)), to_m @ seen.covariance @ to_m.T)
+
+
+def _from_reference(linear: Array) -> Array:
+    # d = A q is given half-way between both scans; here by the position in the reference
+    whole: Array = linear @ np.linalg.inv(np.eye(2) - linear / 2)
+    return whole
+
+
+def _believed(expected: ExpectedShift | None) -> Believed:
+    mean, precision = np.zeros(COUNT), np.zeros((COUNT, COUNT))
+    precision[2:, 2:] = np.diag(
+        1.0 / np.square([*WIDEST, *WIDEST, *[CREEP_SD_PX] * (CREEP.stop - CREEP.start), GAIN_SD, BEND_SD])
+    )
+    if expected is not None:
+        mean[:2], precision[:2, :2] = expected.mean, np.linalg.inv(expected.covariance)
+    return Believed(mean, precision)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lines:
+    own_px: tuple[float, float]
+    to_own: Array
+
+    @classmethod
+    def of(cls, reference: DriftScan, scan: DriftScan, grid: CommonGrid) -> _Lines:
+        width_m = float(np.linalg.norm(grid.to_m[:, 0]))
+        turned = abs(math.sin(scan.region.angle_rad - reference.region.angle_rad)) > TURNED
+        return cls((reference.pixel_m[0] / width_m, 0.0 if turned else scan.pixel_m[0] / width_m), grid.to_own)
+
+    def crossing(self, box: OverlapBox, shift_px: Array) -> CrossingLines | None:
+        if self.own_px[1]:
+            return None
+        x, y = np.meshgrid(box.x + shift_px[0] / 2, box.y + shift_px[1] / 2)
+        return CrossingLines.of(*np.tensordot(self.to_own, np.stack([x, y]), 1))
+
+
+def _expected_shear(prior: Prior | None, reference: DriftScan, scan: DriftScan, grid: CommonGrid) -> Shear:
+    mean_m, sd = shear_by_drift(prior, reference, scan)
+    width, height = np.hypot(*grid.to_m)
+    if sd is None:
+        return Shear(float(height / width))
+    angle = reference.region.angle_rad
+    slow = np.array([-np.sin(angle), np.cos(angle)])
+    return Shear(float(height / width), np.linalg.inv(grid.to_m) @ np.outer(mean_m, slow) @ grid.to_m, (sd,))
+
+
+def _evidence(
+    scene: Scene,
+    box: OverlapBox,
+    theta: Array,
+    total: Array,
+    likelihoods: tuple[float, float],
+    expected: ExpectedShift | None,
+) -> MatchEvidence:
+    one, two, known = WarpedPair(*scene.smooth_splines, box, theta[:2]).warped(theta)
+    one, two = without_lines(one, known), without_lines(two, known)
+    elsewhere = MaskedCorrelation(known, known, ELSEWHERE_PX)
+    return MatchEvidence(
+        overlap=float(known.sum() / scene.least_known),
+        sd_px=float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[-1])),
+        gap=likelihoods[0] - likelihoods[1],
+        rival=likelihoods[1] / max(likelihoods[0], 1e-300),
+        agreement=agreement(one, two, known),
+        above_repeats=above_repeats(elsewhere.of(one, two), elsewhere.overlap, elsewhere.origin),
+        surprise=0.0 if expected is None else expected.surprise(theta[:2], total[:2, :2]),
+        searched=1.0 if expected is None else min(expected.area_px2 / scene.least_known, 1.0),
+    )

@@ -1,0 +1,91 @@
+"""What displaces an image besides drift between two scans: averaged over what there may be of it.
+
+Where features are few, a shift looks much like a shear or like creep at the start of the lines, and a fit that leaves
+all of them free is less certain of the shift than need be: most scans have little of most of them. So the fit is made
+once with all of them free, and then reckoned again for each of some models of what there is. The results are averaged
+by how likely each model makes the images (Hoeting et al., Stat. Sci. 14, 382, 1999). The fit is linear about its end,
+so that takes no further look at the images.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.plugins.drift.estimators.warp import CREEP, CREEP_PX, LINEAR
+
+Array = NDArray[np.float64]
+
+SHEARS: Final = (0.003, 0.01)
+"""By drift during the scans: pixels per pixel along y, where nothing is known of it."""
+CALIBRATIONS: Final = (0.0, 0.01)
+TURNS: Final = (0.0, 0.01)
+CREEP_AT: Final = ((0.6, None), (0.2, slice(0, len(CREEP_PX))), (0.2, slice(len(CREEP_PX), 2 * len(CREEP_PX))))
+"""How likely lines creep nowhere, at their left and at their right end."""
+CREEP_SD_PX: Final = 0.5  # of each part
+NONE: Final = 1e-3  # px, or px over ten: so little is nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Shear:
+    """Knowledge of the linear map by which drift during the scans shears one against the other.
+
+    Attributes:
+        aspect: height of a pixel over its width.
+        mean: (2, 2), in pixels.
+        sds: of the displacement per length along y; one of them is right.
+    """
+
+    aspect: float = 1.0
+    mean: Array = field(default_factory=lambda: np.zeros((2, 2)))
+    sds: tuple[float, ...] = SHEARS
+
+
+def averaged(information: Array, pull: Array, precision: Array, shear: Shear) -> tuple[Array, Array]:
+    """Return theta and its covariance, averaged over the models of linear map and creep.
+
+    Args:
+        information: (n, n), what the images tell of theta (see `warp.WarpedPair`): the logarithm of their likelihood is
+            -theta' information theta / 2 + pull' theta.
+        pull: (n,); the mean of the prior of all but linear map and creep is in it already.
+        precision: (n, n), the inverse covariance of that prior.
+    """
+    weights, priors = _models(precision, shear)
+    mean = np.zeros(len(pull))
+    mean[LINEAR] = shear.mean.ravel()
+    pull = pull - information @ mean
+    total = information + priors
+    covariances = np.linalg.inv(total)
+    found = covariances @ pull
+    log_likely = np.log(weights) + (_log_det(priors[:, 2:, 2:]) - _log_det(total) + found @ pull) / 2
+    likely = np.exp(log_likely - log_likely.max())
+    likely /= likely.sum()
+    theta = likely @ found
+    apart = found - theta
+    return theta + mean, np.tensordot(likely, covariances, 1) + (likely[:, None] * apart).T @ apart
+
+
+def _log_det(matrices: Array) -> Array:
+    found: Array = np.linalg.slogdet(matrices)[1]
+    return found
+
+
+def _models(precision: Array, shear: Shear) -> tuple[Array, Array]:
+    weights, priors = [], []
+    to_px = np.diag([1.0, shear.aspect, 1.0 / shear.aspect, 1.0])
+    stretched, turned = np.diag([1.0, 0.0, 0.0, 1.0]), np.outer((0, 1, -1, 0), (0, 1, -1, 0))
+    for (weight, ends), sd, calibration, turn in itertools.product(CREEP_AT, shear.sds, CALIBRATIONS, TURNS):
+        linear = np.diag([0.0, sd**2, 0.0, sd**2]) + calibration**2 * stretched + turn**2 * turned
+        creep = np.full(CREEP.stop - CREEP.start, NONE)
+        if ends is not None:
+            creep[ends] = CREEP_SD_PX
+        prior = precision.copy()
+        prior[LINEAR, LINEAR] = np.linalg.inv(to_px @ linear @ to_px + (NONE / 10) ** 2 * np.eye(4))
+        prior[CREEP, CREEP] = np.diag(creep**-2)
+        weights.append(weight)
+        priors.append(prior)
+    return np.array(weights), np.array(priors)

@@ -1,0 +1,130 @@
+"""Spikes and scars: pixels and stretches of rows that stand out in one of two scans, and not in the other.
+
+A filter would smear them over features, and the fit would take their edges for the sample's. In one image a spike and
+the top of a small particle look alike, and on a rough surface most scars are lower than what lies beside them. The
+difference of both images shows what one of them has alone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.plugins.drift.estimators.images import (
+    SCAR_PX,
+    Image,
+    levelled,
+    mended_rows,
+    scarred,
+    spread_of,
+    standing_out,
+)
+from afspm.plugins.drift.estimators.warp import GAIN, LINEAR, Scene, Spline
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+SPIKE_PX = 2  # along its row
+LEAST_SD = 6.0  # above both neighbours, or below both, in standard deviations of the steps along the rows
+OTHER = 0.5  # how much of that the other scan has, at most
+LEAST_SHARED = 0.1  # of a row, for it to be compared
+
+
+SCAR_ROWS = 3
+SCAR_SD = 3.0  # above the rows on both sides of it, or below, in the difference of the scans
+OWN = 0.6  # how much of that the scan itself has, at least: else the scar is in the other one, or an edge
+
+
+def without_scars_of_one(scene: Scene, theta: Array) -> Scene:
+    """Return two images without the scars that one of them has alone; what stands in for them is marked as made up.
+
+    Args:
+        theta: how they are displaced, to a fraction of a pixel; see `warp.WarpedPair`.
+    """
+    first, second = scene.first, scene.second
+    return Scene(_unscarred(first, second, theta), _unscarred(second, first, -theta))
+
+
+def _unscarred(image: Image, other: Image, theta: Array) -> Image:
+    ny, nx = image.values.shape
+    x, y = np.meshgrid(np.arange(nx) - (nx - 1) / 2, np.arange(ny) - (ny - 1) / 2)
+    dx, dy = theta[:2, None, None] + np.tensordot(theta[LINEAR].reshape(2, 2), np.stack([x, y]), 1)
+    there, known = Spline.of(other.values, other.known).at(x + dx, y + dy)
+    known &= image.known
+    own, shared = levelled(image.values), np.flatnonzero(known.mean(axis=1) > LEAST_SHARED)
+    if shared.size <= SCAR_ROWS + 1:
+        return image
+    rows = slice(int(shared[0]), int(shared[-1]) + 1)
+    masked = np.where(known, image.values - np.exp(-theta[GAIN]) * there, np.nan)[rows]
+    offsets = np.nan_to_num(np.nanmedian(np.where(known[rows].any(axis=1, keepdims=True), masked, 0.0), axis=1))
+    difference = np.nan_to_num(masked - offsets[:, None])
+    scar = np.zeros(image.values.shape, dtype=bool)
+    for thick in range(1, SCAR_ROWS + 1):
+        up, down, apart = standing_out(difference, thick)
+        inside = apart[known[rows][1:-thick]]
+        if not inside.size:
+            continue
+        least, both = SCAR_SD * spread_of(inside), _along(apart)
+        alone = np.sign(both) * _along(standing_out(own[rows], thick)[2]) > OWN * np.abs(both)
+        scar[rows] |= scarred((up > least) & alone, (down > least) & alone, thick)
+    if not scar.any():
+        return image
+    return Image(mended_rows(image.values, own, scar), image.known, scar)
+
+
+def _along(values: Array) -> Array:
+    from scipy.ndimage import uniform_filter1d
+
+    mean: Array = uniform_filter1d(values, SCAR_PX, axis=1)
+    return mean
+
+
+def without_spikes(scene: Scene, theta: Array) -> Scene:
+    """Return two images with the mean of its neighbours in the row in place of a spike.
+
+    Args:
+        theta: how they are displaced, to a pixel; see `warp.WarpedPair`.
+    """
+    first, second = scene.first, scene.second
+    return Scene(_mended(first, second, theta), _mended(second, first, -theta))
+
+
+def _mended(image: Image, other: Image, theta: Array) -> Image:
+    values = image.values
+    least = LEAST_SD * spread_of(np.diff(values, axis=1))
+    mended = values
+    for wide in range(1, SPIKE_PX + 1):
+        up, down, _ = standing_out(values.T, wide)
+        beyond = np.maximum(up, down).T
+        rows, first = np.nonzero(beyond > least)
+        there = _there(image, other, theta, rows, first + (1 + wide) // 2)
+        spike = beyond[rows, first] * OTHER > _most_there(other.values, there, wide)
+        rows, first = rows[spike], first[spike]
+        if rows.size and mended is values:
+            mended = values.copy()
+        for k in range(1, wide + 1):
+            share = k / (wide + 1)
+            mended[rows, first + k] = (1.0 - share) * values[rows, first] + share * values[rows, first + wide + 1]
+    return Image(mended, image.known, image.made_up)
+
+
+def _there(image: Image, other: Image, theta: Array, rows: Index, columns: Index) -> tuple[Index, Index]:
+    (ny, nx), (there_ny, there_nx) = image.values.shape, other.values.shape
+    x, y = columns - (nx - 1) / 2, rows - (ny - 1) / 2
+    dx, dy = theta[:2, None] + theta[LINEAR].reshape(2, 2) @ np.stack([x, y])
+    return np.rint(y + dy + (there_ny - 1) / 2).astype(int), np.rint(x + dx + (there_nx - 1) / 2).astype(int)
+
+
+def _most_there(values: Array, at: tuple[Index, Index], wide: int) -> Array:
+    rows, columns = at
+    ny, nx = values.shape
+    inside = (rows >= 1) & (rows < ny - 1) & (columns >= 1 + wide) & (columns < nx - 1 - wide)
+    rows, columns = rows[inside], columns[inside]
+    most = np.zeros(rows.size)
+    for row in (rows - 1, rows, rows + 1):
+        for column in (columns - 1, columns, columns + 1):
+            bent = values[row, column] - (values[row, column - wide] + values[row, column + wide]) / 2
+            most = np.maximum(most, np.abs(bent))
+    found = np.full(inside.shape, np.inf)
+    found[inside] = most
+    return found

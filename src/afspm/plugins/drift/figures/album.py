@@ -1,0 +1,121 @@
+"""All figures of a run into a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from afspm.plugins.drift.figures import style
+from afspm.plugins.drift.figures.drawings import (
+    ScanPair,
+    draw_errors,
+    draw_estimates,
+    draw_features,
+    draw_histogram,
+    draw_offsets,
+    draw_pairs,
+)
+from afspm.plugins.drift.offline import spread_pairs
+from afspm.plugins.drift.record import DriftRecord
+from afspm.plugins.drift.registration import DriftScan, Registration
+
+Array = NDArray[np.float64]
+
+PAIRS_APART_S = 2 * 3600.0
+_PAIRS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class RunPart:
+    """Some scans of a run, one after the other: those before or after drift correction was switched on.
+
+    Attributes:
+        name: what becomes of it in a file's name, e.g. "on".
+        title: e.g. "correction on".
+        start, stop: indices of its scans.
+        estimates: off-line, of each against the first of the part; None where they were not made.
+    """
+
+    name: str
+    title: str
+    start: int
+    stop: int
+    estimates: DriftRecord | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class DriftRun:
+    """The material for the figures of a run of n scans.
+
+    Attributes:
+        scans: in the order of time.
+        record: of the tracker.
+        parts: one after the other.
+        matched: a registration of two scans (indices) that rests on features, if there is one.
+        truth_m: (n, 2) true drift, where it is known.
+    """
+
+    scans: Sequence[DriftScan]
+    record: DriftRecord
+    parts: Sequence[RunPart]
+    matched: tuple[int, int, Registration] | None = None
+    truth_m: Array | None = None
+
+    @property
+    def switched_on_s(self) -> float | None:
+        """Time at which correction was switched on, the start of the second of two parts."""
+        return float(self.record.time_s[self.parts[1].start]) if len(self.parts) > 1 else None
+
+
+def write(run: DriftRun, folder: Path, *, title: str = "") -> list[Path]:
+    """Write what can be drawn of it; returns the files."""
+    written = []
+    for name, made in _figures(run, title):
+        path = folder / f"drift_{name}.png"
+        style.save(made, path)
+        written.append(path)
+    return written
+
+
+def _figures(run: DriftRun, title: str) -> Iterator[tuple[str, Figure]]:
+    record, switched = run.record, run.switched_on_s
+    yield "offset", draw_offsets(record, truth_m=run.truth_m, switched_on_s=switched, title=title)
+    if chosen := [pair for part in run.parts for pair in _pairs(run, part)]:
+        yield "pairs", draw_pairs(chosen)
+    for part in run.parts:
+        if part.estimates is None or len(part.estimates) < 2:
+            continue
+        told = f"{part.title}: first scan against each later one"
+        yield _named("estimates", part), draw_estimates(part.estimates, title=told, truth_m=_left_over(run, part))
+        yield _named("histogram", part), draw_histogram(part.estimates, title=told)
+    if run.matched is not None and run.matched[2].matches is not None:
+        first, second, found = run.matched
+        yield "features", draw_features(run.scans[first], run.scans[second], found.matches)
+    if run.truth_m is not None:
+        yield "errors", draw_errors(record, run.truth_m, switched_on_s=switched)
+
+
+def _named(name: str, part: RunPart) -> str:
+    return f"{name}_{part.name}" if part.name else name
+
+
+def _left_over(run: DriftRun, part: RunPart) -> Array | None:
+    if run.truth_m is None:
+        return None
+    truth, centers = (array[part.start : part.stop] for array in (run.truth_m, run.record.center_m))
+    left: Array = (truth - truth[0]) - (centers - centers[0])
+    return left
+
+
+def _pairs(run: DriftRun, part: RunPart) -> list[ScanPair]:
+    record, scans = run.record[part.start : part.stop], run.scans[part.start : part.stop]
+    moved = record.misplacement_m
+    return [
+        ScanPair(scans[first], scans[second], moved[second] - moved[first], part.title)
+        for first, second in spread_pairs(record, PAIRS_APART_S, _PAIRS)
+    ]

@@ -1,0 +1,314 @@
+"""The figures of drift: one function each, which returns a matplotlib figure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import ConnectionPatch
+from numpy.typing import NDArray
+
+from afspm.basics.errors import InvalidValue
+from afspm.plugins.drift.figures.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    HOUR_S,
+    MAGENTA,
+    ORANGE,
+    TIME_COLOURS,
+    WIDTH_IN,
+    Array,
+    figure,
+    letter,
+    show_scan,
+    styled,
+    time_axis,
+    unit_of,
+)
+from afspm.plugins.drift.record import DriftRecord
+from afspm.plugins.drift.registration import DriftScan, Matches
+
+
+def draw_offsets(
+    record: DriftRecord, *, truth_m: Array | None = None, switched_on_s: float | None = None, title: str = ""
+) -> Figure:
+    """As in the paper's experiment: how far the sample has come, and how its velocity changes.
+
+    Args:
+        record: of the run.
+        truth_m: (n, 2) true drift from any zero, where it is known.
+        switched_on_s: when drift correction was switched on.
+    """
+    with styled():
+        made = figure(3.6, 6.2)
+        plane, over_x, over_y = made.subplots(3, 1, gridspec_kw={"height_ratios": (2.2, 1, 1)})
+        hours = (record.time_s - record.time_s[0]) / HOUR_S
+        unit, factor = unit_of(record.drift_m)
+        drift, sd = record.drift_m * factor, record.sd_m * factor
+        dots = _dots(plane, drift[:, 0], drift[:, 1], hours)
+        plane.set(xlabel=f"x / {unit}", ylabel=f"y / {unit}", aspect="equal", title=title)
+        plane.set_adjustable("datalim")
+        for axis, (ax, name) in enumerate(((over_x, "x"), (over_y, "y"))):
+            ax.errorbar(hours, drift[:, axis], 2 * sd[:, axis], fmt="none", ecolor=GREY, elinewidth=0.6)
+            _dots(ax, hours, drift[:, axis], hours)
+            ax.set_ylabel(f"{name} / {unit}")
+            if switched_on_s is not None:
+                ax.axvline((switched_on_s - record.time_s[0]) / HOUR_S, color=BLUE, linestyle="--", linewidth=0.8)
+        if truth_m is not None:
+            truth_m = truth_m - truth_m[:1] + record.drift_m[:1]
+            for ax, across, up in ((plane, truth_m[:, 0] * factor, 1), (over_x, hours, 0), (over_y, hours, 1)):
+                ax.plot(across, truth_m[:, up] * factor, color="black", linewidth=0.6, zorder=1, label="true")
+            plane.legend(loc="best")
+        if switched_on_s is not None:
+            over_x.set_title("correction: off ¦ on", loc="center", color=BLUE)
+        time_axis(over_x, label=False)
+        time_axis(over_y)
+        made.colorbar(dots, ax=plane, label="time / h")
+    return made
+
+
+def _dots(ax: Axes, across: Array, up: Array, hours: Array) -> PathCollection:
+    ax.plot(across, up, color=GREY, linewidth=0.5, zorder=1)
+    return ax.scatter(across, up, c=hours, cmap=TIME_COLOURS, s=12, linewidths=0, zorder=3)
+
+
+_PAIR_INCHES = 2.2
+
+
+@dataclass(frozen=True, eq=False)
+class ScanPair:
+    """Two scans, and by how much the features lie elsewhere within the second.
+
+    Attributes:
+        moved_m: (2,) in the frame of the image: where a feature of the first is in the second, minus where it was.
+        title: e.g. "correction off".
+    """
+
+    first: DriftScan
+    second: DriftScan
+    moved_m: Array
+    title: str = ""
+
+
+def draw_pairs(pairs: Sequence[ScanPair]) -> Figure:
+    """A row of two scans for each pair, in their own frames, with the arrow in the second."""
+    with styled():
+        made = figure(2 * _PAIR_INCHES, (_PAIR_INCHES + 0.15) * len(pairs))
+        for row, pair in zip(made.subplots(len(pairs), 2, squeeze=False), pairs, strict=True):
+            for ax, scan in zip(row, (pair.first, pair.second), strict=True):
+                show_scan(ax, scan)
+                ax.set(xlabel="x / µm", ylabel="y / µm")
+            hours = (pair.second.mid_s - pair.first.mid_s) / HOUR_S
+            unit, factor = unit_of(pair.moved_m)
+            row[0].set_title(pair.title, loc="left")
+            row[1].set_title(f"{hours:.2f} h later: {np.hypot(*pair.moved_m) * factor:.1f} {unit}", loc="left")
+            _arrow(row[1], pair)
+    return made
+
+
+def _arrow(ax: Axes, pair: ScanPair) -> None:
+    # from the middle of the frame to the feature's place now; a dot below one pixel
+    start = 1e6 * np.asarray(pair.second.region.center_m)
+    end = start + 1e6 * pair.moved_m
+    if np.hypot(*pair.moved_m) > max(pair.second.pixel_m):
+        how = {"arrowstyle": "-|>", "color": ORANGE, "linewidth": 1.8, "mutation_scale": 10, "shrinkA": 0, "shrinkB": 0}
+        ax.annotate("", xy=tuple(end), xytext=tuple(start), arrowprops=how)
+    ax.plot(*start, "o", color=ORANGE, markersize=3.5)
+
+
+def draw_estimates(record: DriftRecord, *, title: str = "", truth_m: Array | None = None) -> Figure:
+    """Draw how far the features lie from where they were in the first scan, against time.
+
+    Args:
+        record: of the pairs; `matched` says which were accepted.
+        truth_m: (n, 2) true values, where known.
+    """
+    with styled():
+        made = figure(WIDTH_IN, 2.6)
+        ax = made.subplots()
+        hours = (record.time_s - record.time_s[0]) / HOUR_S
+        moved = record.misplacement_m
+        unit, factor = unit_of(moved[record.matched])
+        for axis, (name, colour, marker) in enumerate((("x", BLUE, "o"), ("y", ORANGE, "s"))):
+            _estimates(
+                ax, record, hours, moved[:, axis] * factor, record.sd_m[:, axis] * factor, (name, colour, marker)
+            )
+            if truth_m is not None:
+                ax.plot(hours, truth_m[:, axis] * factor, color=colour, linewidth=0.8, label=f"{name}, true")
+        _refused(ax, hours[~record.matched])
+        ax.axhline(0.0, color="black", linewidth=0.4)
+        ax.set(ylabel=f"displacement / {unit}", title=title)
+        ax.legend(ncols=5, loc="best")
+        time_axis(ax)
+    return made
+
+
+def _estimates(ax: Axes, record: DriftRecord, hours: Array, at: Array, sd: Array, how: tuple[str, str, str]) -> None:
+    (name, colour, marker), good = how, record.matched
+    ax.errorbar(
+        hours[good],
+        at[good],
+        2 * sd[good],
+        fmt=marker,
+        color=colour,
+        markersize=3,
+        elinewidth=0.6,
+        label=f"{name} ± 2 sd",
+    )
+
+
+def _refused(ax: Axes, hours: Array) -> None:
+    if hours.size:
+        height = np.full(hours.shape, 0.02)
+        ax.plot(hours, height, "x", color=GREY, markersize=4, transform=ax.get_xaxis_transform(), label="refused")
+
+
+_MOST_BINS = 100
+
+
+def draw_histogram(record: DriftRecord, *, title: str = "") -> Figure:
+    """Of x, of y and of the distance, for the pairs that were accepted (the first scan itself left out)."""
+    moved = record.misplacement_m[1:][record.matched[1:]]
+    with styled():
+        made = figure(WIDTH_IN, 2.2)
+        unit, factor = unit_of(moved)
+        distance = np.hypot(*moved.T)
+        columns = zip(
+            made.subplots(1, 3), (moved[:, 0], moved[:, 1], distance), ("x", "y", "distance"), (BLUE, ORANGE, GREEN),
+            strict=True,
+        )  # fmt: skip
+        for ax, values, name, colour in columns:
+            _histogram(ax, values * factor, colour)
+            ax.set(xlabel=f"{name} / {unit}", ylabel="scans" if name == "x" else "")
+        made.suptitle(title, size=7)
+    return made
+
+
+def freedman_diaconis(values: Array) -> Array:
+    """Edges of bins as wide as 2 IQR n^(-1/3), which makes the histogram close to the density in the mean square (D.
+    Freedman, P. Diaconis, Z. Wahrscheinlichkeitstheorie verw. Gebiete 57, 453, 1981). One bin where all are alike."""
+    low, high = float(values.min()), float(values.max())
+    quarter, three_quarters = np.percentile(values, (25, 75))
+    width = 2.0 * (three_quarters - quarter) / len(values) ** (1 / 3)
+    count = int(np.ceil((high - low) / width)) if width > 0.0 else 1
+    if high == low:
+        low, high = low - 0.5, high + 0.5
+    return np.linspace(low, high, min(max(count, 1), _MOST_BINS) + 1)
+
+
+def _histogram(ax: Axes, values: Array, colour: str) -> None:
+    if values.size == 0:
+        ax.text(0.5, 0.5, "no pair was accepted", ha="center", transform=ax.transAxes)
+        return
+    ax.hist(values, freedman_diaconis(values).tolist(), color=colour, edgecolor="white", linewidth=0.5)
+    ax.axvline(float(np.median(values)), color="black", linewidth=0.8)
+    ax.set_title(f"median {np.median(values):.2f}, rms {np.sqrt(np.mean(values**2)):.2f}, n = {len(values)}", size=6.5)
+
+
+_MOST_LINES = 60
+_INCHES = 2.6
+
+
+def draw_features(reference: DriftScan, scan: DriftScan, matches: Matches | None) -> Figure:
+    """a: both scans with the matched keypoints in orange; b: the pairs joined, inliers in colour, outliers dotted.
+
+    Raises:
+        InvalidValue: an estimator that matches no features.
+    """
+    if matches is None:
+        raise InvalidValue("this estimator uses no features", hint='e.g. estimator "brief"')
+    with styled():
+        made = figure(2 * _INCHES, 2 * _INCHES + 0.3)
+        rows = made.subplots(2, 2)
+        for row in rows:
+            for ax, one in zip(row, (reference, scan), strict=True):
+                show_scan(ax, one)
+                ax.set_xlabel("x / µm")
+            row[0].set_ylabel("y / µm")
+            row[1].set_yticklabels([])  # the lines come across
+        points = [_in_frame(one, at) for one, at in ((reference, matches.reference_m), (scan, matches.scan_m))]
+        for ax, at in zip(rows[0], points, strict=True):
+            ax.plot(at[:, 0], at[:, 1], "o", markersize=4, markerfacecolor="none", markeredgecolor=ORANGE)
+        letter(rows[0, 0], "a")
+        letter(rows[1, 0], "b")
+        inliers = matches.inlier
+        rows[1, 1].set_title(f"{np.count_nonzero(inliers)} inliers of {len(inliers)} pairs", loc="right")
+        _join(made, rows[1], points, ~inliers, None)
+        _join(made, rows[1], points, inliers, "viridis")
+    return made
+
+
+def _in_frame(scan: DriftScan, xy_m: Array) -> Array:
+    # positions in the frame before it is turned, µm
+    angle = scan.region.angle_rad
+    cos, sin = np.cos(angle), np.sin(angle)
+    center = np.asarray(scan.region.center_m)
+    turned_back: Array = ((xy_m - center) @ np.array([[cos, -sin], [sin, cos]]) + center) * 1e6
+    return turned_back
+
+
+def _join(made: Figure, axes: Array, points: list[Array], which: NDArray[np.bool_], colours: str | None) -> None:
+    # of many lines some are drawn, evenly chosen: all would hide the scans
+    from matplotlib import colormaps
+
+    chosen = np.flatnonzero(which)
+    if len(chosen) > _MOST_LINES:
+        chosen = chosen[np.linspace(0, len(chosen) - 1, _MOST_LINES).round().astype(int)]
+    for rank, index in enumerate(chosen):
+        colour = MAGENTA if colours is None else colormaps[colours](rank / max(len(chosen) - 1, 1))
+        line = ConnectionPatch(
+            points[0][index], points[1][index], "data", "data", axesA=axes[0], axesB=axes[1], color=colour,
+            linewidth=0.6, linestyle=":" if colours is None else "-",
+        )  # fmt: skip
+        made.add_artist(line)
+        for ax, at in zip(axes, points, strict=True):
+            ax.plot(*at[index], "x" if colours is None else "o", color=colour, markersize=3)
+
+
+def draw_errors(record: DriftRecord, truth_m: Array, *, switched_on_s: float | None = None) -> Figure:
+    """a: how far off the place of the first scan each was taken; b: what was known after it, minus the truth.
+
+    Args:
+        record: of the run.
+        truth_m: (n, 2) the true displacement at the middle of each scan, from any zero on.
+        switched_on_s: when drift correction was switched on.
+    """
+    with styled():
+        made = figure(WIDTH_IN, 4.2)
+        above, below = made.subplots(2, 1, sharex=True)
+        hours = (record.time_s - record.time_s[0]) / HOUR_S
+        came_m = truth_m - truth_m[:1]
+        _misplaced(above, came_m - (record.center_m - record.center_m[:1]), hours)
+        _known(below, record, came_m, hours)
+        if switched_on_s is not None:
+            for ax in (above, below):
+                ax.axvline((switched_on_s - record.time_s[0]) / HOUR_S, color=BLUE, linestyle="--", linewidth=0.8)
+            above.set_title("correction: off ¦ on", color=BLUE)
+        letter(above, "a")
+        letter(below, "b")
+        time_axis(below)
+    return made
+
+
+def _misplaced(ax: Axes, off_m: Array, hours: Array) -> None:
+    distance_m = np.hypot(*off_m.T)
+    distance_m[distance_m == 0.0] = np.nan  # the zero of the first scan has no place on a logarithmic axis
+    ax.semilogy(hours, distance_m * 1e9, "o-", color="black", markersize=2.5, linewidth=0.6)
+    ax.set_ylabel("position error of the scan / nm")
+
+
+def _known(ax: Axes, record: DriftRecord, truth_m: Array, hours: Array) -> None:
+    error_m = record.drift_m - record.drift_m[:1] - truth_m
+    unit, factor = unit_of(error_m)
+    for axis, (name, colour) in enumerate((("x", BLUE), ("y", ORANGE))):
+        sd = record.sd_m[1:, axis] * factor  # the first is what displacements are counted from
+        ax.fill_between(hours[1:], -2 * sd, 2 * sd, color=colour, alpha=0.15, linewidth=0, label=f"± 2 sd, {name}")
+        ax.plot(hours, error_m[:, axis] * factor, color=colour, linewidth=0.9, label=f"{name}, believed - true")
+    ax.axhline(0.0, color=GREY, linewidth=0.4)
+    ax.set_ylabel(f"error of the estimate / {unit}")
+    ax.legend(ncols=2, loc="best")

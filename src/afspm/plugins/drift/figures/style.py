@@ -1,0 +1,90 @@
+"""The style of the figures: sizes, colours that everybody can tell apart, units on the axes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import matplotlib.style
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from afspm.basics.plain_data import Plain
+from afspm.model.line_levelling import flattened
+from afspm.plugins.drift.registration import DriftScan
+from afspm.record.drawing.raster import value_range
+
+Array = NDArray[np.float64]
+
+WIDTH_IN = 7.2  # two columns of a journal
+ORANGE, BLUE, GREEN, MAGENTA, GREY = "#EE7733", "#0077BB", "#009988", "#EE3377", "#999999"  # P. Tol's vibrant scheme
+TIME_COLOURS = "viridis"  # of even lightness: distinct in grey, too
+DPI = 200
+LAYOUT: Literal["constrained"] | None = "constrained"
+HOUR_S = 3600.0
+_UNITS = ((1e-9, "pm", 1e12), (1e-6, "nm", 1e9), (np.inf, "µm", 1e6))
+_STYLE: Plain = {
+    "font.size": 7,
+    "axes.titlesize": 7,
+    "axes.linewidth": 0.6,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.direction": "in",
+    "ytick.direction": "in",
+    "legend.fontsize": 6.5,
+    "legend.frameon": False,
+    "lines.linewidth": 1.0,
+}
+
+
+def styled() -> Any:
+    """Return the context for making a figure in afspm's style instead of the user's."""
+    return matplotlib.style.context(["default", _STYLE])
+
+
+def figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure that needs no screen."""
+    made = Figure(figsize=(width_in, height_in), facecolor="white", layout=LAYOUT)
+    FigureCanvasAgg(made)
+    return made
+
+
+def save(made: Figure, path: Path) -> None:
+    """Write a figure as the ending of the file says."""
+    made.savefig(path, dpi=DPI)
+
+
+def unit_of(*lengths_m: Array | float) -> tuple[str, float]:
+    """In which unit lengths of this size are best read, and the factor from metres to it."""
+    finite = [np.abs(np.asarray(a, dtype=np.float64)[np.isfinite(a)]) for a in lengths_m]
+    largest = max((float(a.max()) for a in finite if a.size), default=0.0)
+    return next((unit, factor) for below, unit, factor in _UNITS if largest < 2 * below)
+
+
+def time_axis(ax: Axes, *, label: bool = True) -> None:
+    """Hours."""
+    ax.set_xlabel("time / h" if label else "")
+    ax.margins(x=0.02)
+
+
+def show_scan(ax: Axes, scan: DriftScan) -> None:
+    """A scan in grey, levelled by the differences of its lines, in µm of its own frame (before it is turned)."""
+    left, low = (1e6 * edge for edge in scan.region.top_left_m)
+    width, height = (1e6 * size for size in scan.region.size_m)
+    level = flattened(scan.values)
+    span = value_range(level)
+    # the first and last pixels lie on the border of the region: half of each reaches over it
+    half_x, half_y = (
+        size / (count - 1) / 2 for size, count in zip((width, height), scan.values.shape[::-1], strict=True)
+    )
+    extent = (left - half_x, left + width + half_x, low - half_y, low + height + half_y)
+    ax.imshow(level, cmap="gray", vmin=span.low, vmax=span.high, extent=extent, origin="lower", interpolation="nearest")
+    ax.set_aspect("equal")
+
+
+def letter(ax: Axes, text: str) -> None:
+    """Names a part of a figure."""
+    ax.set_title(text, loc="left", weight="bold", size=9)

@@ -1,0 +1,183 @@
+"""`afspm drift FILE…`, what it does: read, follow on all cores while bars grow, print, write."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import UTC
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.errors import AfspmError, FileError, InvalidValue
+from afspm.basics.formatting import counted, day_and_time
+from afspm.model import RegistrationOutcome
+from afspm.plugins.drift.estimators import estimator
+from afspm.plugins.drift.offline import Stack, against_first, corrected, followed
+from afspm.plugins.drift.record import DriftRecord
+from afspm.plugins.drift.registration import DriftScan, Registration
+from afspm.plugins.drift.simulated_truth import true_drift
+from afspm.plugins.drift.study.scan_series import Series, series
+from afspm.plugins.drift.study.workers import on_cores, processes
+from afspm.plugins.drift.trackers import tracker
+from afspm.record.journal import JOURNAL_FILE
+from afspm.record.measured_files import SUFFIX as RECORDED
+from afspm.storage.formats import FileContent, read, suffixes
+
+Array = NDArray[np.float64]
+
+NM = 1e9
+NM_PER_MIN = 60e9
+_SCANS_OF_A_RUN = "scans"
+
+
+@dataclass(frozen=True, eq=False)
+class Analysis:
+    """The result for all scans of a channel.
+
+    Attributes:
+        record: of the tracker.
+        pairs: the first scan with each later one.
+        estimates: those, as a record.
+    """
+
+    record: DriftRecord
+    pairs: tuple[Registration, ...]
+    estimates: DriftRecord
+
+
+def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Path, jobs: int | None) -> None:
+    """Analyse files, print the table and write the results.
+
+    Raises:
+        InvalidValue: nothing in it that can be followed. ConfigError: no such estimator or tracker.
+    """
+    console, aside = Console(file=sys.stdout, highlight=False), Console(stderr=True, highlight=False)
+    contents, unreadable = read_all(paths)
+    for told in unreadable:
+        aside.print(f"left out: {told}", markup=False, soft_wrap=True)
+    if not contents:
+        raise InvalidValue("there is nothing to follow: no file was read", hint="name scans, or folders of them")
+    found = series(contents, channel)
+    for told in found.left_out:
+        aside.print(f"left out: {told}", markup=False, soft_wrap=True)
+    begun = day_and_time(round(found.scans[0].mid_s * NS_PER_S), UTC, seconds=False)
+    console.print(f"{counted(len(found.scans), 'scan')} of {found.channel} from {begun} on", markup=False)
+    analysis = analysed(found.scans, by, following, jobs, aside)
+    console.print(as_table(analysis.record))
+    console.print(analysis.record.summary())
+    truth_m = true_drift(paths[0], found.scans) if len(paths) == 1 else None  # of one simulated run
+    for path in written(found, analysis, truth_m, output, aside):
+        console.print(str(path), markup=False, soft_wrap=True)
+
+
+def read_all(paths: Sequence[Path]) -> tuple[list[FileContent], list[str]]:
+    """Return the content of files and folders, and what could not be read."""
+    contents: list[FileContent] = []
+    unreadable: list[str] = []
+    for path in _files(paths):
+        try:
+            contents.append(read(path))
+        except AfspmError as error:
+            unreadable.append(str(error))
+    return contents, unreadable
+
+
+def _files(paths: Sequence[Path]) -> Iterator[Path]:
+    for path in paths:
+        if not path.is_dir():
+            yield path
+            continue
+        folder = path / _SCANS_OF_A_RUN if (path / _SCANS_OF_A_RUN).is_dir() else path
+        found = sorted(file for file in folder.rglob("*") if file.is_file() and file.suffix.lower() in suffixes())
+        of_the_controller = [file for file in found if file.suffix != RECORDED]
+        # the record has the same scans once more, where drift was compensated in sample coordinates
+        yield from of_the_controller if (path / JOURNAL_FILE).exists() and of_the_controller else found
+
+
+def register_pair(by: str, reference: DriftScan, scan: DriftScan) -> Registration:
+    """Register a pair, in a worker."""
+    return estimator(by).register(reference, scan)
+
+
+def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int | None, console: Console) -> Analysis:
+    """Follow the scans in this process, while others compare each with the first."""
+    tracking = tracker(following, estimator(by))
+    wanted = processes(jobs, sum(scan.values.size for scan in scans))
+    others = 1 if wanted == 1 else max(wanted - 1, 2)  # processes that compare; 1 is this one
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as progress, ThreadPoolExecutor(1) as beside:
+        track = progress.add_task("followed", total=len(scans))
+        pair = progress.add_task("compared with the first", total=len(scans) - 1)
+        work = beside.submit(_pairs, scans, by, others, lambda: progress.advance(pair))
+        updates = []
+        for update in followed(scans, tracking):
+            updates.append(update)
+            progress.advance(track)
+        pairs = work.result()
+    record = DriftRecord.of(scans, updates)
+    return Analysis(record, pairs, against_first(record, scans, pairs))
+
+
+def _pairs(scans: Sequence[DriftScan], by: str, jobs: int, done: Callable[[], None]) -> tuple[Registration, ...]:
+    tasks = [(by, scans[0], scan) for scan in scans[1:]]
+    pairs = [Registration.refused("")] * len(tasks)
+    for outcome in on_cores(register_pair, tasks, jobs=jobs):
+        pairs[outcome.index] = Registration.failed(outcome.error) if outcome.error else outcome.value
+        done()
+    return tuple(pairs)
+
+
+def as_table(record: DriftRecord) -> Table:
+    """Return the record as a table: hours since the first scan, nm, and nm a minute."""
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("scan", no_wrap=True, max_width=24)
+    for name in ("h", "x / nm", "y / nm", "± sd", "nm/min x", "y"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("accepted", overflow="fold", min_width=16)
+    hours = (record.time_s - record.time_s[0]) / 3600.0
+    for k, key in enumerate(record.keys):
+        numbers = (*record.drift_m[k] * NM, record.sd_m[k].max() * NM, *record.rate_m_s[k] * NM_PER_MIN)
+        texts = (f"{value:.2f}" if abs(value) < 1e5 else f"{value:.1e}" for value in numbers)
+        outcome = record.outcomes[k]
+        accepted = "yes" if record.matched[k] else "no"
+        if outcome is not RegistrationOutcome.REGISTERED:
+            accepted += f", {outcome.label}: {record.reasons[k]}"
+        table.add_row(Path(key).name, f"{hours[k]:.2f}", *texts, accepted)
+    return table
+
+
+def written(found: Series, analysis: Analysis, truth: Array | None, folder: Path, console: Console) -> Iterator[Path]:
+    """Write all that can be; what can't is said."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"can't be made: {error.strerror or error}", where=str(folder)) from error
+    analysis.record.write(folder / "drift.csv")
+    yield folder / "drift.csv"
+    analysis.estimates.write(folder / "drift_estimates.csv")
+    yield folder / "drift_estimates.csv"
+    try:
+        _stack(found, analysis.record).write(folder / "drift_stack.nc", channel=found.channel, unit=found.unit)
+        yield folder / "drift_stack.nc"
+    except InvalidValue as error:
+        console.print(f"no stack: {error}", markup=False, soft_wrap=True)
+    from afspm.plugins.drift.figures import album
+
+    part = album.RunPart("", found.channel, 0, len(found.scans), analysis.estimates)
+    matched = next(((0, k, one) for k, one in enumerate(analysis.pairs, 1) if one.accepted and one.matches), None)
+    yield from album.write(album.DriftRun(found.scans, analysis.record, [part], matched, truth), folder)
+
+
+def _stack(found: Series, record: DriftRecord) -> Stack:
+    """Return the stack of the scans that were matched: where the others lie is a guess."""
+    which = np.flatnonzero(record.matched)
+    return corrected([found.scans[k] for k in which], record.drift_m[which], record.rate_then_m_s[which])

@@ -1,0 +1,88 @@
+"""Parts of drift correction by name: ready-made ones, and users' own as "module.Name"."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import inspect
+from collections.abc import Iterable
+
+from afspm.basics import entry_points
+from afspm.basics.errors import AfspmError, ConfigError
+from afspm.basics.plain_data import PlainMapping
+from afspm.basics.requirements import require
+
+
+def named(what: str, spec: str | PlainMapping, default: str, *arguments: object) -> tuple[object, str]:
+    """Return the part named by a user's setting, and its name.
+
+    Args:
+        what: "estimator" or "tracker".
+        spec: a name that a package declares or "module.Name", or a table with that as its `class` and the settings of
+            it (only `class` names code).
+        default: where the table has no class.
+        arguments: given before the settings.
+
+    Raises:
+        ConfigError: no such name, class or setting, a setting without a meaning, or a library that is missing.
+    """
+    settings = {"class": spec} if isinstance(spec, str) else dict(spec)
+    name = settings.pop("class", default)
+    if not isinstance(name, str):
+        raise ConfigError(f"{_a(what)} must be a text, not {name!r}", where="class")
+    found = _imported(what, name) if "." in name else _declared(what, name)
+    require(found)
+    _check_settings(what, name, found, settings, len(arguments))
+    try:
+        return found(*arguments, **settings), name
+    except AfspmError as error:
+        where = f"{name}: {error.where}" if error.where else name
+        raise ConfigError(error.what, where=where, hint=error.hint) from error
+    except Exception as error:  # anybody's constructor
+        raise ConfigError(f"the {what} {name} can't be made with these settings: {error}") from error
+
+
+def _imported(what: str, name: str) -> type[object]:
+    module_name, _, class_name = name.rpartition(".")
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        hint = "is it installed, or on the path?"
+        raise ConfigError(f"the {what} {name} can't be imported: {error}", hint=hint) from error
+    found = getattr(module, class_name, None)
+    if not isinstance(found, type):
+        raise ConfigError(f"the module {module_name} has no class {class_name}", hint=_near(class_name, vars(module)))
+    return found
+
+
+def _declared(what: str, name: str) -> type[object]:
+    found = entry_points.load(f"afspm.{what}s", name)
+    if not isinstance(found, type):
+        known = entry_points.names(f"afspm.{what}s")
+        hint = _near(name.casefold(), known) or f"known: {', '.join(known)}; name one of your own as module.Name"
+        raise ConfigError(f"there is no {what} {name!r}", hint=hint)
+    return found
+
+
+def _check_settings(what: str, name: str, class_: type[object], settings: PlainMapping, given: int) -> None:
+    # settings are checked before the constructor runs, so that a typo gives its own error
+    try:
+        parameters = list(inspect.signature(class_).parameters.values())[given:]
+    except ValueError:  # a class of C code without a signature
+        return
+    if any(p.kind is p.VAR_KEYWORD for p in parameters):
+        return
+    known = [p.name for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.POSITIONAL_ONLY)]
+    for key in settings:
+        if key not in known:
+            hint = _near(key, known) or f"it takes {', '.join(known) or 'none'}"
+            raise ConfigError(f"the {what} {name} has no setting {key!r}", where=key, hint=hint)
+
+
+def _near(name: str, names: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, list(names), n=1)
+    return f"did you mean {close[0]!r}?" if close else ""
+
+
+def _a(what: str) -> str:
+    return f"an {what}" if what[0] in "aeiou" else f"a {what}"

@@ -1,0 +1,184 @@
+"""Overlap of regions and ratio of resolutions: the criteria for comparing pairs and for taking a scan again.
+
+Both after the paper, "Overarching workflow": intersection_ratio, sr_norm, f'.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from afspm.basics.errors import InvalidValue
+from afspm.model import Frame, Region
+from afspm.model.geometry import XY
+
+Array = NDArray[np.float64]
+
+
+def intersection_m(first: Region, second: Region) -> Array:
+    """Return the polygon that two turned rectangles share.
+
+    Clips one against each side of the other (Sutherland and Hodgman 1974), which is exact for convex polygons.
+
+    Clips one against each side of the other (Sutherland and Hodgman 1974), which is exact for convex ones.
+
+    Returns:
+        Its corners (n, 2), counter-clockwise; none where at most a border is shared.
+
+    Raises:
+        InvalidValue: they are in different frames.
+    """
+    if first.frame is not second.frame:
+        raise InvalidValue(f"a region in {first.frame.value} and one in {second.frame.value} coordinates can't overlap")
+    # About one centre, in units of one size: far from the origin the digits of the corners would be used up.
+    origin, unit = np.array(first.center_m), max(*first.size_m, *second.size_m)
+    corners: list[XY] = ((first.corners_m() - origin) / unit).tolist()
+    sides: list[XY] = ((second.corners_m() - origin) / unit).tolist()
+    for start, end in zip(sides, sides[1:] + sides[:1], strict=True):
+        corners = _clipped(corners, start, end)
+    polygon = np.array(corners)
+    return polygon * unit + origin if _area(polygon) > 0.0 else np.empty((0, 2))
+
+
+def intersection_area_m2(first: Region, second: Region) -> float:
+    """Return the area that two regions share, m². Raises InvalidValue as `intersection_m` does."""
+    polygon = intersection_m(first, second)
+    return _area(polygon - polygon[0]) if len(polygon) else 0.0
+
+
+def intersection_ratio(first: Region, second: Region) -> float:
+    """Return the share of the smaller region that both have in common. Raises InvalidValue as `intersection_m` does."""
+    smaller_m2 = min(region.size_m[0] * region.size_m[1] for region in (first, second))
+    return min(intersection_area_m2(first, second) / smaller_m2, 1.0)
+
+
+def intersection_center_m(first: Region, second: Region) -> Array | None:
+    """Return the centre of mass (2,) of the shared area, None without one. Raises InvalidValue as `intersection_m`
+    does."""
+    polygon = intersection_m(first, second)
+    if not len(polygon):
+        return None
+    corners = polygon - polygon[0]
+    after = _after(corners)
+    twice = corners[:, 0] * after[:, 1] - after[:, 0] * corners[:, 1]
+    center: Array = ((corners + after) * twice[:, None]).sum(axis=0) / (3.0 * twice.sum()) + polygon[0]
+    return center
+
+
+def overlap_center_m(reference: Region, scan: Region, displacement_m: ArrayLike) -> Array | None:
+    """Return the middle (2,) of the area that both scans show, in the coordinates of the reference.
+
+    Features of the reference are `displacement_m` further in the scan. None without an overlap. Raises InvalidValue as
+    `intersection_m`.
+    """
+    x_m, y_m = np.asarray(displacement_m, dtype=np.float64)
+    center = intersection_center_m(_moved(reference, x_m, y_m), scan)
+    return None if center is None else center - (x_m, y_m)
+
+
+def overlap_ratio(reference: Region, scan: Region, displacement_m: ArrayLike) -> float:
+    """Return the share of the smaller region that both scans show, 0 to 1.
+
+    Features of the reference are `displacement_m` further in the scan. Raises InvalidValue as `intersection_m` does.
+    """
+    x_m, y_m = np.asarray(displacement_m, dtype=np.float64)
+    return intersection_ratio(_moved(reference, x_m, y_m), scan)
+
+
+def sr_norm(first: Region, first_shape: tuple[int, int], second: Region, second_shape: tuple[int, int]) -> float:
+    """Return the ratio of two spatial resolutions: min/max of pixels per length, of the axis where they differ most.
+
+    A pair is good enough where this is at least sr_norm,min (the paper's "<=" is reversed).
+
+    Args:
+        first_shape, second_shape: pixels (ny, nx).
+
+    Returns:
+        Above 0, and 1 for the same.
+    """
+    per_m = [
+        np.array([nx / region.size_m[0], ny / region.size_m[1]])
+        for region, (ny, nx) in ((first, first_shape), (second, second_shape))
+    ]
+    return float((np.minimum(*per_m) / np.maximum(*per_m)).min())
+
+
+def _moved(region: Region, x_m: float, y_m: float) -> Region:
+    return region.moved_to((region.center_m[0] + x_m, region.center_m[1] + y_m))
+
+
+def _clipped(polygon: list[XY], start: XY, end: XY) -> list[XY]:
+    # the part of a polygon left of the line from `start` to `end`
+    along_x, along_y = end[0] - start[0], end[1] - start[1]
+    left = [along_x * (y - start[1]) - along_y * (x - start[0]) for x, y in polygon]
+    kept = []
+    for k, (x, y) in enumerate(polygon):
+        side, side_before, (x_before, y_before) = left[k], left[k - 1], polygon[k - 1]
+        if side * side_before < 0.0:
+            share = side_before / (side_before - side)
+            kept.append((x_before + (x - x_before) * share, y_before + (y - y_before) * share))
+        if side >= 0.0:
+            kept.append((x, y))
+    return kept
+
+
+def _area(polygon: Array) -> float:
+    if len(polygon) < 3:
+        return 0.0
+    (x, y), (x_after, y_after) = polygon.T, _after(polygon).T
+    return max(float(x @ y_after - y @ x_after) / 2, 0.0)
+
+
+def _after(corners: Array) -> Array:
+    return np.concatenate([corners[1:], corners[:1]])
+
+
+F_RESCAN = 0.75
+
+
+def too_little_shared(asked: Region, scanned: Region, f_rescan: float = F_RESCAN) -> str:
+    """Return why a scan is to be taken again by the paper's rule, f' = intersection_ratio(r', r) below f_rescan; empty
+    if not.
+
+    Raises:
+        InvalidValue: a region that is not in sample coordinates.
+    """
+    _in_sample(asked, scanned)
+    shared = intersection_ratio(asked, scanned)
+    if shared >= f_rescan:
+        return ""
+    return f"it shows {shared:.0%} of the requested region, less than {f_rescan:.0%}"
+
+
+def too_far_off(asked: Region, scanned: Region, sd_m: float, tolerance_m: float) -> str:
+    """Return why a scan is to be taken again: its furthest corner may be further off than tolerated; empty if not.
+
+    The paper's rule lets a scan be off by an eighth of its size. Here the user sets the tolerance, and the uncertainty
+    counts: |residual| + 2 sd > tolerance.
+
+    The paper's rule lets a scan be off by an eighth of its size. Here the user says how much it may be, and what is
+    uncertain counts: |residual| + 2 sd > tolerance.
+
+    Args:
+        sd_m: standard deviation of the position that was found, `update.after.sd_m`.
+
+    Raises:
+        InvalidValue: a region that is not in sample coordinates, or a tolerance that is not above zero.
+    """
+    _in_sample(asked, scanned)
+    if not tolerance_m > 0.0:
+        raise InvalidValue(f"a tolerance of {tolerance_m} m", hint="above zero")
+    off_m = float(np.linalg.norm(asked.corners_m() - scanned.corners_m(), axis=1).max())
+    if off_m + 2.0 * sd_m <= tolerance_m:
+        return ""
+    tolerated = f"{tolerance_m * 1e9:.3g} nm is tolerated"
+    return f"it is {off_m * 1e9:.3g} nm off (standard deviation {sd_m * 1e9:.2g} nm), {tolerated}"
+
+
+def _in_sample(*regions: Region) -> None:
+    for region in regions:
+        if region.frame is not Frame.SAMPLE:
+            raise InvalidValue(
+                f"a region in {region.frame.value} coordinates can't be compared",
+                hint="map it to sample coordinates first",
+            )

@@ -1,0 +1,166 @@
+"""The table of a run: what drift did, scan by scan. Made by on-line runs and off-line analysis alike, kept as CSV."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.errors import FileError
+from afspm.model import RegistrationOutcome, registration_summary
+from afspm.model.drift_mapping import drift_at
+from afspm.plugins.drift.registration import DriftScan
+from afspm.plugins.drift.tracking import Update
+
+Array = NDArray[np.float64]
+
+COLUMNS = (
+    "scan", "time_s", "center_x_m", "center_y_m", "drift_x_m", "drift_y_m", "var_x_m2", "var_y_m2", "cov_xy_m2",
+    "rate_x_m_s", "rate_y_m_s", "matched", "reason", "outcome", "failures",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class DriftRecord:
+    """The drift of n scans in the order of time; positions in tip coordinates.
+
+    Attributes:
+        keys: the name of each scan.
+        time_s: (n,) middle of each scan.
+        center_m: (n, 2) centre of its region.
+        drift_m: (n, 2) displacement of the sample under the tip since the start, known after the scan.
+        covariance_m2: (n, 2, 2) of it.
+        rate_m_s: (n, 2) velocity of the sample then; zero after the first scan, when it is unknown.
+        matched: (n,) whether the scan could be registered; where not, the drift is predicted.
+        reasons: why it could not, for a person.
+        outcomes: how the position of each scan is known.
+        failures: the number of errors of the estimator over each scan.
+    """
+
+    keys: tuple[str, ...]
+    time_s: Array
+    center_m: Array
+    drift_m: Array
+    covariance_m2: Array
+    rate_m_s: Array
+    matched: NDArray[np.bool_]
+    reasons: tuple[str, ...]
+    outcomes: tuple[RegistrationOutcome, ...]
+    failures: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def __getitem__(self, part: slice) -> DriftRecord:
+        """Return some of the scans."""
+        return self.chosen(range(len(self.keys))[part])
+
+    def chosen(self, which: Sequence[int]) -> DriftRecord:
+        """Return the scans of some numbers."""
+        at = list(which)
+        return DriftRecord(
+            tuple(self.keys[k] for k in at), self.time_s[at], self.center_m[at], self.drift_m[at],
+            self.covariance_m2[at], self.rate_m_s[at], self.matched[at], tuple(self.reasons[k] for k in at),
+            tuple(self.outcomes[k] for k in at), tuple(self.failures[k] for k in at),
+        )  # fmt: skip
+
+    def summary(self) -> str:
+        """Return how many scans were registered, for people."""
+        return registration_summary(self.outcomes)
+
+    @property
+    def sd_m(self) -> Array:
+        """Standard deviations of x and y of the drift, (n, 2)."""
+        return np.sqrt(np.diagonal(self.covariance_m2, axis1=1, axis2=2))
+
+    @property
+    def rate_then_m_s(self) -> Array:
+        """Velocity during each scan, (n, 2); the first scan has that of the second if it knows none."""
+        rates = self.rate_m_s.copy()
+        if len(rates) > 1 and not rates[0].any():
+            rates[0] = rates[1]
+        return rates
+
+    @property
+    def misplacement_m(self) -> Array:
+        """Displacement of the features from their place in the first scan, (n, 2), which correction left over."""
+        followed = self.center_m - self.center_m[:1]
+        misplaced: Array = self.drift_m - self.drift_m[:1] - followed
+        return misplaced
+
+    @classmethod
+    def of(cls, scans: Sequence[DriftScan], updates: Sequence[Update]) -> DriftRecord:
+        """Make the record from a tracker's updates of the scans."""
+        after = [update.after for update in updates]
+        return cls(
+            keys=tuple(scan.key for scan in scans),
+            time_s=np.array([scan.mid_s for scan in scans]),
+            center_m=np.array([scan.region.center_m for scan in scans]).reshape(-1, 2),
+            drift_m=np.array(
+                [drift_at(one.mapping.matrix, scan.region.center_m) for one, scan in zip(after, scans, strict=True)]
+            ).reshape(-1, 2),
+            covariance_m2=np.array([one.covariance_m2 for one in after]).reshape(-1, 2, 2),
+            rate_m_s=np.array([one.rate_m_s for one in after]).reshape(-1, 2),
+            matched=np.array([update.matched for update in updates], dtype=bool),
+            reasons=tuple(update.reason for update in updates),
+            outcomes=tuple(update.outcome for update in updates),
+            failures=tuple(sum(bool(one.failure) for one in u.registrations.values()) for u in updates),
+        )
+
+    def write(self, path: Path) -> None:
+        """Write CSV, in SI units.
+
+        Raises:
+            FileError: it can't be written.
+        """
+        try:
+            with path.open("w", newline="", encoding="utf-8") as file:
+                table = csv.writer(file)
+                table.writerow(COLUMNS)
+                table.writerows(self._rows())
+        except OSError as error:
+            raise FileError(f"can't be written: {error}", where=str(path)) from error
+
+    def _rows(self) -> Iterable[list[str]]:
+        for k, key in enumerate(self.keys):
+            (xx, xy), (_, yy) = self.covariance_m2[k]
+            numbers = (*self.center_m[k], *self.drift_m[k], xx, yy, xy, *self.rate_m_s[k])
+            told = [f"{self.time_s[k]:.6f}", *(f"{number:.9g}" for number in numbers)]
+            how = (self.outcomes[k].label, str(self.failures[k]))
+            yield [key, *told, "yes" if self.matched[k] else "no", self.reasons[k], *how]
+
+    @classmethod
+    def read(cls, path: Path) -> DriftRecord:
+        """Read a file that `write` wrote; further columns are ignored.
+
+        Raises:
+            FileError: missing, or not such a table.
+        """
+        try:
+            with path.open(newline="", encoding="utf-8") as file:
+                rows = list(csv.DictReader(file))
+        except OSError as error:
+            raise FileError(f"can't be read: {error}", where=str(path)) from error
+
+        def numbers(*names: str) -> Array:
+            return np.array([[float(row[name]) for name in names] for row in rows]).reshape(-1, len(names))
+
+        try:
+            return cls(
+                keys=tuple(row["scan"] for row in rows),
+                time_s=numbers("time_s")[:, 0],
+                center_m=numbers("center_x_m", "center_y_m"),
+                drift_m=numbers("drift_x_m", "drift_y_m"),
+                covariance_m2=numbers("var_x_m2", "cov_xy_m2", "cov_xy_m2", "var_y_m2").reshape(-1, 2, 2),
+                rate_m_s=numbers("rate_x_m_s", "rate_y_m_s"),
+                matched=np.array([row["matched"] == "yes" for row in rows], dtype=bool),
+                reasons=tuple(row["reason"] for row in rows),
+                outcomes=tuple(RegistrationOutcome.from_label(row["outcome"]) for row in rows),
+                failures=tuple(int(row["failures"]) for row in rows),
+            )
+        except (KeyError, ValueError, TypeError) as error:
+            raise FileError(f"is not a table of drift: {error}", where=str(path)) from error

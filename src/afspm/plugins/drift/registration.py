@@ -1,0 +1,177 @@
+"""Registration of two scans: the interface of all estimators, and its result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping as Table
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.errors import InvalidValue
+from afspm.model import Region, RegistrationOutcome
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DriftScan:
+    """One channel of a scan as drift sees it.
+
+    Attributes:
+        values: [y, x], both ascending; NaN where nothing was measured.
+        region: in tip coordinates. Its first and last pixels lie on its border.
+        start_s, end_s: experiment time of its first and last row.
+        upwards: whether small y was scanned first; None: not known.
+        key: the caller's name of it.
+    """
+
+    values: Array
+    region: Region
+    start_s: float
+    end_s: float
+    upwards: bool | None = None
+    key: str = ""
+
+    def __post_init__(self) -> None:
+        if self.values.ndim != 2 or min(self.values.shape) < 2:
+            raise InvalidValue(f"a scan of shape {self.values.shape} can't be registered", hint="2 x 2 pixels at least")
+        if not (np.isfinite((self.start_s, self.end_s)).all() and self.end_s >= self.start_s):
+            raise InvalidValue(f"a scan from {self.start_s} s to {self.end_s} s can't be")
+
+    @property
+    def mid_s(self) -> float:
+        """Time for which its position holds."""
+        return (self.start_s + self.end_s) / 2
+
+    @property
+    def duration_s(self) -> float:
+        return self.end_s - self.start_s
+
+    @property
+    def pixel_m(self) -> tuple[float, float]:
+        """Distance of pixels (x, y)."""
+        ny, nx = self.values.shape
+        return (self.region.size_m[0] / (nx - 1), self.region.size_m[1] / (ny - 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """The expected displacement before the scans are compared.
+
+    Attributes:
+        mean_m: (2,) expected displacement.
+        covariance_m2: (2, 2) of it.
+        velocity_difference_m_s: (2,) expected drift velocity during the scan minus that during the reference: it shears
+            one against the other.
+        velocity_sd_m_s: standard deviation of each component of it; None: not known, so any shear is possible.
+    """
+
+    mean_m: Array
+    covariance_m2: Array
+    velocity_difference_m_s: Array = field(default_factory=lambda: np.zeros(2))
+    velocity_sd_m_s: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Feature pairs, for drawings. Positions (n, 2) are (x, y) in tip coordinates, m.
+
+    Attributes:
+        inlier: (n,) whether the estimate rests on the pair.
+    """
+
+    reference_m: Array
+    scan_m: Array
+    inlier: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearSeen:
+    """The linear part from the scans alone; `Registration.linear` may be pulled towards the likely.
+
+    Attributes:
+        linear: (2, 2).
+        covariance: (4, 4) of its elements, row by row.
+    """
+
+    linear: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """The displacement between two scans.
+
+    A feature at `x` of the reference is found at `x + displacement_m + linear @ (x - center_m)` in the scan, both in
+    tip coordinates.
+
+    Attributes:
+        accepted: whether it may be used; if not, the numbers are the best guess, or NaN where there is none.
+        reason: why it was refused, for a person; empty if it was accepted.
+        displacement_m: (2,) at `center_m`.
+        covariance_m2: (2, 2) of it.
+        linear: (2, 2) what rotation, scale and shear there is besides, zero for a pure translation.
+        center_m: (2,) where the displacement holds, in tip coordinates of the reference: the middle of the overlap.
+        quality: figures of merit by name (overlap, correlation, …), for a person and for studies.
+        matches: of estimators that match features.
+        linear_seen: of estimators that know how uncertain the linear part is.
+        failure: the error of an estimator that raised, or gave no usable result; empty if there was none. An error says
+            nothing about the scans. The result is accepted nevertheless where a coarse estimate took its place; its
+            linear part is then unknown.
+    """
+
+    accepted: bool
+    reason: str
+    displacement_m: Array
+    covariance_m2: Array
+    linear: Array
+    center_m: Array
+    quality: Table[str, float] = field(default_factory=dict)
+    matches: Matches | None = None
+    linear_seen: LinearSeen | None = None
+    failure: str = ""
+
+    @classmethod
+    def refused(cls, reason: str, quality: Table[str, float] | None = None) -> Registration:
+        """Return a result without an estimate."""
+        none, unknown = np.full(2, np.nan), np.full((2, 2), np.nan)
+        return cls(
+            accepted=False,
+            reason=reason,
+            displacement_m=none,
+            covariance_m2=unknown,
+            linear=np.zeros((2, 2)),
+            center_m=none,
+            quality=quality or {},
+        )
+
+    @classmethod
+    def failed(cls, failure: str) -> Registration:
+        """Return the result of an estimator that raised, or whose result is unusable."""
+        return replace(cls.refused(failure), failure=failure)
+
+    @property
+    def outcome(self) -> RegistrationOutcome:
+        """Return what became of the pair."""
+        if self.accepted:
+            return RegistrationOutcome.COARSE if self.failure else RegistrationOutcome.REGISTERED
+        return RegistrationOutcome.FAILED if self.failure else RegistrationOutcome.REFUSED
+
+    @property
+    def sd_m(self) -> float:
+        """Standard deviation of the displacement along the axis where it is largest."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance_m2)[-1]))
+
+
+class Estimator(Protocol):
+    """Registers two scans of the same channel. Keeps no state between calls."""
+
+    def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
+        """Return the place of the features of `reference` in `scan`.
+
+        Never raises for the content of scans: pairs that can't be registered (no values, constant, no common features,
+        ambiguous) are refused with the reason.
+        """
+        ...

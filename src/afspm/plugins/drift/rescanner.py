@@ -1,0 +1,192 @@
+"""`Rescanner`: takes the scans again that the Drift Compensated Scheduler asks for (paper, "Overarching Workflow")."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any, ClassVar
+
+from afspm import wire
+from afspm.basics.errors import ConfigError, ControlLost, Refused
+from afspm.client.component import Component
+from afspm.client.events import Events
+from afspm.model import Problem, Region, RescanKind, ScanParameters, names
+
+WANTED, TOLD = "DriftRescan", "DriftMapping"
+FLAGGED_WITHIN_S = 5.0
+BACK_WITHIN_S = 60.0
+_BEFORE, _FRAME_BEFORE = "direction_before", "frame_before"
+Pixels = tuple[int, int] | None
+
+_IN_WORDS = {
+    RescanKind.AGAIN: "the same region again",
+    RescanKind.OPPOSITE: "the other direction",
+    RescanKind.SEARCH: "a wider region",
+}
+
+
+class Rescanner(Component):
+    """Takes a region again on a `DriftRescan`: as it was, in the other direction, or wider.
+
+    Meanwhile thermal-drift is flagged, so that nobody else scans. It tries a few times. A scan that still lies too far
+    off is then told, and the experiment goes on; where the sample is not found again a person is needed, for which it
+    flags device-malfunction.
+
+    Args:
+        attempts: scans for one request; in the other direction there is one.
+        widen: by how much each search is wider than the one before it.
+        most_pixels: of a side of a search, whose pixels are those of the scans before as far as this allows.
+        problem: what it solves.
+    """
+
+    solves: ClassVar = ("thermal-drift",)
+    flags: ClassVar = ("thermal-drift", "device-malfunction")
+    listens: ClassVar = (WANTED, TOLD)
+    needs_actions = (names.START_SCAN,)
+
+    def __init__(
+        self, attempts: int = 3, widen: float = 2.0, most_pixels: int = 512, problem: str = "thermal-drift"
+    ) -> None:
+        if attempts < 1 or not widen > 1.0 or most_pixels < 2:
+            raise ConfigError(f"attempts = {attempts}, widen = {widen}, most_pixels = {most_pixels} can't be")
+        self.attempts, self.widen, self.most_pixels = attempts, widen, most_pixels
+        self.problem = problem
+
+    def run(self) -> None:
+        with self.scope.events(WANTED) as wanted, self.scope.events(TOLD, timeout_s=0.0) as told:
+            self._put_back_at_last()
+            for event in wanted:
+                if event.message.timestamp.ToNanoseconds() <= int(self.memory.get("done_ns", -1)):
+                    continue  # of a scan of ours, or from before a restart
+                try:
+                    self._obey(event.message, told)
+                except ControlLost as lost:
+                    self.log.info("the rescan was given up: %s", lost.what)
+                self._put_back_at_last()
+                self.memory["done_ns"] = self.clock.now_ns()
+                self.memory.save()
+
+    def _obey(self, message: Any, told: Events) -> None:
+        parameters: ScanParameters = wire.decode("ScanParameters2d", message.params.SerializeToString())
+        if not isinstance(parameters.region, Region):
+            self.log.error("a request for a rescan names no region: %s", message.reason)
+            return
+        self.log.info("%s: %s", _IN_WORDS.get(message.kind, "a scan"), message.reason)
+        if not self._is_flagged():
+            self.scope.flag(self.problem)
+            self.scope.wait_until(self._is_flagged, timeout_s=FLAGGED_WITHIN_S)
+        with self.scope.control(solving=self.problem):
+            optional = message.kind == RescanKind.OPPOSITE
+            try:
+                found = self._take(message, parameters, told)
+            except Refused as refused:
+                level = logging.INFO if optional else logging.ERROR
+                self.log.log(level, "it can't be scanned again: %s", refused.reason)
+                found = False
+            if not found and optional:
+                self.log.info("the velocity of drift stays unknown until the second scan")
+            elif not found and message.kind == RescanKind.SEARCH:
+                # before the other flag is gone: nobody is to go on in between
+                self.log.critical(
+                    "the sample can't be found again; nothing is scanned until a person clears the problem"
+                )
+                self.scope.flag(Problem.DEVICE_MALFUNCTION)
+            elif not found:
+                self.log.error("%d rescans did not help; the experiment goes on, please check it", self.attempts)
+            self.scope.clear(self.problem)
+
+    def _take(self, message: Any, parameters: ScanParameters, told: Events) -> bool:
+        # until the scan is as requested; changed settings are then restored
+        region, shape = parameters.region, parameters.shape
+        assert isinstance(region, Region)
+        assert shape is None or isinstance(shape, tuple)
+        try:
+            self._turn(message)
+            if message.kind == RescanKind.SEARCH:
+                self._note_before(_FRAME_BEFORE, [*region.center_m, *region.size_m, region.angle_rad, shape])
+            for attempt in range(1 if message.kind == RescanKind.OPPOSITE else self.attempts):
+                self._forget(told)
+                if message.kind == RescanKind.SEARCH:
+                    self._search(region, shape, attempt + 1)
+                else:
+                    self.scope.scan(region, shape=shape)
+                if self._is_as_asked(message.kind, told):
+                    return True
+            return False
+        finally:
+            self._put_back()
+
+    def _turn(self, message: Any) -> None:
+        if message.HasField("upwards"):
+            self._note_before(_BEFORE, str(self.scope.get(names.SCAN_DIRECTION)))
+            self.scope.set(names.SCAN_DIRECTION, names.UP if message.upwards else names.DOWN)
+
+    def _note_before(self, name: str, value: object) -> None:
+        # the settings are saved, so that a life after a kill restores them, too
+        self.memory.setdefault(name, value)
+        self.memory.save()
+
+    def _put_back(self) -> None:
+        if (direction := self.memory.get(_BEFORE)) is not None:
+            self.scope.set(names.SCAN_DIRECTION, direction)
+            self.memory.pop(_BEFORE)
+        if (frame := self.memory.get(_FRAME_BEFORE)) is not None:
+            self._set_back(*frame)
+            self.memory.pop(_FRAME_BEFORE)
+        self.memory.save()
+
+    def _put_back_at_last(self) -> None:
+        # control was lost before the settings were restored: another component has cleared the drift
+        if _BEFORE not in self.memory and _FRAME_BEFORE not in self.memory:
+            return
+        try:
+            with self.scope.control(timeout_s=BACK_WITHIN_S):
+                self._put_back()
+        except (ControlLost, Refused) as error:
+            self.log.warning("direction and region of the scans before could not be set again: %s", error.what)
+
+    def _search(self, region: Region, shape: Pixels, times: int) -> None:
+        # a wider region, at most the widest that limits and scanner allow
+        for fewer in range(times, -1, -1):
+            wider, pixels = self._wider(region, shape, fewer)
+            try:
+                self.scope.scan(wider, shape=pixels)
+            except Refused as refused:
+                if fewer == 0:
+                    raise
+                self.log.warning("no region of %.3g nm: %s", wider.size_m[0] * 1e9, refused.reason)
+            else:
+                return
+
+    def _wider(self, region: Region, shape: Pixels, times: int) -> tuple[Region, Pixels]:
+        factor = self.widen**times
+        width, height = region.size_m
+        wider = Region(region.center_m, (width * factor, height * factor), region.angle_rad)
+        if shape is None:
+            return wider, None
+        rows, columns = (min(round((n - 1) * factor) + 1, max(self.most_pixels, n)) for n in shape)
+        return wider, (rows, columns)
+
+    def _set_back(self, x: float, y: float, width: float, height: float, angle: float, shape: list[int] | None) -> None:
+        rows_columns = None if shape is None else (shape[0], shape[1])
+        try:
+            self.scope.set_scan_region(Region((x, y), (width, height), angle), shape=rows_columns)
+        except Refused as refused:
+            self.log.warning("the region of the scans before could not be set again: %s", refused.reason)
+
+    def _is_as_asked(self, kind: int, told: Events) -> bool:
+        # by the drift mapping published right before the scan
+        mapping = None
+        for event in told:
+            mapping = event.message
+        if mapping is None:
+            self.log.warning("the scheduler reported no drift for the scan")
+            return False
+        is_enough = kind in (RescanKind.OPPOSITE, RescanKind.SEARCH)  # for these the place need not be exact
+        return bool(mapping.matched and not mapping.lost and (is_enough or not mapping.rescan))
+
+    def _forget(self, told: Events) -> None:
+        for _ in told:
+            pass
+
+    def _is_flagged(self) -> bool:
+        return self.scope.is_flagged(self.problem)

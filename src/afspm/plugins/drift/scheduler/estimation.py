@@ -1,0 +1,131 @@
+"""The worker's task: register scans one after the other, and remember the last answers.
+
+A scan that it is asked for again, since it or the scheduler was killed, is answered from memory: no tracker may take a
+scan twice, and no scan has two mappings.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from afspm.basics.errors import ConfigError
+from afspm.basics.plain_data import Plain
+from afspm.model import Region
+from afspm.plugins.drift.estimators import PairFailure
+from afspm.plugins.drift.overlap import too_far_off, too_little_shared
+from afspm.plugins.drift.registration import DriftScan
+from afspm.plugins.drift.scheduler.messages import Registered
+from afspm.plugins.drift.scheduler.settings import RescanRule
+from afspm.plugins.drift.tracking import Tracker, Update
+
+_ANSWERS = 16
+
+
+class Estimation:
+    """A tracker with its memory.
+
+    Args:
+        save: keeps the state on disk, before it is published.
+        failures: to which the tracker's estimator adds its errors; they are taken from it scan by scan.
+    """
+
+    def __init__(
+        self, tracker: Tracker, rule: RescanRule, save: Callable[[Plain], None], failures: list[PairFailure]
+    ) -> None:
+        self._tracker = tracker
+        self._rule = rule
+        self._save = save
+        self._failures = failures
+        self._answers: OrderedDict[str, Registered] = OrderedDict()
+
+    @property
+    def forecast(self) -> Plain | None:
+        """Of what is known now; None before the first scan."""
+        return self._tracker.forecast.to_dict() if self._answers else None
+
+    def restore(self, state: Plain) -> None:
+        """Take up what was saved. Raises InvalidValue, KeyError or TypeError if it is of something else."""
+        self._tracker.restore(state["tracker"])
+        self._answers = OrderedDict((one["key"], Registered(**one)) for one in state["answers"])
+
+    def register(self, key: str, scan: DriftScan, asked: Region | None = None) -> Registered:
+        """Register a scan.
+
+        Args:
+            key: of the scan; its name for people is `scan.key`.
+            asked: the region that was meant, in sample coordinates.
+
+        Raises:
+            AfspmError: the tracker does not take it.
+        """
+        known = self._answers.get(key)
+        if known is not None:
+            return known
+        self._failures.clear()
+        answer = self._answer(key, scan, asked, self._tracker.add(scan))
+        self._answers[key] = answer
+        if len(self._answers) > _ANSWERS:
+            self._answers.popitem(last=False)
+        self._keep()
+        return answer
+
+    def compensated(self, time_s: float, velocity_m_s: tuple[float, float]) -> None:
+        """From that time on the controller moves the tip along.
+
+        Raises:
+            ConfigError: the tracker does not reckon with that.
+        """
+        told = getattr(self._tracker, "compensated", None)
+        if told is None:
+            raise ConfigError("the tracker can't follow a controller that compensates", hint='tracker = "bank"')
+        told(time_s, velocity_m_s)
+        self._keep()
+
+    def _keep(self) -> None:
+        self._save({"tracker": self._tracker.state(), "answers": [asdict(one) for one in self._answers.values()]})
+
+    def _answer(self, key: str, scan: DriftScan, asked: Region | None, update: Update) -> Registered:
+        after, before = update.after, update.before
+        center_m = np.asarray(scan.region.center_m)
+        residual_m = before.mapping.apply(center_m) - after.mapping.apply(center_m)
+        used = [key for key, one in update.registrations.items() if one.accepted]
+        return Registered(
+            key=key,
+            time_s=scan.mid_s,
+            matrix=after.mapping.matrix.tolist(),
+            covariance_m2=_plain(after.covariance_m2),
+            rate_m_s=_plain(after.rate_m_s),
+            rate_covariance=_plain(after.rate_covariance),
+            outcome=update.outcome,
+            lost=update.lost,
+            reason=update.reason,
+            residual_m=_plain(residual_m),
+            references=used,
+            rescan=_why_again(self._rule, scan, asked, update),
+            forecast=update.forecast.to_dict(),
+            failures=list(dict.fromkeys(map(str, self._failures))),  # a pair may be tried in several ways
+        )
+
+
+def _why_again(rule: RescanRule, scan: DriftScan, asked: Region | None, update: Update) -> str:
+    """Why a scan lies too far from where it was asked for; empty if it does not.
+
+    Nothing was known before the first scan, and nothing is found where it was not matched.
+    """
+    if rule.rule == "never" or asked is None or not update.registrations or not update.matched or update.lost:
+        return ""
+    scanned = update.after.mapping.to_sample(scan.region)
+    if rule.rule == "paper":
+        return too_little_shared(asked, scanned, rule.f_rescan)
+    tolerance_m = min(scan.region.size_m) / 10 if rule.tolerance is None else rule.tolerance
+    return too_far_off(asked, scanned, update.after.sd_m, tolerance_m)
+
+
+def _plain(array: object) -> list[Any]:
+    plain: list[object] = np.asarray(array, dtype=np.float64).tolist()
+    return plain

@@ -1,0 +1,155 @@
+"""Messages about drift: jobs and reports of the worker, and wishes to components."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+from afspm.basics.plain_data import Plain
+from afspm.model import Region, RegistrationOutcome, RescanKind, Scan
+from afspm.model.geometry import XY
+from afspm.plugins.drift.mapping import Mapping
+from afspm.plugins.drift.scheduler.positions import PlaceCodec
+
+Matrix = list[list[float]]
+
+
+@dataclass(frozen=True)
+class Registered:
+    """The result of a registration.
+
+    Attributes:
+        key: of the scan.
+        time_s: its middle, experiment time.
+        matrix: 3 x 3, of the mapping then.
+        covariance_m2, rate_m_s, rate_covariance: see `drift.tracking.Prediction`; empty where nothing is known.
+        outcome, lost, reason: see `drift.tracking.Update`.
+        residual_m: (x, y) by which the sample was found elsewhere than predicted.
+        references: names of the scans that it was compared with.
+        rescan: why it should be taken again; empty if not.
+        forecast: of what is known now, for `forecast_from_dict`; None: unchanged.
+        failures: the errors of the estimator over this scan, each with its pair.
+    """
+
+    key: str
+    time_s: float
+    matrix: Matrix
+    covariance_m2: Matrix
+    rate_m_s: list[float]
+    rate_covariance: Matrix
+    outcome: RegistrationOutcome
+    lost: bool
+    reason: str
+    residual_m: list[float]
+    references: list[str]
+    rescan: str
+    forecast: Plain | None
+    failures: list[str]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "outcome", RegistrationOutcome(self.outcome))  # out of a file it is a number
+
+    @property
+    def matched(self) -> bool:
+        return self.outcome.is_registered
+
+    @property
+    def sd_m(self) -> float:
+        """Standard deviation of the position along the axis where it is largest; NaN: not known."""
+        if not self.covariance_m2:
+            return math.nan
+        (xx, xy), (_, yy) = self.covariance_m2
+        return math.sqrt(max((xx + yy) / 2 + math.hypot((xx - yy) / 2, xy), 0.0))
+
+    @property
+    def mapping(self) -> Mapping:
+        return Mapping(self.matrix)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Forecasted:
+    """The worker runs, or knows something new without a scan."""
+
+    forecast: Plain | None
+
+
+@dataclass(frozen=True)
+class NotRegistered:
+    """A scan could not be looked at at all."""
+
+    key: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class WorkerGone:
+    """The worker has ended."""
+
+    reason: str
+
+
+WorkerReport = Registered | Forecasted | NotRegistered | WorkerGone
+
+
+@dataclass(frozen=True)
+class ScanJob:
+    """A scan to be registered; its region is in tip coordinates.
+
+    Attributes:
+        start_s, end_s: experiment time.
+        upwards: direction of the slow axis; None: not known.
+        asked: the region that was meant, in sample coordinates; None: not known.
+    """
+
+    key: str
+    scan: Scan
+    start_s: float
+    end_s: float
+    upwards: bool | None
+    asked: Region | None
+
+
+@dataclass(frozen=True)
+class StartWorker:
+    """Start the worker; one that runs is killed, and its job forgotten."""
+
+
+@dataclass(frozen=True)
+class Compensated:
+    """From that time on the controller moves the tip along with this velocity."""
+
+    time_s: float
+    velocity_m_s: tuple[float, float]
+
+
+WorkerJob = StartWorker | ScanJob | Compensated
+"""Jobs for the worker. A scan may come twice: then it is answered as the first time."""
+
+
+@dataclass(frozen=True)
+class RescanWanted:
+    """A wish to the Rescanner.
+
+    Attributes:
+        said: the ScanParameters2d of the region, in the coordinates of components.
+        shape: (rows, columns); None: what is set.
+        upwards: the direction wanted; None: any.
+    """
+
+    kind: RescanKind
+    said: bytes
+    shape: tuple[int, int] | None
+    reason: str
+    time_ns: int
+    upwards: bool | None = None
+
+
+class DriftCodec(PlaceCodec, Protocol):
+    """The wire as far as drift compensation needs it."""
+
+    def encode_mapping(self, registered: Registered, filename: str, center_m: XY, *, correcting: bool) -> bytes:
+        """Return a DriftMapping as the payload of a packet, for a scan with this file and centre at the tip."""
+
+    def encode_rescan(self, wanted: RescanWanted) -> bytes:
+        """A DriftRescan as the payload of a packet."""

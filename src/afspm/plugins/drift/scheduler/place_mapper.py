@@ -1,0 +1,438 @@
+"""Maps every request and packet between components, in sample coordinates, and the microscope, in tip coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from collections.abc import Mapping as Table
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from afspm.basics.errors import AfspmError, InvalidValue
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Packet,
+    PacketHeader,
+    Parameter,
+    PositionChange,
+    ProbePosition,
+    Region,
+    RegionChange,
+    Request,
+    Response,
+    ScanParameters,
+    names,
+)
+from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, scan_values
+from afspm.plugins.drift.mapping import Mapping
+from afspm.plugins.drift.scheduler.positions import (
+    PlaceCodec,
+    PositionPair,
+    TargetPosition,
+    away_m,
+    is_same,
+    told_as,
+    value_in,
+)
+from afspm.plugins.drift.scheduler.scan_timing import ScanDurations
+from afspm.scheduler.coordinate_frame import MappedRequest
+from afspm.scheduler.safety.parameter_values import number_of
+from afspm.wire.messages import PROBE_POSITION, SCAN_LINES, SCAN_PARAMETERS, SPECTRUM
+
+MOVES_PX = 0.01
+"""A region that lies this far off in the tip's coordinates is set again before it is scanned."""
+MOVES_M = 1e-11
+"""The same of the probe: finer than any scanner positions it."""
+
+_REMEMBERED = 64
+_SET_SCAN, _SET_PROBE = int(ControlRequest.SET_SCAN_PARAMS), int(ControlRequest.SET_PROBE_POS)
+_PARAM = int(ControlRequest.PARAM)
+_MESSAGES = {_SET_SCAN: "ScanParameters2d", _SET_PROBE: "ProbePosition"}
+
+MappingAt = Callable[[float], Mapping | None]
+"""The mapping from tip to sample coordinates at an experiment time, s; None: components are given tip coordinates."""
+
+
+@dataclass(frozen=True)
+class SavedPlace:
+    """A `PositionPair` as its two messages."""
+
+    said: bytes
+    sent: bytes
+
+
+@dataclass(frozen=True)
+class MappedBefore:
+    """The mapped form of a request with an id, which is sent again as it was."""
+
+    kind: int
+    place: SavedPlace
+    payload: bytes
+
+
+@dataclass(frozen=True)
+class Places:
+    """The scan and the probe in force at the microscope, in both coordinates.
+
+    Attributes:
+        shape: (rows, columns) in force; None: not known.
+        upwards: the direction of the slow axis in force; None: not known.
+        remembered: by client and id.
+    """
+
+    region: TargetPosition[Region] = field(default_factory=TargetPosition)
+    probe: TargetPosition[ProbePosition] = field(default_factory=TargetPosition)
+    shape: tuple[int, int] | None = None
+    upwards: bool | None = None
+    durations: ScanDurations = field(default_factory=ScanDurations)
+    remembered: Table[str, MappedBefore] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SavedPlaces:
+    """The part of `Places` that survives a kill."""
+
+    region: SavedPlace | None
+    probe: SavedPlace | None
+    shape: tuple[int, int] | None
+    upwards: bool | None
+    durations: ScanDurations
+    remembered: Table[str, MappedBefore]
+
+    @classmethod
+    def of(cls, places: Places) -> SavedPlaces:
+        region, probe = (
+            None if one is None else SavedPlace(one.said, one.sent)
+            for one in (places.region.current, places.probe.current)
+        )
+        return cls(region, probe, places.shape, places.upwards, places.durations, places.remembered)
+
+    def restored(self, codec: PlaceCodec) -> Places:
+        """Raises ValueError: a place can't be read."""
+        region = None if self.region is None else _place(codec, _SET_SCAN, self.region)
+        probe = None if self.probe is None else _place(codec, _SET_PROBE, self.probe)
+        return Places(
+            TargetPosition(region), TargetPosition(probe),
+            self.shape, self.upwards, self.durations, self.remembered,
+        )  # fmt: skip
+
+
+_PARTS = tuple(one.name for one in fields(Places))
+
+
+class PlaceMapper:
+    """One step of mapping in progress: the places so far.
+
+    Args:
+        mapping_at: by what is known of the drift now.
+    """
+
+    region: TargetPosition[Region]
+    probe: TargetPosition[ProbePosition]
+    shape: tuple[int, int] | None
+    upwards: bool | None
+    durations: ScanDurations
+    remembered: Table[str, MappedBefore]
+
+    def __init__(self, places: Places, codec: PlaceCodec, mapping_at: MappingAt) -> None:
+        self.__dict__.update(places.__dict__)
+        self._codec = codec
+        self._mapping_at = mapping_at
+
+    def finish(self) -> Places:
+        """Return the places after the step."""
+        return Places(**{name: self.__dict__[name] for name in _PARTS})
+
+    # --- requests ---
+
+    def in_force(self, place: Region | ProbePosition, now_ns: int) -> None:
+        mapping = self._mapping_at(now_ns * 1e-9)
+        if isinstance(place, Region):
+            if (known := self.region.published(place)) is None:
+                region = place if mapping is None else mapping.to_sample(place)
+                said, sent = (self._codec.encode(ScanParameters(one)) for one in (region, place))
+                known = self.region.at(PositionPair(region, said, place, sent))
+            self.region = known
+            return
+        if (known_probe := self.probe.published(place)) is None:
+            probe = place if mapping is None else _position(mapping, place.xy_m)
+            pair = PositionPair(probe, self._codec.encode(probe), place, self._codec.encode(place))
+            known_probe = self.probe.at(pair)
+        self.probe = known_probe
+
+    def outgoing(self, who: str, request: Request, now_ns: int) -> MappedRequest | Response | None:
+        now_s = now_ns * 1e-9
+        mapping = self._mapping_at(now_s)
+        change = _place_of(request)
+        if mapping is None or change is None:
+            return None
+        key = f"{who} {request.id}"
+        if request.id and (known := self.remembered.get(key)) is not None:
+            return self._again(known, request)
+        asks = isinstance(request.subject, Parameter) and request.subject.value is None
+        try:
+            if isinstance(change, PositionChange | ProbePosition):
+                sample: Region | ProbePosition = self._position_after(change)
+            else:
+                sample = self._region_after(change)
+        except AfspmError as error:
+            return Response(int(ControlResponse.PARAM_ERROR), b"", str(error), request.id)
+        if asks:
+            return None  # its answer will be mapped
+        return self._mapped(key, request, sample, now_s)
+
+    def _mapped(self, key: str, request: Request, sample: Region | ProbePosition, now_s: float) -> MappedRequest:
+        """Map a place as a whole, whatever part of it was asked for, and remember what comes of it."""
+        kind, asked = (_SET_SCAN if isinstance(sample, Region) else _SET_PROBE), request.subject
+        rest = asked if isinstance(asked, ScanParameters) else ScanParameters()
+        is_whole = isinstance(asked, ProbePosition) or isinstance(rest.region, Region)
+        place, subject = self._to_tip(sample, request.payload if is_whole else None, rest, now_s)
+        payload = self._codec.encode(subject)
+        if request.id:
+            newest = MappedBefore(kind, SavedPlace(place.said, place.sent), payload)
+            self.remembered = dict([*self.remembered.items(), (key, newest)][-_REMEMBERED:])
+        return MappedRequest(Request(kind, subject, payload, request.id), _names(asked), _said(place))
+
+    def _again(self, known: MappedBefore, request: Request) -> MappedRequest:
+        place = _place(self._codec, known.kind, known.place)
+        self._sending(place)
+        subject = self._codec.decode_packet(_MESSAGES[known.kind], known.payload)
+        return MappedRequest(
+            Request(known.kind, subject, known.payload, request.id), _names(request.subject), _said(place)
+        )
+
+    def _sending(self, place: PositionPair[Any]) -> None:
+        if isinstance(place.tip, Region):
+            self.region = self.region.sending(place)
+        else:
+            self.probe = self.probe.sending(place)
+
+    def move_before(self, action: str, now_ns: int) -> MappedRequest | None:
+        now_s = now_ns * 1e-9
+        if self._mapping_at(now_s) is None:
+            return None
+        here: PositionPair[Any] | None = None
+        if action == names.START_SCAN:
+            here = self.region.current
+        elif action in names.AT_PROBE:
+            here = self.probe.current
+        if here is None:
+            return None
+        there = self._tip_of(here.sample, now_s)
+        if away_m(there, here.tip) <= self._tolerance_m(here.tip):
+            return None
+        place, subject = self._to_tip(here.sample, here.said, ScanParameters(), now_s)
+        kind = _SET_SCAN if isinstance(place.tip, Region) else _SET_PROBE
+        return MappedRequest(Request(kind, subject, place.sent), (), _said(place))
+
+    def _tip_of(self, sample: Region | ProbePosition, now_s: float) -> Any:
+        """Where the tip must be: for a scan that begins now at its middle, for the probe now."""
+        middle_s = now_s
+        if isinstance(sample, Region):
+            middle_s += self.durations.expected_s(self.shape, sample.size_m) / 2
+        mapping = self._mapping_at(middle_s) or Mapping.identity()
+        if isinstance(sample, Region):
+            return mapping.to_tip(sample)
+        x, y = mapping.inverse.apply(sample.xy_m)
+        return ProbePosition((float(x), float(y)))
+
+    def _to_tip(
+        self, sample: Region | ProbePosition, said: bytes | None, rest: ScanParameters, now_s: float
+    ) -> tuple[PositionPair[Any], object]:
+        """The place in both coordinates, and what the microscope is to be sent for it."""
+        tip = self._tip_of(sample, now_s)
+        if isinstance(sample, Region):
+            subject: object = ScanParameters(tip, rest.shape, rest.unit)
+            if said is None:
+                said = self._codec.encode(ScanParameters(sample))
+            region_place = PositionPair(sample, said, tip, self._codec.encode(subject))
+            self._sending(region_place)
+            return region_place, subject
+        said = self._codec.encode(sample) if said is None else said
+        probe_place = PositionPair(sample, said, tip, self._codec.encode(tip))
+        self._sending(probe_place)
+        return probe_place, tip
+
+    def _tolerance_m(self, tip: Region | ProbePosition) -> float:
+        if isinstance(tip, ProbePosition) or self.shape is None:
+            return MOVES_M
+        rows, columns = self.shape
+        pixel_m = min(tip.size_m[0] / max(columns - 1, 1), tip.size_m[1] / max(rows - 1, 1))
+        return MOVES_PX * pixel_m
+
+    def _region_after(self, change: Region | RegionChange) -> Region:
+        if isinstance(change, Region):
+            return change
+        if self.region.current is None:
+            raise AfspmError(
+                "the microscope has not reported its scan region, so a part of it can't be mapped; set the whole region"
+            )
+        return change.onto(self.region.current.sample)
+
+    def _position_after(self, change: ProbePosition | PositionChange) -> ProbePosition:
+        if isinstance(change, ProbePosition):
+            return change
+        if self.probe.current is None:
+            raise AfspmError(
+                "the microscope has not reported its probe position, so a part of it can't be mapped; set x and y"
+            )
+        x_m, y_m = self.probe.current.sample.xy_m
+        return ProbePosition((x_m if change.x_m is None else change.x_m, y_m if change.y_m is None else change.y_m))
+
+    # --- what the microscope answers ---
+
+    def carried_out(self, sent: Request, told: Parameter | None, now_ns: int) -> None:
+        if sent.kind == _SET_SCAN:
+            self.region = self.region.was_set(sent.payload)
+            if isinstance(sent.subject, ScanParameters) and isinstance(sent.subject.shape, tuple):
+                self.shape = sent.subject.shape
+        elif sent.kind == _SET_PROBE:
+            self.probe = self.probe.was_set(sent.payload)
+        elif isinstance(sent.subject, Parameter):
+            parameter = told or sent.subject
+            if parameter.name == names.SCAN_SPEED and sent.subject.value is not None:
+                self.durations = ScanDurations()
+            elif parameter.name == names.SCAN_DIRECTION and parameter.value is not None:
+                self.upwards = {names.UP: True, names.DOWN: False}.get(parameter.value)
+
+    def answer(self, asked: Request, told: Parameter | None, now_ns: int) -> Parameter | None:
+        subject, mapping = asked.subject, self._mapping_at(now_ns * 1e-9)
+        if mapping is None or not isinstance(subject, Parameter) or _place_of(asked) is None:
+            return None
+        if subject.value is not None:
+            return subject  # set as a part of the whole place, about which no value came back
+        tip_value = None if told is None else number_of(told)
+        if tip_value is None:
+            return None
+        sample_value = self._in_sample(subject.name, tip_value, mapping)
+        return None if sample_value is None else told_as(subject.name, sample_value, told)
+
+    def _in_sample(self, name: str, tip_value: float, mapping: Mapping) -> float | None:
+        """A part of the place in force, from what the microscope tells of it."""
+        if name in PROBE_CHANGES:
+            position = self.probe.current
+            if position is None:
+                return None
+            axis = int(name == names.PROBE_POS_Y)
+            xy_m = [position.tip.xy_m[0], position.tip.xy_m[1]]
+            xy_m[axis] = tip_value
+            if is_same(ProbePosition((xy_m[0], xy_m[1])), position.tip):
+                return position.sample.xy_m[axis]
+            return float(mapping.apply(xy_m)[axis])
+        region = self.region.current
+        if region is None:
+            return None
+        try:
+            tip = REGION_CHANGES[name](tip_value).onto(region.tip)
+        except InvalidValue:  # the microscope tells what is no frame: that is told as it is
+            return None
+        return value_in(name, region.sample if is_same(tip, region.tip) else mapping.to_sample(tip))
+
+    # --- packets ---
+
+    def incoming(self, packet: Packet, header: PacketHeader, now_ns: int) -> Packet:
+        handler = {
+            SCAN_PARAMETERS.name: self._region_told,
+            PROBE_POSITION.name: self._probe_told,
+            SPECTRUM.name: self._spectrum_told,
+            SCAN_LINES.name: self._lines_told,
+        }.get(header.message)
+        if handler is None:
+            return packet
+        told = self._codec.decode_packet(header.message, packet.payload)
+        payload = handler(told, packet.payload, (header.time_ns or now_ns) * 1e-9)
+        return packet if payload is None else Packet(packet.envelope, payload, packet.time_ns)
+
+    def _region_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
+        if not isinstance(told, ScanParameters) or not isinstance(told.region, Region):
+            return None
+        if isinstance(told.shape, tuple):
+            self.shape = told.shape
+        mapping, known = self._mapping_at(time_s), self.region.published(told.region)
+        if known is None or mapping is None:
+            sample = told.region if mapping is None else mapping.to_sample(told.region)
+            place = PositionPair(sample, self._codec.encode(ScanParameters(sample)), told.region, bytes(payload))
+            known = self.region.at(place)
+        self.region = known
+        if mapping is None or known.current is None:
+            return None
+        return self._codec.relocated("ScanParameters2d", payload, known.current.said)
+
+    def _lines_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
+        """They lie where the frame is that they are taken in; the finished scan will be told to lie where it was."""
+        region, mapping = getattr(told, "region", None), self._mapping_at(time_s)
+        if region is None or mapping is None:
+            return None
+        known = self.region.published(region)
+        if known is None or known.current is None:
+            said = self._codec.encode(ScanParameters(mapping.to_sample(region)))
+        else:
+            self.region, said = known, known.current.said
+        return self._codec.relocated("ScanLines", payload, said)
+
+    def _probe_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
+        if not isinstance(told, ProbePosition):
+            return None
+        mapping, known = self._mapping_at(time_s), self.probe.published(told)
+        if known is None or mapping is None:
+            sample = told if mapping is None else _position(mapping, told.xy_m)
+            known = self.probe.at(PositionPair(sample, self._codec.encode(sample), told, bytes(payload)))
+        self.probe = known
+        if mapping is None or known.current is None:
+            return None
+        return self._codec.relocated("ProbePosition", payload, known.current.said)
+
+    def _spectrum_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
+        """It lies where the sample was at its own time, which may not be that of the move to it."""
+        mapping, position_m = self._mapping_at(time_s), getattr(told, "position_m", None)
+        if mapping is None or position_m is None:
+            return None
+        return self._codec.relocated("Spec1d", payload, self._codec.encode(_position(mapping, position_m)))
+
+
+def _place(codec: PlaceCodec, kind: int, saved: SavedPlace) -> PositionPair[Any]:
+    sample, tip = (codec.decode_packet(_MESSAGES[kind], part) for part in (saved.said, saved.sent))
+    if isinstance(sample, ScanParameters) and isinstance(tip, ScanParameters):
+        sample, tip = sample.region, tip.region
+    if sample is None or tip is None:
+        raise ValueError("a place in force that can't be read")
+    return PositionPair(sample, saved.said, tip, saved.sent)
+
+
+def _place_of(request: Request) -> Region | RegionChange | ProbePosition | PositionChange | None:
+    subject = request.subject
+    if request.kind == _SET_SCAN and isinstance(subject, ScanParameters):
+        return subject.region
+    if request.kind == _SET_PROBE and isinstance(subject, ProbePosition | PositionChange):
+        return subject
+    if request.kind != _PARAM or not isinstance(subject, Parameter):
+        return None
+    if subject.name not in REGION_CHANGES and subject.name not in PROBE_CHANGES:
+        return None
+    value = 1.0 if subject.value is None else number_of(subject)
+    if value is None:
+        return None  # the limits say what is wrong with it
+    return REGION_CHANGES[subject.name](value) if subject.name in REGION_CHANGES else PROBE_CHANGES[subject.name](value)
+
+
+def _names(asked: object) -> tuple[str, ...]:
+    if isinstance(asked, Parameter):
+        return (asked.name,)
+    if isinstance(asked, ScanParameters):
+        return tuple(name for name, _ in scan_values(asked))
+    if isinstance(asked, PositionChange):
+        return (names.PROBE_POS_X,) if asked.y_m is None else (names.PROBE_POS_Y,)
+    return (names.PROBE_POS_X, names.PROBE_POS_Y)
+
+
+def _said(place: PositionPair[Any]) -> str:
+    def centre(where: Region | ProbePosition) -> str:
+        x, y = where.center_m if isinstance(where, Region) else where.xy_m
+        return f"({x:.6g}, {y:.6g}) m"
+
+    return f"that is {centre(place.tip)} at the tip, asked for at {centre(place.sample)} on the sample"
+
+
+def _position(mapping: Mapping, xy_m: tuple[float, float]) -> ProbePosition:
+    x, y = mapping.apply(xy_m)
+    return ProbePosition((float(x), float(y)))

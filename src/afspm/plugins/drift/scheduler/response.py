@@ -1,0 +1,196 @@
+"""The response to a registered scan: flags, scans to be taken again, a rate handed over to the controller."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from afspm.basics.frozen import replace
+from afspm.model import (
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Parameter,
+    Problem,
+    Request,
+    RescanKind,
+    Response,
+    names,
+)
+from afspm.plugins.drift.scheduler.messages import Compensated, RescanWanted
+from afspm.plugins.drift.scheduler.state import CallPerson, DriftDraft, FollowUp, RespondToFailure, RespondToScan
+from afspm.plugins.drift.scheduler.tally import LATELY
+from afspm.scheduler.coordinate_frame import AskMicroscope
+from afspm.scheduler.events import Announced, Delegate, ProblemSeen
+
+RESCAN = "DriftRescan"
+_DRIFT, _MALFUNCTION = int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFUNCTION)
+_MOST_UNREGISTERED = 3
+"""As many unregistered scans in a row are as good as a lost sample: the number of the trackers."""
+_AT_START = "a scan in the other direction gives the velocity of the drift"
+
+
+def respond(draft: DriftDraft, what: FollowUp) -> None:
+    """Give a response that was put off until its scan was published."""
+    match what:
+        case RespondToScan():
+            _to_scan(draft, what)
+        case RespondToFailure():
+            _to_failure(draft, what.why)
+        case CallPerson():
+            _call_person(draft)
+
+
+def is_given_up(draft: DriftDraft) -> bool:
+    """Return whether a person was called to a worker that always ends."""
+    return _MALFUNCTION in draft.control.problems
+
+
+def _to_scan(draft: DriftDraft, what: RespondToScan) -> None:
+    registered = what.registered
+    draft.duties = replace(draft.duties, unregistered=0)
+    if not draft.corrects:
+        draft.duties = replace(draft.duties, started=True)  # before correction the velocity has time to show
+    elif draft.control.mode is ControlMode.MANUAL:
+        # a person's scan is followed, and not scanned again
+        if registered.matched and not registered.lost:
+            _clear_own_flag(draft)
+    elif registered.lost:
+        _search(draft, f"the sample is lost: {registered.reason}")
+    elif not draft.duties.started:
+        _scan_in_opposite_direction(draft, what.job.upwards)
+    elif draft.tally.exceeds(draft.env.settings.most_unregistered):
+        _too_few(draft)
+    else:
+        if registered.matched:
+            _clear_own_flag(draft)
+        if registered.rescan:
+            _want(draft, RescanKind.AGAIN, registered.rescan)
+
+
+def _to_failure(draft: DriftDraft, why: str) -> None:
+    if not draft.corrects or draft.control.mode is ControlMode.MANUAL:
+        return
+    unregistered = draft.duties.unregistered + 1
+    if unregistered < _MOST_UNREGISTERED:
+        draft.duties = replace(draft.duties, unregistered=unregistered)
+        if draft.tally.exceeds(draft.env.settings.most_unregistered):
+            _too_few(draft)
+        return
+    draft.duties = replace(draft.duties, unregistered=0)  # a component that goes on gets the flag after as many again
+    draft.tally = draft.tally.share_restarted()
+    _search(draft, f"{_MOST_UNREGISTERED} scans in a row could not be registered: {why}")
+
+
+def _call_person(draft: DriftDraft) -> None:
+    """Flag a malfunction until a person has looked; a worker whose drift is never corrected delays no component."""
+    if not draft.env.settings.correct:
+        return
+    draft.worker = replace(draft.worker, waits_for_person=True)
+    draft.outputs.append(ProblemSeen(_MALFUNCTION, flagged=True, name=draft.env.name))
+
+
+def _too_few(draft: DriftDraft) -> None:
+    draft.tally = draft.tally.share_restarted()
+    share = f"more than {draft.env.settings.most_unregistered:.0%} of the last {LATELY} scans were not registered"
+    _search(draft, f"{share}: {draft.tally.summary()}")
+
+
+def _search(draft: DriftDraft, why: str) -> None:
+    draft.outputs.append(ProblemSeen(_DRIFT, flagged=True, name=draft.env.name))
+    # a component that searches has widened the region: the region of the scans before is what was asked for
+    if draft.control.solving != _DRIFT:
+        _want(draft, RescanKind.SEARCH, why)
+
+
+def _scan_in_opposite_direction(draft: DriftDraft, upwards: bool | None) -> None:
+    """Have the first scan taken in the other direction before any component goes on."""
+    draft.duties = replace(draft.duties, started=True)
+    if upwards is None:
+        why = f"the microscope does not report {names.SCAN_DIRECTION}"
+        draft.log("INFO", f"{why}: the first scan is not taken in both directions")
+        return
+    draft.log("INFO", "thermal-drift is flagged until the first scan was taken in both directions: normal at the start")
+    draft.outputs.append(ProblemSeen(_DRIFT, flagged=True, name=draft.env.name))
+    _want(draft, RescanKind.OPPOSITE, _AT_START, upwards=not upwards)
+
+
+def _clear_own_flag(draft: DriftDraft) -> None:
+    """Clear the scheduler's flag; a component that solves it restores its own changes first."""
+    control = draft.control
+    if control.problems.get(_DRIFT) == draft.env.name and control.solving != _DRIFT:
+        draft.outputs.append(ProblemSeen(_DRIFT, flagged=False, name=draft.env.name))
+
+
+def _want(draft: DriftDraft, kind: RescanKind, reason: str, *, upwards: bool | None = None) -> None:
+    place = draft.places.region.current
+    if place is None:
+        draft.log("ERROR", f"{reason}, and the region to scan again is unknown")
+        return
+    wanted = RescanWanted(kind, place.said, draft.places.shape, reason, draft.now_ns, upwards)
+    level = "INFO" if kind is RescanKind.OPPOSITE else "WARNING"  # one belongs to the beginning of every night
+    draft.log(level, f"requesting a rescan: {reason}")
+    draft.outputs.append(Announced(RESCAN, draft.env.codec.encode_rescan(wanted)))
+
+
+# --- a controller that compensates by itself --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RateGiven:
+    """The controller was asked to compensate `value_m_s` along an axis.
+
+    Attributes:
+        is_new: the worker has to reckon with it from now on.
+    """
+
+    axis: int
+    name: str
+    value_m_s: float
+    is_new: bool
+
+
+def restore_compensation(draft: DriftDraft) -> None:
+    """Have the controller compensate what is reckoned with: nothing at first, whatever a night before has left."""
+    for axis, name in enumerate(_axes(draft)):
+        _ask_rate(draft, RateGiven(axis, name, draft.duties.given_m_s[axis], is_new=False))
+
+
+def hand_over(draft: DriftDraft) -> None:
+    """Give the controller the newest rate, if it is significant; nothing is changed under the hands of a person."""
+    predicted = draft.forecast.predicted(draft.now_ns * 1e-9)
+    if draft.control.mode is ControlMode.MANUAL or predicted is None or not draft.corrects:
+        return
+    sd_m_s = np.sqrt(np.diagonal(predicted.rate_covariance))
+    if np.hypot(*predicted.rate_m_s) <= np.hypot(*sd_m_s):
+        return
+    for axis, name in enumerate(_axes(draft)):
+        value_m_s = float(draft.duties.given_m_s[axis] + predicted.rate_m_s[axis])
+        _ask_rate(draft, RateGiven(axis, name, value_m_s, is_new=True))
+
+
+def rate_answered(draft: DriftDraft, given: RateGiven, response: Response) -> None:
+    """Take the answer for one axis: the controller may take one and refuse the other."""
+    if not response.ok:
+        # not free: a scan has begun already, and the rate is handed over after the next
+        if response.code != ControlResponse.NOT_FREE:
+            draft.log("ERROR", f"the controller refused the drift rate, {given.name}: {response.reason}")
+        return
+    if not given.is_new:
+        return
+    x_m_s, y_m_s = draft.duties.given_m_s
+    now_given = (given.value_m_s, y_m_s) if given.axis == 0 else (x_m_s, given.value_m_s)
+    draft.duties = replace(draft.duties, given_m_s=now_given)
+    draft.outputs.append(Delegate(Compensated(draft.now_ns * 1e-9, now_given)))
+
+
+def _axes(draft: DriftDraft) -> tuple[str, ...]:
+    compensate = draft.env.settings.compensate
+    return () if compensate is None else (compensate.x, compensate.y)
+
+
+def _ask_rate(draft: DriftDraft, given: RateGiven) -> None:
+    parameter = Parameter(given.name, f"{given.value_m_s:.9g}", "m/s")
+    request = Request(int(ControlRequest.PARAM), parameter, draft.env.codec.encode(parameter))
+    draft.outputs.append(AskMicroscope(request, given))

@@ -1,0 +1,355 @@
+"""A scan from its first packet to its publication in sample coordinates.
+
+| step | when | then |
+| --- | --- | --- |
+| held | its first channel comes | all that follows it waits in the gate |
+| registered | its channel for drift comes | a job for the worker |
+| settled | the worker's report, an error, a time limit | its mapping is announced, and saved with the state |
+| released | at once | scan and followers come once more, and pass in their order |
+| responded to | in a step of its own | flags and rescans, after the scan was published |
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from afspm.basics.errors import AfspmError
+from afspm.basics.formatting import lengths_text
+from afspm.basics.frozen import replace
+from afspm.basics.plain_data import Plain
+from afspm.model import (
+    Frame,
+    Packet,
+    PacketHeader,
+    Region,
+    RegistrationOutcome,
+    Scan,
+    ScanParameters,
+    ScopeState,
+    ScopeStatus,
+)
+from afspm.plugins.drift.mapping import Mapping
+from afspm.plugins.drift.scheduler import response
+from afspm.plugins.drift.scheduler.messages import (
+    DriftCodec,
+    Forecasted,
+    Matrix,
+    NotRegistered,
+    Registered,
+    ScanJob,
+    StartWorker,
+    WorkerGone,
+    WorkerReport,
+)
+from afspm.plugins.drift.scheduler.positions import is_same
+from afspm.plugins.drift.scheduler.state import (
+    CallPerson,
+    DriftDraft,
+    FollowUp,
+    HeldScan,
+    RespondToFailure,
+    RespondToScan,
+)
+from afspm.scheduler.coordinate_frame import HoldControl, Reconsider, SaveNow
+from afspm.scheduler.events import Announced, Delegate, PacketIn
+
+MAPPING = "DriftMapping"
+_HOW = {
+    RegistrationOutcome.COARSE: "is registered coarsely",
+    RegistrationOutcome.REFUSED: "is not recognised, and published at the predicted position",
+    RegistrationOutcome.FAILED: "could not be registered, and is published at the predicted position",
+    RegistrationOutcome.NEW: "shows a new place, and is published at the predicted position",
+}
+_LEVELS = {
+    RegistrationOutcome.COARSE: "WARNING",
+    RegistrationOutcome.REFUSED: "WARNING",
+    RegistrationOutcome.FAILED: "ERROR",
+    RegistrationOutcome.NEW: "INFO",
+}
+_MOST_TRIES = 2
+"""A scan over which the worker ends is tried as often."""
+_MOST_ENDS = 4
+"""After as many ends in a row, without a scan registered between them, the worker is not started again."""
+
+
+# --- packets ----------------------------------------------------------------------------------------------------------
+
+
+def take_packet(draft: DriftDraft, event: PacketIn) -> None:
+    """Pass a packet on, or keep it with the scan that it belongs to or follows."""
+    if (before := draft.gate.held) is not None:
+        draft.gate = draft.gate.keep(event)
+        _look_at(draft, before, event)
+        return
+    message, packet = event.header.message, event.packet
+    if message == "ScopeStateMsg":
+        note_state(draft, packet.payload, packet.time_ns)
+    scan = draft.env.codec.decode_packet(message, packet.payload) if message == "Scan2d" else None
+    if not isinstance(scan, Scan) or not scan.values.size:
+        draft.outputs.append(event)
+        return
+    key = scan_key(scan, packet)
+    if key in draft.gate.settled:
+        draft.outputs.append(_relocated(event, scan, draft.gate.settled[key], draft.env.codec))
+        return
+    draft.timing = draft.timing.scan_came()
+    until_s = draft.now_s + draft.env.settings.longest_registration
+    held = HeldScan(key, _middle_s(draft, scan, event), until_s, scan.filename, scan.region.center_m)
+    draft.gate = replace(draft.gate, held=held).keep(event)
+    draft.outputs.append(HoldControl(until_s))
+    _look_at(draft, held, event)
+
+
+def _look_at(draft: DriftDraft, held: HeldScan, event: PacketIn) -> None:
+    """Find the channel to register among the packets that wait, or the end of a scan that has none."""
+    if held.asked:
+        return
+    if draft.worker.ends >= _MOST_ENDS:  # a person was called, or decided that the experiment goes on
+        publish_as_predicted(draft, held, "drift is no longer followed", "WARNING")
+        return
+    message, codec = event.header.message, draft.env.codec
+    if message == "ScopeStateMsg":
+        status = codec.decode_packet(message, event.packet.payload)
+        if isinstance(status, ScopeStatus) and status.state is not ScopeState.SCANNING:
+            channel = draft.gate.channel or "in a unit of length"
+            _give_up(draft, held.key, f"without the channel {channel} it can't be used for drift", "WARNING")
+    elif message == "Scan2d":
+        scan = codec.decode_packet(message, event.packet.payload)
+        if not isinstance(scan, Scan) or not scan.values.size or scan_key(scan, event.packet) != held.key:
+            return
+        draft.gate = draft.gate.with_channel_of(scan)
+        if scan.channel == draft.gate.channel:
+            _register(draft, held, scan, event)
+
+
+def _register(draft: DriftDraft, held: HeldScan, scan: Scan, event: PacketIn) -> None:
+    end_s = _end_s(scan, event, draft.now_ns)
+    start_s, upwards = 2 * held.middle_s - end_s, None
+    begun = draft.timing.of_scan(end_s)
+    if begun is not None and not begun.was_paused:
+        upwards = begun.upwards
+        durations = draft.places.durations.learn(scan.shape, scan.region.size_m, end_s - start_s)
+        draft.places = replace(draft.places, durations=durations)
+    _ask_worker(draft, held, ScanJob(held.key, scan, start_s, end_s, upwards, _meant(draft, scan)))
+
+
+def _ask_worker(draft: DriftDraft, held: HeldScan, job: ScanJob) -> None:
+    draft.gate = replace(draft.gate, held=replace(held, asked=True, tries=held.tries + 1))
+    draft.worker = replace(draft.worker, job=job)
+    draft.outputs.append(Delegate(job))
+
+
+def _meant(draft: DriftDraft, scan: Scan) -> Region | None:
+    """The region that the scan was meant to show, if it was taken where the scheduler had it set."""
+    place = draft.places.region.current
+    if place is None or not is_same(place.tip, scan.region):
+        return None
+    return dataclasses.replace(place.sample, frame=Frame.SAMPLE)
+
+
+def _middle_s(draft: DriftDraft, scan: Scan, event: PacketIn) -> float:
+    """The middle between the scan's start and its own end: a file that comes late biases nothing."""
+    expected_s = draft.places.durations.expected_s(scan.shape, scan.region.size_m)
+    return draft.timing.middle_s(_end_s(scan, event, draft.now_ns), expected_s)
+
+
+def note_state(draft: DriftDraft, payload: bytes | memoryview, time_ns: int | None) -> None:
+    """Follow the start of scans."""
+    status = draft.env.codec.decode_packet("ScopeStateMsg", payload)
+    if isinstance(status, ScopeStatus) and time_ns is not None:
+        draft.timing = draft.timing.with_state(status, time_ns * 1e-9, draft.places.upwards)
+
+
+# --- reports of the worker --------------------------------------------------------------------------------------------
+
+
+def take_report(draft: DriftDraft, report: WorkerReport) -> None:
+    """Take a report of the worker."""
+    match report:
+        case Registered():
+            _registered(draft, report)
+        case NotRegistered():
+            draft.worker = replace(draft.worker, ends=0)
+            _give_up(draft, report.key, report.reason)
+        case WorkerGone():
+            _gone(draft, report)
+        case Forecasted():
+            _learn(draft, report.forecast)
+
+
+def _registered(draft: DriftDraft, report: Registered) -> None:
+    draft.worker = replace(draft.worker, ends=0)
+    _learn(draft, report.forecast)
+    held, job = draft.gate.held, draft.worker.job
+    is_awaited = held is not None and held.key == report.key
+    if held is not None and is_awaited:
+        corrects = draft.forecast.corrects(draft.env.settings, report.time_s)
+        draft.gate = draft.gate.settle(report.key, report.matrix if corrects else None)
+        _log_if_slow(draft, held)
+    if job is None or job.key != report.key:
+        return  # a worker that was restarted repeats its last report
+    draft.worker = replace(draft.worker, job=None)
+    draft.forecast = replace(draft.forecast, lost=report.lost)
+    before_ns = draft.gate.next_ns() if is_awaited else None
+    _announce(draft, report, job.scan.filename, job.scan.region.center_m, before_ns)
+    _log_outcome(draft, report, job.scan.filename)
+    if is_awaited:
+        _release(draft)
+    _follow(draft, RespondToScan(report, job))
+    response.hand_over(draft)
+
+
+def _gone(draft: DriftDraft, report: WorkerGone) -> None:
+    ends = draft.worker.ends + 1
+    draft.worker = replace(draft.worker, ends=ends)
+    held, job = draft.gate.held, draft.worker.job
+    if ends >= _MOST_ENDS:
+        draft.log("CRITICAL", f"drift is no longer followed: {report.reason}")
+        _follow(draft, CallPerson())
+        if held is not None:
+            publish_as_predicted(draft, held, report.reason)
+        return
+    draft.log("ERROR", f"the process that registers scans ended and is restarted: {report.reason}")
+    draft.outputs.append(Delegate(StartWorker()))
+    if held is None or not held.asked:
+        return
+    if job is None or job.key != held.key or held.tries >= _MOST_TRIES:
+        _give_up(draft, held.key, report.reason)
+    else:
+        _ask_worker(draft, held, job)
+
+
+def expire(draft: DriftDraft) -> None:
+    """Give up a scan that waits too long; a worker that hangs over it is killed."""
+    held = draft.gate.held
+    if held is None or draft.now_s < held.until_s:
+        return
+    if held.asked:
+        draft.worker = replace(draft.worker, job=None)
+        draft.outputs.append(Delegate(StartWorker()))
+    _give_up(draft, held.key, f"it was not registered within {draft.env.settings.longest_registration:g} s")
+
+
+def restart_if_cleared(draft: DriftDraft) -> None:
+    """Start the worker again once a person has cleared the malfunction."""
+    if draft.worker.waits_for_person and not response.is_given_up(draft):
+        draft.worker = replace(draft.worker, waits_for_person=False, ends=0)
+        draft.outputs.append(Delegate(StartWorker()))
+
+
+def _learn(draft: DriftDraft, forecast: Plain | None) -> None:
+    try:
+        draft.forecast = draft.forecast.learn(forecast)
+    except AfspmError as error:
+        draft.log("ERROR", f"the drift forecast can't be read: {error}")
+
+
+def _log_if_slow(draft: DriftDraft, held: HeldScan) -> None:
+    """Warn once, before it takes too long: with more references it takes several times as long."""
+    limit_s = draft.env.settings.longest_registration
+    took_s = draft.now_s - (held.until_s - limit_s)
+    if draft.worker.slow_logged or took_s < limit_s / 3:
+        return
+    draft.worker = replace(draft.worker, slow_logged=True)
+    text = f"registering a scan took {took_s:.1f} s, and is given up after longest_registration = {limit_s:g} s"
+    draft.log("WARNING", f"{text}: use fewer pixels, or raise it")
+
+
+# --- publication ------------------------------------------------------------------------------------------------------
+
+
+def _give_up(draft: DriftDraft, key: str, why: str, level: str = "") -> None:
+    """Publish a scan by prediction; after too many of them the prediction is not reliable."""
+    held = draft.gate.held
+    if held is not None and held.key == key:
+        _follow(draft, RespondToFailure(why))
+        publish_as_predicted(draft, held, why, level)
+
+
+def publish_as_predicted(draft: DriftDraft, held: HeldScan, why: str, level: str = "") -> None:
+    """Publish a scan that was not registered where the sample is predicted."""
+    mapping = draft.forecast.mapping_at(draft.env.settings, held.middle_s)
+    draft.gate = draft.gate.settle(held.key, None if mapping is None else mapping.matrix.tolist())
+    report = _predicted(draft, held, why)
+    _announce(draft, report, held.filename, held.center_m, draft.gate.next_ns())
+    _log_outcome(draft, report, held.filename, level)
+    _release(draft)
+
+
+def _announce(
+    draft: DriftDraft, report: Registered, filename: str, center_m: tuple[float, float], before_ns: int | None
+) -> None:
+    """Count a scan, and publish how its position is known."""
+    draft.tally = draft.tally.add(report.outcome)
+    payload = draft.env.codec.encode_mapping(report, filename, center_m, correcting=draft.corrects)
+    draft.outputs.append(Announced(MAPPING, payload, before_ns))
+
+
+def _log_outcome(draft: DriftDraft, report: Registered, filename: str, level: str = "") -> None:
+    """Log the errors of an estimator, and a scan that is not registered well."""
+    for failure in report.failures:
+        draft.log("ERROR", failure)
+    if report.outcome is not RegistrationOutcome.REGISTERED:
+        how = _HOW[report.outcome]
+        sd = "unknown" if math.isnan(report.sd_m) else f"± {lengths_text([float(f'{report.sd_m:.2g}')])}"
+        name = filename.replace("\\", "/").rpartition("/")[2] or report.key
+        why = "" if report.failures else f": {report.reason}"  # an error is logged already
+        text = f"scan {name} {how} ({sd}){why}; {draft.tally.summary()}"
+        draft.log(level or _LEVELS[report.outcome], text)
+
+
+def _release(draft: DriftDraft) -> None:
+    # saved first: published again after a kill, the scan must have the same mapping
+    draft.outputs += (SaveNow(), *map(Reconsider, draft.gate.waiting))
+    draft.gate = draft.gate.opened()
+
+
+def _follow(draft: DriftDraft, what: FollowUp) -> None:
+    """Put a response off to a step of its own, since it may change who is in control."""
+    draft.following = (*draft.following, (draft.now_s, what))
+
+
+def _predicted(draft: DriftDraft, held: HeldScan, why: str) -> Registered:
+    there = draft.forecast.predicted(held.middle_s)
+    known = None if there is None else (there.covariance_m2, there.rate_m_s, there.rate_covariance)
+    covariance_m2, rate_m_s, rate_covariance = ([], [], []) if known is None else (one.tolist() for one in known)
+    return Registered(
+        key=held.key,
+        time_s=held.middle_s,
+        matrix=(Mapping.identity() if there is None else there.mapping).matrix.tolist(),
+        covariance_m2=covariance_m2,
+        rate_m_s=rate_m_s,
+        rate_covariance=rate_covariance,
+        outcome=RegistrationOutcome.FAILED,
+        lost=draft.forecast.lost,
+        reason=why,
+        residual_m=[],
+        references=[],
+        rescan="",
+        forecast=None,
+        failures=[],
+    )
+
+
+def scan_key(scan: Scan, packet: Packet) -> str:
+    """Return a key that all channels of a scan share, and no other scan has."""
+    if scan.time_ns is None and scan.filename:
+        return scan.filename
+    return f"at {packet.time_ns if scan.time_ns is None else scan.time_ns} ns"
+
+
+def _end_s(scan: Scan, event: PacketIn, now_ns: int) -> float:
+    time_ns = scan.time_ns if scan.time_ns is not None else event.packet.time_ns
+    return (now_ns if time_ns is None else time_ns) * 1e-9
+
+
+def _relocated(event: PacketIn, scan: Scan, matrix: Matrix | None, codec: DriftCodec) -> PacketIn:
+    if matrix is None:
+        return event
+    region = Mapping(matrix).to_sample(scan.region)  # type: ignore[arg-type]
+    packet, header = event.packet, event.header
+    payload = codec.relocated("Scan2d", packet.payload, codec.encode(ScanParameters(region)))
+    size_m = region.size_m if header.size_m is not None else None
+    moved = PacketHeader(header.message, header.channel, size_m, header.kind, header.time_ns)
+    return PacketIn(Packet(packet.envelope, payload, packet.time_ns), moved)

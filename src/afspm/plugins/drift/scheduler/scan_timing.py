@@ -1,0 +1,105 @@
+"""The timing of scans: when the running scan began, and how long a scan will take."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from afspm.basics.frozen import replace
+from afspm.model import ScopeState, ScopeStatus
+
+XY = tuple[float, float]
+Shape = tuple[int, int]
+
+_KEPT = 16
+
+
+@dataclass(frozen=True)
+class ScanStart:
+    """A scan that has begun.
+
+    Attributes:
+        time_s: experiment time.
+        upwards: direction of its slow axis; None: not known.
+        was_paused: its rows did not all follow each other at once.
+    """
+
+    time_s: float
+    upwards: bool | None
+    was_paused: bool = False
+
+
+@dataclass(frozen=True)
+class ScanStartTracker:
+    """Follows the state of the microscope.
+
+    SCANNING is published again after a pause, and to a scheduler after its restart: then the scan began before.
+    """
+
+    begun: ScanStart | None = None
+    is_scanning: bool = False
+
+    def with_state(self, status: ScopeStatus, time_s: float, upwards: bool | None) -> ScanStartTracker:
+        """Take a state; `upwards`: the direction in force. A lost microscope goes on with its scan."""
+        if status.state is ScopeState.UNDEFINED:
+            return self
+        is_scanning, begun = status.state is ScopeState.SCANNING, self.begun
+        if is_scanning and not self.is_scanning:
+            begun = ScanStart(time_s, upwards, status.paused is True)
+        elif is_scanning and begun is not None and status.paused is True:
+            begun = replace(begun, was_paused=True)
+        return ScanStartTracker(begun, is_scanning)
+
+    def scan_came(self) -> ScanStartTracker:
+        """Close the scan: the next SCANNING begins another, even without a state between them."""
+        return replace(self, is_scanning=False)
+
+    def of_scan(self, end_s: float) -> ScanStart | None:
+        """Return the start of the scan that ended at a time; None: it is not known."""
+        return self.begun if self.begun is not None and self.begun.time_s < end_s else None
+
+    def middle_s(self, end_s: float, expected_s: float) -> float:
+        """Return the middle of the scan that ended then: by its start, or by its expected duration."""
+        begun = self.of_scan(end_s)
+        return end_s - expected_s / 2 if begun is None else (begun.time_s + end_s) / 2
+
+
+@dataclass(frozen=True)
+class ScanDuration:
+    """The duration of one kind of scan."""
+
+    shape: Shape
+    size_m: XY
+    duration_s: float
+
+
+@dataclass(frozen=True)
+class ScanDurations:
+    """Learnt from finished scans, newest last; empty again when the speed is set."""
+
+    known: tuple[ScanDuration, ...] = ()
+
+    def learn(self, shape: Shape, size_m: XY, duration_s: float) -> ScanDurations:
+        """Take the duration of a scan of this shape and size."""
+        newest = ScanDuration(shape, _rounded(size_m), duration_s)
+        others = [one for one in self.known if (one.shape, one.size_m) != (newest.shape, newest.size_m)]
+        return ScanDurations((*others, newest)[-_KEPT:])
+
+    def expected_s(self, shape: Shape | None, size_m: XY) -> float:
+        """Return the expected duration of a scan; 0 if nothing is known.
+
+        One of another size or shape is reckoned from the latest: its time goes as the length of its lines.
+        """
+        if not self.known:
+            return 0.0
+        latest = self.known[-1]
+        shape = latest.shape if shape is None else shape
+        size_m = _rounded(size_m)
+        for one in self.known:
+            if (one.shape, one.size_m) == (shape, size_m):
+                return one.duration_s
+        return latest.duration_s * (shape[0] * size_m[0]) / (latest.shape[0] * latest.size_m[0])
+
+
+def _rounded(size_m: XY) -> XY:
+    """Sizes to six digits: a controller's rounding makes no other scan."""
+    return (float(f"{size_m[0]:.6g}"), float(f"{size_m[1]:.6g}"))

@@ -1,0 +1,130 @@
+"""The Drift Compensated Scheduler (paper, "Drift Compensated Scheduler"): takes the place of the Scheduler."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+from afspm import wire
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.errors import ConfigError
+from afspm.basics.plain_data import PlainMapping
+from afspm.model import Frame
+from afspm.model.geometry import XY
+from afspm.plugins.drift.scheduler.messages import Matrix, Registered, RescanWanted
+from afspm.plugins.drift.scheduler.response import RESCAN
+from afspm.plugins.drift.scheduler.sample_frame import SampleFrame
+from afspm.plugins.drift.scheduler.scan_intake import MAPPING
+from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings
+from afspm.plugins.drift.scheduler.worker_process import DriftWorkerProcess
+from afspm.scheduler.scheduler import Coordinates, Scheduler
+from afspm.scheduler.wire_codec import WireCodec
+from afspm.transport.process.context import ProcessContext
+from afspm.wire.mapping import timestamp
+from afspm.wire.messages import DriftMapping, DriftRescan, ScanParameters2d
+
+
+class DriftCompensatedScheduler(Scheduler):
+    """A Scheduler whose components live in the coordinates of the sample, while the microscope stays in those of its
+    tip: drift is followed from scan to scan, scans and spectra are published where they were taken on the sample, and
+    what is asked for is sent to where it is at the tip by then.
+
+    It publishes a `DriftMapping` whenever more is known, and a `DriftRescan` when it would like a scan to be taken
+    again, for the component `Rescanner`. When it does not know any more where the sample is, since it is not found or
+    three scans in a row could not be registered, it flags thermal-drift; when nothing will be registered any more,
+    device-malfunction: who removes that has it tried again.
+
+    Args:
+        drift: how drift is followed and corrected.
+        control, limits, cache: as for the Scheduler. Limits hold for what goes to the microscope: tip coordinates.
+    """
+
+    frame: ClassVar = Frame.SAMPLE
+    flags: ClassVar = ("thermal-drift", "device-malfunction")
+    publishes: ClassVar = (MAPPING, RESCAN)
+    plain_settings: ClassVar = ("drift",)
+    needs_parameters: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        drift: DriftCompensationSettings | None = None,
+        control: PlainMapping | None = None,
+        limits: PlainMapping | None = None,
+        cache: PlainMapping | None = None,
+    ) -> None:
+        super().__init__(control, limits, cache)
+        self.drift = (
+            DriftCompensationSettings.from_table(drift or {})
+            if not isinstance(drift, DriftCompensationSettings)
+            else drift
+        )
+        if (compensate := self.drift.compensate) is not None:
+            self.needs_parameters = (compensate.x, compensate.y)
+
+    def check(self) -> None:
+        """Make estimator and tracker once, and check that they do what is asked. Raises ConfigError if not."""
+        from afspm.plugins.drift.estimators import estimator
+        from afspm.plugins.drift.trackers import tracker
+
+        made = tracker(self.drift.tracker, estimator(self.drift.estimator))
+        if self.drift.compensate is not None and not hasattr(made, "compensated"):
+            raise ConfigError(
+                "this tracker can't follow a controller that compensates by itself",
+                where="drift: compensate",
+                hint='tracker = "bank", or leave compensate out',
+            )
+
+    def coordinates(self, context: ProcessContext) -> Coordinates:
+        launch = context.launch
+        file = Path(launch.state_dir) / f"{launch.name}.drift.npz" if launch.state_dir else None
+        drift = self.drift.beside(launch.solved)
+        if drift != self.drift:
+            context.log.info("no component solves thermal-drift: the first scan is not taken in both directions")
+        worker = DriftWorkerProcess(drift, file, context.log)
+        worker.late = context.clock.late
+        return Coordinates(SampleFrame.initial(drift, DriftWireCodec(), launch.name), worker)
+
+
+class DriftWireCodec(WireCodec):
+    """See `scheduler.drift.messages.DriftCodec`."""
+
+    def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
+        of = "ProbePosition" if message in ("Spec1d", "ProbePosition") else "ScanParameters2d"
+        return wire.relocated(message, payload, wire.place_in(of, told))
+
+    def encode_mapping(self, registered: Registered, filename: str, center_m: XY, *, correcting: bool) -> bytes:
+        return DriftMapping(
+            timestamp=timestamp(round(registered.time_s * NS_PER_S)),
+            matrix=_flat(registered.matrix[:2]),
+            covariance=_flat(registered.covariance_m2),
+            rate=registered.rate_m_s,
+            rate_covariance=_flat(registered.rate_covariance),
+            matched=registered.matched,
+            lost=registered.lost,
+            reason=registered.reason,
+            residual=registered.residual_m,
+            references=registered.references,
+            filename=filename,
+            center=center_m,
+            correcting=correcting,
+            rescan=registered.rescan,
+            outcome=int(registered.outcome),  # type: ignore[arg-type]
+            failures=len(registered.failures),
+        ).SerializeToString()
+
+    def encode_rescan(self, wanted: RescanWanted) -> bytes:
+        params = ScanParameters2d.FromString(wanted.said)
+        if wanted.shape is not None:
+            params.data.shape.y, params.data.shape.x = wanted.shape
+        message = DriftRescan(
+            timestamp=timestamp(wanted.time_ns),
+            params=params,
+            kind=int(wanted.kind),  # type: ignore[arg-type]
+            reason=wanted.reason,
+            upwards=wanted.upwards,
+        )
+        return message.SerializeToString()
+
+
+def _flat(rows: Matrix) -> list[float]:
+    return [value for row in rows for value in row]

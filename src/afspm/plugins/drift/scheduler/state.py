@@ -1,0 +1,290 @@
+"""The state of drift compensation: a tree of frozen parts, the draft of its next state, and what survives a kill."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+
+from afspm.basics.frozen import replace
+from afspm.basics.plain_data import Plain
+from afspm.basics.units import same_kind
+from afspm.model import Scan
+from afspm.model.geometry import XY
+from afspm.plugins.drift.mapping import Mapping as DriftMapping
+from afspm.plugins.drift.scheduler.messages import DriftCodec, Matrix, Registered, ScanJob
+from afspm.plugins.drift.scheduler.place_mapper import Places, SavedPlaces
+from afspm.plugins.drift.scheduler.scan_timing import ScanStartTracker
+from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings
+from afspm.plugins.drift.scheduler.tally import RegistrationTally
+from afspm.plugins.drift.trackers import forecast_from_dict
+from afspm.plugins.drift.tracking import Forecast, Prediction
+from afspm.scheduler.control.arbitration import ArbitrationState
+from afspm.scheduler.coordinate_frame import FrameOutput
+from afspm.scheduler.events import Log, PacketIn, TranslatorCaughtUp
+
+Waits = PacketIn | TranslatorCaughtUp
+
+_SETTLED = 32
+
+
+@dataclass(frozen=True)
+class CurrentForecast:
+    """The newest forecast.
+
+    Attributes:
+        start_s: experiment time at which the experiment began; None: before that.
+        lost: whether the position of the sample is unknown, as of the newest registered scan.
+        text: the forecast as JSON, which only its tracker understands; None: nothing is known yet.
+
+    Raises:
+        InvalidValue: the text is no forecast.
+    """
+
+    start_s: float | None = None
+    lost: bool = False
+    text: str | None = None
+    forecast: Forecast | None = field(init=False, default=None, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.text is not None:
+            object.__setattr__(self, "forecast", forecast_from_dict(json.loads(self.text)))
+
+    def learn(self, forecast: Plain | None) -> CurrentForecast:
+        """Take a forecast of the worker; None: it knows nothing new. Raises InvalidValue if it is no forecast."""
+        return self if forecast is None else CurrentForecast(self.start_s, self.lost, json.dumps(forecast))
+
+    def predicted(self, time_s: float) -> Prediction | None:
+        """Return the prediction for a time; None: nothing is known yet."""
+        return None if self.forecast is None else self.forecast.at(time_s)
+
+    def corrects(self, settings: DriftCompensationSettings, time_s: float) -> bool:
+        """Return whether components are given sample coordinates at a time."""
+        since_s = 0.0 if self.start_s is None else time_s - self.start_s
+        return settings.correct and since_s >= settings.correct_after
+
+    def mapping_at(self, settings: DriftCompensationSettings, time_s: float) -> DriftMapping | None:
+        """Return the mapping from tip to sample coordinates; None: components are given tip coordinates."""
+        if not self.corrects(settings, time_s):
+            return None
+        predicted = self.predicted(time_s)
+        return DriftMapping.identity() if predicted is None else predicted.mapping
+
+
+@dataclass(frozen=True)
+class HeldScan:
+    """A scan that waits for its position.
+
+    Attributes:
+        middle_s: experiment time that its position stands for.
+        until_s: real time until which it waits.
+        filename, center_m: of its first channel, in tip coordinates.
+        asked: it is being registered.
+        tries: how often that was begun.
+    """
+
+    key: str
+    middle_s: float
+    until_s: float
+    filename: str
+    center_m: XY
+    asked: bool = False
+    tries: int = 0
+
+
+@dataclass(frozen=True)
+class ScanGate:
+    """Keeps a scan back until its position is known, and everything that the microscope publishes after it.
+
+    So all channels of a scan get the same mapping, the best that is known, and the order of packets is kept.
+
+    Attributes:
+        waiting: inputs behind the scan, oldest first.
+        settled: the mappings of the latest scans that have passed; None: published unchanged.
+        channel: of the scans that are registered; None: the first in a unit of length.
+    """
+
+    channel: str | None = None
+    held: HeldScan | None = None
+    waiting: tuple[Waits, ...] = ()
+    settled: Mapping[str, Matrix | None] = field(default_factory=dict)
+
+    def keep(self, event: Waits) -> ScanGate:
+        return replace(self, waiting=(*self.waiting, event))
+
+    def next_ns(self) -> int | None:
+        """Return the translator's time of the first packet that waits."""
+        return next((event.packet.time_ns for event in self.waiting if isinstance(event, PacketIn)), None)
+
+    def settle(self, key: str, matrix: Matrix | None) -> ScanGate:
+        """Fix the mapping of a scan, now and should it be published again."""
+        others = [(other, one) for other, one in self.settled.items() if other != key]
+        return replace(self, settled=dict([*others, (key, matrix)][-_SETTLED:]))
+
+    def opened(self) -> ScanGate:
+        """Return the gate without a scan that waits; `waiting` is to be reconsidered."""
+        return replace(self, held=None, waiting=())
+
+    def with_channel_of(self, scan: Scan) -> ScanGate:
+        """Choose the channel, if it is not chosen and a scan is in a unit of length."""
+        is_chosen = self.channel is not None or not same_kind(scan.unit, "m")
+        return self if is_chosen else replace(self, channel=scan.channel)
+
+
+@dataclass(frozen=True)
+class Duties:
+    """The responses that were given, as far as later ones depend on them.
+
+    Attributes:
+        started: the first scan was followed by one in the other direction, or need not be.
+        unregistered: scans in a row that could not be registered.
+        given_m_s: the velocity that the controller compensates.
+    """
+
+    started: bool = False
+    unregistered: int = 0
+    given_m_s: XY = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class WorkerLife:
+    """The worker process, as far as it is known.
+
+    Attributes:
+        job: the scan that it registers.
+        ends: its ends in a row, without a scan registered between them.
+        waits_for_person: it is started again when a person clears device-malfunction.
+        slow_logged: a slow registration was logged.
+    """
+
+    job: ScanJob | None = None
+    ends: int = 0
+    waits_for_person: bool = False
+    slow_logged: bool = False
+
+
+# --- responses that are still to be given, each in a step of its own --------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RespondToScan:
+    registered: Registered
+    job: ScanJob
+
+
+@dataclass(frozen=True)
+class RespondToFailure:
+    why: str
+
+
+@dataclass(frozen=True)
+class CallPerson:
+    """No scan will be registered any more."""
+
+
+FollowUp = RespondToScan | RespondToFailure | CallPerson
+
+
+@dataclass(frozen=True)
+class DriftState:
+    """All that drift compensation decides by.
+
+    Attributes:
+        following: responses to come, each with the real time since when it is due.
+    """
+
+    places: Places = field(default_factory=Places)
+    forecast: CurrentForecast = field(default_factory=CurrentForecast)
+    gate: ScanGate = field(default_factory=ScanGate)
+    timing: ScanStartTracker = field(default_factory=ScanStartTracker)
+    tally: RegistrationTally = field(default_factory=RegistrationTally)
+    duties: Duties = field(default_factory=Duties)
+    worker: WorkerLife = field(default_factory=WorkerLife)
+    following: tuple[tuple[float, FollowUp], ...] = ()
+
+    @classmethod
+    def initial(cls, settings: DriftCompensationSettings) -> DriftState:
+        return cls(gate=ScanGate(settings.channel), duties=Duties(started=settings.at_start == "nothing"))
+
+
+@dataclass(frozen=True)
+class SavedDrift:
+    """The part of a `DriftState` that survives a kill."""
+
+    places: SavedPlaces
+    forecast: CurrentForecast
+    channel: str | None
+    settled: Mapping[str, Matrix | None]
+    tally: RegistrationTally
+    duties: Duties
+
+    @classmethod
+    def of(cls, state: DriftState) -> SavedDrift:
+        gate = state.gate
+        places = SavedPlaces.of(state.places)
+        return cls(places, state.forecast, gate.channel, gate.settled, state.tally, state.duties)
+
+    def restored(self, settings: DriftCompensationSettings, codec: DriftCodec) -> DriftState:
+        """Raises ValueError: a place can't be read."""
+        return DriftState(
+            places=self.places.restored(codec),
+            forecast=self.forecast,
+            gate=ScanGate(settings.channel or self.channel, settled=self.settled),
+            tally=self.tally,
+            duties=self.duties,
+        )
+
+
+@dataclass(frozen=True)
+class DriftEnvironment:
+    """Everything that a step needs beside the state.
+
+    Attributes:
+        name: of the scheduler, in which it flags problems.
+    """
+
+    settings: DriftCompensationSettings
+    codec: DriftCodec
+    name: str
+
+
+_PARTS = tuple(one.name for one in fields(DriftState))
+
+
+class DriftDraft:
+    """One step in progress: the parts of the state so far, the outputs so far, and the time.
+
+    Attributes:
+        control: of the scheduler, before the input of this step.
+        now_s: real and monotonic, for timeouts.
+        now_ns: of the experiment.
+    """
+
+    places: Places
+    forecast: CurrentForecast
+    gate: ScanGate
+    timing: ScanStartTracker
+    tally: RegistrationTally
+    duties: Duties
+    worker: WorkerLife
+    following: tuple[tuple[float, FollowUp], ...]
+
+    def __init__(
+        self, state: DriftState, env: DriftEnvironment, control: ArbitrationState, now_s: float, now_ns: int
+    ) -> None:
+        self.__dict__.update(state.__dict__)
+        self.env = env
+        self.control = control
+        self.now_s = now_s
+        self.now_ns = now_ns
+        self.outputs: list[FrameOutput] = []
+
+    @property
+    def corrects(self) -> bool:
+        return self.forecast.corrects(self.env.settings, self.now_ns * 1e-9)
+
+    def log(self, level: str, text: str) -> None:
+        self.outputs.append(Log(level, text))
+
+    def finish(self) -> DriftState:
+        return DriftState(**{name: self.__dict__[name] for name in _PARTS})

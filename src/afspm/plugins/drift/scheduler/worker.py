@@ -1,0 +1,129 @@
+"""The process that registers scans: whatever an estimator of a user does, and however long, the scheduler goes on.
+
+It takes jobs one after the other, and saves its state before it reports. The end of its jobs ends it, and so does the
+death of the scheduler's process, even while it registers: the worker of the next scheduler knows more by then.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+import threading
+from dataclasses import dataclass
+from multiprocessing import connection
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+
+from afspm.basics.errors import AfspmError, FileError
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.plain_data import Plain
+from afspm.plugins.drift.estimators import PairFailure, estimator
+from afspm.plugins.drift.registration import DriftScan
+from afspm.plugins.drift.scheduler.estimation import Estimation
+from afspm.plugins.drift.scheduler.messages import (
+    Compensated,
+    Forecasted,
+    NotRegistered,
+    ScanJob,
+    WorkerGone,
+    WorkerReport,
+)
+from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings
+from afspm.plugins.drift.scheduler.worker_state import WorkerStateFile
+from afspm.plugins.drift.trackers import tracker
+from afspm.transport.process.parent import leave_interrupts_to_parent
+
+
+@dataclass(frozen=True)
+class Complaint:
+    """An error for the log; the worker goes on."""
+
+    reason: str
+
+
+def main(jobs: Connection, reports: Connection, settings: DriftCompensationSettings, file: Path | None) -> None:
+    """Register scans until there are no more jobs."""
+    leave_interrupts_to_parent()
+    # a print of a user's estimator goes to where errors go
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
+    try:
+        worker = _Worker(settings, WorkerStateFile(file), reports)
+    except AfspmError as error:
+        reports.send(WorkerGone(str(error)))
+        sys.exit(1)
+    while True:
+        try:
+            job: ScanJob | Compensated = jobs.recv()
+        except EOFError:
+            return
+        worker.take(job)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    connection.wait([parent.sentinel])
+    os._exit(ExitCode.ORPHAN)
+
+
+class _Worker:
+    def __init__(self, settings: DriftCompensationSettings, store: WorkerStateFile, reports: Connection) -> None:
+        self._settings = settings
+        self._store = store
+        self._reports = reports
+        self._is_full_logged = False
+        self._estimation = self._saved()
+        self._report(Forecasted(self._estimation.forecast))
+
+    def _saved(self) -> Estimation:
+        """The estimation as it was when a scan was registered last."""
+        failures: list[PairFailure] = []
+        made = tracker(self._settings.tracker, estimator(self._settings.estimator, failures.append))
+        estimation = Estimation(made, self._settings.rescan, self._save, failures)
+        if (state := self._store.load()) is None:
+            return estimation
+        try:
+            estimation.restore(state)
+        except (AfspmError, LookupError, TypeError, ValueError) as error:
+            reason = f"the saved state is of another tracker, or damaged: {error}"
+            hint = "use the tracker that wrote it, or remove the file: the position of the sample is then unknown"
+            raise FileError(reason, where=str(self._store.path), hint=hint) from error
+        return estimation
+
+    def _save(self, state: Plain) -> None:
+        try:
+            self._store.save(state)
+        except FileError as error:  # the knowledge of the drift now is worth more than what a kill would lose
+            if not self._is_full_logged:
+                self._report(Complaint(f"the state of the drift can't be saved: {error}"))
+            self._is_full_logged = True
+        else:
+            self._is_full_logged = False
+
+    def take(self, job: ScanJob | Compensated) -> None:
+        if isinstance(job, ScanJob):
+            self._report(self._register(job))
+            return
+        try:
+            self._estimation.compensated(job.time_s, job.velocity_m_s)
+        except AfspmError as error:
+            self._report(Complaint(str(error)))
+        self._report(Forecasted(self._estimation.forecast))
+
+    def _register(self, job: ScanJob) -> WorkerReport:
+        scan, name = job.scan, job.scan.filename or job.key
+        values = np.ascontiguousarray(scan.values, np.float64)
+        drift_scan = DriftScan(values, scan.region, job.start_s, job.end_s, job.upwards, name)
+        try:
+            return self._estimation.register(job.key, drift_scan, job.asked)
+        except Exception as error:  # of a user's own estimator or tracker, too: its text is the reason
+            reason = str(error) if isinstance(error, AfspmError) else f"{type(error).__name__}: {error}"
+            self._estimation = self._saved()  # without what was half done
+            return NotRegistered(job.key, reason)
+
+    def _report(self, report: WorkerReport | Complaint) -> None:
+        self._reports.send(report)

@@ -1,0 +1,148 @@
+"""The worker as the scheduler's process has it: a child that takes jobs, and whose reports come by a thread."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import queue
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+from afspm.plugins.drift.scheduler.messages import Forecasted, ScanJob, StartWorker, WorkerGone, WorkerReport
+from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings
+from afspm.plugins.drift.scheduler.worker import Complaint, main
+
+_FAREWELL_S = 1.0
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+# forked, the child would hold the scheduler's sockets and locks
+_CONTEXT = multiprocessing.get_context("spawn")
+
+
+class DriftWorkerProcess:
+    """See `scheduler.shell.FrameWorker`.
+
+    Args:
+        file: where the worker keeps its state; None: nowhere.
+
+    Attributes:
+        wake: called from another thread when there is a report.
+        late: keeps a simulated time from running away while a scan is registered.
+    """
+
+    def __init__(self, settings: DriftCompensationSettings, file: Path | None, log: logging.Logger) -> None:
+        self.wake: Callable[[], None] = lambda: None
+        self.late: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext
+        self._settings = settings
+        self._file = file
+        self._log = log
+        self._late = contextlib.ExitStack()
+        self._reports: deque[tuple[int, WorkerReport]] = deque()
+        self._life = 0
+        self._process: BaseProcess | None = None
+        self._jobs: queue.SimpleQueue[object] = queue.SimpleQueue()
+
+    def take(self, job: object) -> None:
+        """Hand a `WorkerJob` to the worker; returns at once."""
+        if isinstance(job, StartWorker):
+            self._start()
+            return
+        if isinstance(job, ScanJob):
+            self._late.enter_context(self.late())
+        self._jobs.put(job)
+
+    def reports(self) -> Iterator[WorkerReport]:
+        """Yield the reports since the last call, oldest first; those of a former worker are dropped.
+
+        Simulated time passes again once the report about a scan was handled.
+        """
+        while self._reports:
+            life, report = self._reports.popleft()
+            if life == self._life:
+                yield report
+                if not isinstance(report, Forecasted):
+                    self._late.close()
+
+    def close(self) -> None:
+        """End the worker: its state is on disk."""
+        self._life += 1
+        self._end(within_s=_FAREWELL_S)
+
+    def _start(self) -> None:
+        self._end(within_s=0.0)
+        self._life += 1
+        from_us, jobs = _CONTEXT.Pipe(duplex=False)
+        reports, to_us = _CONTEXT.Pipe(duplex=False)
+        process = _CONTEXT.Process(
+            target=main, args=(from_us, to_us, self._settings, self._file), name="drift worker", daemon=True
+        )
+        try:
+            with _one_thread_each():
+                process.start()
+        except OSError as error:
+            for end in (jobs, reports):
+                end.close()
+            self._add(self._life, WorkerGone(f"it can't be started: {error}"))
+            return
+        finally:  # only the child holds these: so that their end is the end of the child
+            from_us.close()
+            to_us.close()
+        self._process, self._jobs = process, queue.SimpleQueue()
+        threading.Thread(target=_write_all, args=(jobs, self._jobs), name="drift jobs", daemon=True).start()
+        arguments = (process, reports, self._life)
+        threading.Thread(target=self._read_all, args=arguments, name="drift reports", daemon=True).start()
+
+    def _end(self, *, within_s: float) -> None:
+        self._late.close()
+        process, self._process = self._process, None
+        if process is None:
+            return
+        self._jobs.put(None)
+        process.join(within_s)
+        process.kill()
+        # not for the thread that reads: a process that an estimator has forked holds the pipe open
+        process.join()
+
+    def _read_all(self, process: BaseProcess, reports: Connection, life: int) -> None:
+        """In a thread: from the worker's first report to its end."""
+        gone = None
+        with contextlib.suppress(EOFError, OSError), reports:
+            while True:
+                report = reports.recv()
+                if isinstance(report, WorkerGone):
+                    gone = report
+                elif isinstance(report, Complaint):
+                    self._log.error("drift: %s", report.reason)
+                else:
+                    self._add(life, report)
+        process.join()
+        self._add(life, gone or WorkerGone(f"exit code {process.exitcode}"))
+
+    def _add(self, life: int, report: WorkerReport) -> None:
+        self._reports.append((life, report))
+        self.wake()
+
+
+def _write_all(jobs: Connection, waiting: queue.SimpleQueue[object]) -> None:
+    """In a thread: a worker that is busy does not read, and the scheduler must not wait for it."""
+    with contextlib.suppress(OSError), jobs:
+        while (job := waiting.get()) is not None:
+            jobs.send(job)
+
+
+@contextlib.contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Small matrices are not worth more threads than one; libraries of the child read it as they are loaded."""
+    added = [name for name in _THREADS if name not in os.environ]
+    os.environ.update(dict.fromkeys(added, "1"))
+    try:
+        yield
+    finally:
+        for name in added:
+            del os.environ[name]

@@ -1,0 +1,82 @@
+"""The worker's state on disk: one .npz file of JSON and arrays, replaced as a whole. Nothing in it is code."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from afspm.basics.errors import FileError
+from afspm.basics.plain_data import Plain
+from afspm.storage.atomic import write_atomic
+
+_JSON = "json"
+_ARRAY = "array"
+
+
+class WorkerStateFile:
+    """Holds numbers, texts, lists, dicts and numpy arrays.
+
+    Args:
+        path: None: nothing is kept.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self.path = path
+
+    def save(self, state: Plain) -> None:
+        """Write it aside and rename; a power cut leaves the one or the other.
+
+        Raises:
+            FileError: the disk is full …
+        """
+        if self.path is None:
+            return
+        arrays: dict[str, np.ndarray] = {}
+        text = json.dumps(_without_arrays(state, arrays))
+        file = io.BytesIO()
+        np.savez(file, **{_JSON: np.frombuffer(text.encode(), np.uint8)}, **arrays)  # type: ignore[arg-type]
+        write_atomic(self.path, [file.getbuffer()], synced=True)
+
+    def load(self) -> Plain | None:
+        """Return what was saved last; None if nothing was.
+
+        Raises:
+            FileError: it can't be read.
+        """
+        if self.path is None or not self.path.exists():
+            return None
+        try:
+            with self.path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                state = json.loads(arrays[_JSON].tobytes())
+                found: Plain = _with_arrays(state, arrays)
+        except Exception as error:  # a damaged file makes numpy raise whatever it likes
+            raise FileError(f"can't be read: {error}", where=str(self.path), hint="remove it to begin anew") from error
+        return found
+
+
+def _without_arrays(thing: object, arrays: dict[str, np.ndarray]) -> object:
+    if isinstance(thing, np.ndarray):
+        name = f"{_ARRAY}{len(arrays)}"
+        arrays[name] = thing
+        return {_ARRAY: name}
+    if isinstance(thing, np.generic):
+        return thing.item()
+    if isinstance(thing, dict):
+        return {str(key): _without_arrays(value, arrays) for key, value in thing.items()}
+    if isinstance(thing, list | tuple):
+        return [_without_arrays(value, arrays) for value in thing]
+    return thing
+
+
+def _with_arrays(thing: object, arrays: Any) -> Any:
+    if isinstance(thing, dict):
+        if thing.keys() == {_ARRAY}:
+            return arrays[thing[_ARRAY]]
+        return {key: _with_arrays(value, arrays) for key, value in thing.items()}
+    if isinstance(thing, list):
+        return [_with_arrays(value, arrays) for value in thing]
+    return thing

@@ -1,0 +1,209 @@
+"""The shear that drift makes in an image while it is taken, and the velocity that two opposite frames tell.
+
+Rows are taken one after the other, so a feature at `p` when half of the scan is done is found at
+x = p + v a e.(x - c), with c the centre, e the direction of the slow axis and a the time per length along it, negative
+when scanning down. Two scans with a_1 and a_2 are then related by 1 + A = (1 - a_2 v e')^-1 (1 - a_1 v e'), that is
+A e = v (a_2 - a_1) / (1 - a_2 v.e): an up frame and a down frame differ by a shear and a stretch of 2 v for each height
+per duration, at any drift in between. The shear gives a velocity without a lattice's ambiguity, the displacement
+between their middles a more precise one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.errors import InvalidValue
+from afspm.model.drift_removal import undistorted
+from afspm.plugins.drift.registration import DriftScan, Estimator, Prior, Registration
+
+Array = NDArray[np.float64]
+
+_SAFETY = 2.0  # of the standard deviation of the shear, which is derived from that of the displacement
+_CONTRADICTION = 16.0  # chi2 of both routes' difference
+
+
+@dataclass(frozen=True, eq=False)
+class DriftVelocity:
+    """The absolute velocity of the sample in tip coordinates.
+
+    Attributes:
+        accepted: whether it may be used.
+        reason: why not, for a person.
+        velocity_m_s: (2,); NaN where nothing could be found.
+        covariance: (2, 2) of it, (m/s)².
+        time_s: the middle of the two scans, for which it holds.
+        by_shear_m_s, by_displacement_m_s: (2,) what each route says by itself.
+        by_shear_covariance: (2, 2) of the former.
+        registration: what it rests on, or what was refused.
+    """
+
+    accepted: bool
+    reason: str
+    velocity_m_s: Array
+    covariance: Array
+    time_s: float
+    by_shear_m_s: Array
+    by_shear_covariance: Array
+    by_displacement_m_s: Array
+    registration: Registration | None = None
+
+    @classmethod
+    def refused(cls, reason: str, time_s: float, registration: Registration | None = None) -> DriftVelocity:
+        """Return a result without a velocity."""
+        nothing, unknown = np.full(2, np.nan), np.full((2, 2), np.nan)
+        return cls(
+            accepted=False,
+            reason=reason,
+            velocity_m_s=nothing,
+            covariance=unknown,
+            time_s=time_s,
+            by_shear_m_s=nothing,
+            by_shear_covariance=unknown,
+            by_displacement_m_s=nothing,
+            registration=registration,
+        )
+
+
+def slow_axis(scan: DriftScan) -> Array:
+    """Return the (2,) unit vector along which rows follow each other with ascending y, in tip coordinates."""
+    angle = scan.region.angle_rad
+    return np.array([-math.sin(angle), math.cos(angle)])
+
+
+def delay_per_length_s_m(scan: DriftScan) -> float | None:
+    """Return a, the delay of a position per length along the slow axis; None if the direction is unknown."""
+    if scan.upwards is None:
+        return None
+    return (1.0 if scan.upwards else -1.0) * scan.duration_s / scan.region.size_m[1]
+
+
+def row_delay_s(scan: DriftScan, position_m: Array) -> float | None:
+    """Return how long after its middle a scan passes a position (tip coordinates); None if its direction is unknown."""
+    a = delay_per_length_s_m(scan)
+    return None if a is None else a * float(slow_axis(scan) @ (position_m - np.array(scan.region.center_m)))
+
+
+def velocity_by_shear(reference: DriftScan, scan: DriftScan, found: Registration) -> tuple[Array, Array] | None:
+    """Return velocity (2,) and covariance from the shear between scans of different directions or speeds.
+
+    Features are assumed to be spread evenly over the image: the slope over a height h is then known to sqrt(12) / h of
+    the uncertainty of the displacement.
+
+    Its covariance takes what is in the image as spread evenly over it: a slope over a height h is then known to
+    sqrt(12) / h of what the displacement is known to.
+
+    Returns:
+        None where both were sheared alike, a direction is not known, or nothing was found but coarsely.
+    """
+    first, second = delay_per_length_s_m(reference), delay_per_length_s_m(scan)
+    if first is None or second is None or not np.isfinite(found.covariance_m2).all():
+        return None
+    if found.failure:  # a coarse estimate knows no shear
+        return None
+    difference = second - first
+    if abs(difference) < 0.1 * max(abs(first), abs(second)):
+        return None
+    along = slow_axis(reference)
+    slope = found.linear @ along / difference
+    shrunk = 1.0 + second * float(along @ slope)
+    if shrunk < 0.1:
+        return None
+    height_m = min(reference.region.size_m[1], scan.region.size_m[1])
+    covariance = found.covariance_m2 * (12.0 * (_SAFETY / (height_m * difference)) ** 2)
+    velocity = slope / shrunk
+    # some controllers count the time of the last row, others do not: durations are known to one row
+    rows = min(reference.values.shape[0], scan.values.shape[0])
+    return velocity, covariance + float(velocity @ velocity) / rows**2 * np.eye(2)
+
+
+def velocity_from_up_down(up: DriftScan, down: DriftScan, estimator: Estimator) -> DriftVelocity:
+    """Return the velocity from an up frame and a down frame, in either order, of about the same region.
+
+    Both are first registered freely. If that is refused, or if displacement and shear contradict each other (another
+    site of a lattice, a picture with little shear), the velocity of either route is a guess. Both scans are freed from
+    that drift and registered again with a prior from it, and the remaining displacement and shear must agree.
+
+    Registers them freely. If that is refused, or displacement and shear contradict each other (another site of a
+    lattice, a picture in which shear hardly shows), what either says is taken as a guess: both scans are freed from
+    that drift and registered again where it lets expect them to be, and what is left of both has to agree.
+    """
+    first, second = sorted((up, down), key=lambda scan: scan.mid_s)
+    time_s = (first.mid_s + second.mid_s) / 2
+    if first.upwards is None or second.upwards is None or first.upwards == second.upwards:
+        return DriftVelocity.refused("the scans must have opposite slow-scan directions", time_s)
+    free = estimator.register(first, second)
+    result = _combined(first, second, free, np.zeros(2))
+    if result.accepted:
+        return result
+    for guess in _guesses(first, second, free):
+        prior = _prior_from(first, second, free, guess)
+        found = estimator.register(_freed(first, guess), _freed(second, guess), prior)
+        guided = _combined(first, second, found, guess)
+        if guided.accepted:
+            return guided
+    return result
+
+
+def _guesses(first: DriftScan, second: DriftScan, free: Registration) -> list[Array]:
+    sheared = velocity_by_shear(first, second, free)
+    if sheared is None:
+        return []
+    return [sheared[0], free.displacement_m / _between_s(first, second, free)]
+
+
+def _prior_from(first: DriftScan, second: DriftScan, free: Registration, guess: Array) -> Prior:
+    # as uncertain as the shear
+    sheared = velocity_by_shear(first, second, free)
+    covariance = np.zeros((2, 2)) if sheared is None else sheared[1]
+    between_s = second.mid_s - first.mid_s
+    one_px_m2 = min(first.pixel_m) ** 2
+    return Prior(guess * between_s, covariance * between_s**2 + one_px_m2 * np.eye(2))
+
+
+def _freed(scan: DriftScan, velocity_m_s: Array) -> DriftScan:
+    x, y = (float(v) for v in velocity_m_s)
+    try:
+        values = undistorted(scan.values, scan.region, (x, y), scan.duration_s, upwards=scan.upwards is not False)
+    except InvalidValue:  # as fast as the scan: no guess
+        return scan
+    return replace(scan, values=values)
+
+
+def _combined(first: DriftScan, second: DriftScan, found: Registration, freed_m_s: Array) -> DriftVelocity:
+    # Both routes of a registration, combined if they agree. `freed_m_s` is the drift already taken out of the scans.
+    time_s = (first.mid_s + second.mid_s) / 2
+    sheared = velocity_by_shear(first, second, found)
+    if not found.accepted or sheared is None:
+        return DriftVelocity.refused(found.reason or "no shear between the scans can be found", time_s, found)
+    by_shear, shear_covariance = sheared[0] + freed_m_s, sheared[1]
+    between_s, middles_s = _between_s(first, second, found), second.mid_s - first.mid_s
+    # rows that are freed are all as they were at the middle, but for what the guess was wrong by
+    by_displacement = (found.displacement_m + freed_m_s * (between_s - middles_s)) / between_s
+    covariance = found.covariance_m2 / between_s**2
+    difference, both = by_displacement - by_shear, covariance + shear_covariance
+    if float(difference @ np.linalg.solve(both, difference)) > _CONTRADICTION:
+        return DriftVelocity.refused("the displacement between the scans contradicts their shear", time_s, found)
+    share = np.linalg.solve(both, covariance).T  # of the shear
+    together = covariance - share @ covariance
+    return DriftVelocity(
+        accepted=True,
+        reason="",
+        velocity_m_s=by_displacement - share @ difference,
+        covariance=(together + together.T) / 2,
+        time_s=time_s,
+        by_shear_m_s=by_shear,
+        by_shear_covariance=shear_covariance,
+        by_displacement_m_s=by_displacement,
+        registration=found,
+    )
+
+
+def _between_s(first: DriftScan, second: DriftScan, found: Registration) -> float:
+    # from the passage of the overlap in the first scan to that in the second
+    there_m = found.center_m + found.displacement_m
+    late_s, later_s = row_delay_s(first, found.center_m) or 0.0, row_delay_s(second, there_m) or 0.0
+    return second.mid_s + later_s - first.mid_s - late_s

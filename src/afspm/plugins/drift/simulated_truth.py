@@ -1,0 +1,65 @@
+"""The true drift of a simulated run, from the `truth.jsonl` that the simulator leaves."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.errors import AfspmError, FileError
+from afspm.basics.plain_data import Plain
+from afspm.plugins.drift.registration import DriftScan
+from afspm.simulation import World
+
+Array = NDArray[np.float64]
+
+TRUTH_FILE = "truth.jsonl"
+
+
+def true_drift(run_dir: Path, scans: Sequence[DriftScan]) -> Array | None:
+    """Return by how much the sample was displaced (n, 2) at the centre of each scan, since the first; None if unknown.
+
+    It includes what rotation and expansion of the sample displace there. Tip coordinates go along with what the
+    controller follows by itself, which is known at the ends of each scan.
+
+    Raises:
+        FileError: there is such a file, but it is not one of a simulated run.
+    """
+    path = run_dir / TRUTH_FILE
+    if not path.exists() or not scans:
+        return None
+    try:
+        start, followed = _read(path)
+        world = World.from_settings(start["settings"], int(start["seed"]), float(start["time_s"]))
+    except (OSError, KeyError, ValueError, AfspmError) as error:
+        raise FileError(f"does not say what was simulated: {error}", where=str(path)) from error
+    time_s = np.array([scan.mid_s for scan in scans])
+    tip_m = np.array([scan.region.center_m for scan in scans])
+    followed_m = np.stack([np.interp(time_s, followed[:, 0], followed[:, axis]) for axis in (1, 2)], axis=-1)
+    on_sample_m = world.sample.to_sample(tip_m + followed_m, time_s)
+    at_first_m: Array = world.sample.to_tip(on_sample_m, time_s[0]) - followed_m[0]
+    return tip_m - at_first_m
+
+
+def _read(path: Path) -> tuple[Plain, Array]:
+    """The entry of the moment when the simulated microscope was switched on; and what the controller had followed of
+    the drift, (n, 3): time, x, y."""
+    start: Plain | None = None
+    followed: list[tuple[float, float, float]] = [(0.0, 0.0, 0.0)]
+    with path.open(encoding="utf-8") as file:
+        for line in file:
+            try:
+                entry: Plain = json.loads(line)
+            except ValueError:
+                continue  # cut off by a kill
+            if entry["event"] == "start" and start is None:
+                start = entry
+            scan = entry.get("scan")
+            if isinstance(scan, dict) and "compensated_start_m" in scan:
+                followed += [(scan[f"{at}_s"], *scan[f"compensated_{at}_m"][:2]) for at in ("start", "end")]
+    if start is None:
+        raise ValueError("it has no beginning")
+    return start, np.array(sorted(followed), dtype=np.float64)

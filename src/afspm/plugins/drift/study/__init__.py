@@ -1,0 +1,25 @@
+"""Studies of drift: many simulated nights over a grid of settings, on the cores of this computer or on a Dask cluster.
+
+settings = NightSettings.of({"tracker": "paper", "paper.queue": 3})
+metrics = night(settings, seed=1)
+"""
+
+from __future__ import annotations
+
+from afspm.plugins.drift.study.grid import SettingsGrid
+from afspm.plugins.drift.study.night import SimulatedNight, night
+from afspm.plugins.drift.study.settings import NightSettings
+from afspm.plugins.drift.study.summary import Summary, summarised
+from afspm.plugins.drift.study.workers import TaskOutcome, on_cluster, on_cores
+
+__all__ = [
+    "NightSettings",
+    "SettingsGrid",
+    "SimulatedNight",
+    "Summary",
+    "TaskOutcome",
+    "night",
+    "on_cluster",
+    "on_cores",
+    "summarised",
+]

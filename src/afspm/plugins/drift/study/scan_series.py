@@ -1,0 +1,84 @@
+"""Recorded scans as drift sees them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.errors import InvalidValue
+from afspm.model import Scan
+from afspm.plugins.drift.registration import DriftScan
+from afspm.storage.formats import FileContent
+
+
+@dataclass(frozen=True)
+class Series:
+    """One channel of many scans, in the order of time.
+
+    Attributes:
+        channel, unit: of the values.
+        scans: each with the name of its file as the key; in tip coordinates.
+        left_out: what can't be followed, and why.
+    """
+
+    channel: str
+    unit: str
+    scans: tuple[DriftScan, ...]
+    left_out: tuple[str, ...]
+
+
+def series(contents: Sequence[FileContent], channel: str = "") -> Series:
+    """Return the scans of one channel; without a name, that of the topography of most files.
+
+    Raises:
+        InvalidValue: there are no two scans of it.
+    """
+    name = channel or topography(contents)
+    found: list[DriftScan] = []
+    left_out: list[str] = []
+    unit = ""
+    for content in contents:
+        for scan in content.scans:
+            if scan.channel != name:
+                continue
+            if (why := _unfit(scan, content)) != "":
+                left_out.append(f"{scan.filename}: {why}")
+                continue
+            found.append(drift_scan(scan, content))
+            unit = scan.unit
+    if len(found) < 2:
+        there = ", ".join(sorted({scan.channel for content in contents for scan in content.scans})) or "none"
+        raise InvalidValue(f"drift needs two scans of a channel, not {len(found)} of {name!r}", hint=f"in it: {there}")
+    found.sort(key=lambda one: one.mid_s)
+    return Series(name, unit, tuple(found), tuple(left_out))
+
+
+def topography(contents: Sequence[FileContent]) -> str:
+    """Return the channel that is the topography of most files.
+
+    Raises:
+        InvalidValue: none has one.
+    """
+    heights = Counter(content.topography.channel for content in contents if content.topography is not None)
+    if not heights:
+        raise InvalidValue("there is no scan of a topography", hint="name a channel")
+    return heights.most_common(1)[0][0]
+
+
+def drift_scan(scan: Scan, content: FileContent) -> DriftScan:
+    """Return one channel of a file. Without a duration it counts as taken when it was finished."""
+    end_ns = content.end_ns if content.end_ns is not None else content.start_ns
+    start_ns = content.start_ns if content.start_ns is not None else end_ns
+    if start_ns is None or end_ns is None:
+        raise InvalidValue("it does not say when it was taken", where=scan.filename)
+    return DriftScan(scan.values, scan.region, start_ns / NS_PER_S, end_ns / NS_PER_S, content.upwards, scan.filename)
+
+
+def _unfit(scan: Scan, content: FileContent) -> str:
+    if content.end_ns is None and content.start_ns is None:
+        return "it does not say when it was taken"
+    if missing := scan.lines_missing:
+        return f"it was broken off: {missing} of {scan.shape[0]} lines are missing"
+    return f"{scan.shape[1]} x {scan.shape[0]} pixels" if min(scan.shape) < 2 else ""

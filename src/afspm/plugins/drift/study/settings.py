@@ -1,0 +1,98 @@
+"""The settings of a simulated night, from names in a command line or a TOML file."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass, field, fields
+
+from afspm.basics.errors import ConfigError, InvalidValue
+from afspm.basics.plain_data import Plain, PlainMapping
+from afspm.plugins.drift.estimators import DEFAULT as DEFAULT_ESTIMATOR
+from afspm.plugins.drift.overlap import F_RESCAN
+from afspm.plugins.drift.trackers import DEFAULT as DEFAULT_TRACKER
+
+Table = PlainMapping
+
+
+@dataclass(frozen=True)
+class NightSettings:
+    """One region, scanned again and again while the sample drifts.
+
+    Attributes:
+        surface: kind of the sample, see `afspm.simulation`.
+        size_m, pixels: of the square that is scanned.
+        every_s: from the beginning of one scan to that of the next.
+        line_s: of trace and retrace together.
+        hours: how long.
+        drift_m: how far the sample goes in the end; its direction, and a random walk besides, follow from the seed.
+        rescan: when a scan is taken again, see `afspm.plugins.drift.overlap`: "tolerance", "paper" or "never".
+        tolerance_m: for that rule; None: a tenth of the size.
+        f_rescan: for that of the paper.
+        at_start: "up-down": the first place is scanned in both directions, as by the scheduler's default; "nothing".
+        estimator, tracker: "class" and settings.
+    """
+
+    surface: str = "stamper"
+    size_m: float = 2e-6
+    pixels: int = 128
+    every_s: float = 900.0
+    line_s: float = 1.0
+    hours: float = 8.0
+    drift_m: float = 1.5e-6
+    rescan: str = "tolerance"
+    tolerance_m: float | None = None
+    f_rescan: float = F_RESCAN
+    at_start: str = "up-down"
+    estimator: Table = field(default_factory=lambda: {"class": DEFAULT_ESTIMATOR})
+    tracker: Table = field(default_factory=lambda: {"class": DEFAULT_TRACKER})
+
+    def __post_init__(self) -> None:
+        if self.rescan not in RULES:
+            raise ConfigError(f"no rule {self.rescan!r} for rescans", hint=f"one of {', '.join(RULES)}")
+        if self.at_start not in STARTS:
+            raise ConfigError(f"no start {self.at_start!r} of a night", hint=f"one of {', '.join(STARTS)}")
+        if self.pixels * self.line_s > self.every_s:
+            raise InvalidValue(
+                f"a scan of {self.pixels * self.line_s:g} s does not fit into {self.every_s:g} s",
+                hint="less pixels, a shorter line_s or a longer every_s",
+            )
+        if self.scans < 2:
+            raise InvalidValue(f"{self.hours:g} h with a scan every {self.every_s:g} s are not two scans")
+
+    @property
+    def scans(self) -> int:
+        """Return how many scans are planned."""
+        return int(self.hours * 3600.0 / self.every_s + 1e-9)
+
+    @classmethod
+    def of(cls, names: Table) -> NightSettings:
+        """Make settings from names: fields, and "paper.queue" for a setting of the tracker (estimator) "paper" where it
+        is chosen.
+
+        Raises:
+            ConfigError: unknown names. InvalidValue: values that don't fit each other.
+        """
+        plain: Plain = {name: value for name, value in names.items() if "." not in name}
+        known = [one.name for one in fields(cls)]
+        for name in plain:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1)
+                hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
+                raise ConfigError(f"a night has no setting {name!r}", hint=hint)
+        for part in PARTS:
+            table = plain.get(part, {})
+            table = {"class": table} if isinstance(table, str) else dict(table)
+            table.setdefault("class", _DEFAULTS[part])
+            plain[part] = table | _told(table["class"], names)
+        return cls(**plain)
+
+
+PARTS = ("estimator", "tracker")
+RULES = ("tolerance", "paper", "never")
+STARTS = ("up-down", "nothing")
+_DEFAULTS = {"estimator": DEFAULT_ESTIMATOR, "tracker": DEFAULT_TRACKER}
+
+
+def _told(name: str, names: Table) -> dict[str, object]:
+    before = f"{name}."
+    return {key.removeprefix(before): value for key, value in names.items() if key.startswith(before)}

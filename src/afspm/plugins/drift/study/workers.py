@@ -1,0 +1,123 @@
+"""Many independent tasks, on the cores of this computer or on a Dask cluster. A worker that dies costs only time."""
+
+from __future__ import annotations
+
+import importlib
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import Any
+
+from afspm.basics.errors import AfspmError, ConfigError
+
+_FEW_PIXELS = 100_000  # of all scans: to register these takes no longer than to start a process for it
+_MOST_DEATHS = 3  # of workers one after the other while nothing gets done
+
+
+@dataclass(frozen=True)
+class TaskOutcome:
+    """The result or the error of a task.
+
+    Attributes:
+        index: which one.
+        value: what it returned, None if it failed.
+        error: how it failed, for a person.
+    """
+
+    index: int
+    value: Any = None
+    error: str = ""
+
+
+def processes(asked: int | None, pixels: int) -> int:
+    """Return the number of processes: `jobs`, or one a core where that pays."""
+    if asked is not None:
+        return asked
+    return 1 if pixels <= _FEW_PIXELS else os.cpu_count() or 1
+
+
+def on_cores(
+    function: Callable[..., object], tasks: Sequence[tuple[object, ...]], *, jobs: int
+) -> Iterator[TaskOutcome]:
+    """Yield the outcomes of `function(*task)`, as they come, from `jobs` processes (1: in this one)."""
+    if jobs <= 1:
+        for index, task in enumerate(tasks):
+            yield _done(function, index, task)
+        return
+    left = dict(enumerate(tasks))
+    deaths = 0
+    while left:
+        before = len(left)
+        for outcome in _until_one_dies(function, left, jobs):
+            del left[outcome.index]
+            yield outcome
+        deaths = 0 if len(left) < before else deaths + 1
+        if deaths >= _MOST_DEATHS:
+            died = f"worker processes died {deaths} times one after the other (too little memory?)"
+            yield from (TaskOutcome(index, error=died) for index in left)
+            return
+
+
+def on_cluster(
+    function: Callable[..., object], tasks: Sequence[tuple[object, ...]], *, address: str
+) -> Iterator[TaskOutcome]:
+    """Yield outcomes as `on_cores` does, from the workers of a Dask cluster with the same afspm installed.
+
+    The task of a dead worker goes to another.
+
+    Raises:
+        ConfigError: `distributed` is not installed, or nobody answers at the address.
+    """
+    try:
+        distributed: Any = importlib.import_module("distributed")
+    except ImportError as error:
+        raise ConfigError("a cluster needs Dask", hint='pip install "afspm[study]"') from error
+    try:
+        client = distributed.Client(address, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"no cluster can be reached: {error}", where=address) from error
+    with client:
+        futures = {client.submit(_done, function, index, task, pure=False): index for index, task in enumerate(tasks)}
+        for future in distributed.as_completed(list(futures), loop=client.loop):
+            yield _result(future, futures[future])
+            future.release()
+
+
+def _until_one_dies(
+    function: Callable[..., object], left: dict[int, tuple[object, ...]], jobs: int
+) -> Iterator[TaskOutcome]:
+    # a dead worker ends all others
+    # spawn: the same on all systems, and none of the threads of numpy are copied half
+    with ProcessPoolExecutor(min(jobs, len(left)), mp_context=multiprocessing.get_context("spawn")) as pool:
+        try:
+            futures = [pool.submit(_done, function, index, task) for index, task in left.items()]
+            for future in as_completed(futures):
+                yield future.result()
+        except BrokenProcessPool:
+            return
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _result(future: Any, index: int) -> TaskOutcome:
+    # a task is done again if its worker died before the result was fetched
+    try:
+        outcome: TaskOutcome = future.result()
+    except Exception as error:  # of the cluster: a task tells its own
+        return TaskOutcome(index, error=_told(error))
+    return outcome
+
+
+def _done(function: Callable[..., object], index: int, task: tuple[object, ...]) -> TaskOutcome:
+    # errors are returned as text: not every exception can be pickled
+    try:
+        return TaskOutcome(index, function(*task))
+    except Exception as error:
+        return TaskOutcome(index, error=_told(error))
+
+
+def _told(error: BaseException | None) -> str:
+    return str(error) if isinstance(error, AfspmError) else f"{type(error).__name__}: {error}"

@@ -1,0 +1,60 @@
+"""Trackers by name, users' own, and forecasts from JSON.
+
+tracker("bank", estimator)
+tracker({"class": "paper", "w_update": 0.8}, estimator)
+tracker({"class": "my_lab.Follower"}, estimator)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping as Table
+
+from afspm.basics.errors import ConfigError, InvalidValue
+from afspm.basics.plain_data import PlainMapping
+from afspm.model.snapshot import restored
+from afspm.plugins.drift.estimators import estimator as default_estimator
+from afspm.plugins.drift.naming import named
+from afspm.plugins.drift.registration import Estimator
+from afspm.plugins.drift.trackers.bank import BankTracker
+from afspm.plugins.drift.trackers.forecast import BankForecast
+from afspm.plugins.drift.trackers.paper import PaperForecast, PaperTracker
+from afspm.plugins.drift.tracking import FORECAST_VERSION, Forecast, Tracker
+
+__all__ = ["DEFAULT", "BankTracker", "PaperTracker", "forecast_from_dict", "tracker"]
+
+DEFAULT = "bank"
+
+_FORECASTS: Table[str, type[BankForecast] | type[PaperForecast]] = {
+    kind.KIND: kind for kind in (BankForecast, PaperForecast)
+}
+
+
+def tracker(spec: str | PlainMapping = DEFAULT, estimator: Estimator | None = None) -> Tracker:
+    """Return a tracker by name.
+
+    Args:
+        spec: a name that a package declares or "module.Name", or a table with that as its `class` and its settings.
+        estimator: that it registers scans with, its first argument; the default one if there is none.
+
+    Raises:
+        ConfigError: no such name, class or setting, a setting without a meaning, or a library that is missing.
+    """
+    made, name = named("tracker", spec, DEFAULT, default_estimator() if estimator is None else estimator)
+    if not all(callable(getattr(made, method, None)) for method in ("add", "state", "restore")):
+        raise ConfigError(
+            f"{name} is not a tracker",
+            hint="give it the methods add, state and restore, see afspm.plugins.drift.tracking",
+        )
+    return made  # type: ignore[return-value]
+
+
+def forecast_from_dict(table: PlainMapping) -> Forecast:
+    """Return the forecast of one of afspm's trackers from the result of its `to_dict`.
+
+    Raises:
+        InvalidValue: something else.
+    """
+    kind = str(table.get("kind"))
+    if kind not in _FORECASTS:
+        raise InvalidValue(f"a forecast of kind {kind!r}", hint=f"one of {', '.join(_FORECASTS)}")
+    return restored(_FORECASTS[kind], table, kind, FORECAST_VERSION)

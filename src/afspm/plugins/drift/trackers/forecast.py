@@ -1,0 +1,119 @@
+"""The forecast of a bank of filters: its knowledge, without the scans."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.plain_data import Plain
+from afspm.model.snapshot import snapshot
+from afspm.plugins.drift.mapping import Mapping
+from afspm.plugins.drift.trackers.filters import Filters, Models, mixed
+from afspm.plugins.drift.tracking import FORECAST_VERSION, Prediction
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Compensation:
+    """A velocity that changes in steps; zero at the start.
+
+    Attributes:
+        changes: (since when in s, v_x, v_y in m/s), in the order of time.
+    """
+
+    changes: tuple[tuple[float, float, float], ...] = ()
+
+    def velocity_m_s(self, time_s: float) -> Array:
+        """Return the velocity (2,) at a time."""
+        velocity = (0.0, 0.0)
+        for since_s, x, y in self.changes:
+            if since_s <= time_s:
+                velocity = (x, y)
+        return np.array(velocity)
+
+    def followed_m(self, from_s: float, to_s: float) -> Array:
+        """Return the (2,) movement of tip coordinates between two times, negative if the first is later."""
+        start_s, end_s = min(from_s, to_s), max(from_s, to_s)
+        edges = [start_s, *(since_s for since_s, _, _ in self.changes if start_s < since_s < end_s), end_s]
+        parts = [self.velocity_m_s(a) * (b - a) for a, b in itertools.pairwise(edges)]
+        followed: Array = np.sum(parts, axis=0) * (1.0 if to_s >= from_s else -1.0)
+        return followed
+
+    def changed(self, since_s: float, velocity_m_s: Array, *, needed_s: float) -> Compensation:
+        """Return the same with another velocity from a time on, without changes older than `needed_s` needs."""
+        before = [change for change in self.changes if change[0] < since_s]
+        while len(before) > 1 and before[1][0] <= needed_s:
+            del before[0]
+        return Compensation((*before, (float(since_s), float(velocity_m_s[0]), float(velocity_m_s[1]))))
+
+
+_LEAST_WEIGHT = 1e-4  # filters that are less likely are left out
+
+
+@dataclass(frozen=True, eq=False)
+class BankForecast:
+    """The likely filters of a bank, n of them.
+
+    Attributes:
+        time_s: of the states.
+        models: how they move on.
+        weight: (n,) probabilities.
+        mean: (n, 4) displacement and velocity of the sample.
+        covariance: (n, 4, 4).
+        compensation: with which tip coordinates follow the sample.
+        straight: from tip coordinates to those in which the sample is only displaced; None: they are the same.
+    """
+
+    KIND: ClassVar = "bank forecast"
+
+    time_s: float
+    models: Models
+    weight: Array
+    mean: Array
+    covariance: Array
+    compensation: Compensation
+    straight: Mapping | None = None
+
+    @classmethod
+    def at_start(cls) -> BankForecast:
+        """Return the forecast before the first scan, from which positions will be counted."""
+        nothing = Models(np.zeros(1), np.zeros(1), np.zeros(1))
+        return cls(0.0, nothing, np.ones(1), np.zeros((1, 4)), np.zeros((1, 4, 4)), Compensation())
+
+    @classmethod
+    def of(cls, filters: Filters, compensation: Compensation, straight: Mapping | None = None) -> BankForecast:
+        """Return the forecast of these filters."""
+        likely = filters.weight >= _LEAST_WEIGHT
+        models = filters.models
+        return cls(
+            filters.time_s,
+            Models(models.density_m2_s3[likely], models.fading_per_s[likely], models.walk_m2_s[likely]),
+            filters.weight[likely] / filters.weight[likely].sum(),
+            filters.mean[likely, :4],
+            filters.covariance[likely, :4, :4],
+            compensation,
+            straight,
+        )
+
+    def at(self, time_s: float) -> Prediction:
+        """See `Forecast`."""
+        step_s = time_s - self.time_s
+        transition, gained = self.models.over(step_s)
+        means = (transition @ self.mean[..., None])[..., 0]
+        means[:, :2] -= self.compensation.followed_m(self.time_s, time_s)
+        means[:, 2:] -= self.compensation.velocity_m_s(time_s)
+        covariances = transition @ self.covariance @ transition.transpose(0, 2, 1) + gained
+        mean, covariance = mixed(self.weight, means, covariances)
+        mapping = Mapping.of_drift(mean[:2])
+        if self.straight is not None:
+            mapping = mapping @ self.straight
+        return Prediction(time_s, mapping, covariance[:2, :2], mean[2:], covariance[2:, 2:])
+
+    def to_dict(self) -> Plain:
+        """See `Forecast`."""
+        return snapshot(self, self.KIND, FORECAST_VERSION, lists=True)

@@ -1,0 +1,110 @@
+"""The settings of the default tracker."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from afspm.basics.errors import ConfigError
+from afspm.basics.plain_data import Plain
+from afspm.plugins.drift.registration import DriftScan
+from afspm.plugins.drift.trackers.filters import Filters, Models
+from afspm.plugins.drift.trackers.references import Choice
+
+TRANSFORMS = ("translation", "similarity")
+
+
+@dataclass(frozen=True)
+class BankSettings:
+    """Measured on simulated nights with 2 µm scans every 15 minutes; wide enough for most microscopes.
+
+    Attributes:
+        densities_m2_s3: of the acceleration: how fast the velocity of drift wanders.
+        fadings_s: after which a velocity is gone to 1/e; inf for one that stays.
+        walks_m2_s: variance that positions gain in a second besides. There is a filter for each density, fading and
+            walk.
+        jitter_m: standard deviation of a scan's position that no registration can measure.
+        start_velocity_sd_m_s: standard deviation of the velocity at the start.
+        start_px: standard deviation of where the sample is found in the first scan, in its pixels.
+        forget: share of the logarithm of the weights of the filters that is kept from one scan to the next.
+        rarest: least weight of a filter, beside the largest.
+        inflation: of the covariance that an estimator gives, above 1. What exceeds 1 belongs to the pair, the rest half
+            to each of its scans.
+        widening: of the covariance of an expected displacement, where the estimator is told to search.
+        doubt: chi2 above which a result is not believed before the next scan says so too.
+        second_looks: references that are searched without a prediction after none was found with it.
+        lost_after: scans in a row that should have matched and did not.
+        transform: "translation"; or "similarity": rotation and scale are estimated as well.
+        linear_walk_per_s: variance that the angle (rad) and the logarithm of the scale gain in a second.
+    """
+
+    densities_m2_s3: tuple[float, ...] = (1e-26, 1e-25, 1e-24, 1e-23, 1e-22, 1e-21)
+    fadings_s: tuple[float, ...] = (math.inf, 10800.0, 2700.0)
+    walks_m2_s: tuple[float, ...] = (0.5e-18 / 900.0, 3e-18 / 900.0, 16e-18 / 900.0)
+    jitter_m: float = 0.05e-9
+    start_velocity_sd_m_s: float = 3e-10
+    start_px: float = 0.02
+    forget: float = 0.97
+    rarest: float = 1e-6
+    inflation: float = 2.0
+    widening: float = 4.0
+    doubt: float = 36.0
+    second_looks: int = 2
+    lost_after: int = 3
+    transform: str = "translation"
+    linear_walk_per_s: float = 2.8e-10
+
+    def __post_init__(self) -> None:
+        numbers = (self.jitter_m, self.start_velocity_sd_m_s, self.start_px, self.rarest, self.doubt)
+        if self.transform not in TRANSFORMS:
+            raise ConfigError(
+                f"the bank knows no transform {self.transform!r}",
+                where="transform",
+                hint=f"one of {', '.join(TRANSFORMS)}",
+            )
+        several = (self.densities_m2_s3, self.fadings_s, self.walks_m2_s)
+        if not all(several):
+            raise ConfigError("the bank has no filters", where="densities_m2_s3, fadings_s, walks_m2_s")
+        if not min(*numbers, self.linear_walk_per_s, *itertools.chain(*several)) > 0.0:
+            raise ConfigError("all settings of the bank must be above 0")
+        if not (0.0 < self.forget <= 1.0 and self.rarest < 1.0):
+            raise ConfigError("weights: forget up to 1, rarest below it", where="forget, rarest")
+        if not (self.inflation > 1.0 and self.widening >= 1.0 and self.lost_after >= 1):
+            raise ConfigError("inflation must be above 1, widening and lost_after at least 1", where="inflation")
+
+    @classmethod
+    def split(cls, settings: Plain) -> tuple[BankSettings, Choice]:
+        """Split settings into those of the bank and those of its references.
+
+        Raises:
+            ConfigError: a name that neither has, or a value without a meaning.
+        """
+        own, others = ({field.name for field in dataclasses.fields(one)} for one in (cls, Choice))
+        for name in settings:
+            if name not in own | others:
+                close = difflib.get_close_matches(name, sorted(own | others), n=1)
+                hint = f"did you mean {close[0]!r}?" if close else ", ".join(sorted(own | others))
+                raise ConfigError(f"the tracker has no setting {name!r}", where=name, hint=hint)
+        try:
+            values: Plain = {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
+            return (
+                cls(**{k: v for k, v in values.items() if k in own}),
+                Choice(**{k: v for k, v in values.items() if k in others}),
+            )
+        except TypeError as error:
+            raise ConfigError(f"the settings of the tracker: {error}") from error
+
+    def models(self) -> Models:
+        """Return a model of motion for each density, fading and walk."""
+        densities, fadings, walks = np.meshgrid(self.densities_m2_s3, self.fadings_s, self.walks_m2_s, indexing="ij")
+        return Models(densities.ravel(), 1.0 / fadings.ravel(), walks.ravel())
+
+    def filters(self, first: DriftScan) -> Filters:
+        """Return all filters after the first scan."""
+        position_sd_m = self.start_px * min(first.pixel_m)
+        return Filters.start(self.models(), first.mid_s, position_sd_m, self.start_velocity_sd_m_s, first.duration_s)

@@ -1,0 +1,128 @@
+"""The interface of all trackers, and what passes through it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping as Table
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.errors import InvalidValue
+from afspm.basics.plain_data import Plain, PlainMapping
+from afspm.model import RegistrationOutcome
+from afspm.plugins.drift.mapping import Mapping
+from afspm.plugins.drift.registration import DriftScan, Registration
+
+Array = NDArray[np.float64]
+
+FORECAST_VERSION = 2
+"""Of all kinds of forecast as plain data."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """The mapping to sample coordinates at one time.
+
+    Attributes:
+        time_s: experiment time.
+        mapping: from tip to sample coordinates.
+        covariance_m2: (2, 2) of the translation of the mapping.
+        rate_m_s: (2,) velocity of the sample in tip coordinates.
+        rate_covariance: (2, 2) of it, (m/s)².
+    """
+
+    time_s: float
+    mapping: Mapping
+    covariance_m2: Array
+    rate_m_s: Array
+    rate_covariance: Array
+
+    @property
+    def sd_m(self) -> float:
+        """Standard deviation of a position along the axis where it is largest."""
+        return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance_m2)[-1], 0.0)))
+
+
+class Forecast(Protocol):
+    """A tracker's knowledge for other times: small, immutable, JSON-able, without the scans."""
+
+    def at(self, time_s: float) -> Prediction:
+        """Return the prediction for any time; before the newest scan it is the estimate of that scan, moved back."""
+        ...
+
+    def to_dict(self) -> Plain:
+        """Return plain JSON, for `forecast_from_dict`."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """The result of one scan.
+
+    Attributes:
+        key: the scan's.
+        before: the prediction for the middle of the scan.
+        after: the knowledge of the same time with the scan.
+        matched: whether any reference could be registered with it (the first scan of all counts as matched).
+        reason: why not, or why only coarsely, for a person.
+        lost: the tracker does not know any more where it is.
+        registrations: by the key of the reference.
+        forecast: from the knowledge with the scan.
+    """
+
+    key: str
+    before: Prediction
+    after: Prediction
+    matched: bool
+    reason: str
+    lost: bool
+    registrations: Table[str, Registration]
+    forecast: Forecast
+    quality: Table[str, float] = field(default_factory=dict)
+
+    @property
+    def outcome(self) -> RegistrationOutcome:
+        """Return how the position of the scan is known."""
+        found = self.registrations.values()
+        if self.matched:
+            accepted = [one for one in found if one.accepted]
+            is_coarse = bool(accepted) and all(one.failure for one in accepted)
+            return RegistrationOutcome.COARSE if is_coarse else RegistrationOutcome.REGISTERED
+        if not found:
+            return RegistrationOutcome.NEW
+        is_failed = any(one.failure for one in found)
+        return RegistrationOutcome.FAILED if is_failed else RegistrationOutcome.REFUSED
+
+
+def require_newer(scan: DriftScan, newest_s: float | None) -> None:
+    """Raise for a scan out of order.
+
+    Raises:
+        InvalidValue: it is older than the newest one.
+    """
+    if newest_s is not None and scan.mid_s < newest_s:
+        late = f"the middle of scan {scan.key!r} is at {scan.mid_s:g} s, and {newest_s:g} s was reached already"
+        raise InvalidValue(late, hint="give a tracker its scans in the order of time")
+
+
+class Tracker(Protocol):
+    """Follows the drift from scan to scan. Deterministic: the same scans give the same numbers."""
+
+    @property
+    def forecast(self) -> Forecast:
+        """Forecast from all scans so far."""
+        ...
+
+    def add(self, scan: DriftScan) -> Update:
+        """Add a scan, in the order of time. Raises InvalidValue for a scan older than the newest."""
+        ...
+
+    def state(self) -> Plain:
+        """Return everything that must survive a kill: numbers, texts, lists and dicts of JSON, and numpy arrays."""
+        ...
+
+    def restore(self, state: PlainMapping) -> None:
+        """Restore a state that `state` returned."""
+        ...

@@ -1,0 +1,289 @@
+"""GXSM, versions 3 and 4: over Gxsm4's shared memory, or a script in the console. See the README beside this."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from afspm.basics.errors import ConfigError, Refused
+from afspm.basics.units import Duration
+from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.plugins.gxsm import bridge
+from afspm.plugins.gxsm.activity import SHOWS_S, GxsmActivity, Saving
+from afspm.plugins.gxsm.hardware import (
+    ABORT,
+    APPROACH,
+    AUTOSAVE,
+    REPEAT_OFF,
+    Hardware,
+    Offered,
+    available,
+    execute,
+    recognised,
+)
+from afspm.plugins.gxsm.link import Address, Asking, open_link
+from afspm.plugins.gxsm.result_files import LATE_S, SOON_S, GxsmFiles
+from afspm.plugins.gxsm.scan_memory import new_lines
+from afspm.plugins.gxsm.settings import (
+    REFNAMES,
+    FeedbackSwitch,
+    FrameSettings,
+    ScanFrame,
+    TipPlace,
+    number,
+    send,
+    user_unit_m,
+)
+from afspm.translator.driver import ControllerLost, Driver, Introduction, action
+from afspm.translator.parameters import FEEDBACK_ON, Value
+from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
+
+_AT_FIRST: Final[dict[str, Value]] = {names.SPEC_KIND: "IV", names.PULSE_VOLTAGE: 4.0, names.PULSE_DURATION: 0.1}
+_SAVERS: Final = ("afspm", "gxsm")
+
+
+class Gxsm(Driver):
+    """The microscope behind GXSM.
+
+    Args:
+        address: "HOST:PORT" of `bridge.py` in GXSM's console; "shm" for the shared memory of a Gxsm4 on this computer,
+            "shm:BLOCK@PROCESS" if that or its process is not called as usual.
+        saving: "afspm": while a scan of this translator runs, GXSM's Auto Save is off, and the translator has GXSM save
+            once at its end; else Auto Save is on. "gxsm": Auto Save is left on, and its files are waited for.
+        hardware: "SRanger", "RPSPMC" or "simulator", if the kind that is found is wrong.
+        scan_dir, probe_dir: where scans and spectra are saved, if not where GXSM says that it saves channels.
+        feedback_actions: GXSM's actions that switch the feedback on and off, where its hardware has such.
+        secret_file: a copy of the bridge's `~/.afspm/gxsm-bridge-secret`, if GXSM runs on another computer.
+        reply_timeout_s: how long an answer may take, in real time.
+        common: as for every microscope.
+    """
+
+    parameters_file = Path(__file__).with_name("parameters.toml")
+    translated = (*FRAME, *POSITION, FEEDBACK_ON, names.CONTROLLER, *_AT_FIRST)
+    maker: ClassVar[str] = "Gxsm project"
+    software: ClassVar[str] = "Gxsm"
+    max_pixels: ClassVar[int] = 8192 * 8192
+    program_s: ClassVar[float] = 2.0
+
+    def __init__(
+        self,
+        *,
+        address: str = "127.0.0.1:65431",
+        saving: str = "afspm",
+        hardware: str | None = None,
+        scan_dir: str | None = None,
+        probe_dir: str | None = None,
+        feedback_actions: tuple[str, str] | None = None,
+        secret_file: str | None = None,
+        reply_timeout_s: Duration = 5.0,
+        **common: Any,
+    ) -> None:
+        super().__init__(**common)
+        kinds = [kind.value for kind in Hardware]
+        if hardware is not None and hardware not in kinds:
+            raise ConfigError(f"there is no {hardware!r}", where="hardware", hint=f"there are {', '.join(kinds)}")
+        if saving not in _SAVERS:
+            raise ConfigError(f"{saving!r} is not a way of saving", where="saving", hint=f"{' or '.join(_SAVERS)}")
+        self.controller_at = address
+        Address.parse(address)
+        folders = (None if path is None else Path(path) for path in (scan_dir, probe_dir))
+        self._saving = Saving(saving == "afspm", *folders)
+        self._given_hardware = hardware
+        self._feedback_actions: Sequence[str] = feedback_actions or ()
+        secret = None if secret_file is None else Path(secret_file)
+        self._open = partial(open_link, timeout_s=reply_timeout_s, secret_file=secret)
+        self._whole_table = self.table
+        self._asking: Asking | None = None
+        self._kept = KeptSettings(_AT_FIRST)
+
+    @classmethod
+    def introductions(cls) -> Callable[[str], Introduction]:
+        return partial(bridge.Introduction, bridge.secret())
+
+    @classmethod
+    def excused(cls, controller: str) -> Mapping[str, str]:
+        """Return what GXSM's own simulator does otherwise than GXSM itself says."""
+        if not controller.endswith(f"({Hardware.SIMULATOR.value})"):
+            return {}
+        return {
+            "scan/picture": "GXSM's simulator turns its picture against the direction in which GXSM turns the frame"
+        }
+
+    def connect(self) -> None:
+        """The link; what this GXSM has, in which unit it has it, and how it saves."""
+        self.close()
+        address = Address.parse(self.controller_at)
+        ask = self._asking = Asking(self._open(address, monotonic_s=self.clock.monotonic_s))
+        self.prove()
+        refnames, actions = ask.names("list_refnames"), ask.names("list_actions")
+        missing = [ref for ref in REFNAMES if ref not in refnames]
+        if missing:
+            raise ControllerLost(f"this GXSM has no {', '.join(missing)}", where="list_refnames")
+        found = recognised(refnames, actions)
+        hardware = Hardware(self._given_hardware) if self._given_hardware else found
+        self._offered = Offered(refnames, actions, hardware)
+        self._find_parameters()
+        self.lacking = self._missing_actions()
+        scan_frame = ScanFrame(ask, user_unit_m(ask))
+        switches_autosave = self._saving.by_us and self._offered.actions.issuperset(AUTOSAVE.values())
+        self._kept.kept_in(self.memory)
+        self._files = GxsmFiles(
+            self.memory,
+            self.log,
+            patience_s=self.patience_s(self.result_timeout_s / 2),
+            soon_s=self.patience_s(SOON_S),
+            late_s=self.patience_s(LATE_S),
+        )
+        self._activity = GxsmActivity(
+            ask,
+            hardware,
+            scan_frame,
+            self._files,
+            self.memory,
+            self.clock,
+            self.log,
+            set_frame=lambda: frame(self.in_force(FRAME)),
+            shows_s=self.patience_s(SHOWS_S),
+            saving=self._saving,
+            switches_autosave=switches_autosave,
+        )
+        self._tip = TipPlace(scan_frame, self.memory, self._sets_out)
+        own = FrameSettings(scan_frame, self._tip, is_led=self._offered.hardware is Hardware.RPSPMC)
+        feedback = FeedbackSwitch(ask, self._activity.doing, self._feedback_actions)
+        self.groups = (own, self._tip, self._kept, feedback)
+
+    def _find_parameters(self) -> None:
+        table = self._whole_table
+        vendors = {name: spec.vendor for name, spec in table.items() if name not in self.translated}
+        there = available(vendors, self._offered.refnames)
+        lacking = sorted(vendors.keys() - there.keys())
+        if self._feedback_actions and self._offered.actions.issuperset(self._feedback_actions):
+            table = table.extended({FEEDBACK_ON: {"read_only": False}}, where="feedback_actions")
+        self.table = table.without(lacking)
+        self.log.info("GXSM with the hardware %s; unsupported: %s", self._offered.kind, ", ".join(lacking) or "none")
+
+    def _missing_actions(self) -> dict[str, str]:
+        """GXSM says 0 to actions that it does not have."""
+        needed = {names.ENGAGE: [APPROACH], names.STOP_SPEC: [ABORT]}
+        if names.TIP_BIAS_VOLTAGE not in self.table:
+            needed[names.PULSE] = [names.TIP_BIAS_VOLTAGE]
+        needed[names.START_SPEC] = [execute(kind) for kind in self._whole_table[names.SPEC_KIND].choices]
+        for name, what in self.added_actions.items():
+            if "command" in what:
+                needed[name] = [str(what["command"])]
+        return {
+            name: f"this GXSM has no action {' or '.join(wanted[:3])} with its hardware ({self._offered.kind})"
+            for name, wanted in needed.items()
+            if self._offered.actions.isdisjoint(wanted)
+        }
+
+    def close(self) -> None:
+        if self._asking is not None:
+            self._asking.close()
+            self._asking = None
+
+    @property
+    def _ask(self) -> Asking:
+        if self._asking is None:
+            raise ControllerLost("GXSM is not connected")
+        return self._asking
+
+    def status(self) -> ScopeStatus:
+        return self._activity.status()
+
+    def next_change_s(self) -> float | None:
+        return self._activity.next_change_s()
+
+    # --- parameters ---
+
+    def get(self, vendor: str) -> Value:
+        if vendor == names.CONTROLLER:
+            return f"{self._files.program or 'GXSM'} ({self._offered.kind})"
+        return number(self._ask, self._there(vendor))
+
+    def set(self, values: Mapping[str, Value]) -> None:
+        for vendor, value in values.items():
+            send(self._ask, self._there(vendor), float(value))
+
+    def _there(self, vendor: str) -> str:
+        """Return the name that this GXSM has, of those that a parameter may have: of others it does not say that it has
+        them not."""
+        there = available({"": vendor}, self._offered.refnames)
+        if not there:
+            raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, f"this GXSM has no parameter {vendor!r}")
+        return there[""]
+
+    def _way_s(self, way_m: float) -> float:
+        """Return the time that the tip takes for so long a way; none if GXSM does not tell its speed."""
+        if names.MOVE_SPEED not in self.table:
+            return 0.0
+        speed_m_s = float(self.read_rows([names.MOVE_SPEED])[names.MOVE_SPEED])
+        return way_m / speed_m_s if speed_m_s > 0.0 else 0.0
+
+    def _sets_out(self, way_m: float) -> None:
+        self._activity.sets_out(self._way_s(way_m))
+
+    # --- results ---
+
+    def results(self) -> Sequence[str]:
+        return self._files.results(self.clock.now_s())
+
+    def followed(self) -> bool | None:
+        return self._files.followed()
+
+    def load(self, result: str) -> Sequence[Scan | Spectrum]:
+        return self._files.load(result)
+
+    def lines(self, start: int) -> Sequence[ScanLines]:
+        """Return what is new in GXSM's memory; of channels that a scan was saved of."""
+        endings = self._activity.endings()
+        if not endings:
+            return ()
+        done = self._activity.lines_done()
+        found = new_lines(self._ask, endings, self._files.channels, self._files.scanning, start, done)
+        # of a scan that is stopped meanwhile GXSM says that it is at its last line
+        return found if self._activity.doing().measuring else ()
+
+    # --- actions ---
+
+    @action(names.START_SCAN)
+    def start_scan(self) -> None:
+        """Scan the frame once, with the channels and the direction of GXSM's panel."""
+        if REPEAT_OFF in self._offered.actions:  # it would never end
+            self._ask.call("action", REPEAT_OFF)
+        self._activity.start_scan()
+
+    @action(names.STOP_SCAN)
+    def stop_scan(self) -> None:
+        self._activity.stop_scan()
+
+    @action(names.START_SPEC)
+    def start_spec(self) -> None:
+        """Take a spectrum of the kind `x-spec-kind` where the probe was sent to last: it is sent there again, since a
+        scan has moved it."""
+        kind = str(self._kept[names.SPEC_KIND])
+        if execute(kind) not in self._offered.actions:
+            reason = f"this GXSM has no {execute(kind)} with its hardware ({self._offered.kind}): see x-spec-kind"
+            raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, reason)
+        reach_m = math.hypot(*self._tip.frame.region().size_m)
+        self._activity.start_curve(kind, self._tip.xy_m(), self._way_s(reach_m))
+
+    @action(names.STOP_SPEC)
+    def stop_spec(self) -> None:
+        self._activity.stop_curve()
+
+    @action(names.PULSE, state=ScopeState.BUSY_PARAM)
+    def pulse(self) -> None:
+        self.pulse_bias()
+
+    @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
+    def engage(self) -> None:
+        """The auto approach."""
+        self._ask.call("action", APPROACH)
+
+    def command(self, text: str) -> None:
+        """One of GXSM's actions, e.g. "DSP_CMD_STOPALL"."""
+        self._ask.call("action", text)

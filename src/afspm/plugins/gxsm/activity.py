@@ -1,0 +1,416 @@
+"""The state of GXSM. It never says that something began or ended: that is seen by looking."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar, Final
+
+from afspm.basics.clock import Clock
+from afspm.model import Region, ScopeState, ScopeStatus
+from afspm.plugins.gxsm.errors import GxsmError
+from afspm.plugins.gxsm.hardware import ABORT, AUTOSAVE, STATUS, Doing, Hardware, decoded, execute
+from afspm.plugins.gxsm.link import Asking
+from afspm.plugins.gxsm.result_files import GxsmFiles, endings
+from afspm.plugins.gxsm.scan_memory import Rows, is_unfinished, looked_at, only
+from afspm.plugins.gxsm.settings import ScanFrame
+from afspm.translator.activity import Activity, TipWay
+from afspm.translator.result_files import SCAN, as_list
+from afspm.translator.state import Kept
+
+SETTLES_S: Final = 0.3
+"""So long GXSM needs from the end of a scan until it is done with it: a file that is saved before lacks its end."""
+SHOWS_S: Final = 1.0
+"""So long what was begun may take to be seen running; 0.3 s were measured."""
+_CHANNELS: Final = 40
+_NO_CHANNEL: Final = "EE:"
+
+
+@dataclass(frozen=True)
+class Saving:
+    """The way that scans and spectra are saved.
+
+    Attributes:
+        by_us: True if the translator has GXSM save its own scans at their end. GXSM saves all others by itself.
+        scan_dir, probe_dir: where files are, if not where GXSM says that it saves channels.
+    """
+
+    by_us: bool
+    scan_dir: Path | None = None
+    probe_dir: Path | None = None
+
+
+@dataclass
+class LineWatch:
+    """The last line that GXSM reported, and the direction of the lines: one against it belongs to another scan.
+
+    The first change shows no direction: until the first line is complete, GXSM reports the last one of the scan before.
+    """
+
+    line: int
+    has_moved: bool = False
+    step: int = 0
+
+    def turned(self, line: int, rows: int) -> bool:
+        """Take in a line. Return True if it goes against the direction."""
+        if line == self.line or not 0 <= line < rows:  # at the start of a scan Gxsm4 once reported line -296
+            return False
+        step = 1 if line > self.line else -1
+        self.line, turned = line, self.step not in (0, step)
+        if self.has_moved:
+            self.step = 0 if turned else step
+        self.has_moved = True
+        return turned
+
+
+@dataclass
+class ScanProgress:
+    """The running scan as it was seen.
+
+    Attributes:
+        endings: of the files of its channels.
+        name: of its first file, in which GXSM raises the number with each scan; empty before the first look.
+        watch: of its lines; None before the first look.
+        goes_up: whether its last row is the first of the picture; None: not seen yet.
+        settles_until_s, ended_ns: when GXSM is done with it, and when it has ended.
+        y_before, y_moved: the line of the scan before, and whether GXSM has reported another one since.
+        follows: it was begun before the one before it was seen to end.
+    """
+
+    endings: list[str] = field(default_factory=list)
+    name: str = ""
+    watch: LineWatch | None = None
+    goes_up: bool | None = None
+    settles_until_s: float = 0.0
+    ended_ns: int = 0
+    y_before: int | None = None
+    y_moved: bool = False
+    follows: bool = False
+
+
+class AutosaveSwitch:
+    """GXSM's Auto Save: on for scans of its panel, off while a scan of the translator's may be stopped.
+
+    Attributes:
+        on: as it was set by this translator; None: not known.
+    """
+
+    def __init__(self, ask: Asking, *, is_used: bool) -> None:
+        self._ask, self._is_used = ask, is_used
+        self.on: bool | None = None
+
+    def switch(self, *, on: bool) -> None:
+        """Switch it, unless it is so already."""
+        if self._is_used and self.on is not on:
+            self._ask.call("action", AUTOSAVE[on])
+            self.on = on
+
+
+class GxsmActivity(Activity):
+    """See the module.
+
+    Args:
+        ask: GXSM.
+        frame: of the next scan; `set_frame` gives the same, as it was set, and (rows, columns).
+        kept: JSON-able, and lasts: when the tip arrives that was sent away.
+        shows_s: how long what was begun may take to be seen running, in experiment time.
+        switches_autosave: GXSM's Auto Save is off while a scan of the translator's runs.
+    """
+
+    program: ClassVar[str] = "GXSM"
+
+    def __init__(
+        self,
+        ask: Asking,
+        hardware: Hardware,
+        frame: ScanFrame,
+        files: GxsmFiles,
+        kept: Kept,
+        clock: Clock,
+        log: logging.Logger,
+        *,
+        set_frame: Callable[[], tuple[Region, tuple[int, int]]],
+        shows_s: float,
+        saving: Saving,
+        switches_autosave: bool,
+    ) -> None:
+        super().__init__(files, clock, log)
+        self._ask = ask
+        self._hardware = hardware
+        self._frame = frame
+        self._set_frame = set_frame
+        self._files = files
+        self._shows_s = shows_s
+        self._saving = saving
+        self._autosave = AutosaveSwitch(ask, is_used=switches_autosave)
+        self._way = TipWay(kept, clock)
+        self._looked_ns = 0  # at the last look
+        self._shows_until_s = 0.0
+        self._scan = ScanProgress()
+        self._seen_last: tuple[tuple[int, int], Rows | None] = (0, 0), None
+
+    # --- what is begun ---
+
+    def start_scan(self) -> None:
+        """Scan the frame."""
+        self._autosave.on = None  # a person may have switched it at the panel
+        self._autosave.switch(on=False)
+        self._begin_scan(self._clock.now_ns(), own=True)
+        self._scan.y_before = int(self._ask.number("y_current"))
+        rows, columns = self._set_frame()[1]
+        self._files.looked(looked_at(self._ask, len(self._channels()), (0, rows - 1), columns), None)
+        self._shows_until_s = self._clock.now_s() + self._shows_s
+        self._ask.call("startscan")
+
+    def start_curve(self, kind: str, position_m: tuple[float, float], way_s: float) -> None:
+        """Send the tip to where a spectrum is to be taken, and take it when it is there.
+
+        Args:
+            way_s: how long it may be on its way, in experiment time.
+
+        Raises:
+            Refused: the position is out of the tip's reach.
+        """
+        self._frame.move_tip(position_m)
+        self.sets_out(way_s)
+        self._begin_curve(kind, position_m)
+        self.curve_awaited = kind
+
+    def stop_scan(self) -> None:
+        """Break the scan off."""
+        self._ask.call("stopscan")
+        self.stopped()
+
+    def stop_curve(self) -> None:
+        """Break the spectrum off."""
+        if not self.curve_awaited:
+            self._ask.call("action", ABORT)
+        self.stopped()
+
+    def sets_out(self, way_s: float) -> None:
+        """The tip was sent on, and arrives so long, experiment time, after it would have been where it was sent before,
+        at the latest."""
+        self._way.sets_out(way_s, after_last_way=True)
+
+    def next_change_s(self) -> float | None:
+        """When the tip has arrived, what was begun must show, or files must be there."""
+        now_s = self._clock.now_s()
+        times = (self._way.arrives_s, self._shows_until_s, self._scan.settles_until_s, self._files.next_s() or 0.0)
+        return min((at_s for at_s in times if at_s > now_s), default=None)
+
+    # --- what goes on ---
+
+    def endings(self) -> list[str]:
+        """Of the files of each channel of the running scan; none before it was seen running: GXSM would still tell of
+        the scan before."""
+        if self._files.what != SCAN or self._shows_until_s > 0.0:
+            return []
+        if not self._scan.endings:
+            self._scan.endings = [next(iter(endings([Path(path)])), "") for path in self._channels()]
+        return self._scan.endings
+
+    def lines_done(self) -> int:
+        """Return how many lines of the running scan are complete; until the first is, GXSM tells of the scan before."""
+        y = int(self._ask.number("y_current"))
+        if self._scan.y_before is None:
+            self._scan.y_before = y
+        self._scan.y_moved = self._scan.y_moved or y != self._scan.y_before
+        return y if self._scan.y_moved else 0
+
+    def doing(self) -> Doing:
+        """Return what GXSM says."""
+        return decoded(self._hardware, self._ask.numbers("rtquery", STATUS))
+
+    def status(self) -> ScopeStatus:
+        """Return what GXSM is doing now; what has ended is awaited from here on."""
+        doing, now_s = self.doing(), self._clock.now_s()
+        # a RedPitaya does not tell measuring from a program of its own that may lead the tip
+        led = self._hardware is Hardware.RPSPMC and self._way.is_on
+        if self.curve_awaited and doing.measuring and not led:
+            return self._forestalled()
+        if self.curve_awaited:
+            if not doing.moving and not self._way.is_on:
+                self._take_curve(now_s)
+            return ScopeStatus(ScopeState.SPEC)
+        if doing.measuring and not (led and not self._files.what):
+            return self._measuring(doing)
+        self._looked_ns = self._clock.now_ns()
+        moving = doing.moving or self._way.is_on
+        # a stopped spectrum may still be at the tip's way to it
+        if self._stopping and (moving or (self._autosave.on is False and not self._is_settled(now_s))):
+            return ScopeStatus(ScopeState.INTERRUPTED)
+        self._stopping = False
+        what = self._files.what
+        if what and now_s < self._shows_until_s:
+            return ScopeStatus(ScopeState.SCANNING if what == SCAN else ScopeState.SPEC)
+        if what == SCAN and not self._is_settled(now_s):
+            return ScopeStatus(ScopeState.SCANNING)
+        if what:
+            self.end()
+        self._autosave.switch(on=True)
+        if doing.approaching:
+            return ScopeStatus(ScopeState.COARSE_MOTOR)
+        return ScopeStatus(ScopeState.MOVING) if moving else self.at_rest()
+
+    def _measuring(self, doing: Doing) -> ScopeStatus:
+        if self._files.what == SCAN and doing.scanning and self._is_another():
+            self._follow()
+        self._shows_until_s = self._scan.settles_until_s = 0.0
+        if not self._files.what and not self._stopping:  # somebody began it at the panel
+            self.begin(SCAN if doing.scanning else "VP")
+        if self._files.what == SCAN and self._files.before is None:
+            self._look_at_memory()
+        self._looked_ns = self._clock.now_ns()
+        curve = doing.probing and (self._files.what not in ("", SCAN) or not doing.scanning)
+        return ScopeStatus(ScopeState.SPEC if curve else ScopeState.SCANNING, doing.paused or None)
+
+    def _is_another(self) -> bool:
+        """Return whether another scan runs than at the last look, though none was seen to end.
+
+        Repeated by GXSM, or by a person, scans follow in less time than passes between two looks. GXSM then has a new
+        number in the names of the files, and begins with its lines again.
+        """
+        before, name = self._scan.name, self._ask.text("chfname", 0)
+        self._scan.name = name
+        # once GXSM has saved, it reports another number in place of one that was taken
+        is_another = bool(before) and name != before and not self._files.is_written(Path(self._absolute(name)))
+        if self._files.is_own:  # Repeat was switched off for it
+            return is_another
+        line, watch = int(self._ask.number("y_current")), self._scan.watch
+        if watch is None:
+            self._scan.watch = LineWatch(line)
+            return is_another
+        if watch.step:
+            self._scan.goes_up = watch.step < 0
+        return watch.turned(line, self._files.scanning[1][0]) or is_another
+
+    def _follow(self) -> None:
+        """End a scan that another one has followed. Only its files, if GXSM saved it, show whether it was whole."""
+        self._log.warning("another scan was begun at GXSM's panel before the last one was seen to end")
+        channels, folder, before = self._channels(), self._folder(), self._before()
+        name, ended_ns, now_ns = self._scan.name, self._scan.ended_ns, self._clock.now_ns()
+        self._files.end(ended_ns or now_ns, now_ns, channels, folder, is_whole=None, before=before)
+        self._begin_scan(self._looked_ns, own=False)
+        self._autosave.switch(on=True)
+        self._scan.name, self._scan.follows = name, True
+        self._seen_last = (0, 0), None
+
+    def _look_at_memory(self) -> None:
+        """Keep the first and last row of a scan that was found running, unless its last line may have been scanned."""
+        rows, columns = self._files.scanning[1]
+        found = looked_at(self._ask, len(self._channels()), (0, rows - 1), columns)
+        line = int(self._ask.number("y_current"))
+        if abs(line - self._last_row()) > 1:
+            self._files.looked(found, line)
+
+    def _last_row(self) -> int:
+        """Return the row that is scanned last, as far as is known of a scan that the panel has begun."""
+        goes_up = self._files.upwards if self._scan.goes_up is None else self._scan.goes_up
+        return 0 if goes_up else self._files.scanning[1][0] - 1
+
+    def _before(self) -> Rows | None:
+        """Return the rows that the running scan found in GXSM's memory, and has to have replaced at its end."""
+        if self._files.before is None:
+            return None
+        rows, line = self._files.before
+        if line is None:
+            return rows
+        last = self._last_row()
+        return only(rows, last) if abs(line - last) > 1 else None
+
+    def _is_settled(self, now_s: float) -> bool:
+        """Return whether GXSM is done with the scan that has just ended."""
+        if not self._scan.settles_until_s:
+            self._scan.settles_until_s, self._scan.ended_ns = now_s + SETTLES_S, self._clock.now_ns()
+        return now_s >= self._scan.settles_until_s
+
+    def _forestalled(self) -> ScopeStatus:
+        """The tip was on its way to a spectrum: that must not be taken into what somebody measures."""
+        self.curve_awaited = ""
+        self._way.give_up()
+        self.forget()
+        return self.fail("the spectrum was not taken: another measurement began while the tip moved")
+
+    def _take_curve(self, now_s: float) -> None:
+        action, self.curve_awaited = execute(self.curve_awaited), ""
+        self._shows_until_s = now_s + self._shows_s
+        self._ask.call("action", action)
+
+    def begin(self, what: str) -> None:
+        """Note a measurement that was begun at the panel, since the last look."""
+        if what != SCAN:
+            self._begin_curve(what, self._frame.tip())
+            return
+        self._begin_scan(self._looked_ns, own=False)
+        self._autosave.switch(on=True)
+        self._is_another()  # the first look, which later ones are compared with
+
+    def _begin_scan(self, begun_ns: int, *, own: bool) -> None:
+        self._stopping, self._scan = False, ScanProgress()
+        region, shape = self._set_frame()
+        taken = {"frame": as_list(region), "shape": list(shape)}
+        by_gxsm = not (own and self._saving.by_us)
+        self._files.begin(SCAN, self._folder(), begun_ns, taken, own=own, by_gxsm=by_gxsm)
+
+    def _begin_curve(self, kind: str, position_m: tuple[float, float]) -> None:
+        self._stopping = False
+        folder = self._saving.probe_dir or self._folder()
+        self._files.begin(kind, folder, 0, {"position": list(position_m)})
+
+    def stopped(self) -> None:
+        self._shows_until_s = 0.0
+        super().stopped()
+
+    def end(self) -> None:
+        if self._files.what != SCAN:
+            now_ns = self._clock.now_ns()
+            self._files.end(now_ns, now_ns)
+            return
+        is_whole = self._is_whole()
+        if is_whole and not self._files.is_saved_by_gxsm:
+            try:
+                self._ask.call("autosave")
+            except GxsmError as error:
+                self._log.error("the scan can't be saved: %s", error)
+        # only now: before, GXSM may still tell of the folder of the scan before
+        channels, folder = self._channels(), self._folder()
+        self._files.end(self._scan.ended_ns, self._clock.now_ns(), channels, folder, is_whole=is_whole)
+
+    def _is_whole(self) -> bool | None:
+        """Return whether the scan that has ended came to its end, as far as GXSM's memory shows.
+
+        None: it followed another one at once, and was seen too late to know what it found there.
+        """
+        before, (_, shape) = self._before(), self._files.scanning
+        if before is None and self._seen_last[0] == shape:  # somebody began it, and it was soon over
+            before = self._seen_last[1]
+        columns = shape[1] if before is None else before["columns"]
+        after = looked_at(self._ask, len(self._channels()), (0, shape[0] - 1), columns)
+        self._seen_last = shape, after
+        if before is None:
+            return None if self._scan.follows else True
+        return not is_unfinished(before, after)
+
+    def _folder(self) -> Path | None:
+        """Return where GXSM saves; before its first scan it does not say, and saves where it was started."""
+        if self._saving.scan_dir:
+            return self._saving.scan_dir
+        channels = self._channels(1)
+        return Path(channels[0]).parent if channels else self._ask.working_folder()
+
+    def _channels(self, most: int = _CHANNELS) -> list[str]:
+        """Where GXSM would save each channel."""
+        found: list[str] = []
+        for channel in range(most):
+            path = self._ask.text("chfname", channel)
+            if path.startswith(_NO_CHANNEL):
+                break
+            found.append(self._absolute(path))
+        return found
+
+    def _absolute(self, path: str) -> str:
+        """Return a path that does not depend on where GXSM was started, if that can be told."""
+        folder = None if path.startswith("/") else self._ask.working_folder()
+        return path if folder is None else str(folder / path)

@@ -1,0 +1,185 @@
+"""An emulated GXSM, version 3 or 4: the module `gxsm` that scripts and programs call it by, and its files, with
+simulated physics behind them."""
+
+from __future__ import annotations
+
+import os
+import select
+from collections import deque
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from afspm.basics.errors import ConfigError
+from afspm.basics.plain_data import PlainMapping
+from afspm.basics.units import Length
+from afspm.plugins.gxsm.emulator import block, calls, file_writer, files, program
+from afspm.plugins.gxsm.emulator.block import SharedMemoryBlock
+from afspm.plugins.gxsm.emulator.calls import GxsmFunctions, NoAnswer, WrongArguments
+from afspm.plugins.gxsm.emulator.console import SCRIPT, ScriptCall, ScriptConsole
+from afspm.plugins.gxsm.emulator.entries import USER_UNITS
+from afspm.plugins.gxsm.emulator.program import GxsmProgram
+from afspm.simulation.emulation.emulator import Crashed, Emulator
+
+PROCESS: Final = "emulated-gxsm4"
+_TRANSPORTS: Final = ("bridge", "shm")
+
+
+class GxsmEmulator(Emulator):
+    """The emulated GXSM.
+
+    Args:
+        version: 3 or 4.
+        card: what its hardware is: "SRanger", "RPSPMC" or GXSM's own "simulator".
+        transport: "bridge": a script runs in its console; "shm": the shared memory of Gxsm4, on Linux.
+        script: that runs in its console; left out: afspm's own.
+        block, process: what the shared memory and its process are called; left out: memory of a name of its own.
+        user_unit: of lengths on its panel: "Å", "nm" or "µm".
+        decimal_comma: it runs where 12,5 is written.
+        auto_save, probe_auto_save: what its panel has on.
+        feedback_actions: names of actions that switch the feedback on and off; left out: its hardware has none.
+        reach_m: of the scanner in x and y, from the centre.
+        seed, faults, and all of the simulated world: as of every emulator.
+
+    Attributes:
+        unanswered: calls that have come.
+        silent: it was asked something that blocks it for good.
+    """
+
+    vendor = "GXSM"
+    usual: ClassVar[PlainMapping] = {"port": 65431, "block": "gxsm4_py_shm_data_block", "process": "gxsm4"}
+    fault_kinds: ClassVar[Mapping[str, str]] = {
+        "wedge": "nothing is answered for the duration",
+        "crash": "GXSM crashes; its shared memory stays",
+        "script-stopped": "script-control is set to 0: the script in the console ends",
+        **calls.FAULT_KINDS,
+        **program.FAULT_KINDS,
+        **file_writer.FAULT_KINDS,
+        **block.FAULT_KINDS,
+    }
+
+    def __init__(
+        self,
+        *,
+        version: int = 4,
+        card: str = "SRanger",
+        transport: str = "bridge",
+        script: str = "",
+        block: str = "",
+        process: str = PROCESS,
+        user_unit: str = "Å",
+        decimal_comma: bool = False,
+        auto_save: bool = True,
+        probe_auto_save: bool = True,
+        feedback_actions: Sequence[str] = (),
+        reach_m: Length = 2e-6,
+        **settings: Any,
+    ) -> None:
+        super().__init__(**settings)
+        for name, value, known in (
+            ("version", version, (3, 4)),
+            ("card", card, program.CARDS),
+            ("transport", transport, _TRANSPORTS if version == 4 else _TRANSPORTS[:1]),
+            ("user_unit", user_unit, USER_UNITS),
+        ):
+            if value not in known:
+                raise ConfigError(f"{value!r}", where=name, hint=f"there are {', '.join(map(str, known))}")
+        self._settings = program.GxsmSettings(
+            version, card, user_unit, decimal_comma, auto_save, probe_auto_save, reach_m
+        )
+        self._transport = transport
+        self._script = Path(script) if script else SCRIPT
+        self._block_name, self._process = block or f"emulated_gxsm4_{os.urandom(8).hex()}", process
+        self._feedback_actions = tuple(feedback_actions)
+        self.unanswered: deque[ScriptCall] = deque()
+        self.silent = False
+        self._console: ScriptConsole | None = None
+        self._listens = False
+        self._block: SharedMemoryBlock | None = None
+
+    def open(self) -> str:
+        """Run the script in the console, or open the shared memory."""
+        files.prepare(self._settings.version)
+        self.silent = False
+        self.unanswered.clear()
+        self.program = GxsmProgram(self.rig, self.faults, self.clock, self.folder, self._settings)
+        self._calls = GxsmFunctions(self.program, self._feedback_actions)
+        if self._transport == "shm":
+            self._block = SharedMemoryBlock(
+                self._block_name, self._process, self.folder, self.faults, self.clock.now_s, self.unanswered.append
+            )
+            return f"shm:{self._block_name}@{self._block.pid}"
+        return self.run_script()
+
+    def run_script(self) -> str:
+        """Run the script in the console, as a user does. Returns where it listens."""
+        self.take_button_away()
+        before = self._console
+        if before is not None:
+            before.end()
+            self.unanswered.clear()
+        self._console = ScriptConsole(self._script, self.port, self.folder.absolute(), self._post, self.woken.post)
+        while (address := self._console.poll()) is None:
+            self.serve(1.0)
+        self.port = int(address.rpartition(":")[2])
+        self._listens = True
+        if before is not None:
+            self.listening(address)
+        return address
+
+    def serve(self, timeout_s: float) -> None:
+        """Answer what has come."""
+        watched: list[Any] = [self.woken] if self._block is None else [self.woken, self._block]
+        ready = select.select(watched, [], [], timeout_s)[0]
+        if self._block is not None and self._block in ready:
+            self._block.take()
+        self.woken.take()
+        self._answer_all()
+
+    def tick(self, now_s: float) -> float | None:
+        """Scans end, files are written, and what has waited is answered."""
+        if self.faults.strikes("crash", now_s):
+            if self._block is not None:
+                self._block.end(remains=True)
+                self._block = None
+            raise Crashed("as it was told to")
+        if self._console is not None and self._listens and not self._console.runs:
+            self._listens = False
+            self.listening("")
+            self.show_button("run-the-script-again", "the script in the console has ended", self.run_script)
+        if self.faults.strikes("script-stopped", now_s):
+            self.program.entries.put("script-control", 0.0)
+        next_s = self.program.advance(now_s)
+        self._answer_all()
+        return next_s
+
+    def close(self) -> None:
+        """GXSM is closed."""
+        if self._console is not None:
+            self._console.end()
+            self._console = None
+        if self._block is not None:
+            self._block.end()
+            self._block = None
+
+    def _post(self, call: ScriptCall) -> None:
+        self.unanswered.append(call)
+        self.woken.post()
+
+    def _answer_all(self) -> None:
+        while self.unanswered and not self.silent and not self.faults.lasts("wedge", self.clock.now_s()):
+            call = self.unanswered.popleft()
+            self.program.advance(self.clock.now_s())  # GXSM does one thing after the other
+            try:
+                found = self._calls.answer(call.method, call.arguments)
+            except NoAnswer:
+                self.silent = True
+                return
+            except WrongArguments as error:
+                found = SystemError(str(error)) if self._block is None else error.value
+            except (NameError, SystemError) as error:  # what a script of the user's is to see
+                found = error
+            except Exception as error:
+                self.log.exception("%s failed", call.method)
+                found = SystemError(str(error))
+            call.answered(found)

@@ -1,0 +1,140 @@
+"""The other end of Gxsm4's shared memory: what programs of its users write there reaches the emulator."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import struct
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Final
+
+from afspm.basics.errors import ConfigError
+from afspm.plugins.gxsm import pickles
+from afspm.plugins.gxsm.emulator.console import ScriptCall
+from afspm.plugins.gxsm.emulator.signalled import CONTENT, SIZE
+from afspm.plugins.gxsm.errors import BadReply
+from afspm.simulation.emulation.emulator import Crashed
+from afspm.simulation.faults import Faults
+
+FAULT_KINDS: Final[Mapping[str, str]] = {
+    "bad-pickle": "shared memory: the result is not a pickle",
+    "evil-pickle": "shared memory: the result would run a program if it were unpickled",
+    "code": "shared memory: the status says that the result can't be passed on",
+    "huge": "shared memory: a result that is longer than the memory",
+}
+NAME_BYTES: Final = 64
+_NO_SUCH_FUNCTION, _NOT_PASSED_ON = -4, -1
+
+
+class SharedMemoryBlock:
+    """The shared memory and the process that has it.
+
+    Args:
+        name: of the memory.
+        process: what the process calls itself.
+        folder: in which it was started.
+        post: takes the calls; `take` must be called when `fileno` is readable.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        process: str,
+        folder: Path,
+        faults: Faults,
+        now_s: Callable[[], float],
+        post: Callable[[ScriptCall], None],
+    ) -> None:
+        if not sys.platform.startswith("linux"):
+            raise ConfigError("Gxsm4's shared memory is there on Linux alone", where="transport", hint='"bridge"')
+        self._name, self._faults, self._now_s, self._post = name, faults, now_s, post
+        command = [sys.executable, "-I", "-S", str(Path(__file__).with_name("signalled.py")), name, process]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=folder)
+        self._frame()  # it is ready
+
+    @property
+    def pid(self) -> int:
+        """Process id to send the signal to."""
+        return self._process.pid
+
+    def fileno(self) -> int:
+        assert self._process.stdout is not None
+        return self._process.stdout.fileno()
+
+    def take(self) -> None:
+        """Post one call that has come. Raises Crashed: somebody has killed the process."""
+        frame = self._frame()
+        if not frame:
+            raise Crashed("its process is gone")
+        method = frame[:NAME_BYTES].split(b"\0", 1)[0].decode("latin-1")
+        try:
+            arguments = pickles.loads(frame[NAME_BYTES:])
+        except BadReply as error:
+            self._answer(error)
+            return
+        self._post(ScriptCall(method, arguments if isinstance(arguments, tuple) else (arguments,), self._answer))
+
+    def end(self, *, remains: bool = False) -> None:
+        """GXSM is closed.
+
+        Args:
+            remains: the memory stays, as it does when the real one has ended.
+        """
+        self._process.kill()
+        self._process.wait()
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                with contextlib.suppress(OSError):
+                    stream.close()
+        if not remains:
+            Path("/dev/shm", self._name).unlink(missing_ok=True)
+
+    def _frame(self) -> bytes:
+        assert self._process.stdout is not None
+        head = self._process.stdout.read(4)
+        if len(head) < 4:
+            return b""
+        return self._process.stdout.read(struct.unpack(">I", head)[0])
+
+    def _answer(self, found: object) -> None:
+        now_s = self._now_s()
+        status, content = 0, b""
+        if isinstance(found, NameError):
+            status = _NO_SUCH_FUNCTION
+        elif isinstance(found, BaseException):
+            status = _NOT_PASSED_ON
+        else:
+            try:
+                content = pickle.dumps(found, 4)
+            except Exception:
+                status = _NOT_PASSED_ON
+        if len(content) > SIZE - CONTENT:
+            status, content = _NOT_PASSED_ON, b""
+        length = len(content)
+        if self._faults.strikes("code", now_s):
+            status = _NOT_PASSED_ON
+        if self._faults.strikes("bad-pickle", now_s):
+            content = bytes(range(255, 255 - length, -1)) if length < 255 else content[: length // 2]
+        if self._faults.strikes("evil-pickle", now_s):
+            content = pickle.dumps(_MaliciousPickle(), 4)
+            length = len(content)
+        if self._faults.strikes("huge", now_s):
+            length = 1 << 31
+        self._write(struct.pack("<qQ", status, length) + content)
+
+    def _write(self, answer: bytes) -> None:
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):  # it was killed
+            self._process.stdin.write(struct.pack(">I", len(answer)) + answer)
+            self._process.stdin.flush()
+
+
+class _MaliciousPickle:
+    """Makes a folder called `evil` where it is unpickled."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return os.mkdir, ("evil",)

@@ -1,0 +1,405 @@
+"""GXSM itself: what it has set and is doing, with the simulated instrument behind it, and the files that it saves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from afspm.basics.clock import Clock
+from afspm.basics.errors import InvalidValue
+from afspm.basics.plain_data import Plain
+from afspm.model import Region
+from afspm.plugins.gxsm.emulator import files
+from afspm.plugins.gxsm.emulator.channels import CHANNELS, SIMULATED_3, GxsmChannel
+from afspm.plugins.gxsm.emulator.entries import GxsmEntries, GxsmEntry, lengths, simulated_3
+from afspm.plugins.gxsm.emulator.file_writer import GxsmFileWriter
+from afspm.simulation.activities import ScanActivity, SpectrumActivity
+from afspm.simulation.faults import Faults
+from afspm.simulation.instrument import Instrument
+
+CARDS: Final = {"SRanger": "SRangerMK2:SPM", "RPSPMC": "RPSPMC:SPM", "simulator": "SPM-SIM:SPM"}
+FAULT_KINDS: Final[Mapping[str, str]] = {
+    "refused": "a value is refused as out of range: a dialog opens on the screen",
+    "no-start": "a scan does not begin, without an error",
+    "panel-stop": "the scan is stopped at the panel",
+}
+ANGSTROM_M: Final = 1e-10
+SHOWS_S: Final = 0.15
+"""A scan is seen running so long after it was begun."""
+NAMED_S: Final = 0.04
+"""Until so long after its begin the names of the scan before are told."""
+IGAIN: Final = 10.0
+"""The simulated integral gain for one of GXSM's, which go to 200."""
+UNFINISHED_S: Final = 0.25
+"""So long after the end of a scan GXSM is not done with it: a file that is saved then has no end in it."""
+_PIXELS_S: Final = 0.045
+"""What its own simulator takes for a line besides its pixels."""
+_NEVER_WRITTEN: Final = -296
+"""The line that Gxsm4's simulator reports at the start of its first scan."""
+_PULSE_S: Final = 1.0
+_MIXER: Final = ("dsp-fbs-mx0-current-set", "nA", 1.0)
+_MIXERS: Final = {
+    "current": ("dsp-fbs-mx0-current-set", "nA", 1e-9),
+    "frequency-shift": ("dsp-fbs-mx1-freq-set", "Hz", 1.0),
+}
+"""By the mode of the feedback: the entry of its setpoint, the unit, and a simulated one for one of GXSM's."""
+_COLUMNS: Final = {"Bias": "Bias-mon", "Z": "Z-mon", "Current": "CurrentSim1"}
+
+
+@dataclass(frozen=True)
+class GxsmSettings:
+    """The settings of the emulated program, as `GxsmEmulator` takes them."""
+
+    version: int
+    card: str
+    user_unit: str
+    decimal_comma: bool
+    auto_save: bool
+    probe_auto_save: bool
+    reach_m: float
+
+
+@dataclass
+class GxsmPanel:
+    """The switches of GXSM's panel.
+
+    Attributes:
+        auto_save: of scans; probe_auto_save of spectra.
+        repeats: a scan that comes to its end is followed by the next.
+        behind_s: how much the clock of its computer, whose times are in files, is behind; it may be set at any time.
+    """
+
+    auto_save: bool
+    probe_auto_save: bool
+    repeats: bool = False
+    behind_s: float = 0.0
+
+
+@dataclass
+class GxsmScan:
+    """The last scan that was begun, and the memory that it is scanned into.
+
+    Attributes:
+        activity: None before the first.
+        frame: offset, range and rotation at its start.
+        runs: until GXSM has seen its end; `saved`: since then.
+        shows_s: how long after its begin it is seen running.
+        next_follows: another scan is to begin; `follows`: it does so at once.
+        number, own: the number in the names of its files; the names, once it is saved.
+        before: the names that are reported at first; None: its own at once.
+        y_before: the line that is reported until its first one is complete.
+        memory: rows of the scan before, by channel.
+    """
+
+    activity: ScanActivity | None = None
+    frame: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    runs: bool = False
+    saved: bool = False
+    shows_s: float = SHOWS_S
+    next_follows: bool = False
+    follows: bool = False
+    number: int = 0
+    before: list[Path] | None = None
+    y_before: int = 0
+    memory: dict[GxsmChannel, np.ndarray] = field(default_factory=dict)
+    own: list[Path] = field(default_factory=list)
+
+
+class GxsmProgram:
+    """The program.
+
+    Attributes:
+        panel: the switches of its panel.
+        channels: that a scan records.
+        dialogs: the texts of dialogs on the screen.
+        scan: the last scan that was begun.
+    """
+
+    def __init__(self, rig: Instrument, faults: Faults, clock: Clock, folder: Path, settings: GxsmSettings) -> None:
+        self.rig, self.faults, self.clock, self.folder = rig, faults, clock, folder
+        self.version, self.card = version, card = settings.version, settings.card
+        self.dialogs: list[str] = []
+        self.panel = GxsmPanel(settings.auto_save, settings.probe_auto_save)
+        self.entries = GxsmEntries(
+            version, settings.user_unit, decimal_comma=settings.decimal_comma, dialogs=self.dialogs.append
+        )
+        known = SIMULATED_3 if (version, card) == (3, "simulator") else CHANNELS[version]
+        self.channels: list[GxsmChannel] = [one for one in known if one.source in rig.channels]
+        self.saving = GxsmFileWriter(folder, faults)
+        self.scan = GxsmScan()
+        self.curve: SpectrumActivity | None = None
+        self._bias_since_s = -math.inf
+        self._curves = 0
+        for ref, entry in lengths(settings.reach_m / ANGSTROM_M, self._told).items():
+            self.entries.add(ref, entry)
+        for ref, entry in self._of_hardware().items():
+            self.entries.add(ref, entry)
+
+    def _told(self, ref: str) -> Callable[[float], None]:
+        if ref in ("ScanX", "ScanY", "OffsetX", "OffsetY"):
+            return lambda _: self._move()
+        return lambda _: None
+
+    def _of_hardware(self) -> dict[str, GxsmEntry]:
+        rig, loop = self.rig, self.rig.setup.feedback
+        bias = GxsmEntry(rig.setup.bias_v, -10.0, 10.0, "V", told=self._bias)
+        if self.card == "simulator":
+            speed = GxsmEntry(1.0, 0.01, 4000.0, "px/s", "{:.2f}")
+            return {"sim-stm-speed": speed, "sim-stm-bias": bias, **(simulated_3() if self.version == 3 else {})}
+
+        def fed_back(name: str, factor: float = 1.0) -> Callable[[float], None]:
+            def told(value: float) -> None:
+                changed: Plain = {name: value * factor}
+                rig.setup.feedback = replace(rig.setup.feedback, **changed)
+
+            return told
+
+        def sloped(axis: int) -> Callable[[float], None]:
+            return lambda value: setattr(
+                rig.setup, "slope", (*rig.setup.slope[:axis], value, *rig.setup.slope[axis + 1 :])
+            )
+
+        speed = GxsmEntry(2e4, 1e-3, 1e7, told=lambda value: setattr(rig.setup, "move_speed_m_s", value * ANGSTROM_M))
+        mixer, unit, factor = _MIXERS.get(rig.world.settings.feedback.mode, _MIXER)
+        setpoint = GxsmEntry((loop.setpoint or 0.0) / factor, -1e3, 1e3, unit, told=fed_back("setpoint", factor))
+        found = {
+            "dsp-fbs-bias": bias,
+            "dsp-fbs-mx0-current-set": GxsmEntry(0.0, -100.0, 100.0, "nA"),
+            mixer: setpoint,
+            "dsp-fbs-mx0-current-level": GxsmEntry(0.0, -100.0, 100.0, "nA"),
+            "dsp-fbs-cp": GxsmEntry(loop.proportional_gain or 0.0, -100.0, 200.0, told=fed_back("proportional_gain")),
+            "dsp-fbs-ci": GxsmEntry(
+                (loop.integral_gain or 0) / IGAIN, -100, 200, told=fed_back("integral_gain", IGAIN)
+            ),
+            "dsp-fbs-scan-speed-scan": GxsmEntry(1e4, 1e-3, 1e7),
+            "dsp-fbs-scan-speed-move": speed,
+            "dsp-adv-scan-slope-x": GxsmEntry(0.0, -0.2, 0.2, told=sloped(0)),
+            "dsp-adv-scan-slope-y": GxsmEntry(0.0, -0.2, 0.2, told=sloped(1)),
+            "dsp-gvp-du00": GxsmEntry(0.0, -10.0, 10.0, "V"),
+        }
+        if self.card == "RPSPMC":
+            return {**found, "dsp-GVP-VPJR": GxsmEntry(0.0)}
+        zs = {"dsp-Z-start": GxsmEntry(0.0, -1e4, 1e4), "dsp-Z-end": GxsmEntry(0.0, -1e4, 1e4)}
+        return {**found, **zs, "dsp-Z-Slope": GxsmEntry(100.0, 1e-3, 1e6), "dsp-fbs-motor": GxsmEntry(0.0, -10.0, 10.0)}
+
+    def _bias(self, value: float) -> None:
+        """Another bias; one that was in force for a short while has been a pulse."""
+        now_s = self.clock.now_s()
+        if now_s - self._bias_since_s < _PULSE_S:
+            self.rig.pulsed(self.rig.setup.bias_v, now_s - self._bias_since_s, now_s)
+        self.rig.setup.bias_v, self._bias_since_s = value, now_s
+
+    # --- what happens by itself ---
+
+    def advance(self, now_s: float) -> float | None:
+        """Up to now; returns when a file is to be written."""
+        if self.scan.runs and self.faults.strikes("panel-stop", now_s):
+            self.rig.stop_scan(now_s)
+        if self.scan.runs and self.scan.activity is not None and not self.scan.activity.running(now_s):
+            self.scan.runs = False
+            if self.panel.auto_save:
+                self.save(now_s, finished=True)
+            self.scan.next_follows = self.scan.follows = self.panel.repeats and self.scan.activity.stopped_s is None
+        if self.curve is not None and not self.curve.running(now_s):
+            curve, self.curve = self.curve, None
+            if self.panel.probe_auto_save:
+                self._save_curve(curve, now_s)
+        next_s = self.saving.advance(now_s)
+        if self.scan.next_follows and now_s >= self.saving.done_s:
+            self.start_scan()
+        return min(next_s or math.inf, self.saving.done_s) if self.scan.next_follows else next_s
+
+    @property
+    def is_between_repeats(self) -> bool:
+        """True after the end of a scan that the next one follows at once: GXSM does not tell of an end then."""
+        is_whole = self.scan.activity is not None and self.scan.activity.stopped_s is None
+        return self.panel.repeats and is_whole and (self.scan.runs or self.scan.next_follows)
+
+    def stop_scan(self) -> None:
+        """Break off the scan that runs, or is to begin."""
+        self.scan.next_follows = False
+        self.rig.stop_scan(self.clock.now_s())
+
+    # --- scans ---
+
+    def start_scan(self) -> None:
+        """If it can; there is no answer. While files are written GXSM does nothing else."""
+        now_s = self.clock.now_s()
+        self.scan.next_follows = now_s < self.saving.done_s
+        if self.scan.next_follows:
+            return
+        follows, self.scan.follows = self.scan.follows, False
+        self.rig.stop_move(now_s)
+        if self.rig.busy(now_s) or self.faults.strikes("no-start", now_s):
+            return
+        if not self.channels:
+            self.dialogs.append("no channel is set")
+            return
+        entries, columns, rows = self.entries, int(self.entries["PointsX"]), int(self.entries["PointsY"])
+        region = self.frame()
+        self.rig.setup.region, self.rig.setup.shape, self.rig.setup.upwards = region, (rows, columns), False
+        if self.card == "simulator":
+            # it turns its picture the other way than the frame
+            self.rig.setup.region = replace(region, angle_rad=-region.angle_rad)
+            self.rig.setup.line_s = _PIXELS_S + len(self.channels) * columns / entries["sim-stm-speed"]
+        else:
+            self.rig.setup.line_s = 2.0 * entries["RangeX"] / entries["dsp-fbs-scan-speed-scan"]
+        try:
+            started = self.rig.start_scan(now_s)
+        except InvalidValue as error:
+            self.dialogs.append(str(error))
+            return
+        self.scan.memory = {one: _resized(self.image(one), (rows, columns)) for one in self.channels}
+        is_first = self.scan.activity is None and self.card == "simulator" and self.version == 4
+        self.scan.y_before = _NEVER_WRITTEN if is_first else self.y_current(now_s)
+        self.scan.before, self.scan.own = None if follows else self.names(now_s), []
+        self.scan.number = self.saving.next_number()
+        self.scan.shows_s = 0.0 if follows else SHOWS_S
+        self.scan.activity = started
+        self.scan.frame = tuple(entries[ref] for ref in ("OffsetX", "OffsetY", "RangeX", "RangeY", "Rotation"))  # type: ignore[assignment]
+        self.scan.runs, self.scan.saved = True, False
+
+    def y_current(self, now_s: float) -> int:
+        """The last line that is complete: that of the scan before until the first is; the very last after a stop."""
+        scan = self.scan.activity
+        if scan is None:
+            return 0
+        if not scan.running(now_s):
+            return scan.shape[0] - 1
+        done = scan.lines_done(now_s)
+        return done - 1 if done else self.scan.y_before
+
+    def frame(self) -> Region:
+        """The frame of the next scan."""
+        x, y, width, height = (self.entries[ref] * ANGSTROM_M for ref in ("OffsetX", "OffsetY", "RangeX", "RangeY"))
+        return Region((x, y), (width, height), -math.radians(self.entries["Rotation"]))
+
+    def names(self, now_s: float) -> list[Path]:
+        """Return where each channel is to be saved, whatever is there already, or was; none before the first scan."""
+        if self.scan.activity is None:
+            return []
+        if self.scan.before is not None and now_s < self.scan.activity.start_s + NAMED_S:
+            return self.scan.before
+        if self.scan.own:
+            return self.scan.own
+        return [self.saving.named(ending, self.scan.number) for ending in self._endings()]
+
+    def shown(self, path: Path) -> str:
+        """Return a path as it is told: a GXSM whose user has chosen no folder saves to ".", wherever it was started."""
+        return f"./{path.name}" if path.parent == self.folder else str(path)
+
+    def image(self, channel: GxsmChannel) -> np.ndarray:
+        """Return what is in memory of a channel: rows that the last scan did not come to are as they were."""
+        if self.scan.activity is None or channel not in self.scan.memory:
+            return np.zeros((0, 0), np.float32)
+        now_s = self.clock.now_s()
+        until_s = now_s if self.scan.runs else self.scan.activity.stopped_s
+        drawn = self.scan.activity.channels(until_s)
+        scanned = channel.raw(drawn[channel.source][1])
+        return np.where(np.isnan(scanned), self.scan.memory[channel], scanned)
+
+    def save(self, now_s: float, *, finished: bool = False) -> None:
+        """Save the last scan, if there is one: again, if it was saved.
+
+        Args:
+            finished: GXSM is done with it, whatever the time.
+        """
+        if self.scan.activity is None:
+            return
+        if self.scan.saved:
+            self.scan.own = []
+        own = [self.saving.free(ending, self.scan.number) for ending in self._endings()]
+        finished = finished or now_s >= self.scan.activity.end_s + UNFINISHED_S
+        pairs = zip(own, self.channels, strict=True)
+        self.saving.write([(path, self._file(one, path, finished=finished)) for path, one in pairs], now_s)
+        self.saving.counted(own)
+        self.scan.own, self.scan.saved = own, True
+
+    def _endings(self) -> list[str]:
+        return [channel.ending(master=number == 0) for number, channel in enumerate(self.channels)]
+
+    def _file(self, channel: GxsmChannel, path: Path, *, finished: bool) -> bytes:
+        scan = self.scan.activity
+        assert scan is not None
+        saved = files.GxsmScanFile(
+            str(path),
+            channel.label,
+            self.image(channel),
+            channel.dz,
+            channel.unit,
+            self.scan.frame,
+            scan.start_s - self.panel.behind_s,
+            scan.end_s - self.panel.behind_s if finished else 0.0,
+            CARDS[self.card],
+            scan.bias_v,
+        )
+        return files.netcdf3(saved) if self.version == 3 else files.netcdf4(saved)
+
+    # --- the tip ---
+
+    def move_tip(self, x: float, y: float) -> float:
+        """Within the frame, in ångström from its centre: 0, or -1 if that is outside."""
+        sides = self.entries["RangeX"], self.entries["RangeY"]
+        if not all(abs(value) <= side / 2 * (1 + 1e-9) for value, side in zip((x, y), sides, strict=True)):
+            return -1
+        self.entries.put("ScanX", x)
+        self.entries.put("ScanY", y)
+        self._move()
+        return 0
+
+    def _move(self) -> None:
+        if self.rig.doing(self.clock.now_s()) in ("", "move"):
+            self.rig.move_probe(self.tip_m(), self.clock.now_s())
+
+    def tip_m(self) -> tuple[float, float]:
+        """The position that the tip was sent to."""
+        angle, (cx, cy) = -math.radians(self.entries["Rotation"]), self.frame().center_m
+        u, v = (self.entries[ref] * ANGSTROM_M for ref in ("ScanX", "ScanY"))
+        return cx + math.cos(angle) * u - math.sin(angle) * v, cy + math.sin(angle) * u + math.cos(angle) * v
+
+    # --- spectra ---
+
+    def take_curve(self, kind: str) -> None:
+        """If it can; nobody is told whether."""
+        if self.rig.busy(self.clock.now_s()):
+            return
+        try:
+            self.curve = self.rig.start_spectrum(kind, self.clock.now_s())
+        except InvalidValue as error:
+            self.dialogs.append(str(error))
+
+    def columns(self, curve: SpectrumActivity) -> dict[str, np.ndarray]:
+        """Return the columns with GXSM's labels."""
+        blanks = "    " if self.card == "RPSPMC" else ""
+        found = {}
+        for name, unit, values in zip(curve.names, curve.units, curve.values.T, strict=True):
+            scale, shown = {"m": (1e10, "Å"), "A": (1e9, "nA")}.get(unit, (1.0, unit))
+            found[f"{blanks}{_COLUMNS.get(name, name)} ({shown})"] = values * scale
+        return found
+
+    def _save_curve(self, curve: SpectrumActivity, now_s: float) -> None:
+        self._curves += 1
+        path = self._curve_path()
+        while self.card == "RPSPMC" and path.exists():  # others overwrite
+            self._curves += 1
+            path = self._curve_path()
+        offset = self.entries["OffsetX"], self.entries["OffsetY"]
+        version = "00.03" if self.card == "RPSPMC" else "00.02"
+        saved = files.GxsmSpectrumFile(str(path), self.columns(curve), now_s, offset, self.rig.setup.bias_v, version)
+        self.saving.write([(path, files.vpdata(saved))], now_s)
+
+    def _curve_path(self) -> Path:
+        return self.folder / f"scan{self.saving.counter:03d}-VP{self._curves:03d}-VP.vpdata"
+
+
+def _resized(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Return memory of another size: what both have stays, the rest is zero."""
+    found = np.zeros(shape, np.float32)
+    rows, columns = (min(pair) for pair in zip(shape, image.shape, strict=True))
+    found[:rows, :columns] = image[:rows, :columns]
+    return found

@@ -1,0 +1,112 @@
+"""The hardware behind GXSM: its drivers ("HwI") differ in what they have and in how they tell what they are doing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+from afspm.plugins.gxsm.errors import BadReply
+
+STATUS: Final = "s"
+ABORT: Final = "DSP_VP_ABORT_EXECUTE"
+APPROACH: Final = "DSP_CMD_AUTOAPP"
+AUTOSAVE: Final = {True: "CHECK-MainAutoSave", False: "UNCHECK-MainAutoSave"}
+"""The actions that switch it on and off."""
+REPEAT_OFF: Final = "UNCHECK-SCAN-REPEAT"
+_MODES: Final = {"force": "FZ"}  # other kinds of spectra are called as GXSM calls them
+_MOST_BITS: Final = 1 << 24
+
+
+class Hardware(Enum):
+    """A kind of driver."""
+
+    SRANGER = "SRanger"
+    RPSPMC = "RPSPMC"
+    SIMULATOR = "simulator"
+
+
+@dataclass(frozen=True)
+class Offered:
+    """The names that a running GXSM has, and its kind of hardware."""
+
+    refnames: frozenset[str]
+    actions: frozenset[str]
+    hardware: Hardware
+
+    @property
+    def kind(self) -> str:
+        return self.hardware.value
+
+
+@dataclass(frozen=True)
+class Doing:
+    """The state that GXSM tells of itself.
+
+    Attributes:
+        scanning, probing: both, where it does not tell them apart.
+    """
+
+    feedback_on: bool
+    scanning: bool
+    probing: bool
+    paused: bool
+    moving: bool
+    approaching: bool
+
+    @property
+    def measuring(self) -> bool:
+        return self.scanning or self.probing
+
+
+def recognised(refnames: Collection[str], actions: Collection[str]) -> Hardware:
+    """The kind, by the names that it adds to GXSM's."""
+    if any(name.startswith("dsp-GVP-") for name in refnames) or any(name.startswith("GVP_CMD_") for name in actions):
+        return Hardware.RPSPMC
+    if any(name.startswith(("sim-", "template-")) for name in refnames):
+        return Hardware.SIMULATOR
+    return Hardware.SRANGER
+
+
+def decoded(hardware: Hardware, slots: list[float]) -> Doing:
+    """Return what `rtquery("s")` says; of its three numbers only the first has a meaning.
+
+    Raises:
+        BadReply: that is no set of bits.
+    """
+    value = slots[0] if slots else math.nan
+    if not (0.0 <= value < _MOST_BITS and value == int(value)):
+        raise BadReply(f"GXSM reports its state as {slots}, which is not a set of bits")
+    bits = int(value)
+    if hardware is Hardware.RPSPMC:
+        running = bool(bits & 2)  # a scan or a spectrum: it does not tell
+        return Doing(bool(bits & 1), running, running, bool(bits & 4), moving=False, approaching=False)
+    return Doing(
+        bool(bits & 1),
+        bool(bits & 2),
+        bool(bits & 8),
+        bool(bits & 4),
+        moving=bool(bits & 16),
+        approaching=bool(bits & 128),
+    )
+
+
+def execute(kind: str) -> str:
+    """The action that takes a spectrum of a kind."""
+    return f"DSP_VP_{_MODES.get(kind, kind)}_EXECUTE"
+
+
+def available(vendors: Mapping[str, str], refnames: Collection[str]) -> dict[str, str]:
+    """Of parameters that GXSM has names for, which of those there is here; those that there are not are left out.
+
+    Args:
+        vendors: by generic names, e.g. "dsp-fbs-bias | sim-stm-bias".
+    """
+    found = {}
+    for name, vendor in vendors.items():
+        there = [ref for ref in (one.strip() for one in vendor.split("|")) if ref in refnames]
+        if there:
+            found[name] = there[0]
+    return found

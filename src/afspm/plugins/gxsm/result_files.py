@@ -1,0 +1,356 @@
+"""The results of measurements: GXSM's files, which come late, one for each channel, one after the other."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Final
+
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.errors import AfspmError
+from afspm.model import Region
+from afspm.plugins.gxsm.scan_memory import Rows, in_files, is_unfinished
+from afspm.storage.formats.content import FileContent
+from afspm.translator.result_files import (
+    SCAN,
+    Content,
+    Entry,
+    FilePrecision,
+    ResultFiles,
+    as_region,
+    lines_missing,
+    modified_ns,
+    read_result,
+)
+
+_NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+\.nc)$")
+_PRECISION: Final = FilePrecision(part=1e-5, angle_rad=1e-6)
+_CLOCK_NS: Final = 2 * NS_PER_S
+"""Files tell the second in which a scan began."""
+LATE_S: Final = 20.0
+"""One scan may begin so much later after it was asked for than another."""
+SOON_S: Final = 1.0
+"""After so long a channel that did not come before will not come; 0.3 s were measured."""
+
+
+class GxsmFiles(ResultFiles):
+    """The measurement that is running or has just ended, and the results.
+
+    Args:
+        patience_s: how long all files may take, in experiment time like the others.
+        soon_s: how long those of channels may that did not come before.
+        late_s: how much later than another a scan may begin, after it was asked for.
+    """
+
+    def __init__(
+        self,
+        kept: Entry,
+        log: logging.Logger,
+        *,
+        patience_s: float,
+        soon_s: float,
+        late_s: float,
+    ) -> None:
+        super().__init__(kept, log)
+        self._patience_s = patience_s
+        self._soon_s = soon_s
+        self._late_ns = round(late_s * NS_PER_S)
+        self._sizes: dict[Path, tuple[int, int]] = {}
+        self._before: set[int] = set()
+        self._whole: dict[Path, FileContent] = {}
+        self._outcome: bool | None = None  # of a measurement that another one followed at once
+        self.upwards = False
+        kept.setdefault("absent", [])
+        kept.setdefault("channels", {})
+        kept.setdefault("program", "")
+        kept.setdefault("starts", [])  # of the last scan's files
+        kept.setdefault("behind_ns", 0)  # how much their clock was
+
+    @property
+    def scanning(self) -> tuple[Region, tuple[int, int]]:
+        """The frame of the running scan, and (rows, columns). Only while one runs."""
+        rows, columns = self._kept["running"]["shape"]
+        return as_region(self._kept["running"]["frame"]), (rows, columns)
+
+    @property
+    def is_own(self) -> bool:
+        """True if the translator began the running scan."""
+        return bool(self._kept["running"]["own"])
+
+    @property
+    def is_saved_by_gxsm(self) -> bool:
+        """True if GXSM saves the running scan by itself."""
+        return bool(self._kept["running"]["by_gxsm"])
+
+    @property
+    def before(self) -> tuple[Rows, int | None] | None:
+        """The rows in GXSM's memory before the running scan, with the line that was being scanned when they were read.
+
+        The line is None if the scan had not begun. None: no rows were read.
+        """
+        found = self._kept["running"]["before"]
+        return None if found is None else (found["rows"], found["line"])
+
+    def looked(self, rows: Rows, line: int | None) -> None:
+        """Keep these for `before`."""
+        self._kept["running"]["before"] = {"rows": rows, "line": line}
+
+    def is_written(self, file: Path) -> bool:
+        """Return True if a file was written since the running measurement began."""
+        return modified_ns(file) > int(self._kept["running"]["newest_ns"])
+
+    @property
+    def channels(self) -> dict[str, list[str]]:
+        """Name and unit of each channel of the last scans, by the ending of its files."""
+        found: dict[str, list[str]] = self._kept["channels"]
+        return found
+
+    @property
+    def program(self) -> str:
+        """Its name and version, which only its files tell; empty before the first of them."""
+        found: str = self._kept["program"]
+        return found
+
+    def begin(
+        self, what: str, folder: Path | None, begun_ns: int, taken: Entry, *, own: bool = False, by_gxsm: bool = False
+    ) -> None:
+        """A measurement begins. One that has ended, and whose files were not read yet, is still waited for.
+
+        Args:
+            folder: where its files will be; None: GXSM does not say yet.
+            begun_ns: not before this; 0: it was found running, and nobody knows since when.
+            taken: "frame" and "shape" of a scan, "position" of a spectrum.
+            own: the translator has begun it.
+            by_gxsm: GXSM saves it by itself: its files may be there before it is over, and be written again.
+        """
+        self._hurry(begun_ns / NS_PER_S)
+        followed = self._kept["ended"]
+        newest = max((file.stat().st_mtime_ns for file in _files(folder, what)), default=0)
+        place = None if folder is None else str(folder)
+        facts = {"folder": place, "newest_ns": newest, "begun_ns": begun_ns, "before": None}
+        self._begins(what, {**facts, "own": own, "by_gxsm": by_gxsm, **taken})
+        if followed is not None:
+            # GXSM saves a scan before it begins the next: all that is there now is of the one that has ended
+            there = _files(_folder(followed), followed["what"])
+            names = [str(file) for file in there if modified_ns(file) > followed["newest_ns"]]
+            self._kept["ended"] = {**followed, "names": sorted(names)}
+
+    def end(
+        self,
+        end_ns: int,
+        now_ns: int,
+        channels: Iterable[str] = (),
+        folder: Path | None = None,
+        *,
+        is_whole: bool | None = True,
+        before: Rows | None = None,
+    ) -> None:
+        """It has ended, and its files are awaited from now on.
+
+        Args:
+            channels: where GXSM says that it saves each channel of a scan.
+            folder: of them, which may be another than at the beginning.
+            is_whole: a scan came to its last row; None: unknown until its files are compared with the rows `before`.
+        """
+        order = [next(iter(endings([Path(path)])), "") for path in channels]
+        now_s = now_ns / NS_PER_S
+        self._hurry(now_s)
+        awaited = {"soon_s": now_s + self._soon_s, "until_s": now_s + self._patience_s}
+        self._ends({"end_ns": end_ns, **awaited, "channels": order, "before": before, "is_whole": is_whole})
+        ended = self._kept["ended"]
+        if folder is not None and str(folder) != ended["folder"]:  # old scans in there are told by when they began
+            ended["folder"] = str(folder)
+            ended["begun_ns"] = ended["begun_ns"] or end_ns
+        self._sizes, self._whole, self._before = {}, {}, set()
+        if is_whole is False:
+            self._give_up("it was stopped or never began: GXSM's first or last row still holds the previous scan")
+
+    def _hurry(self, now_s: float) -> None:
+        """Read now, or not at all, the files of a measurement that another one followed."""
+        for _ in range(2):  # they are read when they have not grown since the last look
+            if self._is_followed:
+                self.results(now_s)
+        if self._is_followed:
+            self._give_up("the next one was over before its files could be read")
+
+    @property
+    def _is_followed(self) -> bool:
+        return self._kept["ended"] is not None and "names" in self._kept["ended"]
+
+    def followed(self) -> bool | None:
+        """Return, once, whether a measurement is whole that another one followed at once; None: there was none."""
+        found, self._outcome = self._outcome, None
+        return found
+
+    def forget(self) -> None:
+        """Forget what is running or has ended: it was broken off."""
+        if self._is_followed:
+            self._give_up("the one that followed it was stopped before its files were read")
+        self._outcome = None
+        super().forget()
+
+    def next_s(self) -> float | None:
+        """When to look again at the latest."""
+        ended = self._kept["ended"]
+        return None if ended is None else float(ended["until_s"])
+
+    def results(self, now_s: float) -> list[str]:
+        """The last results, oldest first: each by one of its files and when it ended."""
+        self.broken_off = False
+        ended = self._kept["ended"]
+        if ended is not None:
+            files = self._new(ended)
+            is_followed = "names" in ended
+            over = now_s >= ended["until_s"] or (is_followed and not ended["names"])
+            gaps = [file for file, content in files.items() if lines_missing(content)]
+            if not any(scan.values.any() for content in files.values() for scan in content.scans):
+                gaps = [file for file in files if ended["what"] == SCAN]  # stopped in its first line
+            if gaps and (over or is_followed or not ended["by_gxsm"]):
+                self._give_up(f"it was stopped: {gaps[0]} lacks lines")
+            elif files and not gaps and (over or self._all(ended, files, now_s)):
+                why = self._why_unfinished(ended, files) if ended["is_whole"] is None else ""
+                if why:
+                    self._give_up(why)
+                else:
+                    self._take(ended, files)
+            elif over:
+                self._give_up(self._missing(ended))
+        return self._listed()
+
+    def _why_unfinished(self, ended: Entry, files: Mapping[Path, FileContent]) -> str:
+        """Return why a scan is not published that another one followed; empty: it came to its end."""
+        before, named = ended["before"], endings(files)
+        if before is None:
+            return "one scan followed the other at once, and whether this one came to its end is unknown"
+        numbered = {k: files[named[ending]] for k, ending in enumerate(ended["channels"]) if ending in named}
+        if is_unfinished(before, in_files(numbered, before)):
+            return "it was stopped: its last row still holds the previous scan"
+        return ""
+
+    def read(self, entry: Entry) -> Content:
+        contents = [self._whole.get(Path(file)) or read_result(file) for file in entry["files"]]
+        return [_PRECISION.as_set(one, entry) for content in contents for one in content]
+
+    def _new(self, ended: Entry) -> dict[Path, FileContent]:
+        """The files of what has ended that are whole: they have stopped growing, and can be read."""
+        found = {}
+        names = ended.get("names")
+        there = _files(_folder(ended), ended["what"]) if names is None else [Path(name) for name in names]
+        for file in sorted(file for file in there if file.exists()):
+            stat = file.stat()
+            if stat.st_mtime_ns <= ended["newest_ns"]:
+                continue
+            size = (stat.st_size, stat.st_mtime_ns)
+            if self._sizes.get(file) != size:
+                self._sizes[file] = size
+                self._whole.pop(file, None)
+            elif file not in self._whole:
+                try:
+                    self._whole[file] = read_result(file)
+                except (AfspmError, OSError):
+                    continue  # not yet
+            content = self._whole.get(file)
+            if content is not None and not self._is_of_before(content, ended["begun_ns"]):
+                found[file] = content
+        if ended["what"] == SCAN:  # one for each channel, should somebody have it saved again
+            return {file: found[file] for file in endings(found).values()}
+        return {file: found[file] for file in sorted(found, key=lambda file: file.stat().st_mtime_ns)[-1:]}
+
+    def _is_of_before(self, content: FileContent, begun_ns: int) -> bool:
+        """Return True if it is a scan of before: the last one, saved again, or one that was stopped, saved late.
+
+        When it began is told by the clock of GXSM's computer, which may be another than ours, and be set meanwhile:
+        what began before the last scan did, by that clock, is new.
+        """
+        start_ns, known = content.start_ns, self._kept["starts"]
+        if start_ns is None:
+            return False
+        if start_ns in known:
+            is_of_before = True
+        elif known and start_ns < max(known):
+            is_of_before = False  # the clock was set back
+        else:
+            is_of_before = start_ns < begun_ns - self._kept["behind_ns"] - (self._late_ns if known else _CLOCK_NS)
+        if is_of_before:
+            self._before.add(start_ns)
+        return is_of_before
+
+    def _saw(self, ended: Entry, starts: set[int]) -> None:
+        """Files that began then, after what was begun."""
+        self._kept["starts"] = sorted(starts)
+        self._kept["behind_ns"] = ended["begun_ns"] - max(starts) if starts and ended["begun_ns"] else 0
+
+    def _all(self, ended: Entry, files: Iterable[Path], now_s: float) -> bool:
+        """Return True if no file is missing; those that the scan before did not have are not waited for as long."""
+        if "names" in ended:
+            return all(Path(name) in self._whole for name in ended["names"])
+        missing = set(ended["channels"]) - endings(files).keys() - {""}
+        return not missing or (missing <= set(self._kept["absent"]) and now_s >= ended["soon_s"])
+
+    def _missing(self, ended: Entry) -> str:
+        if "names" in ended:
+            return "another one began before it was saved"
+        folder = _folder(ended)
+        if folder is None:
+            return "GXSM does not say where it saves: check that it began and that a channel is set"
+        if not folder.is_absolute():
+            return f"its folder {folder} is relative to where GXSM was started: set scan_dir, probe_dir"
+        if not folder.is_dir():
+            return f"its folder {folder} does not exist on this computer: set scan_dir and probe_dir"
+        if self._before:
+            return f"GXSM saved an earlier scan in {folder}: check that this one began"
+        if ended["what"] == SCAN:
+            return (
+                f"no new file in {folder} belongs to it: check that it began, and that a channel is set and saved (AS)"
+            )
+        return f"no new .vpdata in {folder}: switch on Auto Save of probes in GXSM, and set probe_dir to its folder"
+
+    def _give_up(self, why: str) -> None:
+        ended, self._kept["ended"] = self._kept["ended"], None
+        self._log.error("the %s has no result: %s", ended["what"], why)
+        if self._before:
+            self._saw(ended, self._before)
+        if "names" in ended:
+            self._outcome = False
+        else:
+            self.broken_off = True
+
+    def _take(self, ended: Entry, files: Mapping[Path, FileContent]) -> None:
+        if ended["what"] == SCAN:
+            absent = sorted(set(ended["channels"]) - endings(files).keys() - {""})
+            if set(absent) - set(self._kept["absent"]):
+                self._log.warning(
+                    "GXSM did not save %s; the translator waits less long for it from now on", ", ".join(absent)
+                )
+            self._kept["absent"] = absent
+            self._saw(ended, {content.start_ns for content in files.values() if content.start_ns})
+            self.upwards = any(content.upwards for content in files.values())
+            for ending, file in endings(files).items():
+                scan, header = files[file].scans[0], files[file].header
+                self._kept["program"] = f"{header.get('Creator', '')} {header.get('Version', '')}".strip()
+                self._kept["channels"][ending] = [scan.channel, scan.unit]
+        names = [str(file) for file in files]
+        # numbered by its end: files of spectra may be overwritten
+        content = [_PRECISION.as_set(one, ended) for file in files.values() for one in file]
+        self._add(f"{names[0]} ({ended['end_ns']})", ended, {"files": names}, content)
+        self._kept["ended"] = None
+        if "names" in ended:
+            self._outcome = True
+
+
+def endings(files: Iterable[Path]) -> dict[str, Path]:
+    """Return the last file of each channel of a scan, by what follows the number in its name."""
+    named = ((_NUMBERED.search(file.name), file) for file in files)
+    return {match[1]: file for match, file in named if match}
+
+
+def _folder(ended: Entry) -> Path | None:
+    return None if ended["folder"] is None else Path(ended["folder"])
+
+
+def _files(folder: Path | None, what: str) -> list[Path]:
+    if folder is None or not folder.is_dir():
+        return []
+    return list(folder.glob("*.nc" if what == SCAN else "*.vpdata"))

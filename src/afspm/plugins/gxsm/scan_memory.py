@@ -1,0 +1,159 @@
+"""The scan in GXSM's memory: its lines while it runs, and whether it came to its end.
+
+GXSM keeps the values of the scan before wherever it did not come to, and does not tell which rows are new. A scan that
+ended has written both the first and the last row of each channel; one
+that was stopped has left at least one of them, bit by bit, as it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, TypedDict
+
+import numpy as np
+
+from afspm.model import Region, ScanLines
+from afspm.plugins.gxsm.link import Asking
+from afspm.plugins.gxsm.settings import ANGSTROM_M
+from afspm.storage.formats.content import FileContent
+
+_CONSTANT = "="
+_MOST = 1 << 20
+
+
+class Rows(TypedDict):
+    """A few rows of GXSM's memory, JSON-able.
+
+    Attributes:
+        columns: how many of each row were looked at.
+        digests: by channel and row; that of a constant row, which says nothing, begins with `_CONSTANT`.
+    """
+
+    columns: int
+    digests: dict[str, dict[str, str]]
+
+
+def looked_at(ask: Asking, channels: int, rows: Collection[int], columns: int) -> Rows:
+    """Return what is in GXSM's memory now.
+
+    Args:
+        channels: how many, from 0 on.
+        columns: at most: a scan before may have had fewer.
+    """
+    facts = {channel: (ask.call("get_dimensions", channel), _factor(ask, channel)) for channel in range(channels)}
+    there = {channel: (shape, dz) for channel, (shape, dz) in facts.items() if dz and _is_shape(shape)}
+    columns = min([columns, *(shape[0] for shape, _ in there.values())])
+    return Rows(
+        columns=columns,
+        digests={
+            str(channel): {
+                str(row): _digest(values.ravel()[:columns] / dz)
+                for row in rows
+                if row < shape[1]
+                and isinstance(values := ask.call("get_slice", channel, 0, 0, row, 1), np.ndarray)
+                and values.size
+            }
+            for channel, (shape, dz) in there.items()
+        },
+    )
+
+
+def in_files(files: Mapping[int, FileContent], like: Rows) -> Rows:
+    """Return what files have in the rows that were looked at in GXSM's memory; by the number of their channel."""
+    return Rows(
+        columns=like["columns"],
+        digests={
+            channel: {
+                row: _digest(_stored(files[int(channel)])[int(row)][: like["columns"]])
+                for row in rows
+                if int(row) < len(files[int(channel)].scans[0].values)
+            }
+            for channel, rows in like["digests"].items()
+            if int(channel) in files
+        },
+    )
+
+
+def _stored(file: FileContent) -> np.ndarray:
+    """Return the values as GXSM has them in its memory, rows from the top."""
+    scan, dz = file.scans[0], float(str(file.header["dz"]))
+    return scan.values[::-1] / (ANGSTROM_M if scan.unit == "m" else 1.0) / dz
+
+
+def only(rows: Rows, row: int) -> Rows:
+    """Return one of the rows that were looked at, of each channel."""
+    digests = {channel: {str(row): there[str(row)]} for channel, there in rows["digests"].items() if str(row) in there}
+    return Rows(columns=rows["columns"], digests=digests)
+
+
+def is_unfinished(before: Rows, after: Rows) -> bool:
+    """Return whether a scan was stopped, or did not begin: some rows are as before.
+
+    A channel that is the same from first to last, while others are not, is one that does not change.
+    """
+    changed = unchanged = False
+    for channel, rows in before["digests"].items():
+        now = after["digests"].get(channel, {})
+        is_new = any(now.get(row) != digest for row, digest in rows.items())
+        is_old = any(now.get(row) == digest for row, digest in rows.items() if not digest.startswith(_CONSTANT))
+        if is_new and is_old:
+            return True
+        changed, unchanged = changed or is_new, unchanged or is_old
+    return unchanged and not changed
+
+
+def _digest(stored: np.ndarray) -> str:
+    """Return that of values as they are stored: the factor that they are told with may change between two scans."""
+    values = stored.astype(np.float32)
+    kind = _CONSTANT if (values == values[0]).all() else ""
+    return kind + hashlib.blake2b(values.tobytes(), digest_size=12).hexdigest()
+
+
+def _is_shape(found: Any) -> bool:
+    is_shape = (
+        isinstance(found, tuple | list) and len(found) == 4 and all(isinstance(one, int | float) for one in found)
+    )
+    return is_shape and 0 < found[0] < _MOST  # where there is no scan, GXSM says 4294967295
+
+
+def _factor(ask: Asking, channel: int) -> float:
+    """Return what stored values are multiplied with; 0: there are none."""
+    found = ask.call("get_differentials", channel)
+    return float(found[2]) if isinstance(found, tuple | list) and len(found) == 4 else 0.0
+
+
+def new_lines(
+    ask: Asking,
+    endings: Sequence[str],
+    known: Mapping[str, Sequence[str]],
+    taken: tuple[Region, tuple[int, int]],
+    start: int,
+    done: int,
+) -> list[ScanLines]:
+    """The lines from `start` to `done`, in the order in which they are scanned.
+
+    GXSM tells neither names nor units of what it hands out: those of the files before are taken.
+
+    Args:
+        endings: of the channels' files, by number.
+        known: name and unit of a channel, by the ending of its files.
+        taken: the frame that is being scanned, and (rows, columns).
+    """
+    region, shape = taken
+    count = min(done, shape[0]) - start
+    if count < 1:
+        return []
+    images: dict[str, np.ndarray] = {}
+    for channel, ending in enumerate(endings):
+        if ending in known:
+            found = ask.call("get_slice", channel, 0, 0, start, count)
+            # of another shape: somebody has changed the next frame, and this one was found running
+            if isinstance(found, np.ndarray) and found.shape == (count, shape[1]):
+                images[ending] = found.astype(np.float64)
+    lines = []
+    for ending, image in images.items():
+        name, unit = known[ending]
+        rows = image[::-1] * (ANGSTROM_M if unit == "m" else 1.0)
+        lines.append(ScanLines(region, shape, name, unit, shape[0] - start - count, rows))
+    return lines

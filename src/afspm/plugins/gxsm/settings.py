@@ -1,0 +1,222 @@
+"""The scan frame and the tip in it: GXSM has the centre, a clockwise angle, and lengths in the unit of its panel.
+
+`get` and `set` are in the unit that the user prefers; `moveto_scan_xy` and files are in ångström, always. A range goes
+from the centre of the first pixel to that of the last, as everywhere in afspm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+from afspm.basics import units
+from afspm.basics.errors import AfspmError, Refused
+from afspm.basics.formatting import position_text
+from afspm.model import ControlResponse, Region, names
+from afspm.plugins.gxsm.errors import BadReply
+from afspm.plugins.gxsm.hardware import Doing
+from afspm.plugins.gxsm.link import Asking
+from afspm.translator.parameters import FEEDBACK_ON, Value
+from afspm.translator.setting_groups import FRAME, POSITION, SettingsGroup, frame, frame_values
+from afspm.translator.state import Kept
+
+ANGSTROM_M: Final = 1e-10
+_UNITS: Final = {"AA": "Å", "Ang": "Å", "\u00c5": "Å", "\u212b": "Å", "\u03bcm": "um", "\u00b5m": "um"}
+_ROUNDED: Final = 0.06  # what a panel's digits may leave out
+REFNAMES: Final = ("PointsX", "PointsY", "RangeX", "RangeY", "OffsetX", "OffsetY", "Rotation")
+_SIZE: Final = {names.SCAN_SIZE_X, names.SCAN_SIZE_Y}
+PIXELS: Final = {names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y}
+_CORNER: Final = {names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y}
+
+
+def user_unit_m(ask: Asking) -> float:
+    """The unit of lengths that GXSM's panel shows, in m.
+
+    Raises:
+        AfspmError: it can't be told, or GXSM would take 12.5 for 12.
+    """
+    shown, number = ask.text("gets", "RangeX").strip(), ask.number("get", "RangeX")
+    digits, _, unit = shown.partition(" ")
+    if "," in digits:
+        hint = "start GXSM with LC_NUMERIC=C"
+        raise AfspmError(f"GXSM shows {shown!r}, with a decimal comma: it would read 12.5 as 12", hint=hint)
+    try:
+        read, unit_m = float(digits), units.convert(1.0, _UNITS.get(unit.strip(), unit.strip()), "m")
+    except (ValueError, AfspmError) as error:
+        raise BadReply(f"GXSM shows {shown!r} for RangeX: {error}") from error
+    if not math.isclose(read, number, rel_tol=0.01, abs_tol=_ROUNDED):
+        raise BadReply(f"GXSM shows {shown!r} for RangeX, and says {number}")
+    return unit_m
+
+
+class ScanFrame:
+    """The frame of the next scan.
+
+    Args:
+        unit_m: what `user_unit_m` says.
+    """
+
+    def __init__(self, ask: Asking, unit_m: float) -> None:
+        self._ask = ask
+        self._unit_m = unit_m
+
+    def read(self) -> dict[str, Value]:
+        """In SI, by generic names."""
+        columns, rows, width, height, x, y, clockwise_deg = (number(self._ask, ref) for ref in REFNAMES)
+        center_m, size_m = (x * self._unit_m, y * self._unit_m), (width * self._unit_m, height * self._unit_m)
+        angle_rad = 0.0 - math.radians(math.remainder(clockwise_deg, 720.0))
+        return frame_values(Region(center_m, size_m, angle_rad), (round(rows), round(columns)))
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        """Change what is given. X goes before Y: setting one in x, GXSM changes that in y."""
+        asked = values.keys()
+        before = {} if asked >= set(FRAME) else self.read()
+        region, (rows, columns) = frame({**before, **values})
+        if asked & PIXELS:
+            self._send("PointsX", columns)
+            self._send("PointsY", rows)
+        if asked & (PIXELS | _SIZE):
+            self._send("RangeX", region.size_m[0] / self._unit_m)
+            self._send("RangeY", region.size_m[1] / self._unit_m)
+        if asked & (_SIZE | _CORNER):
+            self._send("OffsetX", region.center_m[0] / self._unit_m)
+            self._send("OffsetY", region.center_m[1] / self._unit_m)
+        if names.SCAN_ANGLE in asked:
+            self._send("Rotation", 0.0 - math.degrees(region.angle_rad))
+
+    def region(self) -> Region:
+        """Of the next scan."""
+        return frame(self.read())[0]
+
+    def move_tip(self, xy_m: tuple[float, float]) -> None:
+        """Send the tip to a place, which must lie in the frame.
+
+        Raises:
+            Refused: PARAM_ERROR: it does not.
+        """
+        region = self.region()
+        u_m, v_m = in_frame(region, xy_m)
+        if self._ask.number("moveto_scan_xy", u_m / ANGSTROM_M, v_m / ANGSTROM_M) != 0.0:
+            reason = f"GXSM moves the tip only within the scan frame; {position_text(xy_m)} is outside"
+            raise Refused(ControlResponse.PARAM_ERROR, reason)
+
+    def tip(self) -> tuple[float, float]:
+        """Where the tip was last sent in the frame, (x, y) in m; its centre where that can't be told."""
+        region = self.region()
+        try:
+            u_m, v_m = (number(self._ask, ref) * self._unit_m for ref in ("ScanX", "ScanY"))
+        except AfspmError:
+            return region.center_m
+        return in_space(region, (u_m, v_m))
+
+    def _send(self, ref: str, value: float) -> None:
+        send(self._ask, ref, value)
+
+
+class FrameSettings(SettingsGroup):
+    """The frame of the next scan, as settings.
+
+    Args:
+        is_led: True if the tip goes along with its frame, and GXSM does not tell that it moves.
+    """
+
+    names = FRAME
+
+    def __init__(self, scan_frame: ScanFrame, tip: TipPlace, *, is_led: bool) -> None:
+        self._frame = scan_frame
+        self._tip = tip
+        self._is_led = is_led
+
+    def read(self) -> dict[str, Value]:
+        return self._frame.read()
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        moves = self._is_led and not values.keys() <= PIXELS
+        before_m = self._frame.tip() if moves else None
+        self._frame.write(values)
+        if before_m is not None:
+            self._tip.on_move(math.dist(before_m, self._frame.tip()))
+
+
+class TipPlace(SettingsGroup):
+    """The place that the tip was sent to, which GXSM's files of spectra do not tell.
+
+    Args:
+        kept: JSON-able, and lasts.
+        on_move: called with the length of the way when the tip is sent away.
+    """
+
+    names = POSITION
+
+    def __init__(self, scan_frame: ScanFrame, kept: Kept, on_move: Callable[[float], None]) -> None:
+        self.frame = scan_frame
+        self._kept = kept
+        self.on_move = on_move
+
+    def xy_m(self) -> tuple[float, float]:
+        """Return where the tip was sent, (x, y) in m."""
+        sent = self._kept.get("probe")
+        return self.frame.tip() if sent is None else (float(sent[0]), float(sent[1]))
+
+    def read(self) -> dict[str, Value]:
+        return dict(zip(POSITION, self.xy_m(), strict=True))
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        x, y = (float(values.get(name, was)) for name, was in zip(POSITION, self.xy_m(), strict=True))
+        way_m = math.dist(self.frame.tip(), (x, y))
+        self.frame.move_tip((x, y))
+        self._kept["probe"] = [x, y]
+        self.on_move(way_m)
+
+
+class FeedbackSwitch(SettingsGroup):
+    """The feedback, which only some hardware has actions to switch.
+
+    Args:
+        actions: that switch it on and off.
+    """
+
+    names = (FEEDBACK_ON,)
+
+    def __init__(self, ask: Asking, doing: Callable[[], Doing], actions: Sequence[str]) -> None:
+        self._ask = ask
+        self._doing = doing
+        self._actions = actions
+
+    def read(self) -> dict[str, Value]:
+        return {FEEDBACK_ON: self._doing().feedback_on}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        on, off = self._actions
+        self._ask.call("action", on if values[FEEDBACK_ON] else off)
+
+
+def number(ask: Asking, ref: str) -> float:
+    """The value of a parameter. Raises BadReply: GXSM has none."""
+    value = ask.number("get", ref)
+    if not math.isfinite(value):
+        raise BadReply(f"GXSM says {value} for {ref}")
+    return value
+
+
+def send(ask: Asking, ref: str, value: float) -> None:
+    """Set a parameter; GXSM never says whether it did, so that it must be read again.
+
+    It wants a text, reads it up to what it doesn't understand, and has a '.' in it.
+    """
+    ask.call("set", ref, repr(value))
+
+
+def in_frame(region: Region, xy_m: tuple[float, float]) -> tuple[float, float]:
+    """A place as seen from the centre of a frame, along its sides."""
+    x, y = xy_m[0] - region.center_m[0], xy_m[1] - region.center_m[1]
+    cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
+    return cos * x + sin * y, cos * y - sin * x
+
+
+def in_space(region: Region, uv_m: tuple[float, float]) -> tuple[float, float]:
+    """The reverse of `in_frame`."""
+    cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
+    (u, v), (x, y) = uv_m, region.center_m
+    return x + cos * u - sin * v, y + sin * u + cos * v

@@ -1,0 +1,72 @@
+"""GXSM's vector probe data (.vpdata): text, `# KEY :: name=value …`, then a table."""
+
+from __future__ import annotations
+
+import re
+from datetime import tzinfo
+from pathlib import Path
+
+import numpy as np
+
+from afspm.basics.errors import FileError
+from afspm.basics.units import convert
+from afspm.model import Spectrum
+from afspm.plugins.gxsm.scan_files import CONTROLLER
+from afspm.storage.formats.content import FileContent, local_ns, name_and_unit
+from afspm.storage.formats.igor import decoded
+
+_BEGIN, _END = "#C Data Table", "#C END."
+
+
+def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
+    """The curve; `kind` is that of the file's name ("VP", "IV" …).
+
+    Where it was taken is not known: the file has the offset of the scan, not the place of the probe. Columns without
+    a unit (the number of the row, where blocks begin) are left out, and those that come a second time.
+
+    Raises:
+        FileError, ValueError: no probe data, or broken.
+    """
+    lines = decoded(path.read_bytes()).splitlines()
+    starts = [k for k, line in enumerate(lines) if line.startswith(_BEGIN)]
+    ends = [k for k, line in enumerate(lines) if line.startswith(_END)]
+    if len(starts) != 1 or not ends or ends[0] < starts[0] + 3:
+        raise FileError("is not probe data of GXSM, or incomplete: its table has no end")
+    header = _header(lines[: starts[0]])
+    columns = lines[starts[0] + 1].removeprefix("#C ").split("\t")
+    rows = [line.split("\t") for line in lines[starts[0] + 2 : ends[0]] if line.strip("#C \t")]
+    told = re.search(r"N=(\d+)", header.get("Probe Data Number", ""))
+    if told is None or len(rows) != int(told[1]):
+        raise FileError(f"has {len(rows)} rows in its table and announces {told and told[1]}")
+    for number, row in enumerate(rows):
+        if len(row) != len(columns) or row[0] != str(number):
+            raise FileError(f"row {number} of its table is damaged")
+    table = np.array([[float(cell) for cell in row] for row in rows])
+    end = None
+    if "Date" in header:
+        end = local_ns(header["Date"].removeprefix("date="), "%a %b %d %H:%M:%S %Y", zone)
+    named = re.search(r"-([A-Z]+)\.vpdata$", path.name)
+    spectrum = _spectrum(columns, table, named[1] if named else "VP", end, path)
+    return FileContent(CONTROLLER, spectra=(spectrum,), header=header, end_ns=end)
+
+
+def _header(lines: list[str]) -> dict[str, str]:
+    pairs = (line.removeprefix("# ").partition("::") for line in lines if line.startswith("# "))
+    return {key.strip(): value.strip() for key, found, value in pairs if found}
+
+
+def _spectrum(columns: list[str], table: np.ndarray, kind: str, end: int | None, path: Path) -> Spectrum:
+    names: list[str] = []
+    units: list[str] = []
+    values: list[np.ndarray] = []
+    for column, numbers in zip(columns, table.T, strict=True):
+        name, unit = name_and_unit(column.strip().strip('"'))
+        if not unit or name in names:
+            continue
+        length = unit == "Å"
+        names.append(name)
+        units.append("m" if length else unit)
+        values.append(convert(numbers, "Å", "m") if length else numbers)
+    if not names:
+        raise FileError("its table has no column with a unit")
+    return Spectrum(None, kind, tuple(names), tuple(units), np.column_stack(values), end, str(path))

@@ -1,0 +1,42 @@
+"""A picture, or a scan that another microscope took, as the sample of a simulated microscope."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from afspm.basics.plain_data import PlainMapping
+from afspm.basics.units import Length
+from afspm.simulation.simulator import Simulator
+
+__all__ = ["ImageMicroscope"]
+
+# An instrument that shows the picture as it is; whoever wants noise, drift or a blunt tip says so.
+_IDEAL: Mapping[str, PlainMapping] = {
+    "tip": {"radius_m": 1e-12, "half_angle_deg": 1.0, "spread": 0.0},
+    "noise": dict.fromkeys(
+        ("white_m", "one_over_f_m", "line_offset_m", "scar_probability", "amplitude_v", "phase_deg", "current_a"), 0.0
+    ),
+    "scanner": {"band_limit_px": 0.0},
+    "tip_changes": {"per_hour": 0.0},
+}
+
+
+class ImageMicroscope(Simulator):
+    """The simulated microscope with the heights of a file as its sample, shown as they are.
+
+    The middle of the picture lies at the origin; beyond its borders it goes on mirrored.
+
+    Args:
+        file: a picture (bright is high), a numpy array, or a scan of any controller that `afspm.read` reads.
+        width: from its first to its last pixel; a scan says that itself.
+        height: from its lowest to its highest; a scan says that itself.
+        settings: as of the Simulator: with `noise`, `drift`, `tip` … the picture is seen less well than it is.
+    """
+
+    def __init__(self, file: Path, *, width: Length = 0.0, height: Length = 0.0, **settings: Any) -> None:
+        surface = {"kind": "file", "path": str(file), "width_m": width, "height_range_m": height}
+        for name, ideal in _IDEAL.items():
+            settings[name] = {**ideal, **(settings.get(name) or {})}
+        super().__init__(surface=surface, **settings)

@@ -1,0 +1,274 @@
+"""Nanonis (SPECS), over the TCP programming interface of its own software. See the README beside this."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from afspm.basics.errors import ConfigError, FileError, Refused
+from afspm.basics.units import Duration
+from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.plugins.nanonis import fetched, protocol
+from afspm.plugins.nanonis import settings as own
+from afspm.plugins.nanonis.activity import NanonisActivity
+from afspm.plugins.nanonis.result_files import NanonisFiles
+from afspm.plugins.nanonis.session import MODULES, Session
+from afspm.translator.driver import ControllerLost, Driver, action
+from afspm.translator.parameters import Value
+from afspm.translator.result_files import SCAN, Entry, as_region
+from afspm.translator.setting_groups import FRAME, KeptSettings, frame
+
+_AT_FIRST: Final[dict[str, Value]] = {
+    names.SCAN_DIRECTION: names.UP,
+    names.SPEC_KIND: "IV",
+    names.PULSE_VOLTAGE: 4.0,
+    names.PULSE_DURATION: 0.1,
+    names.CRASH_SPEED: 10e-9,
+    names.CRASH_DEPTH: 1e-9,
+}
+_AT_ONCE: Final = 0
+"""To what could also wait until it is done."""
+_NO_TIMEOUT: Final = -1
+
+
+class Nanonis(Driver):
+    """The microscope behind a Nanonis controller.
+
+    Args:
+        address: "host:port,port": two of the ports at File > Settings > TCP, as each serves one client. One is enough
+            for an emulator.
+        session_dir: where Nanonis' session folder is seen from here; left out: Nanonis runs on this computer.
+            What can't be seen is fetched over TCP.
+        release: of Nanonis' software (Help > Info), where it can't tell or tells wrong.
+        reply_timeout_s: how long it may take to answer, in real time.
+        autosave: whether Nanonis is to save every scan; if not, what its panel says is left alone.
+        grabbed_rows, grabbed_backward: see `fetched.Grabbing`.
+        common: as for every microscope.
+    """
+
+    parameters_file = Path(__file__).with_name("parameters.toml")
+    translated = (*own.TRANSLATED, *_AT_FIRST, names.CONTROLLER)
+    maker: ClassVar[str] = "SPECS Zurich"
+    software: ClassVar[str] = "Nanonis"
+    max_pixels: ClassVar[int] = 8192 * 8192
+    program_s: ClassVar[float] = 2.0
+
+    def __init__(
+        self,
+        *,
+        address: str = "127.0.0.1:6501,6502",
+        session_dir: str | None = None,
+        release: int | None = None,
+        reply_timeout_s: Duration = 5.0,
+        autosave: bool = True,
+        grabbed_rows: str = "top-first",
+        grabbed_backward: str = "mirrored",
+        **common: Any,
+    ) -> None:
+        super().__init__(**common)
+        self.controller_at = address
+        _addresses(address)
+        self._session_dir = None if session_dir is None else Path(session_dir)
+        self._release = release
+        self._reply_timeout_s = reply_timeout_s
+        self._autosave = autosave
+        self._grabbing = fetched.Grabbing(grabbed_rows, grabbed_backward)
+        self._session: Session | None = None
+        self._kept = KeptSettings(_AT_FIRST)
+        ask = self._ask
+        self._probe = own.Probe(ask, lambda: self.clock.now_s())
+        feedback = own.FeedbackOn(ask, lambda holds: self.wait_for(holds, reply_timeout_s))
+        by_value = (own.ScanFrame, own.ScanSpeed, own.Gains, own.MoveSpeed, own.Slope, own.DriftRate)
+        self.groups = (*(group(ask) for group in by_value), self._probe, feedback, self._kept)
+        self._files: NanonisFiles
+
+    def connect(self) -> None:
+        self.close()
+        addresses = _addresses(self.controller_at)
+        session = self._session = Session(self, addresses, self._reply_timeout_s, self._release)
+        if not hasattr(self, "_files"):
+            self._kept.kept_in(self.memory)
+            own_folder = (self.run_dir / "scans").resolve()
+            patience_s = self.patience_s(self.result_timeout_s / 2)
+            self._files = NanonisFiles(self.memory, self._session_dir, own_folder, patience_s, self.log)
+        self._activity = NanonisActivity(session, self._files, self._probe, self.memory, self.clock, self.log)
+        folder = self._session_dir or Path(session.ask("Util.SessionPathGet")[0])
+        if not folder.is_dir():
+            self.log.warning(
+                "the session folder %s does not exist on this computer: data is fetched over TCP (or set session_dir)",
+                folder,
+            )
+
+    def close(self) -> None:
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    @property
+    def _there(self) -> Session:
+        if self._session is None:
+            raise ControllerLost("Nanonis is not connected")
+        return self._session
+
+    def _ask(self, name: str, *arguments: object) -> tuple[object, ...]:
+        return self._there.ask(name, *arguments)
+
+    def status(self) -> ScopeStatus:
+        return self._activity.status()
+
+    def next_change_s(self) -> float | None:
+        return self._activity.next_change_s()
+
+    def same(self, name: str, a: Value, b: Value, among: Mapping[str, Value]) -> bool:
+        return own.same_float32(name, a, b, among)
+
+    def get(self, vendor: str) -> Value:
+        """By the name of a pair of functions: "Bias." is Bias.Get."""
+        if vendor == names.CONTROLLER:
+            return self._there.controller
+        value: Value = own.numbers(self._ask, f"{vendor}Get")[0]
+        return value
+
+    def set(self, values: Mapping[str, Value]) -> None:
+        for vendor, value in values.items():
+            self._ask(f"{vendor}Set", value)
+
+    # --- results ---
+
+    def results(self) -> Sequence[str]:
+        return self._files.results(self.clock.now_s(), self._fetch)
+
+    def load(self, result: str) -> Sequence[Scan | Spectrum]:
+        return self._files.load(result)
+
+    def _fetch(self, ended: Entry) -> Sequence[Scan | Spectrum]:
+        if ended["what"] == SCAN:
+            found = fetched.images(self._ask, self._grabbing)
+            return [Scan(as_region(ended["frame"]), image.name, image.unit, image.values) for image in found]
+        curve, self._activity.curve = self._activity.curve, None
+        if curve is None:
+            raise FileError("its data was not requested from Nanonis")
+        return [fetched.spectrum(curve, ended["what"], (ended["position"][0], ended["position"][1]))]
+
+    def lines(self, start: int) -> Sequence[ScanLines]:
+        """From Nanonis' memory, where lines that were not scanned yet are NaN."""
+        region, _ = frame(self.in_force(FRAME))
+        return fetched.new_lines(fetched.images(self._ask, self._grabbing), region, start)
+
+    # --- actions ---
+
+    @action(names.START_SCAN)
+    def start_scan(self) -> None:
+        """Scan the frame once, in the direction of `x-scan-direction`."""
+        self._activity.refuse_safe_tip()
+        self._prepare_panel()
+        self._activity.begin_scan(frame(self.in_force(FRAME))[0])
+        start = 0
+        try:
+            self._ask("Scan.Action", start, int(self._kept[names.SCAN_DIRECTION] == names.UP))
+        except protocol.NanonisError:
+            self._activity.forget()
+            raise
+        if self._ask("Scan.StatusGet")[0]:  # it may be over before it is looked at again
+            self._files.seen()
+
+    @action(names.STOP_SCAN)
+    def stop_scan(self) -> None:
+        self._activity.stop_scan()
+
+    @action(names.START_SPEC)
+    def start_spec(self) -> None:
+        """Take a spectrum of the kind `x-spec-kind` where the tip is."""
+        self._activity.refuse_safe_tip()
+        kind = str(self._kept[names.SPEC_KIND])
+        if MODULES[kind] not in self._there.opened:
+            raise Refused(ControlResponse.ACTION_ERROR, f"Nanonis can't open the module {MODULES[kind]}")
+        self._activity.start_curve(kind)
+
+    @action(names.STOP_SPEC)
+    def stop_spec(self) -> None:
+        self._activity.stop_curve()
+
+    @action(names.PULSE, state=ScopeState.BUSY_PARAM)
+    def pulse(self) -> None:
+        """Do a bias pulse of `x-pulse-voltage` for `x-pulse-duration`, the z controller on hold meanwhile."""
+        duration_s = self._kept.number(names.PULSE_DURATION)
+        hold, absolute = 1, 2
+        with self._activity.occupied(ScopeState.BUSY_PARAM, duration_s):
+            self._ask("Bias.Pulse", _AT_ONCE, duration_s, self._kept.number(names.PULSE_VOLTAGE), hold, absolute)
+
+    @action(names.CRASH, state=ScopeState.MOVING)
+    def crash(self) -> None:
+        """Shape the tip: `x-crash-depth` down at `x-crash-speed`, up again, and the z controller as it was."""
+        self._activity.refuse_safe_tip()
+        depth_m = self._kept.number(names.CRASH_DEPTH)
+        ramp_s = depth_m / self._kept.number(names.CRASH_SPEED)
+        bias_v = own.numbers(self._ask, "Bias.Get")[0]
+        same_bias, settle_s, restore = 2, 0.1, 1
+        before = (settle_s, same_bias, bias_v)
+        self._ask("TipShaper.PropsSet", *before, -depth_m, ramp_s, bias_v, settle_s, depth_m, ramp_s, settle_s, restore)
+        with self._activity.occupied(ScopeState.MOVING, 2 * ramp_s + 4 * settle_s):
+            self._ask("TipShaper.Start", _AT_ONCE, _NO_TIMEOUT)
+
+    @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
+    def retract(self) -> None:
+        """Withdraw the tip by its piezo, whatever is going on, and whether that can be stopped or not."""
+        for stop in (self._activity.stop_approach, self._activity.stop_measuring):
+            try:
+                stop()
+            except protocol.NanonisError as error:
+                self.log.error("the measurement can't be stopped: %s; the tip is withdrawn all the same", error)
+        self._ask("ZCtrl.Withdraw", _AT_ONCE, _NO_TIMEOUT)
+
+    @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
+    def engage(self) -> None:
+        """Switch the z controller on: it brings the tip back that `x-retract` or the safe tip has withdrawn."""
+        on = 1
+        self._ask("ZCtrl.OnOffSet", on)
+
+    def command(self, text: str) -> None:
+        """Call a function with its arguments, e.g. "AutoApproach.OnOffSet 1"."""
+        name, *words = shlex.split(text)
+        codes = [code for code, _ in protocol.function(name).arguments]
+        try:
+            arguments = [_argument(code, word) for code, word in zip(codes, words, strict=True)]
+        except ValueError as error:
+            reason = f"{text!r}: the arguments of {name} are {' '.join(codes) or 'none'}"
+            raise Refused(ControlResponse.ACTION_ERROR, reason) from error
+        self._ask(name, *arguments)
+
+    def _prepare_panel(self) -> None:
+        """Have one scan made and saved; told to Nanonis only if its panel says otherwise.
+
+        What is got is not set as it is: continuous, bouncy and autosave count differently there.
+        """
+        continuous, bouncy, autosave, series, comment, *rest = self._ask("Scan.PropsGet")
+        save = self._autosave and autosave != 0
+        if continuous or bouncy or save:
+            no_change, off, save_all = 0, 2, 1
+            modules = rest[0] if rest else []
+            autosave = save_all if save else no_change
+            self._ask("Scan.PropsSet", off, off, autosave, series, comment, modules, no_change)
+
+
+def _argument(code: str, word: str) -> object:
+    if code in "HIi":
+        return int(word)
+    if code in "fd":
+        return float(word)
+    if code == "S":
+        return word
+    raise ValueError(code)
+
+
+def _addresses(text: str) -> list[tuple[str, int]]:
+    host, _, ports = text.rpartition(":")
+    try:
+        found = [(host, int(port)) for port in ports.split(",") if host]
+    except ValueError:
+        found = []
+    if not found:
+        raise ConfigError(f"{text!r} is not an address", where="address", hint='"host:port,port"')
+    return found

@@ -1,0 +1,268 @@
+"""The state of Nanonis, from what both connections say of it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import ClassVar, Final
+
+from afspm.basics.clock import Clock
+from afspm.basics.errors import Refused
+from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
+from afspm.plugins.nanonis.protocol import NanonisError
+from afspm.plugins.nanonis.result_files import NanonisFiles
+from afspm.plugins.nanonis.session import APPROACH, MODULES, CurveEnded, Heard, ScanEnded, Session
+from afspm.plugins.nanonis.settings import Probe, ScanFrame
+from afspm.translator.activity import Activity
+from afspm.translator.driver import ControllerLost
+from afspm.translator.result_files import SCAN, as_list
+from afspm.translator.setting_groups import frame
+from afspm.translator.state import Kept
+
+_SHOWS_S: Final = 10.0
+"""Real time that a scan may take to be seen running, which may have to go to its first line."""
+_LATEST_S: Final = 10.0
+"""Experiment time that the tip may arrive later than it should."""
+_SAFE_TIP, _WITHDRAWING = 5, 6
+
+
+class NanonisActivity(Activity):
+    """The measurements, moves and pauses of one controller.
+
+    Args:
+        kept: JSON-able, and lasts: what it is occupied with.
+
+    Attributes:
+        curve: the data of the last spectrum, once it has ended.
+    """
+
+    program: ClassVar[str] = "Nanonis"
+    settles_s: ClassVar[float] = 1.0
+
+    def __init__(
+        self,
+        session: Session,
+        files: NanonisFiles,
+        probe: Probe,
+        kept: Kept,
+        clock: Clock,
+        log: logging.Logger,
+    ) -> None:
+        super().__init__(files, clock, log)
+        self._ask = session.ask
+        self._listener = session.listener
+        self._opened = session.opened
+        self._files = files
+        self._probe = probe
+        self._kept = kept
+        self.curve: CurveEnded | None = None
+        self._kind_asked = ""
+        self._told: str | None = None
+        self._was_safe = False
+        self._shows_until_s = 0.0
+
+    # --- what is begun ---
+
+    def begin_scan(self, region: Region) -> None:
+        """A scan of a frame begins, or was found running."""
+        self._stopping = False
+        self._listener.scan()
+        self._files.begin(SCAN, self._session_folder(), {"frame": as_list(region)})
+        self._shows_until_s = self._clock.monotonic_s() + _SHOWS_S
+
+    def start_curve(self, kind: str) -> None:
+        """Take a spectrum; its data come over the second connection.
+
+        Raises:
+            Refused: ACTION_ERROR: Nanonis would not.
+        """
+        self._stopping = False
+        self.begin(kind)
+        self._kind_asked = kind
+        same_name = ""
+        self._listener.curve(MODULES[kind], same_name)
+        self._await_curve(f"{MODULES[kind]}.StatusGet")
+
+    def begin(self, what: str) -> None:
+        """Note that a measurement begins; a scan with the frame that Nanonis has."""
+        if what == SCAN:
+            self.begin_scan(frame(ScanFrame(self._ask).read())[0])
+            return
+        self.curve = None
+        self._files.begin(what, self._session_folder(), {"position": list(self._probe.xy_m())})
+
+    def end(self, path: str | None = None) -> None:
+        """Note that the measurement has ended.
+
+        Args:
+            path: of its file, where Nanonis reported it; empty: it is not saved.
+        """
+        self._files.end(self._clock.now_ns(), self._clock.now_s(), path)
+
+    def _await_curve(self, status: str) -> None:
+        """Return once what was begun is seen running, or has ended already. Raises Refused: Nanonis would not."""
+        until_s = self._clock.monotonic_s() + self.settles_s
+        while not self._ask(status)[0] and self._clock.monotonic_s() < until_s:
+            for heard in self._listener.heard():
+                if isinstance(heard, Exception) and not isinstance(heard, ControllerLost):
+                    self.forget()
+                    raise Refused(ControlResponse.ACTION_ERROR, str(heard))
+                self._take(heard)
+                return
+
+    def stop_measuring(self) -> None:
+        """Break off whatever is being measured."""
+        if self._files.what == SCAN or self._ask("Scan.StatusGet")[0]:
+            self.stop_scan()
+        elif self._files.what:
+            self.stop_curve()
+
+    def stop_scan(self) -> None:
+        """Break the scan off."""
+        stop, no_direction = 1, 0
+        self._ask("Scan.Action", stop, no_direction)
+        self.stopped()
+
+    def stop_curve(self) -> None:
+        """Break the spectrum off."""
+        for module in self._opened.intersection(MODULES.values()):
+            if self._ask(f"{module}.StatusGet")[0]:
+                self._ask(f"{module}.Stop")
+        self.stopped()
+
+    def forget(self) -> None:
+        self._kind_asked = ""
+        super().forget()
+
+    @contextmanager
+    def occupied(self, state: ScopeState, lasts_s: float) -> Iterator[None]:
+        """Note that what is begun in the block takes so long, experiment time, which Nanonis itself does not tell.
+
+        It holds also where its answer is lost, or the connection, or this process.
+        """
+        self._kept["occupied"] = [state.name, self._clock.now_s() + lasts_s]
+        try:
+            yield
+        except NanonisError:
+            self._kept["occupied"] = None
+            raise
+
+    @property
+    def _occupied(self) -> tuple[ScopeState, float]:
+        """The state that it is in, and until when."""
+        name, until_s = self._kept.get("occupied") or (ScopeState.FREE.name, 0.0)
+        return ScopeState[name], float(until_s)
+
+    def next_change_s(self) -> float | None:
+        """Return when a move, a pulse or the wait for a file is over."""
+        now_s = self._clock.now_s()
+        times = (self._occupied[1], self._probe.arrives_s, self._files.next_s() or 0.0)
+        return min((at_s for at_s in times if at_s > now_s), default=None)
+
+    # --- what goes on ---
+
+    def status(self) -> ScopeStatus:
+        """Return what Nanonis is doing now; what has ended is awaited from here on.
+
+        Raises:
+            ControllerLost: one of both connections.
+        """
+        for heard in self._listener.heard():
+            self._take(heard)
+        scanning = bool(self._ask("Scan.StatusGet")[0])
+        told, self._told = self._told, None
+        if scanning:
+            return self._scanning(told)
+        if self._files.what == SCAN and not self._files.was_seen and not self._files.has_file():
+            if self._clock.monotonic_s() < self._shows_until_s:
+                self._listener.scan()  # what it has heard was not of this one
+                return ScopeStatus(ScopeState.SCANNING)
+            told = None
+        if self._files.what == SCAN or told is not None:
+            self.end(told)
+        return self.at_rest(self._besides_scans())
+
+    def refuse_safe_tip(self) -> None:
+        """Raise Refused where the tip was withdrawn in an emergency: nothing is to be measured then."""
+        if self._ask("ZCtrl.StatusGet")[0] == _SAFE_TIP:
+            reason = "Nanonis' safe tip withdrew the tip: find out why, then run x-engage to bring it back"
+            raise Refused(ControlResponse.ACTION_ERROR, reason)
+
+    def _scanning(self, told: str | None) -> ScopeStatus:
+        if told:  # it scans again and again
+            self.end(told)
+        self.follow(SCAN)
+        if not self._stopping:
+            self._files.seen()
+            self._listener.scan()
+            if self._watch_safe_tip(self._ask("ZCtrl.StatusGet")[0]):
+                self.stop_scan()  # it may go on in the air, and look well
+                self._failed = True
+        return ScopeStatus(ScopeState.SCANNING)
+
+    def _besides_scans(self) -> ScopeState:
+        kind = self._kind_running()
+        self.follow(kind)
+        if kind:
+            return ScopeState.SPEC
+        state, until_s = self._occupied
+        if self._clock.now_s() < until_s:
+            return state
+        z_controller = self._ask("ZCtrl.StatusGet")[0]
+        self._watch_safe_tip(z_controller)
+        if z_controller == _WITHDRAWING or self._approaches():
+            return ScopeState.COARSE_MOTOR
+        return ScopeState.FREE if self._is_there() else ScopeState.MOVING
+
+    def stop_approach(self) -> None:
+        """Stop an approach, which would bring a tip back that is withdrawn meanwhile."""
+        if self._approaches():
+            off = 0
+            self._ask("AutoApproach.OnOffSet", off)
+
+    def _approaches(self) -> bool:
+        return APPROACH in self._opened and bool(self._ask("AutoApproach.OnOffGet")[0])
+
+    def _kind_running(self) -> str:
+        if self._kind_asked:
+            return self._kind_asked
+        for kind, module in MODULES.items():
+            if module in self._opened and self._ask(f"{module}.StatusGet")[0]:
+                return kind
+        return ""
+
+    def _is_there(self) -> bool:
+        if self._probe.arrived():
+            return True
+        if self._clock.now_s() < self._probe.arrives_s + _LATEST_S:
+            return False
+        self._log.error("the tip did not reach the position that it was sent to")
+        self._probe.give_up()
+        return True
+
+    def _watch_safe_tip(self, z_controller: int) -> bool:
+        """Return True if it has withdrawn the tip, which is logged once."""
+        safe = z_controller == _SAFE_TIP
+        if safe and not self._was_safe:
+            self._log.error("Nanonis' safe tip withdrew the tip: nothing is measured until it is engaged again")
+        self._was_safe = safe
+        return safe
+
+    def _take(self, heard: Heard) -> None:
+        """Take in what the second connection has to say."""
+        if isinstance(heard, ScanEnded):
+            self._told = heard.path
+        elif isinstance(heard, CurveEnded):
+            self._kind_asked, self.curve = "", heard
+        elif isinstance(heard, ControllerLost):
+            raise heard
+        else:
+            self._log.error("%s", heard)
+            if self._kind_asked:
+                self._kind_asked = ""
+                not_saved = ""
+                self.end(not_saved)
+
+    def _session_folder(self) -> str:
+        return str(self._ask("Util.SessionPathGet")[0])

@@ -1,0 +1,314 @@
+"""An emulated Nanonis controller: the vendor's TCP protocol and files, with simulated physics behind them."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final
+
+from afspm.basics.errors import ConfigError, InvalidValue
+from afspm.basics.plain_data import PlainMapping
+from afspm.basics.units import Length
+from afspm.plugins.nanonis.emulator import logger, wire
+from afspm.plugins.nanonis.emulator.dispatch import DeferredResult, FunctionRefused, Results
+from afspm.plugins.nanonis.emulator.faults import FAULT_KINDS, senseless_value
+from afspm.plugins.nanonis.emulator.software import NanonisSoftware
+from afspm.simulation.emulation.emulator import LOOPBACK, Crashed, Emulator
+from afspm.simulation.emulation.tcp_server import ClientConnection, TcpServer
+from afspm.simulation.instrument import InstrumentBusy
+
+RELEASES: Final = {"2021": 10862, "2022": 11798, "2023": 13742, "2024": 14429, "2025": 14573}
+"""By the year of the software: the first that has what the protocol has from then on."""
+_ACTS: Final = ("Start", "Action", "Set", "Pulse", "Withdraw", "StartMove", "Home")
+_LOGS_EVERY_S: Final = 0.005
+"""Real time between two looks at what the TCP Logger has to send."""
+_OTHER_NAME: Final = "Util.RTFreqGet"
+_QPLUS: Final[PlainMapping] = {"resonance_hz": 30e3, "spring_n_per_m": 1800.0, "oscillation_m": 100e-12}
+_STM: Final[PlainMapping] = {"mode": "current", "setpoint": 100e-12, "qplus": True}
+
+
+@dataclass(frozen=True)
+class NanonisRequest:
+    """A request.
+
+    Attributes:
+        name: of the function as the protocol has it; sent: as the client has written it, which is echoed.
+    """
+
+    name: str
+    sent: str
+    wants_answer: bool
+
+
+@dataclass(frozen=True)
+class PendingReply:
+    """A reply that comes when something has happened."""
+
+    asked: NanonisRequest
+    later: DeferredResult
+
+    @property
+    def name(self) -> str:
+        return self.asked.name
+
+
+@dataclass(frozen=True)
+class DelayedReply:
+    """A reply that is ready, and sent at a time."""
+
+    content: bytes
+    at_s: float
+
+
+class NanonisEmulator(Emulator):
+    """The emulated controller: of an STM with a qPlus sensor, unless `feedback` has another mode.
+
+    Args:
+        release: of its software: a year of `RELEASES`, or the number itself.
+        port: the first that it listens on; 0: any free.
+        ports: how many, one after the other; where any is free, each is any.
+        logger_port: of the TCP Logger's stream; 0: any free one.
+        one_each: whether a port serves one client at a time, as the real one's do.
+        session_path: what it calls its session folder, e.g. "D:\\\\Data"; left out: what the folder is called here.
+        range_m: of its scanner in x and y.
+        bare_errors: replies with an error have no results; they have, all zero, if not.
+        grabbed_rows: how scans in its memory are handed out: "top-first" or as "recorded".
+        seed, faults, and all of the simulated world: as of every emulator.
+    """
+
+    vendor = "Nanonis"
+    usual: ClassVar[Mapping[str, object]] = {"port": 6501, "ports": 4, "logger_port": logger.USUAL_PORT}
+    fault_kinds: ClassVar[Mapping[str, str]] = FAULT_KINDS
+
+    def __init__(
+        self,
+        *,
+        release: str | int = "2025",
+        ports: int = 1,
+        logger_port: int = 0,
+        one_each: bool = False,
+        session_path: str = "",
+        range_m: Length = 100e-6,
+        bare_errors: bool = False,
+        grabbed_rows: str = "top-first",
+        **settings: Any,
+    ) -> None:
+        super().__init__(**{**settings, "feedback": _of_stm(settings.get("feedback", {}))})
+        self.release = _release(release)
+        self._ports = ports
+        self.logger_port = logger_port
+        self._chance = random.Random(self.seed)
+        self._one_each = one_each
+        self._session_path = session_path
+        self._range_m = range_m
+        self._bare_errors = bare_errors
+        if grabbed_rows not in ("top-first", "recorded"):
+            raise ConfigError(f"{grabbed_rows!r}", where="grabbed_rows", hint='"top-first" or "recorded"')
+        self._grabbed_rows = grabbed_rows
+
+    def open(self) -> str:
+        """Listen on all ports."""
+        ports = [self.port + i if self.port else 0 for i in range(self._ports)]
+        self._server = TcpServer(
+            LOOPBACK,
+            ports,
+            stream_port=self.logger_port,
+            one_each=self._one_each,
+            wakes=self.woken,
+            on_bytes=self._answer_all,
+        )
+        self.logger_port = self._server.stream_port
+        self.software = NanonisSoftware(
+            self.rig,
+            self.faults,
+            self.clock,
+            self.folder,
+            session_path=self._session_path,
+            range_m=self._range_m,
+            release=self.release,
+            rows_as_recorded=self._grabbed_rows == "recorded",
+            log=self.log,
+        )
+        return f"{LOOPBACK}:{','.join(map(str, self._server.ports))}"
+
+    def serve(self, timeout_s: float) -> None:
+        """Answer what has come."""
+        self._server.poll(timeout_s)
+
+    def tick(self, now_s: float) -> float | None:
+        """Scans end, files are written, and who has waited for that is answered."""
+        times = [self.software.advance(now_s), self._log_signals(now_s)]
+        for connection in self._server.connections:
+            times.append(self._go_on(connection, now_s))
+            self._answer_all(connection)
+        return min((at_s for at_s in times if at_s is not None), default=None)
+
+    def _log_signals(self, now_s: float) -> float | None:
+        """Send what the TCP Logger has to; returns when there is more."""
+        readers, signals = self._server.readers, self.software.signals
+        stream = signals.logger
+        stream.unread = [len(reader.sending) for reader in readers]
+        if not stream.running:
+            return None
+        for counter in stream.due(now_s):
+            values = signals.values([signals.slots[slot] for slot in stream.slots], now_s)
+            for reader in readers:
+                if len(reader.sending) < logger.MOST_WAITING:
+                    self._server.send(reader, stream.frame(counter, values))
+        return max(stream.next_s(), now_s + self.software.core.experiment_s(_LOGS_EVERY_S))
+
+    def _go_on(self, connection: ClientConnection, now_s: float) -> float | None:
+        """Send what was waited for, if it is there; returns when to look again."""
+        waits = connection.waits_for
+        if isinstance(waits, DelayedReply):
+            if now_s < waits.at_s:
+                return waits.at_s
+            connection.waits_for = None
+            self._server.send(connection, waits.content)
+        elif isinstance(waits, PendingReply):
+            with self._refusing(connection, waits.asked):
+                return self._settled(connection, waits, now_s)
+        return None
+
+    def _settled(self, connection: ClientConnection, waits: PendingReply, now_s: float) -> float | None:
+        """Reply if what was waited for has happened, or not in time; returns when to look again."""
+        later = waits.later
+        results = later.ready(now_s)
+        if results is None and now_s >= later.until_s:
+            results = later.timed_out
+            later.gave_up()
+        if results is None:
+            again_s = min(later.until_s, later.next_s(now_s))
+            return None if math.isinf(again_s) else again_s
+        connection.waits_for = None
+        self._reply(connection, waits.asked, results)
+        return None
+
+    def close(self) -> None:
+        """Listen no more."""
+        if hasattr(self, "_server"):
+            self._server.close()
+
+    # --- requests ---
+
+    def _answer_all(self, connection: ClientConnection) -> None:
+        """Answer the requests received on a connection until one has to wait."""
+        while connection.waits_for is None and not connection.closing:
+            now_s = self.clock.now_s()
+            if self.faults.lasts("dialog", now_s):
+                return
+            try:
+                request = wire.split(connection.received)
+            except wire.MalformedRequest as error:
+                self.log.warning("disconnected a client: %s", error)
+                self._server.cut(connection)
+                return
+            if request is None:
+                return
+            sent, wants_answer, body = request
+            asked = NanonisRequest(wire.known_as(sent) or sent, sent, wants_answer)
+            with self._refusing(connection, asked):
+                self._answer(connection, asked, body, now_s)
+
+    @contextmanager
+    def _refusing(self, connection: ClientConnection, asked: NanonisRequest) -> Iterator[None]:
+        """Answer with an error where something can't be: all that a client asks passes through here."""
+        try:
+            yield
+        except (FunctionRefused, InstrumentBusy, InvalidValue, wire.MalformedRequest) as error:
+            self._refuse(connection, asked, str(error))
+        except Crashed:
+            raise
+        except Exception as error:
+            self.log.exception("%s failed", asked.name)
+            self._refuse(connection, asked, str(error))
+
+    def _refuse(self, connection: ClientConnection, asked: NanonisRequest, reason: str) -> None:
+        connection.waits_for = None
+        if asked.wants_answer:
+            text = f"Error in command: {asked.sent.lower()}: {reason}"
+            body = wire.error_body(asked.name, text, self.release, bare=self._bare_errors)
+            self._send(connection, asked.sent, body)
+
+    def _answer(self, connection: ClientConnection, asked: NanonisRequest, body: bytes, now_s: float) -> None:
+        name = asked.name
+        if self.faults.strikes("crash", now_s):
+            raise Crashed(f"at {name}")
+        known = wire.functions().get(name)
+        if known is None or known.since > self.release:
+            raise FunctionRefused(f"the function {name} is not known")
+        if self.faults.strikes("error", now_s):
+            raise FunctionRefused("an emulated error")
+        if name.endswith(_ACTS) and self.faults.strikes("refused", now_s):
+            raise FunctionRefused("it is not possible now")
+        self.software.core.client = connection.memory
+        found = self.software.functions.call(name, wire.arguments(name, body, self._wire_release(now_s)))
+        if isinstance(found, DeferredResult):
+            connection.waits_for = PendingReply(asked, found)
+        else:
+            self._reply(connection, asked, found)
+
+    def _wire_release(self, now_s: float) -> int:
+        """The release by which the fields go."""
+        if self.faults.lasts("wrong-release", now_s):
+            return min(RELEASES.values()) if self.release > min(RELEASES.values()) else max(RELEASES.values())
+        return self.release
+
+    def _reply(self, connection: ClientConnection, asked: NanonisRequest, results: Results) -> None:
+        if not asked.wants_answer:
+            return
+        now_s = self.clock.now_s()
+        encoding = "utf-8"
+        if self.faults.strikes("not-utf8", now_s):
+            encoding = "latin-1"
+            results = tuple(f"{value}\u00b5" if isinstance(value, str) else value for value in results)
+        if any(isinstance(value, float) for value in results) and self.faults.strikes("nan", now_s):
+            results = tuple(math.nan if isinstance(value, float) else value for value in results)
+        fields = wire.functions()[asked.name].results
+        padded = (*results, *(wire.ZEROS[field.code] for field in fields[len(results) :]))
+        if self.faults.lasts("nonsense", now_s):
+            padded = tuple(senseless_value(field.code, self._chance) for field in fields)
+        self._send(connection, asked.sent, wire.body(asked.name, padded, self._wire_release(now_s), encoding))
+
+    def _send(self, connection: ClientConnection, name: str, body: bytes) -> None:
+        """A reply, or what goes wrong with it."""
+        now_s = self.clock.now_s()
+        content = wire.reply(name, body)
+        if self.faults.strikes("no-reply", now_s):
+            return
+        if self.faults.strikes("cut", now_s):
+            self._server.cut(connection)
+            return
+        if self.faults.strikes("wrong-name", now_s):
+            content = wire.reply(_OTHER_NAME, body)
+        if self.faults.strikes("garbage", now_s):
+            content = bytes(range(255, 155, -1))
+        if self.faults.strikes("huge", now_s):
+            content = content[:32] + (0x7FFFFFFF).to_bytes(4, "big") + content[36:]
+        if self.faults.strikes("truncated", now_s):
+            content, connection.closing = content[: len(content) // 2], True
+        slow = self.faults.strikes("slow", now_s)
+        if slow is not None:
+            connection.waits_for = DelayedReply(content, now_s + slow.duration_s)
+            return
+        self._server.send(connection, content)
+
+
+def _of_stm(feedback: object) -> object:
+    """Complete the settings of the feedback; those of another mode, or no table at all, stay as they are."""
+    if not isinstance(feedback, Mapping) or feedback.get("mode", "current") != "current":
+        return feedback
+    sensor = feedback.get("sensor", {})
+    return {**_STM, **feedback, "sensor": {**_QPLUS, **sensor} if isinstance(sensor, Mapping) else sensor}
+
+
+def _release(given: str | int) -> int:
+    text = str(given)
+    if text in RELEASES:
+        return RELEASES[text]
+    if text.isdigit() and int(text) > 3000:
+        return int(text)
+    raise ConfigError(f"there is no release {text!r}", where="release", hint=f"{', '.join(RELEASES)}, or its number")

@@ -1,0 +1,72 @@
+"""The state that all modules of the Nanonis software share."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Final
+
+from afspm.basics.clock import Clock
+from afspm.basics.plain_data import Plain
+from afspm.plugins.nanonis.emulator.dispatch import Answer, DeferredResult
+from afspm.plugins.nanonis.emulator.registers import Registers
+from afspm.plugins.nanonis.emulator.session import SessionFolder
+from afspm.simulation.faults import Faults
+from afspm.simulation.instrument import Instrument
+
+_Z_CONTROLLERS: Final = {
+    "current": ("log Current", "A"),
+    "frequency-shift": ("OC M1 Freq. Shift", "Hz"),
+    "amplitude": ("Amplitude", "V"),
+}
+"""By the mode of the simulated feedback."""
+
+
+@dataclass
+class NanonisCore:
+    """The shared state.
+
+    Attributes:
+        range_m: of the scanner in x, y and z.
+        release: of the software.
+        client: memory of the client whose request is being answered.
+        opened: the modules that clients have opened.
+    """
+
+    rig: Instrument
+    faults: Faults
+    clock: Clock
+    session: SessionFolder
+    range_m: tuple[float, float, float]
+    release: int
+    registers: Registers = field(default_factory=Registers)
+    client: Plain = field(default_factory=dict)
+    opened: set[str] = field(default_factory=set)
+
+    @property
+    def now_s(self) -> float:
+        """Experiment time."""
+        return self.clock.now_s()
+
+    @property
+    def measures_frequency_shift(self) -> bool:
+        return "Frequency Shift" in self.rig.channels
+
+    @property
+    def z_controller_name(self) -> tuple[str, str]:
+        """Name of the z controller and unit of its setpoint."""
+        return _Z_CONTROLLERS[self.rig.world.settings.feedback.mode]
+
+    def experiment_s(self, real_s: float) -> float:
+        """Convert real to experiment seconds."""
+        return real_s / self.clock.real_s(1.0)
+
+    def deadline_s(self, timeout_ms: int) -> float:
+        """Return the experiment time at which a client's timeout ends, which counts in real time."""
+        return math.inf if timeout_ms < 0 else self.now_s + self.experiment_s(timeout_ms / 1000)
+
+    def until_free(self, wait: int, timeout_ms: int = -1) -> Answer:
+        """Return at once, or when the instrument is free if `wait` is set."""
+        if not wait:
+            return ()
+        return DeferredResult(lambda now_s: None if self.rig.busy(now_s) else (), self.deadline_s(timeout_ms))

@@ -1,0 +1,115 @@
+"""Dispatch of the protocol's functions to their handlers: methods of the software's modules, marked by `answers`."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+
+from afspm.plugins.nanonis.emulator.registers import Registers
+
+Results = tuple[object, ...]
+_STORED: Final = (
+    "Bias", "BiasSpectr", "Current", "ZCtrl", "SafeTip", "AutoApproach", "ZSpectr", "Piezo", "Scan", "FolMe", "Pattern",
+    "TipShaper", "Motor", "AtomTrack", "LockIn", "PLL", "Signals", "UserIn", "UserOut", "TCPLog", "Util", "File",
+)  # fmt: skip
+"""Modules of the real software: of functions without a handler, what is set in them is at least got again."""
+_KEEPS_NAN: Final = ("BiasSpectr.PropsSet",)
+_MAY_BE_INFINITE: Final = ("BiasSpectr.TimingSet", "ZSpectr.TimingSet")
+"""A slew rate that is not limited is infinite."""
+
+
+class FunctionRefused(Exception):
+    """The controller refuses a function, with a reason."""
+
+
+@dataclass(frozen=True)
+class DeferredResult:
+    """A result that comes when something has happened.
+
+    Attributes:
+        ready: gives the results once it has.
+        until_s: or at that time, experiment seconds, with `timed_out`.
+        gave_up: called when that time has come first.
+        next_s: when to look again, where nothing else tells.
+    """
+
+    ready: Callable[[float], Results | None]
+    until_s: float = math.inf
+    timed_out: Results = ()
+    gave_up: Callable[[], None] = lambda: None
+    next_s: Callable[[float], float] = lambda now_s: math.inf
+
+
+Answer = Results | DeferredResult
+Handler = Callable[..., Answer]
+
+
+def answers(*names: str) -> Callable[[Handler], Handler]:
+    """Mark a method as the handler of these functions; a parameter `name` receives the function's name."""
+
+    def marked(handler: Handler) -> Handler:
+        handler.answered_functions = names  # type: ignore[attr-defined]
+        return handler
+
+    return marked
+
+
+class Dispatcher:
+    """The handlers of all modules, and the registers behind the other functions."""
+
+    def __init__(self, registers: Registers, modules: Iterable[object]) -> None:
+        self._registers = registers
+        self._handlers: dict[str, Handler] = {}
+        for module in modules:
+            for attribute, marked in vars(type(module)).items():
+                for name in getattr(marked, "answered_functions", ()):
+                    self._handlers[name] = _bound(getattr(module, attribute), name)
+
+    def call(self, name: str, arguments: list[object]) -> Answer:
+        """Execute a function and return its results.
+
+        Raises:
+            FunctionRefused, InstrumentBusy, InvalidValue.
+        """
+        handler = self._handlers.get(name)
+        _refuse_nan(name, arguments, keeps_nan=handler is None or name in _KEEPS_NAN)
+        if handler is not None:
+            return handler(*arguments)
+        if name.partition(".")[0] not in _STORED:
+            raise FunctionRefused("Module not available")
+        if name.endswith("Get"):
+            return self._registers.got(name, arguments)
+        if not name.endswith("Set"):
+            raise FunctionRefused("it is not part of this emulator")
+        try:
+            self._registers.set(name, arguments)
+        except ValueError as error:
+            raise FunctionRefused(str(error)) from error
+        return ()
+
+
+def _bound(handler: Handler, name: str) -> Handler:
+    """Return the handler for one function, whose name it is told if it asks for that."""
+    return partial(handler, name) if "name" in inspect.signature(handler).parameters else handler
+
+
+def chosen(number: int, *choices: object) -> Any:
+    """Return the choice of a number; choice 0 is usually "no change"."""
+    if not 0 <= number < len(choices):
+        raise FunctionRefused(f"{number} is none of the choices")
+    return choices[number]
+
+
+def _refuse_nan(name: str, arguments: Iterable[object], *, keeps_nan: bool) -> None:
+    """The maker's own examples say of some functions that NaN is no change; (!) how others take it is not known."""
+    for argument in arguments:
+        if not isinstance(argument, str) and np.asarray(argument).dtype.kind == "f":
+            values = np.asarray(argument)
+            if (np.isnan(values).any() and not keeps_nan) or (np.isinf(values).any() and name not in _MAY_BE_INFINITE):
+                raise FunctionRefused("a value is not a number")

@@ -1,0 +1,115 @@
+"""Settings without effect on the emulation: pairs of functions `…Set` and `…Get` that only store values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+from afspm.plugins.nanonis.emulator import wire
+
+Values = tuple[Any, ...]
+
+AT_FIRST: Final[dict[str, Values]] = {
+    "ZCtrl.SwitchOffDelay": (0.05,),
+    "ZCtrl.WithdrawRate": (1e-6,),
+    "ZCtrl.Limits": (1e-6, -1e-6),
+    "BiasSpectr.Timing": (0.05, 0.0, 0.005, math.inf, 0.002, 0.001, 0.005, 0.2),
+    "BiasSpectr.AdvProps": (1, 1, 0, 0),
+    "BiasSpectr.MLSMode": ("Linear",),
+    "ZSpectr.Range": (0.0, 120e-9),
+    "Bias.Calibr": (1.0, 0.0),
+    "Piezo.Sens": (3.8e-9, 3.8e-9, 0.9e-9),
+    "TipShaper.Props": (0.1, 0, 0.0, -1e-9, 0.1, 0.0, 0.1, 1e-9, 0.1, 0.1, 1),
+    "Util.RTFreq": (20e3,),
+    "Util.AcqPeriod": (0.02,),
+    "Util.RTOversampl": (10,),
+    "FolMe.Oversampl": (10, 0.01),
+    "SafeTip.Props": (0, 1, 1e-9),
+    "LockIn.ModAmp": (0.02,),
+    "LockIn.ModPhasFreq": (973.0,),
+    "PLL.CenterFreq": (30e3,),
+    "PLL.AmpCtrlSetpnt": (100e-12,),
+    "UserOut.Limits": (10.0, -10.0),
+    "Pattern.Props": ("Bias Spectroscopy", "Grid_Spectroscopy", "", 0.0, 0),
+    "Pattern.Grid": (10, 10, 0.0, 0.0, 100e-9, 100e-9, 0.0),
+    "Pattern.Line": (10, 0.0, 0.0, 100e-9, 0.0),
+    "Current.Gain": (6,),
+}
+_KEYED_OTHERWISE: Final[dict[str, tuple[tuple[int, ...], tuple[int, ...]]]] = {
+    "Motor.FreqAmp": ((2,), (0, 1)),
+    "UserOut.Limits": ((0, 3), (1, 2)),
+    "Pattern.Grid": ((), (1, 2, 4, 5, 6, 7, 8)),
+    "Pattern.Line": ((), (1, 3, 4, 5, 6)),
+    "Pattern.Cloud": ((), (1, 2, 3)),
+    "APRFGen.Freq": ((), (1,)),
+    "APRFGen.Power": ((), (1,)),
+}
+"""Which of the arguments that are set say what they belong to, and which of them are got, where it is not that the
+first ones are those that it is got by, and the others are got in their order."""
+
+_OTHER_NAMES: Final = {"AtomTrack.StatusGet": "AtomTrack.Ctrl"}
+"""The registers that are got by a name of another form."""
+
+
+class Registers:
+    """The registers, by name and by what they belong to (the number of a modulator, an output …)."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[str, Values], Values] = {}
+
+    def set(self, name: str, arguments: Sequence[object]) -> None:
+        """Store the arguments of the function `name`. Raises ValueError: an argument is none of its choices."""
+        register = name.removesuffix("Set")
+        fields = wire.functions()[name].arguments
+        by, taken = _parts(register, len(arguments))
+        key = (register, tuple(arguments[n] for n in by))
+        before = self.get(register, key[1])
+        now = list(before) + [None] * (len(taken) - len(before))
+        for place, n in enumerate(taken):
+            now[place] = _set(fields[n].mark, arguments[n], now[place])
+        self._kept[key] = tuple(now)
+
+    def put(self, register: str, *values: object) -> None:
+        """Keep the values of a register that belongs to nothing in particular."""
+        self._kept[register, ()] = values
+
+    def get(self, register: str, belongs_to: Sequence[object] = ()) -> Values:
+        """Return the stored values, or the initial ones; empty if there are none."""
+        return self._kept.get((register, tuple(belongs_to)), AT_FIRST.get(register, ()))
+
+    def got(self, name: str, arguments: Sequence[object]) -> Values:
+        """The results of a function `…Get`: all that its fields have, zero where nothing is known."""
+        kept = self.get(_OTHER_NAMES.get(name, name.removesuffix("Get")), arguments)
+        codes = [field.code for field in wire.functions()[name].results]
+        zeros = tuple(wire.ZEROS[code] for code in codes)
+        known = tuple(zeros[n] if value is None else value for n, value in enumerate(kept[: len(codes)]))
+        return known + zeros[len(known) :]
+
+
+def _parts(register: str, count: int) -> tuple[Sequence[int], Sequence[int]]:
+    if register in _KEYED_OTHERWISE:
+        return _KEYED_OTHERWISE[register]
+    getter = wire.functions().get(f"{register}Get")
+    keys = len(getter.arguments) if getter is not None else _keys_without_getter(register)
+    return range(keys), range(keys, count)
+
+
+def _keys_without_getter(register: str) -> int:
+    other = next((name for name, same in _OTHER_NAMES.items() if same == register), None)
+    return len(wire.functions()[other].arguments) if other is not None else 0
+
+
+def _set(mark: str, value: Any, before: object) -> object:
+    """Store a value; NaN is no change."""
+    if isinstance(value, float) and math.isnan(value):
+        return before
+    if mark == "?":
+        if value not in (0, 1, 2):
+            raise ValueError(f"{value} is none of the choices")
+        return (before or 0) if value == 0 else int(value == 1)
+    if mark == "-":
+        return (before or 0) if value == 0 else value - 1
+    if mark and value == float(mark[1:]):
+        return before
+    return value

@@ -1,0 +1,368 @@
+"""The Scan module: frame, buffer, speed and properties, the running scan, and its file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from afspm.model import Region
+from afspm.plugins.nanonis.emulator import files
+from afspm.plugins.nanonis.emulator.core import NanonisCore
+from afspm.plugins.nanonis.emulator.dispatch import Answer, DeferredResult, FunctionRefused, Results, answers, chosen
+from afspm.plugins.nanonis.emulator.session import checked_name
+from afspm.plugins.nanonis.emulator.signals import CHANNELS, NAMES, Signals, name_and_unit
+from afspm.simulation.activities import RETRACE, ScanActivity
+from afspm.simulation.scanning import MOST_PIXELS
+
+Image = tuple[str, str, np.ndarray, np.ndarray]
+"""Name, unit, values forward and backward [y, x]."""
+_PIXELS_AT_ONCE: Final = 16
+_WAITED: Final = "waited"
+"""Memory of a client: how many scans had ended, and when, before it waits for the next end."""
+_PASTES: Final = (0, 1, 2)
+_SMALLEST_M: Final = 2e-12
+"""Of a frame: half of it, in two lines, is what the simulated scanner can just scan."""
+_AUTOSAVE: Final = ("all", "next", "off")
+
+
+@dataclass
+class StartedScan:
+    """A scan with the settings of its start."""
+
+    scan: ScanActivity
+    frame: tuple[float, float, float, float, float]
+    line_s: tuple[float, float]
+    channels: list[int]
+
+
+@dataclass
+class ScanProperties:
+    """The properties that `Scan.PropsSet` sets; `autosave` is "all", "next" or "off"."""
+
+    continuous: bool = False
+    bouncy: bool = False
+    autosave: str = "all"
+    series: str = "unnamed"
+    comment: str = ""
+    modules: tuple[str, ...] = ("Z-Controller",)
+    autopaste: int = 2
+
+
+class ScanFiles:
+    """Images of scans, and the files that they are saved in."""
+
+    def __init__(self, core: NanonisCore, signals: Signals) -> None:
+        self._core, self._signals = core, signals
+
+    def images(self, started: StartedScan, until_s: float | None) -> dict[int, Image]:
+        """Return an image for each channel; lines not yet scanned are NaN."""
+        drawn = started.scan.channels(until_s)
+        found: dict[int, Image] = {}
+        for channel, (unit, values) in drawn.items():
+            if channel in CHANNELS:
+                back = drawn.get(f"{channel}{RETRACE}", (unit, values))[1]
+                found[CHANNELS[channel]] = (NAMES.get(channel, channel), unit, values, back)
+        nothing = np.zeros(started.scan.shape)
+        for index in started.channels:
+            if index not in found:
+                found[index] = (*name_and_unit(self._signals.names[index]), nothing, nothing)
+        return {index: found[index] for index in started.channels}
+
+    def save(self, ended: StartedScan, properties: ScanProperties, now_s: float) -> str:
+        """Save a scan; return the path that the controller announces."""
+        session, scan, feedback = self._core.session, ended.scan, ended.scan.feedback
+        name = session.next_name(properties.series, 3, ".sxm")
+        path = session.path_of(name)
+        images = self.images(ended, scan.stopped_s)
+        controller, unit = self._core.z_controller_name
+        gains = (feedback.proportional_gain or 0.0, feedback.integral_gain or 0.0)
+        content = files.SxmContent(
+            path=path,
+            start_s=scan.start_s,
+            duration_s=scan.end_s - scan.start_s,
+            center_m=ended.frame[:2],
+            range_m=ended.frame[2:4],
+            angle_deg=ended.frame[4],
+            upwards=scan.upwards,
+            line_s=ended.line_s,
+            bias_v=scan.bias_v,
+            z_controller=(controller, bool(feedback.on), feedback.setpoint or 0.0, unit, *gains),
+            comment=properties.comment,
+            channels=[(index, *image) for index, image in images.items()],
+            settings=self._header(ended, properties, images),
+        )
+        return path if session.save(name, files.sxm(content), now_s) else ""
+
+    def _header(self, ended: StartedScan, properties: ScanProperties, images: Mapping[int, Image]) -> dict[str, str]:
+        scan, number = ended.scan, files.engineering
+        return {
+            "NanonisMain>Session Path": self._core.session.path,
+            "NanonisMain>SW Version": "Generic 5",
+            "Bias>Bias (V)": number(scan.bias_v),
+            "Z-Controller>Controller status": "ON" if scan.feedback.on else "OFF",
+            "Z-Controller>Setpoint": number(scan.feedback.setpoint or 0.0),
+            "Scan>Scanfield": ";".join(number(value) for value in ended.frame),
+            "Scan>series name": properties.series,
+            "Scan>channels": ";".join(f"{name} ({unit})" for name, unit, _, _ in images.values()),
+            "Scan>pixels/line": str(scan.shape[1]),
+            "Scan>lines": str(scan.shape[0]),
+            "Scan>speed forw. (m/s)": number(ended.frame[2] / ended.line_s[0]),
+            "Scan>speed backw. (m/s)": number(ended.frame[2] / ended.line_s[1]),
+        }
+
+
+class ScanModule:
+    """The module.
+
+    Args:
+        rows_as_recorded: whether `Scan.FrameDataGrab` returns rows as recorded, or top first.
+
+    Attributes:
+        frame: x, y, width, height in m, angle clockwise in degrees.
+        speed: forward, backward in m/s and s a line, whether the time is kept (and not the speed), their ratio.
+        running: the scan that goes on; `last` the last one started.
+        ends: how many scans have ended.
+    """
+
+    def __init__(self, core: NanonisCore, signals: Signals, *, rows_as_recorded: bool) -> None:
+        self._core, self._signals, self._files = core, signals, ScanFiles(core, signals)
+        self._rows_as_recorded = rows_as_recorded
+        self.channels = sorted(CHANNELS[name] for name in core.rig.channels if name in CHANNELS)
+        self.pixels, self.lines = 128, 128
+        self.frame = (0.0, 0.0, 1e-6, 1e-6, 0.0)
+        self.speed = (2e-6, 2e-6, 0.5, 0.5, 0, 1.0)
+        self.properties = ScanProperties()
+        self.running: StartedScan | None = None
+        self.last: StartedScan | None = None
+        self.ends, self._last_end = 0, (-math.inf, "")
+        self._delayed_start: tuple[float, bool] | None = None
+
+    # --- the running scan ---
+
+    def advance(self, now_s: float) -> float | None:
+        """Start and end scans that are due; return when a delayed one starts."""
+        if self.running is not None and self._core.faults.strikes("panel-stop", now_s):
+            self._core.rig.stop_scan(now_s)
+        if self._delayed_start is not None and now_s >= self._delayed_start[0]:
+            (_, upwards), self._delayed_start = self._delayed_start, None
+            self.start(upwards)
+        if self.running is not None and not self.running.scan.running(now_s):
+            self._end(self.running, now_s)
+        return None if self._delayed_start is None else self._delayed_start[0]
+
+    def start(self, upwards: bool) -> None:
+        """Start a scan at once. Raises InstrumentBusy."""
+        x, y, width, height, clockwise_deg = self.frame
+        rig = self._core.rig
+        size_m = (width * (self.pixels - 1) / self.pixels, height * max(self.lines - 1, 1) / self.lines)
+        rig.setup.region = Region((x, y), size_m, -math.radians(clockwise_deg))
+        rig.setup.shape = (self.lines, self.pixels)
+        forward_s, backward_s = self.speed[2:4]
+        rig.setup.line_s, rig.setup.upwards = forward_s + backward_s, upwards
+        scan = rig.start_scan(self._core.now_s)
+        self.running = self.last = StartedScan(scan, self.frame, (forward_s, backward_s), list(self.channels))
+
+    @answers("Scan.Action")
+    def _action(self, action: int, direction: int) -> Answer:
+        now_s, rig = self._core.now_s, self._core.rig
+        if action == 0:
+            if self.running is not None:  # it begins anew
+                rig.stop_scan(now_s)
+                self.advance(now_s)
+            self._start_on_request(bool(direction), now_s)
+            self._core.client[_WAITED] = self.ends, now_s
+        elif action == 1:
+            rig.stop_scan(now_s)
+        elif action == 2 and rig.scan is not None:
+            rig.scan.pause(now_s)
+        elif action == 3 and rig.scan is not None:
+            rig.scan.resume(now_s)
+        elif action == 6:
+            rig.move_probe(self.frame[:2], now_s)
+        elif action not in (2, 3, 4, 5):
+            raise FunctionRefused(f"{action} is not an action")
+        return ()
+
+    def _start_on_request(self, upwards: bool, now_s: float) -> None:
+        late = self._core.faults.strikes("late-start", now_s)
+        if late is not None:
+            self._delayed_start = (now_s + late.duration_s, upwards)
+        elif not self._core.faults.strikes("no-start", now_s):
+            self.start(upwards)
+
+    def _end(self, ended: StartedScan, now_s: float) -> None:
+        self.running = None
+        finished = ended.scan.stopped_s is None
+        path = self._files.save(ended, self.properties, now_s) if finished and self._saves(now_s) else ""
+        if path and self._core.faults.strikes("stale-name", now_s):
+            path = self._last_end[1]
+        self.ends, self._last_end = self.ends + 1, (ended.scan.end_s, path)
+        if finished and self.properties.continuous:
+            self.start(ended.scan.upwards != self.properties.bouncy)
+
+    def _saves(self, now_s: float) -> bool:
+        if self.properties.autosave == "off" or self._core.faults.lasts("autosave-off", now_s):
+            return False
+        if self.properties.autosave == "next":
+            self.properties.autosave = "off"
+        return True
+
+    @answers("Scan.StatusGet")
+    def _status(self) -> Answer:
+        return (int(self.running is not None and self.running.scan.running(self._core.now_s)),)
+
+    @answers("Scan.XYPosGet")
+    def _position(self, wait: int) -> Answer:
+        return self._core.rig.probe_at(self._core.now_s)
+
+    @answers("Scan.WaitEndOfScan")
+    def _wait_end_of_scan(self, timeout_ms: int) -> Answer:
+        """Wait for the next end of a scan; an earlier one does not count.
+
+        A client's pause since it has begun the scan, or since its last wait has timed out, is taken to last as long in
+        experiment time as it does in real time, as if the clock went no faster.
+        """
+        core, client, ends = self._core, self._core.client, self.ends
+        if self.running is None and core.faults.lasts("ends-at-once", core.now_s):
+            return 0, ""
+        ends_before, since_s = client.pop(_WAITED, (ends, 0.0))
+        pause_s = core.clock.real_s(core.now_s - since_s)
+        ended_s, path = self._last_end
+        if ends > ends_before and ended_s > since_s + pause_s:
+            return 0, path
+
+        def gave_up() -> None:
+            client[_WAITED] = self.ends, core.now_s
+
+        def ready(now_s: float) -> Results | None:
+            return (0, self._last_end[1]) if self.ends > ends else None
+
+        return DeferredResult(ready, core.deadline_s(timeout_ms), (1, ""), gave_up)
+
+    @answers("Scan.WaitEndOfLine")
+    def _wait_end_of_line(self, timeout_ms: int) -> Answer:
+        """Wait for the end of a line, forward (0) or backward (1), counted from 1."""
+        scan = self._core.rig.scan
+        timed_out = (1, 0, 0, 0)
+        if scan is None or not scan.running(self._core.now_s):
+            return timed_out
+        passes = scan.passes(self._core.now_s)
+        first_pass = 1
+
+        def ready(now_s: float) -> Results | None:
+            over = scan.passes(now_s) > passes or not scan.running(now_s)
+            return (0, passes // 2 + 1, passes % 2, first_pass) if over else None
+
+        def next_s(now_s: float) -> float:
+            return now_s + scan.line_s / 2
+
+        return DeferredResult(ready, self._core.deadline_s(timeout_ms), timed_out, next_s=next_s)
+
+    # --- settings ---
+
+    @answers("Scan.FrameSet")
+    def set_frame(self, x: float, y: float, width: float, height: float, angle_deg: float) -> Answer:
+        """Set the frame, moved into the scanner's range as the real one does.
+
+        (!) What the real one does with a frame smaller than an atom is not known: here it is refused.
+        """
+        if not (min(width, height) >= _SMALLEST_M and all(map(math.isfinite, (x, y, width, height, angle_deg)))):
+            raise FunctionRefused(f"a frame of {width:g} m x {height:g} m can't be scanned: from {_SMALLEST_M:g} m")
+        range_m = self._core.range_m[:2]
+        width, height = min(width, range_m[0]), min(height, range_m[1])
+        x, y = (
+            float(np.float32(np.clip(value, (size - whole) / 2, (whole - size) / 2)))
+            for value, size, whole in zip((x, y), (width, height), range_m, strict=True)
+        )
+        self.frame = (x, y, width, height, angle_deg)
+        self._adapt_speed(*self.speed)
+        return ()
+
+    @answers("Scan.FrameGet")
+    def _frame(self) -> Answer:
+        return self.frame
+
+    @answers("Scan.BufferSet")
+    def _set_buffer(self, channels: list[int], pixels: int, lines: int) -> Answer:
+        """The pixels of a line come in packages of 16: any other number is made one of those."""
+        if not all(0 <= channel < 128 for channel in channels) or not 1 <= pixels <= MOST_PIXELS or lines < 0:
+            raise FunctionRefused("no such channel or number of pixels")
+        ratio = self.lines / self.pixels
+        self.channels = channels or self.channels
+        self.pixels = max(_PIXELS_AT_ONCE, round(pixels / _PIXELS_AT_ONCE) * _PIXELS_AT_ONCE)
+        self.lines = lines or max(1, round(self.pixels * ratio))
+        return ()
+
+    @answers("Scan.BufferGet")
+    def _buffer(self) -> Answer:
+        return self.channels, self.pixels, self.lines
+
+    @answers("Scan.SpeedSet")
+    def _set_speed(self, *speed: Any) -> Answer:
+        """`keep` is 1 for the speed and 2 for the time; which of both is kept says which of both counts now."""
+        *speeds, keep, ratio = speed
+        if not min(speeds) > 0.0 or keep > 2:
+            raise FunctionRefused("no such speed")
+        self._adapt_speed(*speeds, self.speed[4] if keep == 0 else keep - 1, ratio)
+        return ()
+
+    def _adapt_speed(self, forward: float, backward: float, forward_s: float, backward_s: float, *keep: Any) -> None:
+        keeps_time, ratio = keep
+        width = self.frame[2]
+        if keeps_time:
+            forward, backward = width / forward_s, width / backward_s
+        else:
+            forward_s, backward_s = width / forward, width / backward
+        self.speed = (forward, backward, forward_s, backward_s, keeps_time, ratio)
+
+    @answers("Scan.SpeedGet")
+    def _speed(self) -> Answer:
+        return self.speed
+
+    @answers("Scan.PropsSet")
+    def _set_properties(
+        self, continuous: int, bouncy: int, autosave: int, series: str, comment: str, *rest: Any
+    ) -> Answer:
+        props = self.properties
+        props.continuous = bool(chosen(continuous, props.continuous, 1, 0))
+        props.bouncy = bool(chosen(bouncy, props.bouncy, 1, 0))
+        props.autosave = chosen(autosave, props.autosave, *_AUTOSAVE)
+        props.series, props.comment = checked_name(series) or props.series, comment
+        if rest:
+            props.modules = tuple(rest[0])
+        if rest[1:]:
+            props.autopaste = chosen(rest[1], props.autopaste, *_PASTES)
+        return ()
+
+    @answers("Scan.PropsGet")
+    def _properties(self) -> Answer:
+        props = self.properties
+        counts, table = [1] * len(props.modules), [["Setpoint"] for _ in props.modules]
+        flags = int(props.continuous), int(props.bouncy), _AUTOSAVE.index(props.autosave)
+        return *flags, props.series, props.comment, list(props.modules), counts, table, props.autopaste
+
+    # --- images and files ---
+
+    @answers("Scan.FrameDataGrab")
+    def _grab(self, channel: int, forward: int) -> Answer:
+        last = self.last
+        if channel not in (last.channels if last else self.channels):
+            raise FunctionRefused("the channel is not among the acquired ones")
+        if last is None or last.scan.drawing:
+            raw, upwards = np.full((self.lines, self.pixels), np.nan), True
+        else:
+            *_, there, back = self._files.images(last, self._core.now_s)[channel]
+            raw, upwards = (there if forward else back[:, ::-1]), last.scan.upwards
+        rows = raw if self._rows_as_recorded and upwards else raw[::-1]
+        return self._signals.names[channel], rows, int(upwards)
+
+    @answers("Scan.Save")
+    def _save(self, wait: int, timeout_ms: int) -> Answer:
+        if self.last is None:
+            raise FunctionRefused("there is no scan to save")
+        self._files.save(self.last, self.properties, self._core.now_s)
+        return (0,)

@@ -1,0 +1,93 @@
+"""The session folder: its path on the controller's computer, file names, and writing as well as the faults allow."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path, PureWindowsPath
+from typing import Final
+
+from afspm.basics.errors import InvalidValue
+from afspm.simulation.faults import Faults
+
+_NO_FILE_NAME: Final = frozenset('\\/:*?"<>|') | {chr(number) for number in range(32)}
+_LONGEST_NAME: Final = 200
+
+
+class SessionFolder:
+    """The folder for scans and spectra.
+
+    Attributes:
+        folder: on this computer; `path` is its path on the controller's computer, which clients see.
+    """
+
+    def __init__(self, folder: Path, path: str, faults: Faults, log: logging.Logger) -> None:
+        self.folder, self.path = folder, path or str(folder)
+        self._root, self._root_path = self.folder, self.path
+        self._faults, self._log = faults, log
+        self._numbers: dict[tuple[str, str], int] = {}
+        self._late: list[tuple[float, Path, bytes]] = []
+
+    def change(self, path: str) -> None:
+        """Change to a folder within the initial one. Raises InvalidValue."""
+        root = self._root_path.rstrip("\\/")
+        if path.rstrip("\\/") != root and not path.startswith((f"{root}/", f"{root}\\")):
+            raise InvalidValue(f"Session Path not valid: {path!r}", hint=f"{root}, or a folder in it")
+        folder = self._root
+        for name in filter(None, path[len(root) :].replace("\\", "/").strip("/").split("/")):
+            folder = folder / checked_name(name)
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder, self.path = folder, path
+
+    def next_name(self, base: str, digits: int, suffix: str) -> str:
+        """Return a name with the next number that no file has."""
+        while True:
+            number = self._numbers[base, suffix] = self._numbers.get((base, suffix), 0) + 1
+            name = f"{base}{number:0{digits}d}{suffix}"
+            if not (self.folder / name).exists():
+                return name
+
+    def path_of(self, name: str) -> str:
+        """Return the path of a file on the controller's computer."""
+        windows = "\\" in self.path
+        return str(PureWindowsPath(self.path) / name) if windows else str(Path(self.path) / name)
+
+    def save(self, name: str, content: bytes, now_s: float) -> bool:
+        """Write a file as well as the faults allow; return whether the controller announces it."""
+        path = self.folder / name
+        if self._faults.strikes("file-missing", now_s):
+            return True
+        late, half = self._faults.strikes("file-late", now_s), self._faults.strikes("half-file", now_s)
+        fault = late or half
+        if fault is not None:
+            self._late.append((now_s + fault.duration_s, path, content))
+        return late is not None or self._write(path, content[: len(content) // 2] if half else content)
+
+    def read(self, path: str) -> bytes:
+        """Return a file of the folder, by the path that the controller announces. Raises OSError, InvalidValue."""
+        name = PureWindowsPath(path).name
+        if path != self.path_of(name):
+            raise InvalidValue(f"{path!r} is not in the session folder", hint=self.path)
+        return (self.folder / checked_name(name)).read_bytes()
+
+    def write_late(self, now_s: float) -> float | None:
+        """Write the late files that are due; return when the next one is."""
+        due = [late for late in self._late if late[0] <= now_s]
+        self._late = [late for late in self._late if late[0] > now_s]
+        for _, path, content in due:
+            self._write(path, content)
+        return min((late[0] for late in self._late), default=None)
+
+    def _write(self, path: Path, content: bytes) -> bool:
+        try:
+            path.write_bytes(content)
+        except OSError as error:
+            self._log.warning("%s can't be written: %s", path, error)
+            return False
+        return True
+
+
+def checked_name(text: str) -> str:
+    """Check a part of a file's name. Raises InvalidValue: Windows, where Nanonis runs, does not allow it."""
+    if not _NO_FILE_NAME.isdisjoint(text) or len(text) > _LONGEST_NAME or text.strip(". ") != text:
+        raise InvalidValue(f"{text!r} can't be part of a file's name")
+    return text

@@ -1,0 +1,234 @@
+"""The modules for bias and z spectroscopy: sweep settings, the running spectrum, and its file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from afspm.plugins.nanonis.emulator import files
+from afspm.plugins.nanonis.emulator.core import NanonisCore
+from afspm.plugins.nanonis.emulator.dispatch import Answer, DeferredResult, FunctionRefused, Results, answers, chosen
+from afspm.plugins.nanonis.emulator.session import checked_name
+from afspm.plugins.nanonis.emulator.signals import Signals, name_and_unit, spectrum_columns, spectrum_signal
+from afspm.simulation.activities import SpectrumActivity
+
+_KINDS: Final = {"BiasSpectr": "IV", "ZSpectr": "force"}
+_CHANNELS: Final = {"BiasSpectr": (0, 22), "ZSpectr": (20, 21)}
+"""Signals that the simulated spectra have."""
+_TITLES: Final = {"BiasSpectr": "bias spectroscopy", "ZSpectr": "Z spectroscopy"}
+_FILE_NAMES: Final = {"BiasSpectr": "Bias-Spectroscopy", "ZSpectr": "Z-Spectroscopy"}
+_MOST_POINTS: Final = 1 << 16
+
+
+@dataclass
+class SweepSettings:
+    """The sweep settings of a spectroscopy module.
+
+    Attributes:
+        points: None: as many as the simulated spectrum has.
+        limits: first and last value of the sweep; None: those of the simulated spectrum. Beyond it the values stay.
+        sweeps: how many are averaged.
+        channels: indexes of the recorded signals; None: all that the simulated spectrum has.
+        backward: whether it is swept back, too.
+        saves: whether a file is written; `saves_all` and `dialog` are only stored.
+    """
+
+    points: int | None = None
+    limits: tuple[float, float] | None = None
+    sweeps: int = 1
+    channels: list[int] | None = None
+    backward: bool = True
+    saves: bool = True
+    saves_all: bool = False
+    dialog: bool = False
+
+    def resample(self, curve: SpectrumActivity) -> SpectrumActivity:
+        """Return the spectrum resampled to this sweep."""
+        values = curve.values
+        if self.points is not None or self.limits is not None:
+            swept = values[:, 0]
+            first, last = self.limits or (swept[0], swept[-1])
+            asked = np.linspace(first, last, self.points or len(swept))
+            ascending = values[np.argsort(swept)]
+            columns = (np.interp(asked, ascending[:, 0], column) for column in ascending.T[1:])
+            values = np.stack([asked, *columns], axis=1)
+        kept = [k for k, name in enumerate(curve.names) if self.backward or not name.endswith(" Retrace")]
+        return replace(
+            curve,
+            values=values[:, kept],
+            names=tuple(curve.names[k] for k in kept),
+            units=tuple(curve.units[k] for k in kept),
+        )
+
+
+class SpectroscopyModules:
+    """Both modules.
+
+    Attributes:
+        sweeps: settings by module.
+        running: the spectrum that goes on; `ended` counts those that have ended.
+    """
+
+    def __init__(self, core: NanonisCore, signals: Signals) -> None:
+        self._core, self._signals = core, signals
+        self.sweeps = {module: SweepSettings() for module in _KINDS}
+        self.running: SpectrumActivity | None = None
+        self.ended = 0
+        self._base_names = dict(_FILE_NAMES)
+
+    def advance(self, now_s: float) -> None:
+        """End and save a spectrum that is over."""
+        curve = self.running
+        if curve is None or curve.running(now_s):
+            return
+        self.running = None
+        self.ended += 1
+        module = next(name for name, kind in _KINDS.items() if kind == curve.kind)
+        if self.sweeps[module].saves and not self._core.faults.lasts("autosave-off", now_s):
+            content = files.dat(self._header(module, curve, now_s), spectrum_columns(curve), curve.values)
+            session = self._core.session
+            session.save(session.next_name(self._base_names[module], 5, ".dat"), content, now_s)
+
+    def start(self, module: str, base_name: str) -> None:
+        """Start a spectrum. Raises InstrumentBusy."""
+        self._base_names[module] = checked_name(base_name) or self._base_names[module]
+        sweep = self.sweeps[module]
+        curve = sweep.resample(self._core.rig.start_spectrum(_KINDS[module], self._core.now_s, sweep.sweeps))
+        self.running = curve if sweep.channels is None else self._recorded(curve, sweep.channels)
+
+    def _recorded(self, curve: SpectrumActivity, channels: list[int]) -> SpectrumActivity:
+        """Select the recorded channels; one that the simulated spectrum does not have is constant."""
+        names, units, columns = [curve.names[0]], [curve.units[0]], [curve.values[:, 0]]
+        for index in channels:
+            having = [k for k, name in enumerate(curve.names) if spectrum_signal(name) == index]
+            for k in having:
+                names.append(curve.names[k])
+                units.append(curve.units[k])
+                columns.append(curve.values[:, k])
+            if not having:
+                name, unit = name_and_unit(self._signals.names[index])
+                names.append(name)
+                units.append(unit)
+                columns.append(np.full(len(curve.values), self._signals.values([index], curve.start_s)[0]))
+        return replace(curve, names=tuple(names), units=tuple(units), values=np.stack(columns, axis=1))
+
+    def _header(self, module: str, curve: SpectrumActivity, now_s: float) -> dict[str, str]:
+        (x, y), number = curve.position_m, files.engineering
+        return {
+            "Experiment": _TITLES[module],
+            "Saved Date": files.moment(now_s),
+            "User": "",
+            "Date": "",
+            "X (m)": number(x),
+            "Y (m)": number(y),
+            "Z (m)": number(0.0),
+            "Start time": files.moment(curve.start_s),
+            "Bias>Bias (V)": number(self._core.rig.setup.bias_v),
+        }
+
+    # --- functions ---
+
+    @answers("BiasSpectr.Open", "ZSpectr.Open")
+    def _open(self, name: str) -> Answer:
+        self._core.opened.add(name.partition(".")[0])
+        return ()
+
+    def _module(self, name: str) -> str:
+        module = name.partition(".")[0]
+        if module not in self._core.opened:
+            raise FunctionRefused(f"the module {module} is not open")
+        return module
+
+    @answers("BiasSpectr.StatusGet", "ZSpectr.StatusGet")
+    def _status(self, name: str) -> Answer:
+        kind, curve = _KINDS[self._module(name)], self.running
+        return (int(curve is not None and curve.kind == kind and curve.running(self._core.now_s)),)
+
+    @answers("BiasSpectr.Start", "ZSpectr.Start")
+    def _start(self, name: str, get_data: int, base_name: str) -> Answer:
+        self.start(self._module(name), base_name)
+        curve, ended = self.running, self.ended
+        if not get_data or curve is None:
+            return [], np.zeros((0, 0)), []
+
+        def ready(now_s: float) -> Results | None:
+            data = spectrum_columns(curve), curve.values.T, [*curve.position_m, float(curve.values[0, 0])]
+            return data if self.ended > ended else None
+
+        return DeferredResult(ready)
+
+    @answers("BiasSpectr.Stop", "ZSpectr.Stop")
+    def _stop(self, name: str) -> Answer:
+        self._module(name)
+        if self.running is not None:
+            self._core.rig.stop_spectrum(self._core.now_s)
+            self.running = None
+            self.ended += 1
+        return ()
+
+    @answers("BiasSpectr.PropsSet")
+    def _set_bias_properties(
+        self, save_all: int, sweeps: int, backward: int, points: int, z_off_m: float, autosave: int, dialog: int
+    ) -> Answer:
+        return self._set_properties("BiasSpectr", points, sweeps, (backward, autosave, save_all, dialog))
+
+    @answers("ZSpectr.PropsSet")
+    def _set_z_properties(
+        self, backward: int, points: int, sweeps: int, autosave: int, dialog: int, save_all: int
+    ) -> Answer:
+        return self._set_properties("ZSpectr", points, sweeps, (backward, autosave, save_all, dialog))
+
+    def _set_properties(self, module: str, points: int, sweeps: int, switches: tuple[int, int, int, int]) -> Answer:
+        sweep = self.sweeps[self._module(module)]
+        if not (points == 0 or 2 <= points <= _MOST_POINTS) or sweeps < 0:
+            raise FunctionRefused(f"a spectrum of {points} points, {sweeps} sweeps")
+        before = (sweep.backward, sweep.saves, sweep.saves_all, sweep.dialog)
+        now = [chosen(switch, was, 1, 0) for switch, was in zip(switches, before, strict=True)]
+        sweep.backward, sweep.saves, sweep.saves_all, sweep.dialog = map(bool, now)
+        sweep.points, sweep.sweeps = points or sweep.points, sweeps or sweep.sweeps
+        return ()
+
+    @answers("BiasSpectr.PropsGet", "ZSpectr.PropsGet")
+    def _properties(self, name: str) -> Answer:
+        module = self._module(name)
+        sweep, channels = self.sweeps[module], self._channel_names(module)
+        backward, saves, saves_all, dialog = map(int, (sweep.backward, sweep.saves, sweep.saves_all, sweep.dialog))
+        fixed = ["X (m)", "Y (m)"]
+        settings = self._core.rig.world.settings
+        if module == "BiasSpectr":
+            points = sweep.points or settings.iv.points
+            return saves_all, sweep.sweeps, backward, points, channels, ["Sweep Start (V)"], fixed, saves, dialog
+        points = sweep.points or settings.force.points
+        return backward, points, channels, ["Sweep Start (m)"], fixed, sweep.sweeps, saves, dialog, saves_all
+
+    @answers("BiasSpectr.LimitsSet")
+    def _set_limits(self, first_v: float, last_v: float) -> Answer:
+        self.sweeps["BiasSpectr"].limits = (first_v, last_v)
+        return ()
+
+    @answers("BiasSpectr.LimitsGet")
+    def _limits(self) -> Answer:
+        range_v = self._core.rig.world.settings.iv.range_v
+        return self.sweeps["BiasSpectr"].limits or (-range_v, range_v)
+
+    @answers("BiasSpectr.ChsSet", "ZSpectr.ChsSet")
+    def _set_channels(self, name: str, indexes: list[int]) -> Answer:
+        module = self._module(name)
+        if not indexes or not all(0 <= index < len(self._signals.names) for index in indexes):
+            raise FunctionRefused("there are no such channels")
+        self.sweeps[module].channels = list(dict.fromkeys(indexes))
+        return ()
+
+    @answers("BiasSpectr.ChsGet", "ZSpectr.ChsGet")
+    def _get_channels(self, name: str) -> Answer:
+        module = self._module(name)
+        return self._channels(module), self._channel_names(module)
+
+    def _channels(self, module: str) -> list[int]:
+        recorded = self.sweeps[module].channels
+        return list(_CHANNELS[module]) if recorded is None else recorded
+
+    def _channel_names(self, module: str) -> list[str]:
+        return [self._signals.names[index] for index in self._channels(module)]

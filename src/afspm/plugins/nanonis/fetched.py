@@ -1,0 +1,124 @@
+"""Scans and spectra that Nanonis has not saved: fetched over TCP, and kept in a file of ours so that they last."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from afspm.basics.errors import ConfigError, FileError
+from afspm.model import Region, Scan, ScanLines, Spectrum
+from afspm.plugins.nanonis.session import CurveEnded
+from afspm.plugins.nanonis.settings import Ask
+from afspm.storage.atomic import write_atomic
+from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
+
+ROWS: Final = ("top-first", "recorded")
+BACKWARD: Final = ("mirrored", "as-seen")
+_FORWARD, _BACKWARD = 1, 0
+_UP: Final = 1
+
+
+@dataclass(frozen=True)
+class Grabbing:
+    """The way that Nanonis hands out the scan in its memory, which its specification does not say.
+
+    Attributes:
+        rows: "top-first" whatever the direction of the scan, or as they were "recorded".
+        backward: "mirrored": backward lines run from right to left; or "as-seen".
+    """
+
+    rows: str = "top-first"
+    backward: str = "mirrored"
+
+    def __post_init__(self) -> None:
+        for name, value, choices in (("rows", self.rows, ROWS), ("backward", self.backward, BACKWARD)):
+            if value not in choices:
+                raise ConfigError(f"{value!r}", where=f"grabbed_{name}", hint=f"one of {', '.join(choices)}")
+
+    def image(self, raw: np.ndarray, *, upwards: bool, backward: bool) -> np.ndarray:
+        """[y, x] with both ascending."""
+        rows = raw if self.rows == "recorded" and upwards else raw[::-1]
+        pixels = rows[:, ::-1] if backward and self.backward == "mirrored" else rows
+        return np.ascontiguousarray(pixels, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Image:
+    """One channel of the scan in Nanonis' memory.
+
+    Attributes:
+        name: as in its files, e.g. "Z Forward".
+        values: [y, x], both ascending; lines that were not scanned are NaN.
+        upwards: whether the lowest was scanned first.
+    """
+
+    name: str
+    unit: str
+    values: np.ndarray
+    upwards: bool
+
+
+def images(ask: Ask, how: Grabbing) -> list[Image]:
+    """Every channel of the scan in Nanonis' memory, forward and backward."""
+    signals = ask("Signals.NamesGet")[0]
+    found = []
+    for channel in ask("Scan.BufferGet")[0]:
+        name, unit = name_and_unit(signals[channel] if 0 <= channel < len(signals) else f"channel {channel}")
+        for way, number in (("Forward", _FORWARD), ("Backward", _BACKWARD)):
+            _, raw, direction = ask("Scan.FrameDataGrab", channel, number)
+            upwards = direction == _UP
+            values = how.image(raw, upwards=upwards, backward=number == _BACKWARD)
+            found.append(Image(f"{name.replace(' ', '_')} {way}", unit, values, upwards))
+    return found
+
+
+def new_lines(found: Sequence[Image], region: Region, start: int) -> list[ScanLines]:
+    """The lines beyond the first `start` that all channels have, in the order in which they are scanned."""
+    lines = []
+    done = min((int(np.isfinite(image.values).all(axis=1).sum()) for image in found), default=0)
+    for image in found if done > start else ():
+        shape = (image.values.shape[0], image.values.shape[1])
+        first = start if image.upwards else shape[0] - done
+        rows = image.values[first : first + done - start]
+        lines.append(ScanLines(region, shape, image.name, image.unit, first, rows))
+    return lines
+
+
+def spectrum(curve: CurveEnded, kind: str, position_m: tuple[float, float]) -> Spectrum:
+    """The data that Nanonis replied with at the end of a spectrum.
+
+    Raises:
+        FileError: they do not fit together.
+    """
+    if not curve.names or curve.values.shape[0] != len(curve.names):
+        raise FileError(f"a spectrum of {len(curve.names)} channels with {curve.values.shape[0]} rows of values")
+    values = np.array(curve.values.T, dtype=np.float64)
+    columns, units = zip(*map(name_and_unit, curve.names), strict=True)
+    return Spectrum(position_m, kind, columns, units, values)
+
+
+def name_and_unit(text: str) -> tuple[str, str]:
+    """ "Current (A)" -> ("Current", "A")."""
+    unit = re.search(r" ?\(([^()]*)\)", text)
+    return (text, "") if unit is None else ((text[: unit.start()] + text[unit.end() :]).strip(), unit[1])
+
+
+def write(path: Path, content: Sequence[Scan | Spectrum], end_ns: int) -> None:
+    """Keep all channels of one scan, or one spectrum, in a file that `afspm.storage.formats.read` reads."""
+    facts = FileFacts(end_ns, {})
+    one = content[0]
+    if isinstance(one, Spectrum):
+        encoded = encode_spectrum(one, facts)
+    else:
+        scans = [scan for scan in content if isinstance(scan, Scan)]
+        names = [scan.channel for scan in scans]
+        told_apart = (name if name not in names[:k] else f"{name} #{k + 1}" for k, name in enumerate(names))
+        channels = {name: (scan.unit, scan.values) for name, scan in zip(told_apart, scans, strict=True)}
+        encoded = encode_scan(one.region, channels, facts)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, [encoded])

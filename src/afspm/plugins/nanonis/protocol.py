@@ -1,0 +1,263 @@
+"""The bytes of Nanonis' TCP protocol: requests to them, results from them. No sockets here.
+
+A header of 40 bytes (name, size of the body), then the body; after the results every reply has an error block. What
+may be asked stands in `functions.txt`, where some fields are there only from a release of the software on.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from afspm.basics.errors import AfspmError, InvalidValue
+from afspm.translator.driver import ControllerLost
+
+HEADER_BYTES: Final = 40
+NEWEST: Final = 1 << 31
+"""A release that has every field."""
+LARGEST_BODY: Final = 1 << 28
+"""Eight channels of the largest scan are less: what claims to be longer is no reply."""
+
+_HEADER: Final = struct.Struct(">32sihh")
+_NUMBERS: Final = {code: struct.Struct(">" + code) for code in "HIifd"}
+
+
+class BadReply(ControllerLost):
+    """The bytes that came can't be the reply: nothing that follows on that connection can be trusted."""
+
+    code = "nanonis-reply"
+
+
+class NanonisError(AfspmError):
+    """Nanonis says that it could not do it, in its own words."""
+
+    code = "nanonis"
+
+
+@dataclass(frozen=True)
+class Function:
+    """One function of the protocol.
+
+    Attributes:
+        arguments, results: codes of the fields, each with the first release that has it.
+    """
+
+    name: str
+    arguments: tuple[tuple[str, int], ...]
+    results: tuple[tuple[str, int], ...]
+
+    def argument_codes(self, release: int) -> tuple[str, ...]:
+        """The fields of a request to that release."""
+        return tuple(code for code, since in self.arguments if since <= release)
+
+    def result_codes(self, release: int) -> tuple[str, ...]:
+        """The fields of a reply of that release."""
+        return tuple(code for code, since in self.results if since <= release)
+
+
+def _fields(text: str) -> tuple[tuple[str, int], ...]:
+    parts = (field.partition("@") for field in text.split() if field != "-")
+    return tuple((code, int(since or 0)) for code, _, since in parts)
+
+
+@cache
+def functions() -> Mapping[str, Function]:
+    """All that are known, by name."""
+    rows = {}
+    for line in Path(__file__).with_name("functions.txt").read_text(encoding="ascii").splitlines():
+        if line and not line.startswith("#"):
+            name, arguments, results = re.split(" {2,}", line)
+            rows[name] = Function(name, _fields(arguments), _fields(results))
+    return rows
+
+
+def function(name: str) -> Function:
+    """A function by its name.
+
+    Raises:
+        InvalidValue: there is none, or it is not known here.
+    """
+    if name not in functions():
+        raise InvalidValue(f"Nanonis has no function {name[:50]!r}")
+    return functions()[name]
+
+
+def request(name: str, arguments: Sequence[object], release: int = NEWEST) -> bytes:
+    """The bytes that ask for `name`; arguments that the release does not have are left out.
+
+    Raises:
+        InvalidValue: the arguments are not those of the function.
+    """
+    fields = function(name).arguments
+    if len(arguments) != len(fields):
+        raise InvalidValue(f"{name} takes {len(fields)} arguments, got {len(arguments)}")
+    body = b""
+    for (code, since), value in zip(fields, arguments, strict=True):
+        if since <= release:
+            try:
+                body += _WRITERS[code](value)
+            except (struct.error, OverflowError, TypeError, ValueError) as error:
+                raise InvalidValue(f"{name}: {value!r} can't be sent as {code}: {error}") from error
+    return _HEADER.pack(name.encode("ascii"), len(body), 1, 0) + body
+
+
+def body_bytes(header: bytes, asked: str) -> int:
+    """Return how many bytes follow the header of a reply to `asked`.
+
+    Raises:
+        BadReply: it is the reply to something else, or none at all.
+    """
+    raw_name, size, _, _ = _HEADER.unpack(header)
+    name = text_of(raw_name.split(b"\0", 1)[0])
+    if name != asked:
+        raise BadReply(f"Nanonis replied to {name!r} instead of {asked}")
+    if not 0 <= size <= LARGEST_BODY:
+        raise BadReply(f"Nanonis announced {size} bytes in reply to {asked}")
+    return int(size)
+
+
+def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[object, ...]:
+    """The results in the body of a reply.
+
+    After an error the results may be there or not: the specification does not say.
+
+    Raises:
+        NanonisError: Nanonis says that it could not.
+        BadReply: the body is not what the function replies.
+    """
+    try:
+        found, status, text = _parsed(body, function(name).result_codes(release))
+    except BadReply as whole:
+        try:
+            _, status, text = _parsed(body, ())
+        except BadReply:
+            status = 0
+        if status == 0:
+            hint = f"it was read as release {release} sends it" if _depends_on_release(name) else ""
+            raise BadReply(f"the reply to {name} is malformed: {whole.what}", hint=hint) from None
+    if status:
+        raise NanonisError(f"Nanonis: {text or 'no reason given'} (error {status})", where=name)
+    return found
+
+
+def text_of(raw: bytes | bytearray | memoryview) -> str:
+    """A text of Nanonis: UTF-8, or in what Windows writes in the west (a µ in a name, an umlaut in a path)."""
+    raw = bytes(raw)
+    try:
+        return raw.decode()
+    except UnicodeDecodeError:
+        return raw.decode("latin-1")
+
+
+def _depends_on_release(name: str) -> bool:
+    return any(since for _, since in function(name).results)
+
+
+def _parsed(body: bytes | bytearray, codes: Sequence[str]) -> tuple[tuple[object, ...], int, str]:
+    reader = _Reader(memoryview(body))
+    found = tuple(_READERS[code](reader) for code in codes)
+    status, text = reader.number("I"), reader.text()
+    if reader.left:
+        raise BadReply(f"it has {reader.left} bytes too many")
+    return found, int(status), text
+
+
+class _Reader:
+    """Takes one field after the other out of a body; what it takes is never more than there is."""
+
+    def __init__(self, body: memoryview) -> None:
+        self._body = body
+        self._at = 0
+
+    @property
+    def left(self) -> int:
+        return len(self._body) - self._at
+
+    def take(self, size: int) -> memoryview:
+        if not 0 <= size <= self.left:
+            raise BadReply(f"a field of {size} bytes where {self.left} are left")
+        self._at += size
+        return self._body[self._at - size : self._at]
+
+    def number(self, code: str) -> Any:
+        number = _NUMBERS[code]
+        return number.unpack(self.take(number.size))[0]
+
+    def text(self) -> str:
+        return text_of(self.take(self.number("i")))
+
+    def texts(self) -> list[str]:
+        self.number("i")  # their size in bytes, which peers reckon in different ways
+        return [self.text() for _ in range(self.count(4))]
+
+    def count(self, at_least_bytes: int) -> int:
+        """A number of elements that can be there."""
+        count = int(self.number("i"))
+        if not 0 <= count <= self.left // at_least_bytes:
+            raise BadReply(f"{count} elements in {self.left} bytes")
+        return count
+
+    def numbers(self, code: str) -> list[object]:
+        raw = self.take(4 * self.count(4))
+        return list(struct.unpack(f">{len(raw) // 4}{code}", raw))
+
+    def shape(self) -> tuple[int, int]:
+        rows, columns = self.number("i"), self.number("i")
+        if min(rows, columns) < 0 or rows * columns * 4 > self.left:
+            raise BadReply(f"{rows} x {columns} values in {self.left} bytes")
+        return rows, columns
+
+    def array(self) -> np.ndarray:
+        rows, columns = self.shape()
+        return np.frombuffer(self.take(4 * rows * columns), ">f4").reshape(rows, columns)
+
+    def text_array(self) -> list[list[str]]:
+        rows, columns = self.shape()
+        if rows > self.left:
+            raise BadReply(f"{rows} rows in {self.left} bytes")
+        return [[self.text() for _ in range(columns)] for _ in range(rows)]
+
+
+def _reader_of(code: str) -> Callable[[_Reader], object]:
+    return lambda reader: reader.number(code)
+
+
+_READERS: Final[Mapping[str, Callable[[_Reader], object]]] = {
+    **{code: _reader_of(code) for code in _NUMBERS},
+    "S": _Reader.text,
+    "A": _Reader.texts,
+    "[i]": lambda reader: reader.numbers("i"),
+    "[f]": lambda reader: reader.numbers("f"),
+    "2f": _Reader.array,
+    "2S": _Reader.text_array,
+}
+
+
+def _counted(code: str, values: Sequence[object]) -> bytes:
+    return struct.pack(f">i{len(values)}{code}", len(values), *values)
+
+
+def _text(value: str) -> bytes:
+    raw = value.encode()
+    return struct.pack(">i", len(raw)) + raw
+
+
+def _texts(values: Sequence[str]) -> bytes:
+    raw = b"".join(map(_text, values))
+    return struct.pack(">ii", len(raw), len(values)) + raw
+
+
+_WRITERS: Final[Mapping[str, Callable[[Any], bytes]]] = {
+    **{code: number.pack for code, number in _NUMBERS.items()},
+    "S": _text,
+    "A": _texts,
+    "[i]": lambda values: _counted("i", values),
+    "[f]": lambda values: _counted("f", values),
+}

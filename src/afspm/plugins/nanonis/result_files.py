@@ -1,0 +1,170 @@
+"""The results of measurements: Nanonis' file of it, or, where there is none, what it has in memory."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path, PureWindowsPath
+from typing import Final
+
+from afspm.basics.errors import AfspmError, FileError
+from afspm.plugins.nanonis import fetched
+from afspm.translator.driver import LOST
+from afspm.translator.result_files import (
+    SCAN,
+    Content,
+    Entry,
+    FilePrecision,
+    ResultFiles,
+    lines_missing,
+    newest,
+    read_result,
+)
+
+_PRECISION: Final = FilePrecision(part=2e-6, angle_rad=1e-3, positions=True)
+"""A file prints seven digits of a position, and degrees with three."""
+
+Fetch = Callable[[Entry], Content]
+
+
+class NanonisFiles(ResultFiles):
+    """The measurement that is running or has just ended, and the results.
+
+    Args:
+        session_dir: where the session folder of Nanonis' computer is seen from here; None: it is this computer.
+        own_folder: for what is fetched.
+        patience_s: how long a file may take before the data is fetched instead.
+    """
+
+    def __init__(
+        self,
+        kept: Entry,
+        session_dir: Path | None,
+        own_folder: Path,
+        patience_s: float,
+        log: logging.Logger,
+    ) -> None:
+        super().__init__(kept, log)
+        self._session_dir = session_dir
+        self._own_folder = own_folder
+        self._patience_s = patience_s
+        kept.setdefault("fetched", 0)
+
+    def begin(self, what: str, session: str, taken: Mapping[str, object]) -> None:
+        """A measurement begins.
+
+        Args:
+            session: Nanonis' session folder.
+            taken: "frame" of a scan, "position" of a spectrum.
+        """
+        folder = self._session_dir or Path(session)
+        newest_ns, _ = newest(_files(folder, what))
+        self._begins(what, {"seen": what != SCAN, "folder": str(folder), "newest_ns": newest_ns, **taken})
+
+    @property
+    def was_seen(self) -> bool:
+        """True if what is running was seen running: if not, what Nanonis has in memory is of the scan before."""
+        return self._kept["running"] is not None and bool(self._kept["running"].get("seen", True))
+
+    def seen(self) -> None:
+        """Note that what is running was seen running."""
+        if self._kept["running"] is not None:
+            self._kept["running"]["seen"] = True
+
+    def end(self, now_ns: int, now_s: float, told: str | None = None) -> None:
+        """It has ended, or more is known of its end.
+
+        Args:
+            told: where Nanonis says that it saved it; empty: it did not; None: it has not said.
+        """
+        running = self._kept["running"]
+        if running is not None:
+            patience_s = self._patience_s if Path(running["folder"]).is_dir() else 0.0
+            self._ends({"told": told, "end_ns": now_ns, "fetch_at_s": now_s + patience_s})
+        ended = self._kept["ended"]
+        if ended is not None and told is not None:
+            ended["told"] = told
+            if not told:
+                ended["fetch_at_s"] = now_s
+
+    def has_file(self) -> bool:
+        """Return True if a file of what is running has appeared."""
+        running = self._kept["running"]
+        return running is not None and self._file({**running, "told": None}) is not None
+
+    def next_s(self) -> float | None:
+        """Return when to look again at the latest."""
+        ended = self._kept["ended"]
+        return None if ended is None else float(ended["fetch_at_s"])
+
+    def results(self, now_s: float, fetch: Fetch) -> list[str]:
+        """Return the last results, oldest first.
+
+        Args:
+            fetch: gets from Nanonis what is in no file.
+        """
+        self.broken_off = False
+        ended = self._kept["ended"]
+        if ended is not None:
+            file = self._file(ended)
+            if file is not None and (content := self._whole(file, ended)) is not None:
+                self._take(file, ended, content)
+            elif now_s >= ended["fetch_at_s"]:
+                self._kept["ended"] = None
+                self._fetch(fetch, ended, file)
+        return self._listed()
+
+    def read(self, entry: Entry) -> Content:
+        return _content(Path(entry["result"]), entry)
+
+    def _fetch(self, fetch: Fetch, ended: Entry, file: Path | None) -> None:
+        missed = str(file or ended["told"] or f"in {ended['folder']}")
+        try:
+            if not ended.get("seen", True):
+                raise FileError("the controller never reported it as running")
+            content = fetch(ended)
+            if missing := lines_missing(content):
+                raise FileError(f"{missing} of its {content[0].values.shape[0]} lines were not scanned")
+        except LOST:
+            self._kept["ended"] = dict(ended)  # once it is found again
+            raise
+        except AfspmError as error:
+            self._log.error("the %s has no file (%s), and can't be fetched over TCP: %s", ended["what"], missed, error)
+            self.broken_off = True
+            return
+        if ended["told"] != "":
+            self._log.warning("the %s has no complete file (%s); it was fetched over TCP", ended["what"], missed)
+        self._kept["fetched"] += 1
+        path = self._own_folder / f"nanonis-{self._kept['fetched']:04d}.nc"
+        fetched.write(path, content, ended["end_ns"])
+        self._take(path, ended, _content(path, ended))
+
+    def _take(self, file: Path, ended: Entry, content: Content) -> None:
+        self._add(str(file), ended, {}, content)
+        self._kept["ended"] = None
+
+    def _whole(self, file: Path, ended: Entry) -> Content | None:
+        try:
+            content = _content(file, ended)
+        except (AfspmError, OSError):
+            return None  # not yet
+        return None if lines_missing(content) else content
+
+    def _file(self, ended: Entry) -> Path | None:
+        """Return the file of what has ended, if it is there."""
+        if ended["told"]:
+            # whatever the other computer calls its folder, the name is the same
+            folder = self._session_dir
+            path = Path(ended["told"]) if folder is None else folder / PureWindowsPath(ended["told"]).name
+            return newest([path] if path.is_file() else [], ended["newest_ns"])[1]
+        if ended["told"] == "":
+            return None
+        return newest(_files(Path(ended["folder"]), ended["what"]), ended["newest_ns"])[1]
+
+
+def _files(folder: Path, what: str) -> list[Path]:
+    return list(folder.glob("*.sxm" if what == SCAN else "*.dat")) if folder.is_dir() else []
+
+
+def _content(path: Path, entry: Entry) -> Content:
+    return [_PRECISION.as_set(one, entry) for one in read_result(path)]

@@ -1,0 +1,82 @@
+"""Nanonis scans (.sxm): a text header, then big-endian float32, for each channel forward and backward.
+
+Rows come as they were recorded (upwards: the lowest first), backward rows from right to left; SCAN_OFFSET is the
+centre, SCAN_ANGLE clockwise in degrees, SCAN_RANGE that of whole pixels; REC_DATE and REC_TIME are of the start.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from datetime import tzinfo
+from pathlib import Path
+
+import numpy as np
+
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.errors import FileError
+from afspm.model import Region, Scan
+from afspm.storage.formats.content import FileContent, local_ns
+
+CONTROLLER = "Nanonis"
+_END = b":SCANIT_END:"
+_DATA = b"\x1a\x04"
+_DIRECTIONS = {"both": ("Forward", "Backward"), "forward": ("Forward",), "backward": ("Backward",)}
+
+
+def read_scan(path: Path, zone: tzinfo | None) -> FileContent:
+    """All channels, named e.g. "Z Forward" and "Z Backward". Raises FileError and ValueError: broken."""
+    head, found, rest = path.read_bytes().partition(_END)
+    start = rest.find(_DATA)
+    if not found or start < 0:
+        raise FileError("is not a Nanonis scan, or incomplete: its header does not end")
+    header = _header(head.decode("latin-1"))
+    if _field(header, "SCANIT_TYPE").split() != ["FLOAT", "MSBFIRST"]:
+        raise FileError(f"holds values as {_field(header, 'SCANIT_TYPE')!r} instead of FLOAT MSBFIRST")
+    nx, ny = (int(value) for value in _field(header, "SCAN_PIXELS").split())
+    images = _images(_field(header, "DATA_INFO"))
+    values, size = rest[start + len(_DATA) :], 4 * len(images) * nx * ny
+    if min(nx, ny) < 2 or len(values) != size:
+        raise FileError(f"is incomplete: {len(values)} bytes of values, not the {size} of {len(images)} images")
+    direction = _field(header, "SCAN_DIR")
+    if direction not in ("up", "down"):
+        raise FileError(f"was scanned {direction!r}, neither up nor down")
+    begun, end = _times(header, zone)
+    region, upwards = _region(header, nx, ny), direction == "up"
+    stack = np.frombuffer(values, ">f4").reshape(len(images), ny, nx)
+    scans = []
+    for (name, way, unit), image in zip(images, stack, strict=True):
+        rows = image if upwards else image[::-1]
+        pixels = rows[:, ::-1] if way == "Backward" else rows
+        scans.append(Scan(region, f"{name} {way}", unit, pixels.astype(np.float64), end, str(path)))
+    return FileContent(CONTROLLER, tuple(scans), header=header, start_ns=begun, end_ns=end, upwards=upwards)
+
+
+def _header(text: str) -> dict[str, str]:
+    """Fields `:NAME:` with what stands below each."""
+    found = re.findall(r"^:([^\r\n]+):\r?\n(.*?)(?=^:[^\r\n]+:\r?$|\Z)", text, re.MULTILINE | re.DOTALL)
+    return {name: value.strip() for name, value in found}
+
+
+def _field(header: dict[str, str], name: str) -> str:
+    if name not in header:
+        raise FileError(f"its header lacks {name}")
+    return header[name]
+
+
+def _images(table: str) -> list[tuple[str, str, str]]:
+    """Name, way and unit of each image, in their order."""
+    rows = [[column.strip() for column in line.strip().split("\t")] for line in table.splitlines() if line.strip()]
+    return [(name, way, unit) for _, name, unit, ways, *_ in rows[1:] for way in _DIRECTIONS[ways]]
+
+
+def _region(header: dict[str, str], nx: int, ny: int) -> Region:
+    width, height = (float(value) for value in _field(header, "SCAN_RANGE").split())
+    x, y = (float(value) for value in _field(header, "SCAN_OFFSET").split())
+    clockwise_deg = float(_field(header, "SCAN_ANGLE"))
+    return Region((x, y), (width * (nx - 1) / nx, height * (ny - 1) / ny), math.radians(0.0 - clockwise_deg))
+
+
+def _times(header: dict[str, str], zone: tzinfo | None) -> tuple[int, int]:
+    begun = local_ns(f"{_field(header, 'REC_DATE')} {_field(header, 'REC_TIME')}", "%d.%m.%Y %H:%M:%S", zone)
+    return begun, begun + round(float(_field(header, "ACQ_TIME")) * NS_PER_S)

@@ -1,0 +1,57 @@
+"""Nanonis spectra (.dat): lines `name<tab>value`, then `[DATA]` and a table, its columns named with their units."""
+
+from __future__ import annotations
+
+import math
+from datetime import tzinfo
+from pathlib import Path
+
+import numpy as np
+
+from afspm.basics.errors import FileError
+from afspm.model import Spectrum
+from afspm.plugins.nanonis.scan_files import CONTROLLER
+from afspm.storage.formats.content import FileContent, OtherFormat, local_ns, name_and_unit
+
+_TABLE = "[DATA]"
+_LAYOUT = "%d.%m.%Y %H:%M:%S"
+
+
+def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
+    """The curve with all its sweeps, each a column; `kind` is Nanonis' own, e.g. "bias spectroscopy".
+
+    A file that was cut off between two lines can't be told from a shorter one.
+
+    Raises:
+        FileError, ValueError: no spectrum, or broken.
+    """
+    text = path.read_bytes().decode("latin-1").replace("\r\n", "\n")
+    head, found, table = text.partition(f"\n{_TABLE}\n")
+    header = {key: rest.strip() for key, _, rest in (line.partition("\t") for line in head.split("\n")) if key}
+    if not found or "Experiment" not in header:
+        raise OtherFormat("is not a spectrum of Nanonis, or incomplete: it has no [DATA]")
+    if not table.endswith("\n"):
+        raise FileError("is incomplete: its last line is cut off")
+    columns, *lines = [line.split("\t") for line in table.splitlines() if line.strip()]
+    for number, line in enumerate(lines, 1):
+        if len(line) != len(columns):
+            raise FileError(f"row {number} of its table has {len(line)} columns instead of {len(columns)}")
+    if not lines:
+        raise FileError("is incomplete: its table is empty")
+    names, units = zip(*map(name_and_unit, columns), strict=True)
+    values = np.array([[float(cell) for cell in line] for line in lines])
+    end = _time(header, ("Saved Date", "Date"), zone)
+    spectrum = Spectrum(_position_m(header), header["Experiment"], names, units, values, end, str(path))
+    start = _time(header, ("Start time",), zone)
+    return FileContent(CONTROLLER, spectra=(spectrum,), header=header, start_ns=start, end_ns=end)
+
+
+def _position_m(header: dict[str, str]) -> tuple[float, float] | None:
+    """Where the tip was; None if that is not said, or is no place."""
+    x, y = (float(header.get(f"{axis} (m)", "nan")) for axis in "XY")
+    return (x, y) if math.isfinite(x) and math.isfinite(y) else None
+
+
+def _time(header: dict[str, str], keys: tuple[str, ...], zone: tzinfo | None) -> int | None:
+    text = next((header[key] for key in keys if header.get(key)), None)
+    return None if text is None else local_ns(text, _LAYOUT, zone)

@@ -1,0 +1,216 @@
+"""Nanosurf, over the scripting interface of Nanosurf Studio. See the README beside this."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from afspm.basics.errors import ConfigError, Refused
+from afspm.basics.plain_data import PlainMapping
+from afspm.basics.units import Duration, PollPeriod
+from afspm.model import ControlResponse, Region, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.plugins.nanosurf import commands, lines
+from afspm.plugins.nanosurf.activity import FORCE, NanosurfFiles, StudioActivity
+from afspm.plugins.nanosurf.link import Link, StudioError
+from afspm.plugins.nanosurf.session import Session
+from afspm.plugins.nanosurf.settings import DIRECTION, UNITS, FrameSettings, Slopes, TipPlace, direction
+from afspm.translator.driver import ControllerLost, Driver, action
+from afspm.translator.parameters import Value
+from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
+
+_AT_FIRST: Final[dict[str, Value]] = {names.SCAN_DIRECTION: names.UP, names.SPEC_KIND: FORCE}
+_STORAGE: Final = "data.storage"
+_ONE_FRAME: Final = 1
+_NEW_FILE: Final = 1
+
+
+class Nanosurf(Driver):
+    """The microscope behind Nanosurf Studio.
+
+    Args:
+        address: "host:port" of its scripting interface.
+        release: of Studio (Help > About): 17 or later. A command that it does not have is not called.
+        session: name of the measurement session, such as "91-21-004"; left out: the only one that is open.
+        gallery_dir: where Studio's gallery folder is seen from here; left out: Studio runs on this computer.
+        image_buffer: number of the low-level buffer that has the running scan, for its lines; left out: none is read.
+        reply_timeout_s: how long a reply may take, in real time.
+        poll_period_s, common: as for every microscope.
+    """
+
+    parameters_file = Path(__file__).with_name("parameters.toml")
+    translated = (*FrameSettings.names, *Slopes.names, *POSITION, *_AT_FIRST, names.CONTROLLER)
+    maker: ClassVar[str] = "Nanosurf"
+    software: ClassVar[str] = "Nanosurf Studio"
+    max_pixels: ClassVar[int] = 8192 * 8192
+    program_s: ClassVar[float] = 2.0
+
+    def __init__(
+        self,
+        *,
+        address: str = "127.0.0.1:33030",
+        release: int = 19,
+        session: str = "",
+        gallery_dir: str | None = None,
+        image_buffer: int | None = None,
+        reply_timeout_s: Duration = 5.0,
+        poll_period_s: PollPeriod = 0.25,
+        **common: Any,
+    ) -> None:
+        super().__init__(poll_period_s=poll_period_s, **common)
+        self.controller_at = address
+        self._level = max(commands.level(release), 0 if image_buffer is None else lines.LEVEL)
+        self._release, self._session_name = release, session
+        self._gallery_dir, self._image_buffer = gallery_dir, image_buffer
+        self._reply_timeout_s = reply_timeout_s
+        self._session: Session | None = None
+        self._activity: StudioActivity | None = None
+        self._kept = KeptSettings(_AT_FIRST)
+        self._place = TipPlace(self._studio)
+        self.groups = (self._kept, FrameSettings(self._studio), Slopes(self._studio), self._place)
+
+    @classmethod
+    def technique(cls, settings: PlainMapping) -> str:
+        return "AFM"
+
+    def connect(self) -> None:
+        self.close()
+        session = self._session = Session(self._open_link, self._release, self._session_name, self._level)
+        self.prove()
+        self._check_table(session)
+        self._kept.kept_in(self.memory)
+        self._files = NanosurfFiles(self.memory, self.log)
+        self._activity = StudioActivity(
+            session, self._files, self._place, self._folder, self._frame_in_force, self.clock, self.log
+        )
+        self._save_files(session)
+
+    def close(self) -> None:
+        if self._activity is not None:
+            self._activity.close()
+            self._activity = None
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    def status(self) -> ScopeStatus:
+        return self._doing.status()
+
+    def get(self, vendor: str) -> Value:
+        return self._studio().values([vendor])[vendor] if vendor != names.CONTROLLER else self._studio().controller
+
+    def set(self, values: Mapping[str, Value]) -> None:
+        self._studio().put(values)
+
+    def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
+        """Return values of the table, all by one question."""
+        rows = [self.table[name] for name in wanted if name != names.CONTROLLER]
+        values = self._studio().values([row.vendor for row in rows]) if rows else {}
+        found = {row.name: row.from_vendor(values[row.vendor]) for row in rows}
+        return found | super().read_rows([name for name in wanted if name not in found])
+
+    def results(self) -> Sequence[str]:
+        return self._files.results(self.clock.now_ns())
+
+    def load(self, result: str) -> Sequence[Scan | Spectrum]:
+        return self._files.load(result)
+
+    def lines(self, start: int) -> Sequence[ScanLines]:
+        """From the buffer `image_buffer`."""
+        if self._image_buffer is None:
+            return ()
+        region, shape = frame(self.in_force(FRAME))
+        upwards = self._studio().values([DIRECTION])[DIRECTION] != direction(names.DOWN)
+        return lines.new_lines(self._studio(), self._image_buffer, region, shape, start, upwards=upwards)
+
+    # --- actions ---
+
+    @action(names.START_SCAN)
+    def start_scan(self) -> None:
+        """Scan the frame once, in the direction of `x-scan-direction`."""
+        wanted = direction(str(self._kept[names.SCAN_DIRECTION]))
+        self._studio().put({DIRECTION: wanted, "imaging.scan_mode": _ONE_FRAME})
+        self._doing.start_scan()
+
+    @action(names.STOP_SCAN)
+    def stop_scan(self) -> None:
+        self._studio().do(commands.STOP)
+        self._doing.stopped()
+
+    @action(names.START_SPEC)
+    def start_spec(self) -> None:
+        """Take a force curve where the tip was sent, by the cycle that is selected in Studio."""
+        self._doing.start_curve()
+
+    @action(names.STOP_SPEC)
+    def stop_spec(self) -> None:
+        self._studio().do(commands.STOP_CURVE)
+        self._doing.stopped()
+
+    @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
+    def retract(self) -> None:
+        """Withdraw the tip, whatever is going on."""
+        self._doing.withdraw()
+
+    @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
+    def engage(self) -> None:
+        """Bring the tip to the sample, by the approach that is selected in Studio."""
+        self._doing.approach()
+
+    def command(self, text: str) -> None:
+        """Run a script, e.g. `root.workflow.approach.stop_approach()`."""
+        try:
+            self._studio().run(text)
+        except StudioError as error:
+            raise Refused(ControlResponse.ACTION_ERROR, f"Studio: {error}") from error
+
+    # --- inside ---
+
+    def _open_link(self) -> Link:
+        return Link(self.controller_at, self._reply_timeout_s, self.clock.monotonic_s)
+
+    def _studio(self) -> Session:
+        if self._session is None:
+            raise ControllerLost("Studio is not connected", where=self.controller_at)
+        return self._session
+
+    @property
+    def _doing(self) -> StudioActivity:
+        if self._activity is None:
+            raise ControllerLost("Studio is not connected", where=self.controller_at)
+        return self._activity
+
+    def _frame_in_force(self) -> Region:
+        return frame(self.in_force(FRAME))[0]
+
+    def _folder(self) -> Path:
+        """The folder of Studio's files, as seen from here."""
+        path = f"{_STORAGE}.gallery_directory"
+        return Path(self._gallery_dir or str(self._studio().values([path])[path]))
+
+    def _save_files(self, session: Session) -> None:
+        """Have every measurement saved to a file of its own. Raises ConfigError: its folder can't be seen."""
+        wanted: dict[str, Value] = {
+            f"{_STORAGE}.nhf_backend_enabled": True,
+            f"{_STORAGE}.nhf_auto_store_mode": _NEW_FILE,
+        }
+        if session.values(list(wanted)) != wanted:
+            self.log.warning("Studio did not save each measurement to a new .nhf file; it does from now on")
+            session.put(wanted)
+        folder = self._folder()
+        if not folder.is_dir():
+            told = f"Studio's gallery {folder} does not exist on this computer"
+            raise ConfigError(told, where="gallery_dir", hint='gallery_dir = "/where/it/is/mounted"')
+
+    def _check_table(self, session: Session) -> None:
+        """Check that Studio has what the table names, and counts as it says. Raises ConfigError."""
+        rows = {row.vendor: row for row in self.table.values() if "." in row.vendor}
+        for path in session.missing(rows):
+            raise ConfigError(f"Studio has no {path}", where=rows[path].name, hint="a path below root.workflow")
+        expected = {**UNITS, **{path: (row.unit,) for path, row in rows.items() if row.type == "float"}}
+        for path, unit in session.units(expected).items():
+            if unit not in expected[path]:
+                told = f"Studio has {path} in {unit or 'no unit'}, not in {expected[path][0] or 'none'}"
+                name = rows[path].name if path in rows else ""
+                hint = f'[microscope.parameters.{name}] unit = "{unit}", with a range' if name else "report it"
+                raise ConfigError(told, where=name or path, hint=hint)

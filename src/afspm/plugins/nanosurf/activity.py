@@ -1,0 +1,137 @@
+"""The state of Studio, and what is awaited of it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import ClassVar, Final
+
+from afspm.basics.clock import Clock
+from afspm.basics.errors import AfspmError, Refused
+from afspm.model import Region, ScopeState, ScopeStatus
+from afspm.plugins.nanosurf import commands
+from afspm.plugins.nanosurf.link import StudioError
+from afspm.plugins.nanosurf.session import Session
+from afspm.plugins.nanosurf.settings import TipPlace
+from afspm.translator.activity import Activity
+from afspm.translator.driver import ControllerLost
+from afspm.translator.folder_files import FolderFiles
+from afspm.translator.long_call import LongCall
+from afspm.translator.result_files import SCAN, FilePrecision, as_list
+
+FORCE: Final = "force"
+
+
+class NanosurfFiles(FolderFiles):
+    """Studio's files: one for each measurement."""
+
+    pattern = "*.nhf"
+    precision = FilePrecision(part=1e-9, angle_rad=1e-9)
+
+
+class StudioActivity(Activity):
+    """The measurement or move that runs, begun by a request or at Studio's panel.
+
+    Args:
+        folder: gives the folder of Studio's files as seen from here.
+        frame_in_force: as it was set.
+    """
+
+    program: ClassVar[str] = "Studio"
+    settles_s: ClassVar[float] = 2.0
+    call_failures: ClassVar[tuple[type[AfspmError], ...]] = (StudioError,)
+
+    def __init__(
+        self,
+        session: Session,
+        files: NanosurfFiles,
+        place: TipPlace,
+        folder: Callable[[], Path],
+        frame_in_force: Callable[[], Region],
+        clock: Clock,
+        log: logging.Logger,
+    ) -> None:
+        super().__init__(files, clock, log)
+        self._session, self._files, self._place = session, files, place
+        self._folder, self._frame_in_force = folder, frame_in_force
+
+    def status(self) -> ScopeStatus:
+        """Return what it is doing now; what has ended is awaited from here on."""
+        scanning = self._session.scanning().running
+        call = self._running_call()
+        curve = call is not None and call.what == FORCE
+        if self._stopping and curve:
+            with suppress(Refused):
+                self._session.do(commands.STOP_CURVE)  # the first may have overtaken the start: see `Session.begin`
+        self.follow(SCAN if scanning else FORCE if curve else "")
+        if scanning:
+            return ScopeStatus(ScopeState.SCANNING)
+        if call is not None:
+            return ScopeStatus(ScopeState.SPEC if curve else ScopeState.COARSE_MOTOR)
+        arrived = self._place.arrived()
+        if self.curve_awaited:
+            if arrived:
+                self.curve_awaited = ""
+                self._take_curve()
+            return ScopeStatus(ScopeState.SPEC)
+        return self.at_rest() if arrived else ScopeStatus(ScopeState.MOVING)
+
+    def begin(self, what: str) -> None:
+        place = {"frame": as_list(self._frame_in_force())} if what == SCAN else {"position": list(self._place.xy_m())}
+        self._files.begin(what, self._folder(), place)
+
+    def end(self) -> None:
+        self._files.end(self._clock.now_ns())
+
+    def start_scan(self) -> None:
+        """Scan the frame. Raises Refused: Studio does not."""
+        before = self._session.scanning().started
+
+        def is_seen() -> bool:
+            seen = self._session.scanning()
+            return seen.running or seen.started > before or self._files.has_file()
+
+        self.started(SCAN, lambda: self._session.do(commands.START), is_seen)
+
+    def start_curve(self) -> None:
+        """Take a force curve where the tip was sent: after a scan, it goes there first. Raises Refused."""
+        self._stopping = False
+        self._place.go()
+        self.curve_awaited = FORCE
+
+    def _take_curve(self) -> None:
+        """Take one curve where the tip is: Studio takes those of its grid, wherever that is on the panel."""
+        try:
+            self._session.put(dict(zip(commands.GRID, (*self._place.xy_m(), 1, 1), strict=True)))
+        except Refused as refused:
+            self._log.error("no curve was taken: %s", refused)
+            self._failed = True
+            return
+        self.begin(FORCE)
+        self.watch(self._session.begin(FORCE, commands.TAKE_CURVE))
+
+    def approach(self) -> None:
+        """Bring the tip to the sample."""
+        self.watch(self._session.begin("approach", commands.APPROACH))
+
+    def withdraw(self) -> None:
+        """Take the tip away, whatever is going on."""
+        self.stopped()
+        self.close()
+        try:
+            self.call = self._session.begin("withdrawal", commands.WITHDRAW, commands.STOP_ALL)
+        except ControllerLost as lost:
+            self._log.warning("there is no further connection (%s): the tip is withdrawn by the first", lost)
+            self._session.run(f"{commands.STOP_ALL} {commands.WORKFLOW}.{commands.WITHDRAW}() return 0")
+
+    def _running_call(self) -> LongCall | None:
+        """Return what takes long while it does; its last words are logged. Raises ControllerLost."""
+        call = self.call
+        if (running := self.watched_call()) is not None or call is None:
+            return running
+        message = call.value[0].get("message") if call.value and isinstance(call.value[0], dict) else None
+        if message:
+            self._log.info("the %s has ended: %s", call.what, message)
+        return None

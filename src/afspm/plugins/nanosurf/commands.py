@@ -1,0 +1,107 @@
+"""The commands of Nanosurf Studio that the driver uses, and in which releases they are.
+
+From the tree that nanosurf-core 2.0.7 (MIT) has of Studio. What is marked with (!) in the README is not known.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from afspm.basics.errors import ConfigError
+
+FIRST_RELEASE: Final = 17
+_WITHOUT_OLD: Final = 19
+"""Release from which the commands of before 17 are gone."""
+
+WORKFLOW: Final = "root.workflow"
+START, STOP = "imaging.start", "imaging.stop"
+IS_SCANNING: Final = "imaging.is_scanning"
+STARTED, FINISHED = "imaging.scanning_started", "imaging.scanning_finished"
+APPROACH, WITHDRAW = "approach.approach", "approach.withdraw"
+TAKE_CURVE, STOP_CURVE = "spectroscopy.acquire", "spectroscopy.stop"
+MOVE: Final = "scanner.move_to_target_offsets"
+GRID: Final = tuple(f"spectroscopy.grid_{name}" for name in ("center_offset_x", "center_offset_y", "columns", "rows"))
+"""Of the curves that are taken: where its centre is, and how many there are."""
+
+_ALWAYS: Final = (START, STOP, APPROACH, WITHDRAW, TAKE_CURVE, STOP_CURVE, MOVE, *GRID)
+_SIGNALS: Final = (f"{STARTED}.connect", f"{STARTED}.empty", f"{FINISHED}.connect")
+
+WATCH: Final = f"""
+if not afspm_seen then
+  afspm_seen = {{scanning = false, started = 0}}
+  {WORKFLOW}.{STARTED}.connect(function()
+    afspm_seen.scanning = true
+    afspm_seen.started = afspm_seen.started + 1
+  end)
+  {WORKFLOW}.{FINISHED}.connect(function() afspm_seen.scanning = false end)
+end
+return {WORKFLOW}.{STARTED}.empty()
+"""
+"""Has Studio note when scans begin and end; it returns whether it has not taken notice."""
+
+MISSING: Final = """
+local missing = {}
+for _, path in ipairs({%s}) do
+  local node = root.workflow
+  for name in path:gmatch("[^.]+") do node = type(node) == "table" and node[name] or nil end
+  if node == nil then missing[#missing + 1] = path end
+end
+return missing
+"""
+"""Returns those of a list of paths that the tree does not have."""
+
+
+UNITS: Final = """
+local units = {}
+for i, path in ipairs({%s}) do
+  local node = root.workflow
+  for name in path:gmatch("[^.]+") do node = type(node) == "table" and node[name] or nil end
+  units[i] = node ~= nil and node.unit_get ~= nil and node.unit_get() or ""
+end
+return units
+"""
+"""Returns the units of a list of paths."""
+
+PUT_ALL: Final = """
+local done = {}
+local function put(node, field, value)
+  local before = node[field .. "_get"]()
+  node[field .. "_set"](value)
+  table.insert(done, 1, function() node[field .. "_set"](before) end)
+end
+local fine, problem = pcall(function() %s end)
+if not fine then
+  for _, back in ipairs(done) do pcall(back) end
+  error(problem, 0)
+end
+return 0
+"""
+"""Sets values; if Studio refuses one, puts back those that were set."""
+
+STOP_ALL: Final = f"""
+local imaging, spectroscopy, approach = {WORKFLOW}.imaging, {WORKFLOW}.spectroscopy, {WORKFLOW}.approach
+pcall(imaging.stop) pcall(spectroscopy.stop) pcall(approach.stop_approach)
+"""
+"""Stops what is going on, as far as that can be stopped."""
+
+
+def has_old_commands(release: int) -> bool:
+    """Return whether a release has the commands of before 17, too.
+
+    Raises:
+        ConfigError: it is older than 17.
+    """
+    if release < FIRST_RELEASE:
+        hint = f"{FIRST_RELEASE} or later"
+        raise ConfigError(f"afspm does not speak to Nanosurf Studio {release}", where="release", hint=hint)
+    return release < _WITHOUT_OLD
+
+
+def used(release: int) -> tuple[str, ...]:
+    """Return the paths of all commands that are used with a release."""
+    return (*_ALWAYS, *((IS_SCANNING,) if has_old_commands(release) else _SIGNALS))
+
+
+def level(release: int) -> int:
+    """Return the level of the session that is needed: the old commands are in the highest alone (!)."""
+    return 5 if has_old_commands(release) else 1

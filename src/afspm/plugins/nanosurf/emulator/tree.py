@@ -1,0 +1,352 @@
+"""The tree of commands, as Lua sees it: `root` of the application and `root` of a measurement session."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path, PureWindowsPath
+from typing import Any, Final
+
+from afspm.basics.plain_data import Plain, PlainMapping
+from afspm.plugins.nanosurf.emulator.studio import CYCLES, MODES, PANEL, PROCEDURES_S, SETPOINT, StudioProgram
+from afspm.plugins.nanosurf.emulator.workspace import MeasurementQueue, Workspace
+from afspm.simulation.emulation.scripted import ScriptFailed
+
+SESSION: Final = "91-01-000"
+"""The name of a simulated controller in the maker's client."""
+LAST_WITH_OLD_COMMANDS: Final = 18
+ALL_LEVELS: Final = 5
+_INT32: Final = 2**31 - 1
+_FIELDS: Final = ("unit", "units", "min", "max")
+"""Of a property, besides its value."""
+_SYNCHRONIZED: Final = 3
+_MEMORY: Final = 64 << 20
+"""Of all scripts together, in bytes."""
+_ROOM: Final = 16 << 20
+"""Scripts may keep so much of it after their end."""
+_WRAPPER: Final = Path(__file__).with_name("wrapper.py.in")
+
+Nested = Plain
+
+
+class CommandTree:
+    """Both trees, in one Lua, and the scripts that run in them.
+
+    Args:
+        level_chosen: called with a level when a client selects the session, None for the application.
+        release: of Studio: 19 has no `is_scanning` any more.
+        image_buffer: number of the low-level buffer with the running scan.
+    """
+
+    def __init__(
+        self,
+        program: StudioProgram,
+        release: int,
+        image_buffer: int,
+        level_chosen: Callable[[int | None], None],
+        log: logging.Logger,
+    ) -> None:
+        self._program, self._release, self._image_buffer = program, release, image_buffer
+        self._level_chosen, self._log = level_chosen, log
+        self._workspace = Workspace(program)
+        self._queue = MeasurementQueue(program, self._workspace)
+        program.on_signal = self._signalled
+        self._open()
+
+    def _open(self) -> None:
+        """Make a Lua with both trees, without anything that scripts have kept in the one before."""
+        from lupa import lua54
+
+        self._lua = lua54.LuaRuntime(
+            register_eval=False, register_builtins=False, unpack_returned_tuples=True, max_memory=_MEMORY
+        )
+        self._prelude = self._lua.execute(Path(__file__).with_name("prelude.lua").read_text(encoding="utf-8"))
+        self._signals = {name: self._prelude.signal() for name in ("scanning_started", "scanning_finished")}
+        shared = self._shared()
+        self._roots: dict[int | None, object] = {None: self._prelude.environment(self._table(shared))}
+        workflow = self._workflow()
+        for level in range(1, ALL_LEVELS + 1):
+            self._roots[level] = self._prelude.environment(self._table({**shared, **self._session(workflow, level)}))
+
+    def start(self, script: str, level: int | None) -> tuple[object, str | None]:
+        """Return a script that is ready to run, or the reply that it can't be. Raises ScriptFailed."""
+        with self._bounded():
+            started = self._prelude.start(script, self._roots[level])
+        return started if isinstance(started, tuple) else ((self._prelude, started), None)
+
+    def step(self, script: Any) -> str | None:
+        """Run a script on; return its reply, or None while it waits for the instrument. Raises ScriptFailed."""
+        prelude, started = script
+        if prelude is not self._prelude:
+            raise ScriptFailed("another script has used up the memory, which ended all")
+        with self._bounded():
+            reply: str | None = prelude.step(started)
+        return reply
+
+    @contextmanager
+    def _bounded(self) -> Iterator[None]:
+        """Bound the memory of a script; make a new Lua if scripts have kept too much of it. Raises ScriptFailed."""
+        from lupa import lua54
+
+        try:
+            yield
+        except lua54.LuaMemoryError as error:
+            raise ScriptFailed("not enough memory") from error
+        finally:
+            if self._lua.get_memory_used() > _ROOM:
+                self._prelude.collect()
+                if self._lua.get_memory_used() > _ROOM:
+                    self._log.warning("scripts have used up the memory: what they kept is gone")
+                    self._open()
+
+    # -- inside
+
+    def _signalled(self, name: str) -> None:
+        try:
+            with self._bounded():
+                self._signals[name].call()
+        except ScriptFailed as error:
+            self._log.warning("the handlers of %s were not called: %s", name, error)
+
+    def _function(self, call: Callable[..., object]) -> object:
+        return self._prelude.as_function(call)
+
+    def _table(self, nested: PlainMapping) -> object:
+        """A Lua table of a nested dictionary; Python's functions become Lua's."""
+        return self._lua.table_from({name: self._in_lua(inner) for name, inner in nested.items()})
+
+    def _in_lua(self, inner: Any) -> object:
+        if isinstance(inner, dict):
+            return self._table(inner)
+        return self._function(inner) if _is_python(inner) else inner
+
+    def _shared(self) -> Nested:
+        version = {"major": lambda: self._release, "minor": lambda: 0, "name": lambda: "Nanosurf Studio SIMULATED"}
+        session = {
+            "list": lambda: self._lua.table_from([SESSION]),
+            "select": self._select,
+            "select_main": lambda *_: self._level_chosen(None),
+        }
+        python = {"create_python_wrapper": self._write_wrapper}
+        return {
+            "session": session,
+            "version": {**version, "full": lambda: f"{self._release}.0.0"},
+            "scripting": {"wrapper": {"python": python}},
+            "util": {"fill_environments": lambda: None},
+        }
+
+    def _select(self, session: str, level: float = 1) -> None:
+        if session != SESSION or not 1 <= level <= ALL_LEVELS:
+            raise ScriptFailed(f"there is no session {session!r} with level {level}")
+        self._level_chosen(int(level))
+
+    def _session(self, workflow: Nested, level: int) -> Nested:
+        """What a licence of a level adds to the application's own commands."""
+        imaging = workflow["imaging"]
+        if level == ALL_LEVELS and self._release <= LAST_WITH_OLD_COMMANDS:
+            imaging = {**imaging, "is_scanning": lambda: self._program.scanning}
+        found: Nested = {"workflow": {**workflow, "imaging": imaging}}
+        if level > 1:
+            found["core"] = {"acquisition": self._buffers()}
+        return found
+
+    def _workflow(self) -> Nested:
+        workflow: Nested = {}
+        for path in PANEL:
+            *parents, name = path.split(".")
+            node = workflow
+            for parent in parents:
+                node = node.setdefault(parent, {})
+            node[name] = self._property(path)
+        program = self._program
+        busy = program.rig.busy
+        workflow["imaging"] |= {
+            **self._signals,
+            "start": lambda: program.start_scan(self._now_s),
+            "stop": lambda: program.stop_scan(self._now_s),
+            "pause": lambda: program.pause(self._now_s),
+            "resume": lambda: program.resume(self._now_s),
+            "acquire": self._blocking(lambda: program.start_scan(self._now_s), lambda: program.scanning),
+        }
+        workflow["approach"] |= {
+            "approach": self._blocking(program.engage, lambda: program.engages or busy(self._now_s)),
+            "approach_async": program.engage,
+            "withdraw": self._blocking(lambda: program.withdraw(self._now_s), lambda: busy(self._now_s)),
+            "stop_approach": program.stop_engaging,
+        }
+        workflow["spectroscopy"] |= {
+            "start": lambda: program.start_curves(self._now_s),
+            "stop": program.stop_curve,
+            "acquire": self._blocking(lambda: program.start_curves(self._now_s), lambda: program.measuring_curve),
+            "select_cycle": program.select_cycle,
+            "select_cycle_by_id": program.select_cycle,
+            "cycle_count": lambda: len(CYCLES),
+            "cycle_id": lambda number: dict(enumerate(CYCLES)).get(number),
+        }
+        workflow["scanner"]["move_to_target_offsets"] = program.move
+        workflow["mode"]["current_mode_name"] = lambda: program.values["mode.name"]
+        for mode, commands in MODES.items():
+            workflow["mode"][mode] = {command: lambda mode=mode: program.load_mode(mode) for command in commands}
+        for path in PROCEDURES_S:
+            *parents, name = path.split(".")
+            node = workflow
+            for parent in parents:
+                node = node.setdefault(parent, {})
+            node[name] = self._procedure(path)
+        workflow["probe"]["cantilever_calibration"]["apply"] = program.apply_calibration
+        workflow["workspace"] = self._workspace_commands()
+        workflow["automation"] |= self._automation_commands()
+        return workflow
+
+    def _procedure(self, path: str) -> object:
+        program = self._program
+        return self._blocking(partial(program.begin_procedure, path), lambda: program.rig.doing(self._now_s) == path)
+
+    def _workspace_commands(self) -> Nested:
+        """The commands of the workspace; (!) the names in what `get_item_…` returns are not known."""
+        items = self._workspace
+
+        def getter(**names: str) -> Callable[[str], object]:
+            def get(item_id: str) -> object:
+                return self._lua.table_from({name: getattr(items[item_id], of) for name, of in names.items()})
+
+            return get
+
+        return {
+            **{f"add_{kind}": partial(items.add, kind) for kind in ("frame", "grid", "point")},
+            "item_id_by_name": items.id_of,
+            "item_count": lambda: len(items.ids()),
+            "item_exists": lambda item_id: item_id in items.ids(),
+            "all_item_ids": lambda: self._lua.table_from(items.ids()),
+            "delete_item": items.delete,
+            "clear": items.clear,
+            "save_to_file": items.save,
+            "load_from_file": items.load,
+            "get_item_name": lambda item_id: items[item_id].name,
+            "get_item_position": getter(x="x_m", y="y_m"),
+            "get_item_size": getter(width="width_m", height="height_m"),
+            "get_item_resolution": getter(columns="columns", rows="rows"),
+            "get_item_rotation": lambda item_id: items[item_id].rotation_deg,
+            "set_item_name": lambda item_id, name: items.change(item_id, name=str(name)),
+            "set_item_position": lambda item_id, x, y: items.change(item_id, x_m=float(x), y_m=float(y)),
+            "set_item_size": lambda item_id, width, height: items.change(
+                item_id, width_m=float(width), height_m=float(height)
+            ),
+            "set_item_resolution": lambda item_id, columns, rows: items.change(
+                item_id, columns=int(columns), rows=int(rows)
+            ),
+            "set_item_rotation": lambda item_id, angle: items.change(item_id, rotation_deg=float(angle)),
+        }
+
+    def _automation_commands(self) -> Nested:
+        queue = self._queue
+
+        def ids(given: Any) -> list[str]:
+            return [given] if isinstance(given, str) else list(given.values())
+
+        def processing(begin: Callable[..., None]) -> object:
+            return self._blocking(begin, lambda: queue.running, lambda: queue.message)
+
+        return {
+            "add_to_queue": lambda given, repetitions=1: queue.add(ids(given), int(repetitions)),
+            "remove_from_queue": queue.remove,
+            "clear_queue": lambda: queue.entries.clear(),
+            "queue_size": lambda: len(queue.entries),
+            "is_running": lambda: queue.running,
+            "abort": queue.abort,
+            "start": lambda: queue.process(queue.entries),
+            "process_queue": processing(lambda: queue.process(queue.entries)),
+            "process_item": processing(lambda item_id: queue.process([(item_id, 1)])),
+        }
+
+    @property
+    def _now_s(self) -> float:
+        return self._program.now_s
+
+    def _blocking(
+        self, call: Callable[..., None], waiting: Callable[[], bool], message: Callable[[], str] = lambda: ""
+    ) -> object:
+        return self._prelude.blocking(call, waiting, message)
+
+    def _property(self, path: str) -> object:
+        row, program = PANEL[path], self._program
+        field = "value_raw" if row.enum else "value"
+        fields: Nested = {field: {"get": lambda: program.get(path), "set": lambda value: program.put(path, value)}}
+        if path == SETPOINT:
+            fields["unit"] = {"get": lambda: program.setpoint_unit, "set": program.set_setpoint_unit}
+            fields["units"] = {"get": lambda: self._lua.table_from(list(program.setpoint_units))}
+        elif row.unit:
+            fields["unit"] = {"get": lambda: row.unit}
+        if row.unit and row.low > -1e300:
+            fields["min"] = {"get": lambda: program.bounds(path)[0]}
+            fields["max"] = {"get": lambda: program.bounds(path)[1]}
+        table = {name: self._lua.table_from(access) for name, access in fields.items()}
+        enum = self._lua.table_from(dict(row.enum)) if row.enum else None
+        return self._prelude.property(self._lua.table_from(table), enum)
+
+    def _buffers(self) -> Nested:
+        """The low-level buffers of measured values, as far as the running scan is in one."""
+
+        def numbers(buffer: float, channel: float) -> object:
+            values = self._channel(buffer, channel)[2]
+            span = self._span(values)
+            return self._lua.table_from([round(value / span * _INT32) for value in values])
+
+        def known(buffer: float) -> bool:
+            return buffer == self._image_buffer
+
+        return {
+            "reserve_lu_data_buffer": lambda buffer: None,
+            "synchronize_lu_data_buffer": lambda buffer: None,
+            "lu_data_buffer_state": lambda buffer: _SYNCHRONIZED if known(buffer) else 0,
+            "lu_data_buffer_channel_count": lambda buffer: len(self._program.rig.channels) if known(buffer) else 0,
+            "lu_data_buffer_channel_name": lambda buffer, channel: self._channel(buffer, channel)[0],
+            "lu_data_buffer_channel_unit": lambda buffer, channel: self._channel(buffer, channel)[1],
+            "lu_data_buffer_channel_range": lambda buffer, channel: self._span(self._channel(buffer, channel)[2]),
+            "lu_data_buffer_channel_data": numbers,
+        }
+
+    def _channel(self, buffer: float, channel: float) -> tuple[str, str, list[float]]:
+        if buffer != self._image_buffer or not 0 <= channel < len(self._program.rig.channels):
+            raise ScriptFailed(f"there is no channel {channel} in the buffer {buffer}")
+        return self._program.lines(int(channel))
+
+    @staticmethod
+    def _span(values: list[float]) -> float:
+        return max(map(abs, values), default=1.0) or 1.0
+
+    def _write_wrapper(self, root: Any, name: str, path: str) -> None:
+        """Write Python classes for the tree, for the maker's client, which asks for it by the path of its own file."""
+        file = Path(path)
+        if not (PureWindowsPath(path).name.startswith("cmd_tree_") and file.suffix == ".py" and file.parent.is_dir()):
+            raise ScriptFailed(f"{path!r} is not the file of a wrapper")
+        tree = json.dumps(_described(root))
+        text = _WRAPPER.read_text(encoding="utf-8").replace("@TREE@", repr(tree)).replace("@ROOT@", repr(name))
+        file.write_text(text, encoding="utf-8")
+
+
+def _is_python(value: object) -> bool:
+    return callable(value) and type(value).__module__ != "lupa" and not type(value).__module__.startswith("lupa.")
+
+
+def _described(table: Any) -> Nested:
+    """A tree: of each table its tables, of each property its fields and whether they can be set, and the functions."""
+    from lupa import lua54
+
+    found: Nested = {}
+    for name, inner in table.items():
+        kind = lua54.lua_type(inner)
+        if kind == "table":
+            choices = inner["enum"]
+            is_property = inner["value_get"] is not None or inner["value_raw_get"] is not None
+            if is_property:
+                fields = {one: inner[f"{one}_set"] is not None for one in _FIELDS if inner[f"{one}_get"] is not None}
+                found[str(name)] = {"enum": dict(choices.items()) if choices is not None else None, "fields": fields}
+            else:
+                found[str(name)] = {"node": _described(inner)}
+        elif kind == "function":
+            found[str(name)] = "function"
+    return found

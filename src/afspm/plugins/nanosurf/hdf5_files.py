@@ -1,0 +1,179 @@
+"""Nanosurf Studio's files (.nhf): HDF5 of format 1 (since 2023) and 2, with images and curves.
+
+From a file of the maker's own examples and from its reader (nanosurf-utils, MIT): rows and columns ascend, backward
+segments are not mirrored, integers are scaled to a range. The sense of a rotation and its unit, taken as
+counter-clockwise and degrees, are not known (!).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import datetime, tzinfo
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.errors import FileError
+from afspm.basics.plain_data import PlainMapping
+from afspm.model import Region, Scan, Spectrum
+from afspm.storage.formats import hdf5
+from afspm.storage.formats.content import FileContent
+
+if TYPE_CHECKING:
+    import h5py
+
+CONTROLLER: Final = "Nanosurf Studio"
+_TYPES: Final = {0: "int32", 1: "uint8", 2: "uint16", 3: "uint32", 4: "uint64", 5: "int16", 6: "int64", 7: "double"}
+"""Of format 1, which numbers the types that format 2 names."""
+_SPECTROSCOPY: Final = ("spectroscopy", "spectroscopy_grid")
+_MEASUREMENTS: Final = (*_SPECTROSCOPY, "image_line_based", "wavemode_nma")
+"""Kinds of groups; a file of format 2 has others, such as one of calibrations."""
+
+Array = NDArray[np.float64]
+
+
+def read_nhf(path: Path, zone: tzinfo | None) -> FileContent:
+    """All images and curves of a file. Raises FileError: another format, or broken."""
+    with hdf5.opened(path) as file:
+        version = int(file.attrs.get("nsf_file_version_major", 0))
+        if version not in (1, 2):
+            raise FileError(f"is of Nanosurf's format {version}, not 1 or 2")
+        groups = [group for group in file.values() if _kind(group) in _MEASUREMENTS]
+        scans = [replace(scan, filename=str(path)) for group in groups for scan in _scans(group)]
+        curves = [one for group in groups if _kind(group) in _SPECTROSCOPY for one in _curves(group)]
+        spectra = [replace(one, filename=str(path)) for one in curves]
+        if not (scans or spectra):
+            raise FileError("holds neither images nor curves")
+        header = {key: _plain(value) for group in groups for key, value in group.attrs.items()}
+    direction = header.get("image_scan_direction")
+    return FileContent(
+        CONTROLLER,
+        tuple(scans),
+        tuple(spectra),
+        header,
+        start_ns=_time_ns(header.get("created")),
+        end_ns=_time_ns(header.get("modified")),
+        upwards={"up": True, "down": False}.get(str(direction)),
+    )
+
+
+def _kind(group: h5py.Group) -> str:
+    return hdf5.text(group.attrs.get("group_type", group.attrs.get("measurement_type", "")))
+
+
+def _scans(group: h5py.Group) -> Iterator[Scan]:
+    """Every channel that fits the image; maps with more values in a pixel are left out."""
+    if _kind(group) in _SPECTROSCOPY:
+        return
+    for segment in _segments(group):
+        region, (rows, columns) = _frame({**group.attrs, **segment.attrs})
+        acquired = int(group.attrs.get("image_number_of_lines_acquired", rows))
+        for name, unit, dataset in _channels(segment):
+            if dataset.size != rows * columns:
+                continue
+            if min(rows, columns) < 2:
+                raise FileError(f"holds an image of {columns} x {rows} pixels")
+            values = _values(dataset).reshape(rows, columns)
+            if acquired < rows:
+                upwards = hdf5.text(group.attrs.get("image_scan_direction", "up")) == "up"
+                values[slice(acquired, None) if upwards else slice(rows - acquired)] = np.nan
+            yield Scan(region, f"{name} {_segment_name(segment)}", unit, values)
+
+
+def _curves(group: h5py.Group) -> Iterator[Spectrum]:
+    """The segments of a curve one after the other, as far as all have the channel; positions are not told (!)."""
+    parts = [_blocks(segment) for segment in _segments(group)]
+    shared = [name for name in parts[0] if all(name in part for part in parts)] if parts else []
+    count = min((len(part[name][1]) for part in parts for name in shared), default=0)
+    for number in range(count):
+        columns = [np.concatenate([part[name][1][number] for part in parts]) for name in shared]
+        if len({len(column) for column in columns}) != 1:
+            raise FileError("a curve has channels of different lengths")
+        units = tuple(parts[0][name][0] for name in shared)
+        yield Spectrum(None, "force", tuple(shared), units, np.column_stack(columns))
+
+
+def _blocks(segment: h5py.Group) -> dict[str, tuple[str, list[Array]]]:
+    """Channel -> (unit, the values of each curve)."""
+    found = {}
+    for name, unit, dataset in _channels(segment):
+        sizes = _block_sizes(segment, dataset)
+        if (sizes < 0).any() or sizes.sum() != dataset.size:
+            raise FileError(f"{name} holds {dataset.size} values instead of {sizes.sum()}")
+        found[name] = (unit, np.split(_values(dataset), np.cumsum(sizes)[:-1]))
+    return found
+
+
+def _block_sizes(segment: h5py.Group, dataset: h5py.Dataset) -> NDArray[np.int64]:
+    """How many values each curve has: told by a dataset beside it."""
+    source = dataset.attrs.get("dataset_block_size_source")
+    for other in segment.values():
+        named = hdf5.text(other.attrs.get("name", "")) == "number_of_datapoints_acquired"
+        told = source is not None and other.attrs.get("dataset_block_size_id") == source
+        if named or told:
+            return hdf5.array(other).astype(np.int64).ravel()
+    return np.array([dataset.size])
+
+
+def _segments(group: h5py.Group) -> list[h5py.Group]:
+    return [one for _, one in sorted(group.items()) if hasattr(one, "keys")]
+
+
+def _segment_name(segment: h5py.Group) -> str:
+    return hdf5.text(segment.attrs.get("segment_name", segment.attrs.get("name", "")))
+
+
+def _channels(segment: h5py.Group) -> Iterator[tuple[str, str, h5py.Dataset]]:
+    """The datasets that are signals: name, unit, dataset."""
+    for _, dataset in sorted(segment.items()):
+        attributes = dataset.attrs
+        prefix = "signal" if "signal_name" in attributes else "base"
+        name = attributes.get("signal_name", attributes.get("name"))
+        unit = attributes.get(f"{prefix}_calibration_unit")
+        if name is not None and unit is not None and hasattr(dataset, "dtype"):
+            yield hdf5.text(name), hdf5.text(unit), dataset
+
+
+def _values(dataset: h5py.Dataset) -> Array:
+    """The values in their unit: integers lie in a range of the type, and in format 2 one of them means none."""
+    raw = hdf5.array(dataset)
+    attributes = dataset.attrs
+    prefix = "signal" if "signal_name" in attributes else "base"
+    kind = attributes.get("dataset_element_type", 7)
+    kind = hdf5.text(kind) if isinstance(kind, str | bytes) else _TYPES.get(int(kind), "double")
+    if kind == "double" or f"{prefix}_calibration_max" not in attributes:
+        return raw
+    low, high = (float(attributes[f"{prefix}_calibration_{end}"]) for end in ("min", "max"))
+    limits = np.iinfo(kind)
+    smallest, largest = float(limits.min), float(limits.max)
+    if prefix == "signal":  # format 2 keeps one number back
+        missing = raw == float(dataset.fillvalue)
+        smallest, largest = (smallest + 1.0, largest) if limits.min else (smallest, largest - 1.0)
+        raw = np.where(missing, np.nan, raw)
+    return (raw - smallest) * ((high - low) / (largest - smallest)) + low
+
+
+def _frame(attributes: PlainMapping) -> tuple[Region, tuple[int, int]]:
+    """The frame and its (rows, columns)."""
+    if "rect_axis_size" in attributes:
+        rows, columns = (int(number) for number in attributes["rect_axis_size"])
+        height, width = (float(length) for length in attributes["rect_axis_range"])
+    else:
+        rows, columns = int(attributes["image_number_of_lines"]), int(attributes["image_points_per_line"])
+        width, height = float(attributes["image_size_x"]), float(attributes["image_size_y"])
+    center = (float(attributes.get("scanner_offset_x", 0.0)), float(attributes.get("scanner_offset_y", 0.0)))
+    angle_deg = float(attributes.get("rect_rotation", attributes.get("scanner_rotation", 0.0)))
+    return Region(center, (width, height), math.radians(angle_deg)), (rows, columns)
+
+
+def _plain(value: Any) -> Any:
+    return hdf5.text(value) if isinstance(value, bytes | str) else getattr(value, "tolist", lambda: value)()
+
+
+def _time_ns(text: object) -> int | None:
+    """A time with its zone, "2023-07-18T15:26:38.320Z"; None: there is none."""
+    return None if not text else round(datetime.fromisoformat(str(text)).timestamp() * 1e6) * 1000

@@ -1,0 +1,81 @@
+"""The connections to Nanosurf Studio: one for short questions, one for each command that takes its time."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Any, Final
+
+from afspm.basics.errors import AfspmError
+from afspm.plugins.nanosurf.lua_values import BadLua, parse
+from afspm.translator.driver import ControllerLost
+from afspm.translator.tcp import Receiver, TcpConnection, host_and_port
+
+_LENGTH: Final = struct.Struct("<I")
+_LONGEST_REPLY: Final = 1 << 28
+_SHOWN: Final = 60
+_HINTS: Final = (
+    "does Nanosurf Studio run, with its scripting interface licensed and switched on?",
+    "a dialog may wait on its screen",
+)
+
+
+class StudioError(AfspmError):
+    """Studio could not run a script: its own words."""
+
+    code = "nanosurf-error"
+
+
+class Link:
+    """One connection. Raises ControllerLost: nobody listens there. ConfigError: it is no address."""
+
+    def __init__(self, address: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
+        self._connection = TcpConnection(host_and_port(address), timeout_s, monotonic_s, _HINTS)
+
+    def run(self, script: str) -> list[Any]:
+        """Run a script, and return the values that it returns.
+
+        Raises:
+            StudioError: it failed. ControllerLost: no reply, or none to be trusted; the connection is closed.
+        """
+        self.begin(script)
+        return self._values(_shown(script))
+
+    def begin(self, script: str) -> None:
+        """Have a script run, whose `reply` is to come before the next. Raises ControllerLost."""
+        raw = script.encode()
+        self._connection.send(_shown(script), _LENGTH.pack(len(raw)) + raw)
+
+    def reply(self, what: str) -> tuple[bool, list[Any]]:
+        """Return whether a reply has come to what was begun, and the values in it. Raises as `run` does."""
+        return (True, self._values(what)) if self._connection.has_answer() else (False, [])
+
+    def _values(self, what: str) -> list[Any]:
+        status, content = self._connection.receive(what, _read)
+        if status != 0:
+            raise StudioError(str(content.get(1, "no reason given")))
+        return [content.get(number) for number in range(1, max(content, default=0) + 1)]
+
+    def close(self) -> None:
+        self._connection.close()
+
+
+def _read(receiver: Receiver) -> tuple[Any, dict[Any, Any]]:
+    """Read "{status,{values}}". Raises ControllerLost: it is something else."""
+    (size,) = _LENGTH.unpack(receiver.exactly(_LENGTH.size))
+    if size > _LONGEST_REPLY:
+        raise ControllerLost(f"a reply of {size} bytes was announced")
+    text = bytes(receiver.exactly(size)).decode("utf-8", "replace")
+    try:
+        reply = parse(text)
+    except BadLua as error:
+        raise ControllerLost(f"a reply that is not Lua: {error}") from error
+    if not (isinstance(reply, dict) and reply.get(1) in (0, 1) and isinstance(reply.get(2), dict)):
+        raise ControllerLost(f"a reply without a status: {text[:60]!r}")
+    return reply[1], reply[2]
+
+
+def _shown(script: str) -> str:
+    """Return the beginning of a script, for messages."""
+    first = " ".join(script.split())
+    return first if len(first) <= _SHOWN else f"{first[:_SHOWN]}…"

@@ -1,0 +1,150 @@
+"""Files of Nanosurf's older programs (.nid): a header of sections like an .ini, "#!", and the values of each channel.
+
+From ten files of the maker's examples (NSFopen, MIT), and against Gwyddion: rows ascend, backward lines are not
+mirrored, integers lie in a range. The sense of a rotation is taken as counter-clockwise (!). A map of curves does not
+say which is where, so curves have no position.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from datetime import tzinfo
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.errors import FileError
+from afspm.model import Region, Scan, Spectrum
+from afspm.storage.formats.content import FileContent, local_ns
+
+_DATA: Final = b"#!"
+_CHANNEL: Final = re.compile(r"Gr(\d{1,6})-Ch(\d{1,6})")
+_CURVE: Final = re.compile(r"Spec (forward|backward)")
+_BITS: Final = {8: "<i1", 16: "<i2", 32: "<i4"}
+
+Section = dict[str, str]
+Array = NDArray[np.float64]
+
+
+def read_nid(path: Path, zone: tzinfo | None) -> FileContent:
+    """All images and curves of a file. Raises FileError: not whole, or not of this format."""
+    head, found, data = path.read_bytes().partition(_DATA)
+    sections = _sections(head.decode("utf-8", "replace"))
+    if not found or "DataSet" not in sections:
+        raise FileError("is not a Nanosurf .nid file")
+    channels = list(_channels(sections, data))
+    info = sections.get("DataSet-Info", {})
+    region = _frame(sections)
+    images = (_scan(channel, values, region) for channel, values in channels if _is_image(channel))
+    scans = tuple(replace(one, filename=str(path)) for one in images)
+    curves = _curves([one for one in channels if _CURVE.match(one[0]["Frame"])])
+    spectra = tuple(replace(one, filename=str(path)) for one in curves)
+    if not (scans or spectra):
+        raise FileError("holds neither images nor curves")
+    date = f"{info.get('Date', '')} {info.get('Time', '')}".strip()
+    start_ns = local_ns(date, "%d-%m-%Y %H:%M:%S", zone) if date else None
+    direction = {"Up": True, "Down": False}.get(info.get("Scan direction", ""))
+    controller = f"Nanosurf {info.get('Software ver.', '')}".strip()
+    return FileContent(controller, scans, spectra, info, start_ns=start_ns, upwards=direction)
+
+
+def _sections(text: str) -> dict[str, Section]:
+    """ "[name]" and its lines "key=value"."""
+    found: dict[str, Section] = {}
+    section: Section = {}
+    for line in text.splitlines():
+        if line.startswith("[") and line.endswith("]"):
+            section = found.setdefault(line[1:-1], {})
+        else:
+            key, _, value = line.partition("=")
+            section[key] = value.strip()
+    return found
+
+
+def _channels(sections: Mapping[str, Section], data: bytes) -> Iterator[tuple[Section, Array]]:
+    """The channels in the order in which their values lie in the file, with all values [line, point]."""
+    dataset, at = sections["DataSet"], 0
+    listed = ((_CHANNEL.fullmatch(key), name) for key, name in dataset.items())
+    for _, name in sorted((tuple(map(int, key.groups())), name) for key, name in listed if key is not None):
+        channel = sections[name]
+        kind = np.dtype(_BITS[int(channel["SaveBits"])])
+        shape = int(channel["Lines"]), int(channel["Points"])
+        if min(shape) < 1:
+            raise FileError(f"{name} has {shape[0]} lines of {shape[1]} points")
+        size = shape[0] * shape[1] * kind.itemsize
+        if at + size > len(data):
+            raise FileError(f"ends within {name}")
+        raw = np.frombuffer(data, kind, shape[0] * shape[1], at).reshape(shape)
+        at += size
+        steps = 2.0 ** (8 * kind.itemsize)
+        yield channel, (raw / steps + 0.5) * float(channel["Dim2Range"]) + float(channel["Dim2Min"])
+
+
+def _is_image(channel: Section) -> bool:
+    return "scan " in channel["Frame"].lower()
+
+
+def _scan(channel: Section, values: Array, frame: Region | None) -> Scan:
+    """One channel, "Z-Axis forward"; the frame is told by the parameters, in files that have them."""
+    if min(values.shape) < 2:
+        raise FileError("holds an image of less than two lines or columns")
+    width, height = float(channel["Dim0Range"]), float(channel["Dim1Range"])
+    region = Region((0.0, 0.0) if frame is None else frame.center_m, (width, height), frame.angle_rad if frame else 0.0)
+    way = re.sub("scan ", "", channel["Frame"], flags=re.IGNORECASE)
+    return Scan(region, f"{channel['Dim2Name']} {way}", channel.get("Dim2Unit", ""), values)
+
+
+def _frame(sections: Mapping[str, Section]) -> Region | None:
+    """Centre and angle: `ScanOffset=V[0,0,0]*[m,m,m]`, `ScanRotation=V[0,0,45]*[°,°,°]`."""
+    imaging = sections.get("DataSet\\Parameters\\Imaging")
+    if imaging is None:
+        return None
+    (x, y, _), (width, height, _), (_, _, angle_deg) = (
+        _vector(imaging[name]) for name in ("ScanOffset", "ScanRange", "ScanRotation")
+    )
+    return Region((x, y), (width, height), math.radians(angle_deg))
+
+
+def _vector(text: str) -> list[float]:
+    return [float(number) for number in text[text.index("[") + 1 : text.index("]")].split(",")]
+
+
+def _curves(channels: list[tuple[Section, Array]]) -> Iterator[Spectrum]:
+    """Curves: forward and then backward, over the axis that was swept."""
+    ways = sorted({channel["Frame"] for channel, _ in channels}, key=lambda way: "forward" not in way)
+    parts = [{channel["Dim2Name"]: (channel, values) for channel, values in channels if channel["Frame"] == way}
+             for way in ways]  # fmt: skip
+    shared = [name for name in parts[0] if all(name in part for part in parts)] if parts else []
+    if not shared:
+        return
+    first = parts[0][shared[0]][0]
+    names = (first["Dim0Name"], *shared)
+    units = (first.get("Dim0Unit", ""), *(parts[0][name][0].get("Dim2Unit", "") for name in shared))
+    for line in range(len(parts[0][shared[0]][1])):
+        swept = np.concatenate([_swept(part[shared[0]][0], line) for part in parts])
+        columns = [np.concatenate([_taken(*part[name], line) for part in parts]) for name in shared]
+        yield Spectrum(None, "force", names, units, np.column_stack([swept, *columns]))
+
+
+def _swept(channel: Section, line: int) -> Array:
+    """The values of the axis of a curve, which may differ from curve to curve."""
+    prefix = f"LineDim{line}" if f"LineDim{line}Min" in channel else "Dim0"
+    low, width = float(channel[f"{prefix}Min"]), float(channel[f"{prefix}Range"])
+    return np.linspace(low, low + width, _points(channel, line))
+
+
+def _taken(channel: Section, values: Array, line: int) -> Array:
+    return values[line, : _points(channel, line)]
+
+
+def _points(channel: Section, line: int) -> int:
+    most = int(channel["Points"])
+    points = int(channel.get(f"LineDim{line}Points", most))
+    if not 0 <= points <= most:
+        raise FileError(f"a curve of {points} points where there are {most}")
+    return points

@@ -1,0 +1,173 @@
+"""A connected Nanosurf Studio: its values, its commands, and whether it scans."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from typing import Any, Final
+
+from afspm.basics.errors import ConfigError, Refused
+from afspm.model import ControlResponse
+from afspm.plugins.nanosurf import commands
+from afspm.plugins.nanosurf.commands import WORKFLOW
+from afspm.plugins.nanosurf.link import Link, StudioError
+from afspm.plugins.nanosurf.lua_values import written
+from afspm.translator.driver import ControllerLost
+from afspm.translator.long_call import LongCall
+from afspm.translator.parameters import Value
+
+ENUMS: Final = frozenset({"imaging.scan_mode", "imaging.slow_axis_scan_direction", "data.storage.nhf_auto_store_mode"})
+"""Paths whose value is a number that stands for a choice."""
+
+
+@dataclass(frozen=True)
+class Scanning:
+    """What is known of scans.
+
+    Attributes:
+        running: a scan runs.
+        started: how many have begun since Studio takes note; 0: this release does not count them.
+    """
+
+    running: bool
+    started: int
+
+
+class Session:
+    """A measurement session of Studio. For one thread.
+
+    Args:
+        open_link: gives a new connection.
+        release: of Studio.
+        name: of the session; empty: the only one that is open.
+        level: of its commands; None: the lowest that is needed.
+
+    Raises:
+        ControllerLost. ConfigError: it is another release, or lacks commands.
+    """
+
+    def __init__(self, open_link: Callable[[], Link], release: int, name: str, level: int | None = None) -> None:
+        self._open_link, self._release, self._name = open_link, release, name
+        self._level = commands.level(release) if level is None else level
+        self._old = commands.has_old_commands(release)
+        self._link = open_link()
+        try:
+            self._name = self._checked_name(name)
+            self._select(self._link)
+            self._check()
+        except BaseException:
+            self._link.close()
+            raise
+
+    def run(self, script: str) -> list[Any]:
+        """Run a script. Raises StudioError, ControllerLost."""
+        return self._link.run(script)
+
+    def do(self, command: str) -> None:
+        """Call a command. Raises Refused: Studio would not."""
+        try:
+            self.run(f"{WORKFLOW}.{command}() return 0")
+        except StudioError as error:
+            raise Refused(ControlResponse.ACTION_ERROR, f"Studio refused {command}: {error}") from error
+
+    def values(self, paths: Sequence[str]) -> dict[str, Value]:
+        """Return values of panels by their paths.
+
+        Raises:
+            ControllerLost: there is none, or a number is not finite: such a reply is not to be trusted.
+        """
+        script = ", ".join(f"{WORKFLOW}.{path}.{_field(path)}_get()" for path in paths)
+        found = dict(zip(paths, self._told(script), strict=False))
+        for path in paths:
+            value = found.get(path)
+            if not isinstance(value, bool | int | float | str) or (isinstance(value, float) and not isfinite(value)):
+                raise ControllerLost(f"Studio replied {value} for {path}")
+        return found
+
+    def put(self, values: Mapping[str, Value]) -> None:
+        """Set values of panels, all or none. Raises Refused: Studio does not take one."""
+        puts = " ".join(
+            f"put({WORKFLOW}.{path}, {written(_field(path))}, {written(value)})" for path, value in values.items()
+        )
+        try:
+            self.run(commands.PUT_ALL % puts)
+        except StudioError as error:
+            raise Refused(ControlResponse.PARAM_ERROR, f"Studio refused {', '.join(values)}: {error}") from error
+
+    def units(self, paths: Iterable[str]) -> dict[str, str]:
+        """Return the units that Studio says its values are in; empty: it says none."""
+        paths = list(paths)
+        told = self.run(commands.UNITS % ", ".join(map(written, paths)))[0]
+        return {path: str(told.get(number, "")) for number, path in enumerate(paths, 1)}
+
+    def missing(self, paths: Iterable[str]) -> list[str]:
+        """Return those paths that Studio does not have."""
+        return [str(one) for one in self.run(commands.MISSING % ", ".join(map(written, paths)))[0].values()]
+
+    def scanning(self) -> Scanning:
+        """Return whether a scan runs."""
+        script = f"{WORKFLOW}.{commands.IS_SCANNING}(), 0" if self._old else "afspm_seen.scanning, afspm_seen.started"
+        told = self._told(script)
+        if len(told) != 2 or not isinstance(told[0], bool) or not isinstance(told[1], int):
+            raise ControllerLost(f"Studio replied {told} to whether it scans")
+        return Scanning(*told)
+
+    def begin(self, what: str, command: str, first: str = "") -> LongCall:
+        """Begin what takes long, after the script `first`, on a connection of its own. Raises ControllerLost."""
+        link = self._open_link()
+        try:
+            self._select(link)
+            link.begin(f"{first} return {WORKFLOW}.{command}()")
+        except BaseException:
+            link.close()
+            raise
+        return LongCall(what, link)
+
+    def close(self) -> None:
+        """Let go of it."""
+        self._link.close()
+
+    # --- inside ---
+
+    def _told(self, script: str) -> list[Any]:
+        """Return the values of a script that any session runs. Raises ControllerLost: this one does not any more."""
+        try:
+            return self.run(f"return {script}")
+        except StudioError as error:
+            raise ControllerLost(f"Studio's session is not what it was: {error}") from error
+
+    def _checked_name(self, name: str) -> str:
+        """Return the name of the session to select. Raises ConfigError: Studio is of another release."""
+        self._link.run("return root.session.select_main(0)")
+        major, full, listed = self._link.run("return root.version.major(), root.version.full(), root.session.list()")
+        self.controller = f"Nanosurf Studio {full}"
+        if major != self._release:
+            told = f"Studio is of release {major}, not {self._release}"
+            raise ConfigError(told, where="release", hint=f"release = {major}")
+        found = [str(one) for one in listed.values()] if isinstance(listed, dict) else []
+        if name in found or (not name and len(found) == 1):
+            return name or found[0]
+        hint = f"open one, or set session to one of {', '.join(found) or 'those that are open'}"
+        raise ControllerLost(f"Studio has no single measurement session {name}", hint=hint)
+
+    def _select(self, link: Link) -> None:
+        try:
+            link.run(f"return root.session.select({written(self._name)}, {self._level})")
+        except StudioError as error:
+            raise ControllerLost(f"Studio's session {self._name!r} can't be selected: {error}") from error
+
+    def _check(self) -> None:
+        """Check that the release has what is used of it, and takes note of scans."""
+        missing = self.missing(commands.used(self._release))
+        if missing:
+            names = ", ".join(missing)
+            hint = "name its release (Help > About) in the setting release, and look at the level of its licence"
+            raise ConfigError(f"{self.controller} has no {names}", where="release", hint=hint)
+        if not self._old and self.run(commands.WATCH)[0]:
+            told = f"{self.controller} does not tell scripts when scans begin and end"
+            raise ConfigError(told, where="release", hint="report it, with the release, to the project of afspm")
+
+
+def _field(path: str) -> str:
+    return "value_raw" if path in ENUMS else "value"

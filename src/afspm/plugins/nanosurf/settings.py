@@ -1,0 +1,122 @@
+"""The frame, the speed and the place of the tip as Studio has them, and as everybody else.
+
+Studio has the centre of a frame, its angle, and lines per second; a line is there and back (!).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from afspm.basics.errors import InvalidValue
+from afspm.model import Region, names
+from afspm.plugins.nanosurf import commands
+from afspm.plugins.nanosurf.session import Session
+from afspm.translator.parameters import Value
+from afspm.translator.setting_groups import FRAME, POSITION, SettingsGroup, frame, frame_values
+
+DIRECTION: Final = "imaging.slow_axis_scan_direction"
+_UPWARD, _DOWNWARD = 1, 0
+_WIDTH, _HEIGHT = "imaging.scan_range_fast_axis", "imaging.scan_range_slow_axis"
+_X, _Y = "imaging.frame_center_offset_x", "imaging.frame_center_offset_y"
+_ANGLE, _RATE = "imaging.rotation", "imaging.line_rate"
+_COLUMNS, _ROWS = "imaging.points_per_line", "imaging.lines_per_frame"
+_FRAME: Final = (_X, _Y, _WIDTH, _HEIGHT, _ANGLE, _COLUMNS, _ROWS, _RATE)
+_SLOPES: Final = ("imaging.slope_x", "imaging.slope_y")
+_TARGET: Final = ("scanner.offset_x_target", "scanner.offset_y_target")
+_PLACE: Final = ("scanner.offset_x", "scanner.offset_y")
+UNITS: Final[dict[str, tuple[str, ...]]] = {
+    **dict.fromkeys((_X, _Y, _WIDTH, _HEIGHT, *_TARGET, *_PLACE), ("m",)),
+    **dict.fromkeys((_ANGLE, *_SLOPES), ("°", "deg")),
+    _RATE: ("Hz", "1/s"),
+}
+"""The units that the translation of these values is right for."""
+SPEED_PATH: Final = 2.0
+"""Widths of the frame that the tip travels in a line."""
+
+
+class FrameSettings(SettingsGroup):
+    """The frame and the speed, which are set together as the speed is told by lines per second."""
+
+    names = frozenset({*FRAME, names.SCAN_SPEED})
+
+    def __init__(self, session: Callable[[], Session]) -> None:
+        self._session = session
+
+    def read(self) -> dict[str, Value]:
+        found = {path: float(value) for path, value in self._session().values(_FRAME).items()}
+        angle_rad = math.radians(found[_ANGLE])
+        region = Region((found[_X], found[_Y]), (found[_WIDTH], found[_HEIGHT]), angle_rad)
+        shape = (round(found[_ROWS]), round(found[_COLUMNS]))
+        speed_m_s = SPEED_PATH * found[_WIDTH] * found[_RATE]
+        return {**frame_values(region, shape), names.SCAN_SPEED: speed_m_s}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        wanted = self.merged(values)
+        region, (rows, columns) = frame(wanted)
+        speed_m_s = float(wanted[names.SCAN_SPEED])
+        if speed_m_s <= 0.0:
+            raise InvalidValue(f"a scan at {speed_m_s} m/s never ends")
+        (x, y), (width, height) = region.center_m, region.size_m
+        rate = speed_m_s / (SPEED_PATH * width)
+        angle_deg = math.degrees(region.angle_rad)
+        self._session().put(dict(zip(_FRAME, (x, y, width, height, angle_deg, columns, rows, rate), strict=True)))
+
+
+class Slopes(SettingsGroup):
+    """The compensation of the sample's tilt, which Studio has as angles; their sense is not known (!)."""
+
+    names = (names.SAMPLE_SLOPE_X, names.SAMPLE_SLOPE_Y)
+
+    def __init__(self, session: Callable[[], Session]) -> None:
+        self._session = session
+
+    def read(self) -> dict[str, Value]:
+        angles = self._session().values(_SLOPES).values()
+        return {name: math.tan(math.radians(float(angle))) for name, angle in zip(self.names, angles, strict=True)}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        wanted = self.merged(values)
+        angles = (math.degrees(math.atan(float(wanted[name]))) for name in self.names)
+        self._session().put(dict(zip(_SLOPES, angles, strict=True)))
+
+
+class TipPlace(SettingsGroup):
+    """The place to which the tip was sent."""
+
+    names = POSITION
+
+    def __init__(self, session: Callable[[], Session]) -> None:
+        self._session = session
+        self._moving = False
+
+    def read(self) -> dict[str, Value]:
+        return dict(zip(POSITION, self.xy_m(), strict=True))
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        wanted = self.merged(values)
+        self._session().put(dict(zip(_TARGET, (float(wanted[name]) for name in POSITION), strict=True)))
+        self.go()
+
+    def xy_m(self) -> tuple[float, float]:
+        """Return where the tip was sent."""
+        x, y = (float(value) for value in self._session().values(_TARGET).values())
+        return x, y
+
+    def go(self) -> None:
+        """Send the tip there. Raises Refused."""
+        self._session().do(commands.MOVE)
+        self._moving = True
+
+    def arrived(self) -> bool:
+        """Return True if the tip is where it was sent, within a nanometre or a thousandth of the distance."""
+        if self._moving:
+            x, y, to_x, to_y = (float(value) for value in self._session().values((*_PLACE, *_TARGET)).values())
+            self._moving = math.dist((x, y), (to_x, to_y)) > max(1e-9, 1e-3 * math.hypot(to_x, to_y))
+        return not self._moving
+
+
+def direction(name: str) -> int:
+    """Return what Studio calls "up" or "down"."""
+    return _UPWARD if name == names.UP else _DOWNWARD

@@ -1,0 +1,194 @@
+"""Park, over SmartScan's SmartRemote. See the README beside this."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from afspm.basics.errors import ConfigError, Refused
+from afspm.basics.plain_data import PlainMapping
+from afspm.basics.units import Duration, Length, PollPeriod
+from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.plugins.park.activity import STOP, STOP_CURVE, SmartScanActivity
+from afspm.plugins.park.link import Link, SmartScanError
+from afspm.plugins.park.result_files import SETTLE_S, ParkFiles
+from afspm.plugins.park.session import FALSE, TRUE, Session
+from afspm.plugins.park.settings import MICROMETRE, FrameSettings, Gains, TipPlace
+from afspm.translator.driver import ControllerLost, Driver, action
+from afspm.translator.long_call import LongCall
+from afspm.translator.parameters import Value
+from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
+
+_SCANNING: Final = TRUE | {"scanning", "running"}
+_IDLE: Final = FALSE | {"idle", "ready", "done", "stopped"}
+_AT_FIRST: Final[dict[str, Value]] = {names.SPEC_KIND: "force"}
+_FOLDER: Final = "dataLocation.baseDir"
+
+
+class Park(Driver):
+    """The microscope behind SmartScan.
+
+    Args:
+        address: of SmartRemote, e.g. "tcp://192.168.0.10:5581".
+        data_dir: where SmartScan's base folder of data is seen from here; left out: SmartScan runs on this computer.
+        lift: how far the stage moves away from the sample after the scanner has, to withdraw the tip; 0: not at all.
+        scanning_words, idle_words: further words by which SmartScan says whether it scans.
+        reply_timeout_s: how long a reply may take, in real time.
+        poll_period_s, common: as for every microscope.
+    """
+
+    parameters_file = Path(__file__).with_name("parameters.toml")
+    translated = (*FrameSettings.names, *Gains.names, *POSITION, *_AT_FIRST, names.CONTROLLER)
+    maker: ClassVar[str] = "Park Systems"
+    software: ClassVar[str] = "SmartScan"
+    max_pixels: ClassVar[int] = 8192 * 8192
+    program_s: ClassVar[float] = 2.0 + SETTLE_S
+
+    def __init__(
+        self,
+        *,
+        address: str = "tcp://127.0.0.1:5581",
+        data_dir: str | None = None,
+        lift: Length = 0.0,
+        scanning_words: Sequence[str] = (),
+        idle_words: Sequence[str] = (),
+        reply_timeout_s: Duration = 5.0,
+        poll_period_s: PollPeriod = 0.25,
+        **common: Any,
+    ) -> None:
+        super().__init__(poll_period_s=poll_period_s, **common)
+        if lift < 0.0:
+            raise ConfigError(f"{lift} m would move the tip to the sample", where="lift", hint="0 or more")
+        self.controller_at = address
+        self._data_dir, self._lift_m, self._reply_timeout_s = data_dir, lift, reply_timeout_s
+        self._scanning = _SCANNING | {word.casefold() for word in scanning_words}
+        self._idle = _IDLE | {word.casefold() for word in idle_words}
+        both = self._scanning & self._idle
+        if both:
+            raise ConfigError(f"{', '.join(sorted(both))} would mean both", where="idle_words", hint="take one away")
+        self._session: Session | None = None
+        self._activity: SmartScanActivity | None = None
+        self._place = TipPlace(self._smartscan, self._begun)
+        self._kept = KeptSettings(_AT_FIRST)
+        self._gains = Gains(self._smartscan)
+        self.groups = (self._kept, FrameSettings(self._smartscan), self._gains, self._place)
+        self._whole_table = self.table
+
+    @classmethod
+    def technique(cls, settings: PlainMapping) -> str:
+        return "AFM"
+
+    def connect(self) -> None:
+        self.close()
+        session = self._session = Session(self._open_link, self._scanning, self._idle)
+        self.prove()
+        self.table = self._whole_table
+        if not self._gains.are_told():
+            self.log.warning("SmartScan does not tell the gains of its feedback: they are not supported")
+            self.table = self.table.without(Gains.names)
+        for group in (self._kept, self._place):
+            group.kept_in(self.memory)
+        folder = self._folder()
+        if not folder.is_dir():
+            told = f"SmartScan's folder of data {folder} does not exist on this computer"
+            raise ConfigError(told, where="data_dir", hint='data_dir = "/where/it/is/mounted"')
+        self._files = ParkFiles(self.memory, self.log, self.clock.monotonic_s)
+        self._activity = SmartScanActivity(
+            session, self._files, self._folder, self._frame_in_force, self.clock, self.log
+        )
+
+    def close(self) -> None:
+        if self._activity is not None:
+            self._activity.close()
+            self._activity = None
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    def status(self) -> ScopeStatus:
+        return self._doing.status()
+
+    def get(self, vendor: str) -> Value:
+        return "SmartScan" if vendor == names.CONTROLLER else self._smartscan().values([vendor])[vendor]
+
+    def set(self, values: Mapping[str, Value]) -> None:
+        self._smartscan().put(values)
+
+    def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
+        """Return values of the table, all by one question."""
+        rows = [self.table[name] for name in wanted if name != names.CONTROLLER]
+        values = self._smartscan().values([row.vendor for row in rows]) if rows else {}
+        found = {row.name: row.from_vendor(values[row.vendor]) for row in rows}
+        return found | super().read_rows([name for name in wanted if name not in found])
+
+    def results(self) -> Sequence[str]:
+        return self._files.results(self.clock.now_ns())
+
+    def load(self, result: str) -> Sequence[Scan | Spectrum]:
+        return self._files.load(result)
+
+    # --- actions ---
+
+    @action(names.START_SCAN)
+    def start_scan(self) -> None:
+        """Scan the frame once."""
+        self._doing.start_scan()
+
+    @action(names.STOP_SCAN)
+    def stop_scan(self) -> None:
+        self._smartscan().do(STOP)
+        self._doing.stopped()
+
+    @action(names.START_SPEC)
+    def start_spec(self) -> None:
+        """Take a curve of the kind `x-spec-kind` where the tip was sent, as it is set in SmartScan."""
+        self._doing.start_curve(str(self._kept[names.SPEC_KIND]), self._place.xy_m())
+
+    @action(names.STOP_SPEC)
+    def stop_spec(self) -> None:
+        self._smartscan().do(STOP_CURVE)
+        self._doing.stopped()
+
+    @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
+    def retract(self) -> None:
+        """Withdraw the tip, whatever is going on: the scanner, and then the stage by `lift`, if one is set."""
+        self._doing.withdraw(self._lift_m / MICROMETRE)
+
+    @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
+    def engage(self) -> None:
+        """Bring the tip to the sample: SmartScan's quick and safe approach."""
+        self._doing.approach()
+
+    def command(self, text: str) -> None:
+        """Evaluate an expression, e.g. `spm.ncm.sweepAutoFullRange()`; one that takes long keeps it busy."""
+        try:
+            self._doing.evaluate(text)
+        except SmartScanError as error:
+            raise Refused(ControlResponse.ACTION_ERROR, f"SmartScan: {error}") from error
+
+    # --- inside ---
+
+    def _open_link(self) -> Link:
+        return Link(self.controller_at, self._reply_timeout_s, self.clock.monotonic_s)
+
+    def _smartscan(self) -> Session:
+        if self._session is None:
+            raise ControllerLost("SmartScan is not connected", where=self.controller_at)
+        return self._session
+
+    @property
+    def _doing(self) -> SmartScanActivity:
+        if self._activity is None:
+            raise ControllerLost("SmartScan is not connected", where=self.controller_at)
+        return self._activity
+
+    def _begun(self, call: LongCall) -> None:
+        self._doing.watch(call)
+
+    def _frame_in_force(self) -> Region:
+        return frame(self.in_force(FRAME))[0]
+
+    def _folder(self) -> Path:
+        """The folder of SmartScan's files, as seen from here."""
+        return Path(self._data_dir or str(self._smartscan().values([_FOLDER])[_FOLDER]))

@@ -1,0 +1,136 @@
+"""The state of SmartScan, and what is awaited of it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import ClassVar, Final
+
+from afspm.basics.clock import Clock
+from afspm.basics.errors import AfspmError, Refused
+from afspm.model import Region, ScopeState, ScopeStatus
+from afspm.plugins.park.link import SmartScanError
+from afspm.plugins.park.result_files import ParkFiles
+from afspm.plugins.park.session import Session
+from afspm.plugins.park.settings import MOVE, way_to
+from afspm.translator.activity import Activity
+from afspm.translator.long_call import LongCall
+from afspm.translator.result_files import SCAN, XY, as_list
+
+START, STOP, STOP_CURVE = "scan.triggerImageScan()", "scan.stop()", "spect.stop()"
+CURVES: Final = {"force": "fd", "IV": "iv"}
+"""Kinds of curves, and what SmartScan calls them."""
+APPROACH: Final = '(spm.approach.start("q+s"), 0)'
+_ENDED_FIRST: Final = ("scan.stop", "spect.stop", "approach.stop")
+_STATES: Final = {MOVE: ScopeState.MOVING, **dict.fromkeys(CURVES, ScopeState.SPEC)}
+_ANSWERS_S: Final = 0.5
+"""So long, in real time, an expression may take before it counts as one that takes long: an error has come by then."""
+
+
+class SmartScanActivity(Activity):
+    """The measurement or move that runs, begun by a request or at SmartScan's panel.
+
+    Args:
+        folder: gives the folder of SmartScan's files as seen from here.
+        frame_in_force: as it was set.
+    """
+
+    program: ClassVar[str] = "SmartScan"
+    settles_s: ClassVar[float] = 2.0
+    call_failures: ClassVar[tuple[type[AfspmError], ...]] = (SmartScanError,)
+
+    def __init__(
+        self,
+        session: Session,
+        files: ParkFiles,
+        folder: Callable[[], Path],
+        frame_in_force: Callable[[], Region],
+        clock: Clock,
+        log: logging.Logger,
+    ) -> None:
+        super().__init__(files, clock, log)
+        self._session, self._files = session, files
+        self._folder, self._frame_in_force = folder, frame_in_force
+        self._curve_at: XY = (0.0, 0.0)
+
+    def status(self) -> ScopeStatus:
+        """Return what it is doing now; what has ended is awaited from here on."""
+        call = self._running_call()
+        curve = call is not None and call.what in CURVES  # it may count as a scan, too (!)
+        scanning = not curve and self._session.scanning()
+        if self._stopping and curve:
+            with suppress(Refused):
+                self._session.do(STOP_CURVE)  # the first may have overtaken the script, which has another connection
+        if scanning:
+            self.follow(self._files.what or SCAN)
+            return ScopeStatus(ScopeState.SCANNING)
+        if not self.curve_awaited:
+            self.follow(call.what if call is not None and curve else "")
+        if call is not None:
+            return ScopeStatus(_STATES.get(call.what, ScopeState.COARSE_MOTOR))
+        return self.at_rest()
+
+    def begin(self, what: str) -> None:
+        place = {"frame": as_list(self._frame_in_force())} if what == SCAN else {"position": list(self._curve_at)}
+        self._files.begin(what, self._folder(), place)
+
+    def end(self) -> None:
+        self._files.end(self._clock.now_ns())
+
+    def start_scan(self) -> None:
+        """Scan the frame. Raises Refused: SmartScan does not."""
+        self.started(SCAN, lambda: self._session.do(START), lambda: self._session.scanning() or self._files.has_file())
+
+    def start_curve(self, kind: str, place_m: XY) -> None:
+        """Take a curve where the tip was sent: after a scan, it goes there first."""
+        self._stopping = False
+        self.watch(self._session.begin(kind, way_to(place_m)))
+        self.curve_awaited, self._curve_at = kind, place_m
+
+    def approach(self) -> None:
+        """Bring the tip to the sample."""
+        self.watch(self._session.begin("approach", APPROACH))
+
+    def evaluate(self, expression: str) -> None:
+        """Evaluate an expression; one that has no value soon keeps the microscope busy. Raises SmartScanError."""
+        call = self._session.begin("command", f"({expression}, 0)", _ANSWERS_S)
+        try:
+            goes_on = call.running()
+        except BaseException:
+            call.close()
+            raise
+        if goes_on:
+            self.watch(call)
+        else:
+            call.close()
+
+    def withdraw(self, lift_um: float) -> None:
+        """Take the tip away, whatever is going on: the scanner first, and then the stage."""
+        self.stopped()
+        self.close()
+        ended = " ".join(f"try {{ spm.{one}(); }} catch (ignored) {{}}" for one in _ENDED_FIRST)
+        away = f"spm.zscanner.retractAll(); if ({lift_um!r} > 0) {{ spm.zstage.move({lift_um!r}, 1); }}"
+        self.watch(self._session.begin("withdrawal", f"(function() {{ {ended} {away} return 0; }})()"))
+
+    def watch(self, call: LongCall) -> None:
+        self.curve_awaited = ""
+        super().watch(call)
+
+    def stopped(self) -> None:
+        """Note that a request has stopped what is running: nothing comes of it, but a tip on its way goes on."""
+        if self.call is not None and self.curve_awaited:
+            self.call.what = MOVE
+        super().stopped()
+
+    # --- inside ---
+
+    def _running_call(self) -> LongCall | None:
+        """Return the script that takes long, while it does; the curve follows the way to it. Raises ControllerLost."""
+        call = self.watched_call()
+        if call is None and self.curve_awaited:
+            kind, self.curve_awaited = self.curve_awaited, ""
+            self.begin(kind)
+            self.call = call = self._session.begin(kind, f'(spm.spect.start("{CURVES[kind]}", "here"), 0)')
+        return call

@@ -1,0 +1,185 @@
+"""An emulated SmartScan: its socket, its scripts in a real JavaScript, and its files, with simulated physics behind."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar, Final, Literal, NoReturn
+
+from afspm.basics.errors import AfspmError
+from afspm.basics.plain_data import Plain, PlainMapping
+from afspm.basics.units import Duration
+from afspm.plugins.park.emulator.engine import Script
+from afspm.plugins.park.emulator.smartscan import GEOMETRY, SmartScanProgram
+from afspm.plugins.park.emulator.wire import SmartRemoteWire
+from afspm.simulation.emulation.program import MakerProgram
+from afspm.simulation.emulation.scripted import (
+    Client,
+    OnRequest,
+    ScriptedEmulator,
+    ScriptFailed,
+    ScriptWire,
+    Unfinished,
+)
+
+_DONE: Final = "Done"
+_FAILED: Final = -32000
+_NO_JSON: Final = -32700
+
+
+class ParkEmulator(ScriptedEmulator):
+    """The emulated program. What is not known of the real one can be chosen.
+
+    Args:
+        errors: how it says that a script failed: in an "error" of JSON-RPC, in the "result", or in the "value" alone.
+        values: a value is told as "text", or as it is ("native").
+        replies: to a script that waits for the instrument, "at-end" of it, or "at-once" and without a value.
+        scan_words: what it says to whether it scans: yes, no.
+        tells_gains: whether the gains of the feedback can be read, or only set.
+        start_s: how long the ramp to the first line takes, experiment time.
+        file_s: how long after the end a file begins to appear; the other half of it comes as much later.
+        seed, faults, and all of the simulated world: as of every emulator.
+    """
+
+    vendor = "Park"
+    requires: ClassVar[tuple[str, ...]] = ("afspm[park]",)
+    usual: ClassVar[PlainMapping] = {"port": 5581}
+    modes: ClassVar[Sequence[str]] = ("amplitude", "frequency-shift")
+
+    def __init__(
+        self,
+        *,
+        errors: Literal["rpc", "result", "value"] = "rpc",
+        values: Literal["text", "native"] = "text",
+        replies: Literal["at-end", "at-once"] = "at-end",
+        scan_words: Sequence[str] = ("true", "false"),
+        tells_gains: bool = True,
+        start_s: Duration = 0.2,
+        file_s: Duration = 0.1,
+        **settings: Any,
+    ) -> None:
+        super().__init__(**settings)
+        self._errors, self._values, self._replies = errors, values, replies
+        self._scan_words, self._tells_gains = scan_words, tells_gains
+        self._times = {"start_s": start_s, "file_s": file_s}
+
+    def make_program(self) -> MakerProgram:
+        """Make SmartScan."""
+        self._scripts: dict[Script, bool] = {}  # and whether its reply was sent already
+        self._smartscan = SmartScanProgram(self.rig, self.faults, self.clock, self.folder, self.log, **self._times)
+        self._smartscan.tells_gains = self._tells_gains
+        return self._smartscan
+
+    def open_wire(self, port: int, on_request: OnRequest) -> ScriptWire:
+        """Listen for clients."""
+        return SmartRemoteWire(port, on_request, self.woken)
+
+    def answer(self, client: Client, request: bytes) -> bytes | Unfinished:
+        """Run a script, or answer a query."""
+        asked = _parsed(request)
+        if asked is None:
+            raise ScriptFailed("a request is no object of JSON")
+        if asked.get("method") == "js_cmd":
+            return self._run(request, str(asked.get("params", "")))
+        return _reply(request, result=self._queried(str(asked.get("method"))))
+
+    def failure(self, request: bytes, reason: str) -> bytes:
+        """The words of an error, where `errors` says; JSON-RPC says how a request is refused that is none."""
+        if _parsed(request) is None:
+            return _reply(request, error={"code": _NO_JSON, "message": reason})
+        if self._errors == "rpc":
+            return _reply(request, error={"code": _FAILED, "message": reason})
+        if self._errors == "result":
+            return _reply(request, result="Error", value=reason)
+        return _reply(request, result=_DONE, value=reason)
+
+    def not_a_number(self, request: bytes) -> bytes:
+        """The text that JavaScript has for 0/0."""
+        return _reply(request, result="NaN", value="NaN")
+
+    def tick(self, now_s: float) -> float | None:
+        """Run the scripts on that are answered already, too."""
+        for script in [one for one, is_answered in self._scripts.items() if is_answered]:
+            try:
+                ended = script.step() is not None
+            except AfspmError as error:
+                self.log.warning("a script failed: %s", error)
+                ended = True
+            if ended:
+                del self._scripts[script]
+        times = [super().tick(now_s), self._smartscan.next_waking_s(now_s)]
+        for script in self._scripts:
+            if math.isfinite(left_s := script.computes_for_s):
+                times.append(now_s + max(left_s, 0.0) / self.clock.real_s(1.0))
+        return min((at_s for at_s in times if at_s is not None), default=None)
+
+    def abandon(self) -> None:
+        """End the scripts, too."""
+        super().abandon()
+        self._end_scripts()
+
+    def close(self) -> None:
+        """Listen no more."""
+        super().close()
+        self._end_scripts()
+
+    def _end_scripts(self) -> None:
+        scripts: dict[Script, bool] = getattr(self, "_scripts", {})
+        for script in scripts:
+            script.end()
+        scripts.clear()
+
+    def _queried(self, method: str) -> str:
+        program = self._smartscan
+        if method == "js_connect":
+            return "true"
+        if method == "js_run":
+            return "true" if self._scripts else "false"
+        if method == "scan_query":
+            return self._scan_words[0 if program.scanning else 1]
+        if method == "pos_query":
+            return ",".join(map(repr, program.stage_um))
+        if method == "geometry_query":
+            return ",".join(repr(program.geometry[name]) for name in GEOMETRY)
+        raise ScriptFailed(f"there is no method {method!r}")
+
+    def _run(self, request: bytes, source: str) -> bytes | Unfinished:
+        script = Script(source, self._smartscan.names, self._smartscan.ask, self.woken.post)
+        self._scripts[script] = False
+        return self._step(request, script)
+
+    def _step(self, request: bytes, script: Script) -> bytes | Unfinished:
+        try:
+            found = script.step()
+        except BaseException:
+            self._scripts.pop(script, None)
+            raise
+        if found is None and script.waits and self._replies == "at-once":
+            self._scripts[script] = True
+            return _reply(request, result=_DONE, value="")
+        if found is None:
+            return Unfinished(lambda: self._step(request, script))
+        self._scripts.pop(script, None)
+        value, text = found
+        return _reply(request, result=_DONE, value=text if self._values == "text" else value)
+
+
+def _reply(request: bytes, **fields: object) -> bytes:
+    asked = _parsed(request)
+    number = None if asked is None else asked.get("id")
+    return json.dumps({"jsonrpc": "2.0", **fields, "id": number}).encode()
+
+
+def _parsed(request: bytes) -> Plain | None:
+    """Return the object of a request; None if it is none, or a text in it can't be encoded."""
+    try:
+        asked = json.loads(request, parse_constant=_no_constant)
+        json.dumps(asked, ensure_ascii=False).encode()
+    except (ValueError, RecursionError):
+        return None
+    return asked if isinstance(asked, dict) else None
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not JSON")

@@ -1,0 +1,147 @@
+"""Scripts of JavaScript, each in an engine of its own, that wait for the instrument without holding anything else up.
+
+An engine can't be left in the middle of a script, so each has a thread; what a script asks of the instrument is done by
+the emulator's own thread, which takes turns with it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import Thread
+from typing import Any, Final
+
+from afspm.basics.errors import AfspmError
+from afspm.simulation.emulation.scripted import ScriptFailed
+
+LONGEST_S: Final = 5.0
+"""Real seconds of computing after which a script is given up. Its thread computes on: the engine can't be left."""
+_AT_ONCE_S: Final = 0.25
+"""Real seconds that the emulator waits for a script before it serves others: as long as most need to the end."""
+_MEMORY: Final = 64 << 20
+_PRELUDE: Final = Path(__file__).with_name("prelude.js")
+_REFUSALS: Final = (AfspmError, ArithmeticError, TypeError, ValueError)
+_END: Final = json.dumps({"error": "the script was ended"})
+
+
+@dataclass(frozen=True)
+class Wait:
+    """What a method returns that takes its time: the script waits until `waiting` is false, and then has the value."""
+
+    waiting: Callable[[], bool]
+    value: Callable[[], object] = lambda: None
+
+
+Ask = Callable[[str, str, list[Any]], object]
+"""Answers a script: "get", "set" or "call", a path below `spm`, arguments; "now" gives ms. Raises AfspmError."""
+
+
+class Script:
+    """A script that runs.
+
+    Args:
+        names: the "values" and "methods" of `spm`.
+        wake: called from the script's thread when `step` has more to do.
+    """
+
+    def __init__(self, source: str, names: str, ask: Ask, wake: Callable[[], None] = lambda: None) -> None:
+        self._ask, self._wake = ask, wake
+        self._computes_since_s = time.monotonic()
+        self._asks: SimpleQueue[tuple[str, str]] = SimpleQueue()
+        self._answers: SimpleQueue[str] = SimpleQueue()
+        self._wait: Wait | None = None
+        self._ended = False
+        Thread(target=self._work, args=(source, names), name="emulated script", daemon=True).start()
+
+    def step(self) -> tuple[object, str] | None:
+        """Run on; return its value as it is and as text, or None while it waits or computes. Raises ScriptFailed."""
+        if self._wait is not None:
+            if self._wait.waiting():
+                return None
+            ended, self._wait = self._wait, None
+            self._answer(ended)
+        while True:
+            try:
+                kind, content = self._asks.get(timeout=_AT_ONCE_S)
+            except Empty:
+                if self.computes_for_s > 0.0:
+                    return None
+                self.end()
+                raise ScriptFailed("the script does not come to an end") from None
+            if kind == "failed":
+                raise ScriptFailed(content)
+            if kind == "done":
+                value, text = json.loads(content)
+                return value, text
+            if not self._answered(content):
+                return None
+
+    @property
+    def waits(self) -> bool:
+        """True while it waits for the instrument."""
+        return self._wait is not None
+
+    @property
+    def computes_for_s(self) -> float:
+        """Real seconds after which a script that computes is given up; infinite while it waits for the instrument."""
+        return math.inf if self.waits else self._computes_since_s + LONGEST_S - time.monotonic()
+
+    def end(self) -> None:
+        """Run it no further: whatever it asks for fails."""
+        self._ended, self._wait = True, None
+        self._answers.put(_END)
+
+    def _answered(self, content: str) -> bool:
+        """Do what was asked for; return False if the script waits for it."""
+        self._computes_since_s = time.monotonic()
+        try:
+            found = self._ask(*json.loads(content))
+        except _REFUSALS as error:
+            self._answers.put(json.dumps({"error": str(error)}))
+            return True
+        wait = found if isinstance(found, Wait) else Wait(lambda: False, lambda: found)
+        if wait.waiting():
+            self._wait = wait
+            return False
+        self._answer(wait)
+        return True
+
+    def _answer(self, wait: Wait) -> None:
+        self._computes_since_s = time.monotonic()
+        try:
+            self._answers.put(json.dumps({"value": wait.value()}))
+        except _REFUSALS as error:
+            self._answers.put(json.dumps({"error": str(error)}))
+
+    # -- in the script's thread
+
+    def _work(self, source: str, names: str) -> None:
+        import quickjs
+
+        try:
+            context = quickjs.Context()
+            context.set_memory_limit(_MEMORY)
+            context.set("__names", names)
+            context.add_callable("__ask", self._asked)
+            context.eval(_PRELUDE.read_text(encoding="utf-8"))
+            context.set("__source", source)
+            self._hand_over("done", context.eval("__run(__source)"))
+        # an engine that fails in any other way must end its script, too: the emulator waits for it
+        except Exception as error:
+            self._hand_over("failed", str(error).partition("\n")[0])
+
+    def _asked(self, content: str) -> str:
+        """Never raises: the engine would not survive it."""
+        if self._ended:
+            return _END
+        self._hand_over("ask", content)
+        return self._answers.get()
+
+    def _hand_over(self, kind: str, content: str) -> None:
+        self._asks.put((kind, content))
+        self._wake()

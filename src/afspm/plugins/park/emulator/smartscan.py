@@ -1,0 +1,374 @@
+"""SmartScan's own part: the values and methods below `spm`, and what it does with the instrument."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+from afspm.basics.errors import InvalidValue
+from afspm.basics.plain_data import Plain
+from afspm.model import Region
+from afspm.plugins.park.emulator import files
+from afspm.plugins.park.emulator.engine import Wait
+from afspm.plugins.park.file_header import MICROMETRE
+from afspm.simulation.activities import RETRACE, ScanActivity, SpectrumActivity
+from afspm.simulation.emulation.program import MakerProgram, NamedFile
+
+GEOMETRY: Final[dict[str, tuple[type, float, float]]] = {
+    "pixelHeight": (int, 1, 8192),
+    "pixelWidth": (int, 1, 8192),
+    "width": (float, 1e-6, 100.0),
+    "height": (float, 1e-6, 100.0),
+    "offsetX": (float, -50.0, 50.0),
+    "offsetY": (float, -50.0, 50.0),
+    "rotation": (float, -360.0, 360.0),
+}
+"""The frame, in the order in which it is told: type and bounds, in micrometres and degrees."""
+_CURVES: Final = {"fd": "force", "iv": "IV"}
+_OTHER_NAMES: Final = {
+    "zheight": "Height",
+    "topography": "Height",
+    "ncmamplitude": "Amplitude",
+    "ncmphase": "Phase",
+    "ncmfrequency": "Frequency Shift",
+}
+"""What users' scripts call channels; "Channel" before a name, capitals and spaces make no difference."""
+_SHOWN: Final = {"m": ("um", 1e6), "A": ("pA", 1e12)}
+"""The unit in which a channel is read, and how many of it are one of the simulation's."""
+_MOST_READ: Final = 10_000
+_LOCATION: Final = {"subDir": "", "fileName": "SIMULATED", "fileSuffix": "", "direction": "auto", "jpegSave": False}
+_RETRACTED_UM, _EXTENDED_UM = 7.5, -7.5
+_SCANNER_UM_S, _STAGE_UM_S = 10.0, 1000.0
+"""Speeds where a script gives none: of the scanner, and of a stage at its normalized speed of 1."""
+_STAGE_TOP_UM: Final = 1e4
+_TOUCHES_UM: Final = 0.02
+"""So far below the height at which it touches, a tip is still not driven into the sample."""
+_SWEEP_S: Final = 3.0
+_LINE_SCAN: Final = "line scan"
+_LINE_SCAN_S: Final = 1e9
+"""A line is scanned again and again until it is stopped."""
+_SETPOINT, _ENABLE, _RATE, _BIAS = "zservo.setpoint.value", "zservo.enable", "scan.rate", "bias.tip"
+_GAIN: Final = "zservo.gain"
+_PROPORTIONAL, _INTEGRAL = 0.2, 3000.0
+"""What SmartScan's gains of 1 are to the simulated feedback; the second in 1/s."""
+_BOUNDS: Final = {_SETPOINT: (-10.0, 10.0), _RATE: (1e-4, 1e5), _BIAS: (-10.0, 10.0), "bias.sample": (-10.0, 10.0)}
+
+
+class SmartScanProgram(MakerProgram):
+    """The program, which scripts lead to.
+
+    Attributes:
+        geometry: the frame.
+        tells_gains: whether the gains of the feedback can be read, or only set.
+    """
+
+    def __init__(self, *given: Any, **settings: Any) -> None:
+        super().__init__(*given, **settings)
+        self.geometry: dict[str, float] = dict(zip(GEOMETRY, (128, 128, 1.0, 1.0, 0.0, 0.0, 0.0), strict=True))
+        feedback = self.rig.setup.feedback
+        self._values: Plain = {
+            _RATE: 1.0,
+            _SETPOINT: 0.7 if feedback.setpoint is None else feedback.setpoint,
+            _ENABLE: True,
+            _BIAS: self.rig.setup.bias_v,
+            "bias.sample": 0.0,
+            "zservo.setpoint.normalized": False,
+            "zservo.setpoint.normValue": 1.0,
+            _GAIN: {"p": 0.5, "i": 0.5, "z+": 1.0, "z-": 1.0},
+            "scan.options": {"twoWay": False, "overScan": {"enable": False, "percent": 5}},
+            "dataLocation": {"baseDir": str(self.folder), **_LOCATION},
+        }
+        self._told: dict[str, Callable[[], object]] = {
+            "zscanner.pos": lambda: self._z_um,
+            "zscanner.fullyRetractedPos": lambda: _RETRACTED_UM,
+            "zscanner.fullyExtendedPos": lambda: _EXTENDED_UM,
+            "zstage.pos": lambda: self.stage_um[2],
+            "xystage.pos": lambda: {"x": self.stage_um[0], "y": self.stage_um[1]},
+            "focusstage.pos": lambda: self._focus_um,
+            "approach.state": lambda: "approaching" if self.engages else "idle",
+        }
+        self._methods: dict[str, Callable[..., object]] = {
+            "scan.setScanGeometry": self._set_geometry,
+            "scan.triggerImageScan": lambda: self.start_scan(self.now_s),
+            "scan.startImageScan": self._start_and_wait,
+            "scan.triggerLineScan": self._scan_line,
+            "scan.stop": lambda: self.stop_scan(self.now_s),
+            "scan.channels.names": lambda: list(self._recorded),
+            "scan.channels.add": self._add_channel,
+            "scan.channels.remove": self._remove_channel,
+            "addChannel": self._add_channel,
+            "spect.start": self._measure_curve,
+            "spect.trigger": self._start_curve,
+            "spect.stop": self.stop_curve,
+            "approach.start": self._approach,
+            "approach.stop": self.stop_engaging,
+            "ncm.sweepAuto": self._sweep,
+            "ncm.sweepAutoFullRange": self._sweep,
+            "zscanner.retractAll": self._retract,
+            "zscanner.moveTo": self._move_scanner,
+            "zstage.move": lambda by_um, speed=1.0: self._move_z_stage(self.stage_um[2] + by_um, speed),
+            "zstage.moveTo": self._move_z_stage,
+            "zstage.reset": lambda: self._move_z_stage(_STAGE_TOP_UM),
+            "xystage.moveTo": self._move_xy_stage,
+            "xystage.reset": lambda: self._move_xy_stage(0.0, 0.0),
+            "focusstage.moveTo": self._move_focus,
+            "focusstage.reset": lambda: self._move_focus(0.0),
+            "xyscanner.moveTo": self._move,
+            "readChannel": self._read_channel,
+            "readChannelAveraged": self._average_channel,
+            "sleep": self._sleep,
+        }
+        self.tells_gains = True
+        self.stage_um = [0.0, 0.0, 0.0]
+        self._z_um = self._focus_um = 0.0
+        self._recorded = dict.fromkeys(name.removesuffix(RETRACE) for name in self.rig.channels)
+        self._wakings_s: list[float] = []
+        self._saved = 0
+        self._apply()
+
+    @property
+    def names(self) -> str:
+        """What there is below `spm`, in JSON."""
+        return json.dumps({"values": [*self._values, *self._told], "methods": list(self._methods)})
+
+    def ask(self, kind: str, path: str, given: list[Any]) -> object:
+        """Do what a script asks for. Raises AfspmError, TypeError."""
+        if kind == "now":
+            return round(self.now_s * 1e3)
+        if kind == "call":
+            return self._methods[path](*given)
+        if kind == "set":
+            self._set(path, given[0])
+            return None
+        if path == _GAIN and not self.tells_gains:
+            return None
+        return self._told[path]() if path in self._told else self._values[path]
+
+    def next_waking_s(self, now_s: float) -> float | None:
+        """Return when the next script that sleeps goes on."""
+        self._wakings_s = [at_s for at_s in self._wakings_s if at_s > now_s]
+        return min(self._wakings_s, default=None)
+
+    # -- methods
+
+    def _set(self, path: str, value: Any) -> None:
+        if path not in self._values:
+            raise InvalidValue(f"{path} can't be set")
+        present = self._values[path]
+        if path in _BOUNDS:
+            low, high = _BOUNDS[path]
+            _number(path, value, low, high)
+        elif isinstance(present, dict):
+            if not isinstance(value, dict):
+                raise InvalidValue(f"{path}: {value!r} is no object")
+            value = {**present, **value}
+            for member, number in value.items() if path == _GAIN else ():
+                _number(f"{path}.{member}", number, 0.0, 100.0)
+        elif isinstance(value, bool) is not isinstance(present, bool):
+            raise InvalidValue(f"{path}: {value!r}")
+        self._values[path] = value
+        self._apply()
+
+    def _set_geometry(self, wanted: Plain) -> None:
+        for name, (kind, low, high) in GEOMETRY.items():
+            _number(name, wanted.get(name, self.geometry[name]), low, high, whole=kind is int)
+        self.geometry |= {name: wanted[name] for name in GEOMETRY if name in wanted}
+
+    def _start_and_wait(self) -> Wait:
+        self.start_scan(self.now_s)
+        return Wait(lambda: self.scanning)
+
+    def _start_curve(self, mode: str | Plain = "fd", place: str = "given") -> None:
+        told = mode if isinstance(mode, dict) else {"mode": mode, "type": place}
+        if told.get("mode") not in _CURVES or told.get("type") != "here":
+            raise InvalidValue(f"no points are given for {mode!r}, or there is no such spectroscopy")
+        self.start_curve(_CURVES[told["mode"]], self.now_s)
+
+    def _measure_curve(self, *given: Any) -> Wait:
+        self._start_curve(*given)
+        return Wait(lambda: self.measuring_curve)
+
+    def _scan_line(self) -> None:
+        self._refuse_busy()
+        self.rig.occupy(_LINE_SCAN, _LINE_SCAN_S, self.now_s)
+
+    def _sweep(self, *given: float) -> Wait:
+        for number, value in enumerate(given, 1):
+            _number(f"number {number} of a sweep", value, 0.0, 1e9)
+        self._refuse_busy()
+        self.rig.occupy("sweep of the drive frequency", _SWEEP_S, self.now_s)
+        return Wait(lambda: self.rig.busy(self.now_s))
+
+    def _approach(self, mode: str = "q+s") -> Wait:
+        if mode not in ("q", "quick", "q+s", "quickAndsafe", "inc", "incremental", "incz", "incrementalzscanner"):
+            raise InvalidValue(f"there is no approach {mode!r}")
+        self.engage()
+        self._z_um = self.stage_um[2] = 0.0  # where the tip touches
+        return Wait(lambda: self.engages or self.rig.doing(self.now_s) == "approach")
+
+    def _retract(self) -> Wait:
+        self.withdraw(self.now_s)
+        return Wait(lambda: self.rig.busy(self.now_s))
+
+    def _move_scanner(self, z_um: float, speed_um_s: float = _SCANNER_UM_S) -> Wait:
+        _number("z of the scanner", z_um, _EXTENDED_UM, _RETRACTED_UM)
+        _number("the speed of the scanner", speed_um_s, 1e-6, 1e4)
+        return self._move_along_z(z_um, self.stage_um[2], abs(z_um - self._z_um), speed_um_s)
+
+    def _move_z_stage(self, z_um: float, speed: float = 1.0) -> Wait:
+        _number("z of the stage", z_um, -_STAGE_TOP_UM, _STAGE_TOP_UM)
+        _number("the normalized speed", speed, 1e-6, 1.0)
+        return self._move_along_z(self._z_um, z_um, abs(z_um - self.stage_um[2]), speed * _STAGE_UM_S)
+
+    def _move_along_z(self, scanner_um: float, stage_um: float, way_um: float, speed_um_s: float) -> Wait:
+        """Move scanner or stage; below the height at which the tip touches, it is driven into the sample."""
+        self._refuse_busy()
+        self.rig.occupy("move along z", way_um / speed_um_s, self.now_s)
+        self._z_um, self.stage_um[2] = scanner_um, stage_um
+        height_um = scanner_um + stage_um
+        self.rig.engaged = height_um <= 0.0
+        if height_um < -_TOUCHES_UM:
+            self.rig.stop("move along z", self.now_s)
+            self.rig.crash(-height_um * MICROMETRE, speed_um_s * MICROMETRE, self.now_s)
+        return Wait(lambda: self.rig.busy(self.now_s))
+
+    def _move_xy_stage(self, x_um: float, y_um: float, x_speed: float = 1.0, y_speed: float = 1.0) -> Wait:
+        """Move the sample under the tip: afterwards the tip is over another place."""
+        for name, value in (("x", x_um), ("y", y_um)):
+            _number(f"{name} of the stage", value, -_STAGE_TOP_UM, _STAGE_TOP_UM)
+        for value in (x_speed, y_speed):
+            _number("the normalized speed", value, 1e-6, 1.0)
+        self._refuse_busy()
+        by_um = (x_um - self.stage_um[0], y_um - self.stage_um[1])
+        lasts_s = max(abs(by_um[0]) / x_speed, abs(by_um[1]) / y_speed) / _STAGE_UM_S
+        self.rig.shift_sample((by_um[0] * MICROMETRE, by_um[1] * MICROMETRE), lasts_s, self.now_s)
+        self.stage_um[:2] = [x_um, y_um]
+        return Wait(lambda: self.rig.busy(self.now_s))
+
+    def _move_focus(self, z_um: float, speed: float = 1.0) -> None:
+        _number("z of the focus stage", z_um, -_STAGE_TOP_UM, _STAGE_TOP_UM)
+        _number("the normalized speed", speed, 1e-6, 1.0)
+        self._focus_um = z_um
+
+    def _move(self, x_um: float, y_um: float) -> Wait:
+        for name, value in (("x", x_um), ("y", y_um)):
+            _number(name, value, -50.0, 50.0)
+        self.rig.move_probe((x_um * MICROMETRE, y_um * MICROMETRE), self.now_s)
+        return Wait(lambda: self.rig.doing(self.now_s) == "move")
+
+    def _sleep(self, lasts_ms: float) -> Wait:
+        _number("milliseconds to sleep", lasts_ms, 0.0, 1e9)
+        until_s = self.now_s + lasts_ms * 1e-3
+        self._wakings_s.append(until_s)
+        return Wait(lambda: self.now_s < until_s)
+
+    # -- channels
+
+    def _add_channel(self, wanted: str | Plain) -> None:
+        self._recorded[self._channel(wanted)] = None
+
+    def _remove_channel(self, wanted: str | Plain) -> None:
+        name = self._channel(wanted)
+        if name not in self._recorded:
+            raise InvalidValue(f"channel {name!r} is not recorded")
+        del self._recorded[name]
+
+    def _channel(self, wanted: str | Plain) -> str:
+        """Return the channel of a name. Raises InvalidValue."""
+        given = str(wanted.get("name") if isinstance(wanted, dict) else wanted)
+        plain = re.sub(r"[\W_]", "", given.casefold()).removeprefix("channel")
+        known = {re.sub(r"\W", "", name.casefold()): name for name in self.rig.channels if not name.endswith(RETRACE)}
+        name = known.get(plain) or _OTHER_NAMES.get(plain, "")
+        if name not in known.values():
+            raise InvalidValue(f"there is no channel {given!r}", hint=f"there are {', '.join(known.values())}")
+        return name
+
+    def _read_channel(self, wanted: str) -> Plain:
+        return self._shown(self._channel(wanted), 1)
+
+    def _average_channel(self, wanted: str, count: int, interval_ms: float) -> Wait:
+        name = self._channel(wanted)
+        _number("the count", count, 1, _MOST_READ, whole=True)
+        _number("the interval", interval_ms, 0.0, 1e6)
+        slept = self._sleep(count * interval_ms)
+        return Wait(slept.waiting, lambda: self._shown(name, count))
+
+    def _shown(self, name: str, count: int) -> Plain:
+        value = sum(self.rig.signals(self.now_s)[name] for _ in range(count)) / count
+        unit, factor = _SHOWN.get(self.rig.channels[name], (self.rig.channels[name], 1.0))
+        return {"value": value * factor, "unit": unit, "rawValue": value}
+
+    # -- what the base asks
+
+    @property
+    def scanning(self) -> bool:
+        return super().scanning or self.rig.doing(self.now_s) == _LINE_SCAN
+
+    def stop_scan(self, now_s: float) -> None:
+        super().stop_scan(now_s)
+        self.rig.stop(_LINE_SCAN, self.now_s)
+
+    def stop_engaging(self) -> None:
+        super().stop_engaging()
+        if not self.rig.engaged:
+            self._z_um = _RETRACTED_UM
+
+    def withdraw(self, now_s: float) -> None:
+        super().withdraw(now_s)
+        self._z_um = _RETRACTED_UM
+
+    def prepare_scan(self) -> None:
+        found, setup = self.geometry, self.rig.setup
+        center = (found["offsetX"] * MICROMETRE, found["offsetY"] * MICROMETRE)
+        size = (found["width"] * MICROMETRE, found["height"] * MICROMETRE)
+        setup.region = Region(center, size, math.radians(found["rotation"]))
+        setup.shape = (int(found["pixelHeight"]), int(found["pixelWidth"]))
+        setup.line_s = 1.0 / self._values[_RATE]
+
+    def prepare_curve(self) -> None: ...
+
+    def scan_files(self, scan: ScanActivity, now_s: float) -> Sequence[NamedFile]:
+        name = self._next_name()
+        made = files.images(scan, now_s, "NCM", self._recorded)
+        return [(f"{name}_{_plain(channel)}.tiff", content) for channel, content in made]
+
+    def curve_files(self, curve: SpectrumActivity, now_s: float) -> Sequence[NamedFile]:
+        return [(f"{self._next_name()}_{curve.kind}.tiff", files.curve(curve, now_s, "NCM"))]
+
+    def _next_name(self) -> str:
+        """Return the beginning of the next files' names, which no file has."""
+        location = self._values["dataLocation"]
+        folder = f"{_plain(location['subDir'])}/" if location["subDir"] else ""
+        while True:
+            self._saved += 1
+            name = f"{folder}{_plain(location['fileName'])}_{self._saved:04d}"
+            if not list(self.folder.glob(f"{name}_*")):
+                return name
+
+    def _apply(self) -> None:
+        setup = self.rig.setup
+        gain = self._values[_GAIN]
+        setup.feedback = replace(
+            setup.feedback,
+            setpoint=self._values[_SETPOINT],
+            on=self._values[_ENABLE],
+            proportional_gain=_PROPORTIONAL * gain["p"],
+            integral_gain=_INTEGRAL * gain["i"],
+        )
+        setup.bias_v = self._values[_BIAS]
+
+
+def _plain(name: object) -> str:
+    """Return a part of a file's name: a file never leaves its folder."""
+    return re.sub(r"[^A-Za-z0-9_-]", "_", str(name))[:100]
+
+
+def _number(name: str, value: Any, low: float, high: float, *, whole: bool = False) -> None:
+    """Raises InvalidValue."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not low <= value <= high or (whole and value != int(value)):
+        raise InvalidValue(f"{name}: {value!r} is not within {low:g} to {high:g}")

@@ -1,0 +1,142 @@
+"""The connection to SmartScan: JSON-RPC over ZeroMQ, and scripts whose outcome is told in a form of our own."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from typing import Any, Final
+
+from afspm.basics.errors import AfspmError
+from afspm.basics.plain_data import Plain
+from afspm.translator.driver import ControllerLost
+from afspm.translator.zmq_connection import ZmqConnection
+
+RUN_SCRIPT, SCRIPT_RUNS, IS_CONNECTED, SCAN_STATUS, GEOMETRY = (
+    "js_cmd",
+    "js_run",
+    "js_connect",
+    "scan_query",
+    "geometry_query",
+)
+_NO_PARAMETERS: Final = "None"
+_ID: Final = 1
+_SHOWN: Final = 60
+_HINTS: Final = (
+    '"tcp://host:5581"',
+    "does SmartScan run, with SmartRemote switched on?",
+    "a dialog may wait on its screen, or a script of another client may be running",
+)
+OK, ERROR = "ok", "error"
+
+
+class SmartScanError(AfspmError):
+    """SmartScan could not run a script: its own words."""
+
+    code = "park-error"
+
+
+class Link:
+    """One connection. For one thread. Raises ControllerLost: nobody listens there. ConfigError: it is no address."""
+
+    def __init__(self, address: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
+        self._address = address
+        self._connection = ZmqConnection(address, timeout_s, monotonic_s, _HINTS)
+
+    def ask(self, method: str) -> Any:
+        """Return the result of a method without parameters. Raises SmartScanError, ControllerLost."""
+        return self._connection.ask(method, _request(method, _NO_PARAMETERS), _fields)["result"]
+
+    def run(self, expression: str) -> Any:
+        """Return the value of an expression of JavaScript.
+
+        Raises:
+            SmartScanError: it failed. ControllerLost: no reply, or none to be trusted; the connection is closed.
+        """
+        reply = self._connection.ask(shown(expression), _request(RUN_SCRIPT, wrapped(expression)), _fields)
+        if not reply.get("value"):
+            raise self._bad(f"SmartScan gave no value of {shown(expression)}")
+        return self._outcome(reply)
+
+    def begin(self, expression: str) -> None:
+        """Have a script run that takes its time. Raises ControllerLost."""
+        self._connection.begin(shown(expression), _request(RUN_SCRIPT, wrapped(expression)))
+
+    def wait(self, within_s: float) -> None:
+        """Wait for the reply to `begin`, in real time. Raises ControllerLost."""
+        self._connection.wait(within_s)
+
+    def reply(self, what: str) -> tuple[bool, Any]:
+        """Return whether a reply has come to what was begun, and the value in it, None if it has none.
+
+        Raises:
+            SmartScanError: it failed. ControllerLost.
+        """
+        raw = self._connection.reply(what)
+        if raw is None:
+            return False, None
+        reply = _fields(raw)
+        return True, self._outcome(reply) if reply.get("value") else None
+
+    def close(self) -> None:
+        """Let go of it."""
+        self._connection.close()
+
+    def _outcome(self, reply: Plain) -> Any:
+        value = reply.get("value")
+        try:
+            told = json.loads(value) if isinstance(value, str) else value
+        except ValueError:
+            told = None
+        if not isinstance(told, dict) or len(told) != 1 or not told.keys() & {OK, ERROR}:
+            raise self._bad(f"SmartScan replied {reply} to a script")
+        if ERROR in told:
+            raise SmartScanError(str(told[ERROR]))
+        return told[OK]
+
+    def _bad(self, told: str) -> ControllerLost:
+        self.close()
+        return ControllerLost(told, where=self._address, hint="afspm does not understand it: report it, with a trace")
+
+
+def wrapped(expression: str) -> str:
+    """Return a line whose value says whether the expression failed: SmartScan's own way to say so is not known."""
+    ok, error = f'JSON.stringify({{"{OK}": ({expression})}})', f'JSON.stringify({{"{ERROR}": String(e)}})'
+    return f"(function() {{ try {{ return {ok}; }} catch (e) {{ return {error}; }} }})()"
+
+
+def shown(script: str) -> str:
+    """Return the beginning of a script, for messages."""
+    return script if len(script) <= _SHOWN else f"{script[:_SHOWN]}…"
+
+
+def numbers(told: object, count: int) -> list[float]:
+    """Return so many finite numbers, of a list or of a text with commas. Raises ControllerLost."""
+    parts = told.split(",") if isinstance(told, str) else told
+    try:
+        found = [float(one) for one in parts] if isinstance(parts, list) else []
+    except (TypeError, ValueError):
+        found = []
+    if len(found) != count or not all(map(math.isfinite, found)):
+        raise ControllerLost(f"SmartScan replied {told!r} instead of {count} numbers")
+    return found
+
+
+def _request(method: str, parameters: str) -> bytes:
+    return json.dumps({"jsonrpc": "2.0", "method": method, "params": parameters, "id": _ID}).encode()
+
+
+def _fields(raw: bytes) -> Plain:
+    """Return a reply. Raises SmartScanError: it is an error. ControllerLost: it is none."""
+    try:
+        reply = json.loads(raw)
+    except ValueError as error:
+        raise ControllerLost(f"a reply that is not JSON: {raw[:_SHOWN]!r}") from error
+    if not isinstance(reply, dict):
+        raise ControllerLost(f"a reply that is not JSON-RPC: {raw[:_SHOWN]!r}")
+    if reply.get("error"):
+        told = reply["error"]
+        raise SmartScanError(str(told.get("message", told) if isinstance(told, dict) else told))
+    if "result" not in reply:
+        raise ControllerLost(f"a reply without a result: {raw[:_SHOWN]!r}")
+    return reply

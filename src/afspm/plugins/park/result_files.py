@@ -1,0 +1,40 @@
+"""SmartScan's files: of one scan, a TIFF for each channel and direction; of a curve, one."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from afspm.basics.plain_data import Plain
+from afspm.translator.folder_files import FolderFiles
+from afspm.translator.result_files import Entry, FilePrecision, modified_ns
+
+SETTLE_S: Final = 1.0
+"""So long, in real time, no other file may have come before a scan's are taken: how many there will be is not known."""
+
+
+class ParkFiles(FolderFiles):
+    """The files of the measurement that is running or has just ended, and the results.
+
+    Args:
+        monotonic_s: real time.
+    """
+
+    pattern = "**/*.tif*"
+    precision = FilePrecision(part=1e-9, angle_rad=1e-9)
+
+    def __init__(self, kept: Plain, log: logging.Logger, monotonic_s: Callable[[], float]) -> None:
+        super().__init__(kept, log)
+        self._monotonic_s = monotonic_s
+        self._seen: tuple[list[tuple[str, int]], float] = ([], 0.0)
+
+    def files_of(self, measured: Entry) -> list[tuple[str, int]]:
+        """Return all new files, once no more come."""
+        listed = [(str(path), modified_ns(path)) for path in self._files(Path(measured["folder"]))]
+        files = sorted(one for one in listed if one[1] > measured["newest_ns"])
+        now_s = self._monotonic_s()
+        if files != self._seen[0]:
+            self._seen = (files, now_s)
+        return files if now_s - self._seen[1] >= SETTLE_S else []

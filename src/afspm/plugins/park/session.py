@@ -1,0 +1,145 @@
+"""A connected SmartScan: its values, its commands, and whether it scans."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Final
+
+from afspm.basics.errors import Refused
+from afspm.model import ControlResponse
+from afspm.plugins.park.link import (
+    GEOMETRY,
+    IS_CONNECTED,
+    SCAN_STATUS,
+    SCRIPT_RUNS,
+    Link,
+    SmartScanError,
+    numbers,
+)
+from afspm.translator.driver import ControllerLost
+from afspm.translator.long_call import LongCall
+from afspm.translator.parameters import Value
+
+TRUE, FALSE = frozenset({"true", "1"}), frozenset({"false", "0"})
+_GEOMETRY: Final = ("pixelHeight", "pixelWidth", "width", "height", "offsetX", "offsetY", "rotation")
+
+
+class Session:
+    """SmartScan over one connection; what takes long has another. For one thread.
+
+    Args:
+        open_link: gives a new connection.
+        scanning, idle: the words of `scan_query`, in small letters.
+    """
+
+    def __init__(self, open_link: Callable[[], Link], scanning: Collection[str], idle: Collection[str]) -> None:
+        self._open_link, self._scanning, self._idle = open_link, scanning, idle
+        self._link = open_link()
+        try:
+            self._link.ask(IS_CONNECTED)
+            self.scanning()
+        except SmartScanError as error:
+            self._link.close()
+            raise ControllerLost(f"SmartScan is not ready: {error}") from error
+        except BaseException:
+            self._link.close()
+            raise
+
+    def values(self, paths: Sequence[str]) -> dict[str, Value]:
+        """Return values by their paths below `spm`. Raises Refused: there is none. ControllerLost: one is no value."""
+        try:
+            told = self._link.run(f"[{', '.join(f'spm.{path}' for path in paths)}]")
+        except SmartScanError as error:
+            raise Refused(ControlResponse.PARAM_ERROR, f"SmartScan refused {', '.join(paths)}: {error}") from error
+        if not isinstance(told, list) or len(told) != len(paths) or not all(map(_is_value, told)):
+            raise ControllerLost(f"SmartScan replied {told} for {', '.join(paths)}")
+        return dict(zip(paths, told, strict=True))
+
+    def is_number(self, path: str) -> bool:
+        """Return True if there is a number at a path below `spm`. Raises ControllerLost."""
+        try:
+            return bool(self._link.run(f"typeof spm.{path}") == "number")
+        except SmartScanError:
+            return False
+
+    def put(self, values: Mapping[str, Value]) -> None:
+        """Set values by their paths below `spm`. Raises Refused: SmartScan does not take one."""
+        given = ", ".join(f"spm.{path} = {json.dumps(value)}" for path, value in values.items())
+        self._do(given, ", ".join(values), ControlResponse.PARAM_ERROR)
+
+    def put_members(self, path: str, members: Mapping[str, Value]) -> None:
+        """Set members of a value that is an object, which is set as a whole only. Raises Refused."""
+        given = "".join(f"all[{json.dumps(name)}] = {json.dumps(value)}; " for name, value in members.items())
+        changed = f"spm.{path} = (function (all) {{ {given}return all; }})(spm.{path})"
+        self._do(changed, path, ControlResponse.PARAM_ERROR)
+
+    def do(self, command: str) -> None:
+        """Call a command, e.g. "scan.stop()". Raises Refused: SmartScan would not."""
+        self._do(f"spm.{command}", command, ControlResponse.ACTION_ERROR)
+
+    def run(self, expression: str) -> object:
+        """Return the value of an expression. Raises SmartScanError, ControllerLost."""
+        return self._link.run(expression)
+
+    def geometry(self) -> dict[str, float]:
+        """Return the frame, in micrometres and degrees. Raises ControllerLost."""
+        return dict(zip(_GEOMETRY, numbers(self._asked(GEOMETRY), len(_GEOMETRY)), strict=True))
+
+    def set_geometry(self, wanted: Mapping[str, float]) -> None:
+        """Set the frame. Raises Refused."""
+        self._do(f"spm.scan.setScanGeometry({json.dumps(dict(wanted))})", "the frame", ControlResponse.PARAM_ERROR)
+
+    def scanning(self) -> bool:
+        """Return whether a scan runs. Raises ControllerLost: SmartScan says neither."""
+        hint = "watch what it says while it scans and while it does not, and set scanning_words and idle_words"
+        return self._word(SCAN_STATUS, self._scanning, self._idle, hint)
+
+    def script_runs(self) -> bool:
+        """Return whether a script runs. Raises ControllerLost: SmartScan says neither."""
+        return self._word(SCRIPT_RUNS, TRUE, FALSE, "report it, with a trace")
+
+    def begin(self, what: str, expression: str, wait_s: float = 0.0) -> LongCall:
+        """Begin what takes long, on a connection of its own, and wait a little for a reply. Raises ControllerLost.
+
+        Whether its reply comes at its end, or at once and without a value, is not known: in the second case SmartScan
+        is asked whether a script runs.
+        """
+        link = self._open_link()
+        try:
+            link.begin(expression)
+            link.wait(wait_s)
+        except BaseException:
+            link.close()
+            raise
+        return LongCall(what, link, lambda value: value is None and self.script_runs())
+
+    def close(self) -> None:
+        """Let go of it."""
+        self._link.close()
+
+    # --- inside ---
+
+    def _do(self, expression: str, what: str, refusal: int) -> None:
+        try:
+            self._link.run(f"({expression}, 0)")
+        except SmartScanError as error:
+            raise Refused(refusal, f"SmartScan refused {what}: {error}") from error
+
+    def _asked(self, method: str) -> object:
+        try:
+            return self._link.ask(method)
+        except SmartScanError as error:
+            raise ControllerLost(f"SmartScan does not answer {method}: {error}") from error
+
+    def _word(self, method: str, yes: Collection[str], no: Collection[str], hint: str) -> bool:
+        told = str(self._asked(method)).strip().casefold()
+        if told not in yes and told not in no:
+            known = ", ".join(sorted({*yes, *no}))
+            raise ControllerLost(f"SmartScan replied {told!r} to {method}, and not one of {known}", hint=hint)
+        return told in yes
+
+
+def _is_value(told: object) -> bool:
+    return isinstance(told, bool | int | str) or (isinstance(told, float) and math.isfinite(told))

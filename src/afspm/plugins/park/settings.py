@@ -1,0 +1,111 @@
+"""The frame, the speed, the gains and the place of the tip as SmartScan has them, and as everybody else.
+
+SmartScan has the centre of a frame in micrometres, its angle in degrees, and lines per second; a line is there and
+back (!).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from afspm.basics.errors import InvalidValue
+from afspm.model import Region, names
+from afspm.plugins.park.session import Session
+from afspm.translator.long_call import LongCall
+from afspm.translator.parameters import Value
+from afspm.translator.result_files import XY
+from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, SettingsGroup, frame, frame_values
+
+MICROMETRE: Final = 1e-6
+MOVE: Final = "move"
+_RATE: Final = "scan.rate"
+_GAIN: Final = "zservo.gain"
+_GAINS: Final = {names.ZCTRL_PGAIN: f"{_GAIN}.p", names.ZCTRL_IGAIN: f"{_GAIN}.i"}
+_SPEED_PATH: Final = 2.0
+"""Widths of the frame that the tip travels in a line."""
+
+
+class FrameSettings(SettingsGroup):
+    """The frame and the speed, which are set together as the speed is told by lines per second."""
+
+    names = frozenset({*FRAME, names.SCAN_SPEED})
+
+    def __init__(self, session: Callable[[], Session]) -> None:
+        self._session = session
+
+    def read(self) -> dict[str, Value]:
+        found = self._session().geometry()
+        width = found["width"] * MICROMETRE
+        center = (found["offsetX"] * MICROMETRE, found["offsetY"] * MICROMETRE)
+        region = Region(center, (width, found["height"] * MICROMETRE), math.radians(found["rotation"]))
+        shape = (round(found["pixelHeight"]), round(found["pixelWidth"]))
+        rate = float(self._session().values([_RATE])[_RATE])
+        return {**frame_values(region, shape), names.SCAN_SPEED: _SPEED_PATH * width * rate}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        wanted = self.merged(values)
+        region, (rows, columns) = frame(wanted)
+        speed_m_s = float(wanted[names.SCAN_SPEED])
+        if speed_m_s <= 0.0:
+            raise InvalidValue(f"a scan at {speed_m_s} m/s never ends")
+        (x, y), (width, height) = region.center_m, region.size_m
+        self._session().set_geometry(
+            {
+                "pixelHeight": rows,
+                "pixelWidth": columns,
+                "width": width / MICROMETRE,
+                "height": height / MICROMETRE,
+                "offsetX": x / MICROMETRE,
+                "offsetY": y / MICROMETRE,
+                "rotation": math.degrees(region.angle_rad),
+            }
+        )
+        self._session().put({_RATE: speed_m_s / (_SPEED_PATH * width)})
+
+
+class Gains(SettingsGroup):
+    """The gains of the feedback: two of the four members of one value, which may not be one to be read (!)."""
+
+    names = tuple(_GAINS)
+
+    def __init__(self, session: Callable[[], Session]) -> None:
+        self._session = session
+
+    def read(self) -> dict[str, Value]:
+        told = self._session().values(list(_GAINS.values()))
+        return {name: float(told[path]) for name, path in _GAINS.items()}
+
+    def are_told(self) -> bool:
+        """Return True if SmartScan tells them. Raises ControllerLost."""
+        return all(map(self._session().is_number, _GAINS.values()))
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        self._session().put_members(
+            _GAIN, {_GAINS[name].rpartition(".")[2]: float(value) for name, value in values.items()}
+        )
+
+
+class TipPlace(KeptSettings):
+    """The place to which the tip was sent: SmartScan tells that of its stage alone (!)."""
+
+    def __init__(self, session: Callable[[], Session], begun: Callable[[LongCall], None]) -> None:
+        super().__init__(dict.fromkeys(POSITION, 0.0))
+        self._session, self._begun = session, begun
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        wanted = self.merged(values)
+        self._begun(self._session().begin(MOVE, way_to((float(wanted[POSITION[0]]), float(wanted[POSITION[1]])))))
+        super().write(values)
+
+    def xy_m(self) -> XY:
+        """Return where the tip was sent."""
+        x, y = map(self.number, POSITION)
+        return x, y
+
+
+def way_to(place_m: XY) -> str:
+    """Return the script that leads the tip to a place."""
+    x, y = (length / MICROMETRE for length in place_m)
+    return f"(spm.xyscanner.moveTo({x!r}, {y!r}), 0)"

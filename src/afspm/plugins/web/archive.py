@@ -1,0 +1,123 @@
+"""The run's folder: what was before this dashboard was started, scans that left the memory, and the limits."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import tomllib
+from collections import OrderedDict
+from pathlib import Path
+
+from afspm import wire
+from afspm.basics.errors import AfspmError
+from afspm.basics.plain_data import Plain
+from afspm.basics.units import si
+from afspm.model import ProblemNames, Region, Scan, Spectrum
+from afspm.plugins.web.frames import ChannelFrame, FrameKey
+from afspm.record.journal import JOURNAL_FILE
+from afspm.record.overview import Overview
+from afspm.record.run import open_run
+from afspm.record.run_json import EXPERIMENT_FILE
+
+KEPT = 6
+
+
+class Archive:
+    """Reads what the recorder has written into the run's folder. From any thread.
+
+    Args:
+        folder: of the run; None where it is on another computer.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
+        self._log = logging.getLogger("afspm.plugins.web.dashboard")
+        self._lock = threading.Lock()
+        self._read: OrderedDict[FrameKey, ChannelFrame] = OrderedDict()
+
+    def past(self, problems: ProblemNames) -> Overview | None:
+        """Return what the run has come to so far, without what was logged; None if there is no record of it yet."""
+        if self._folder is None or not (self._folder / JOURNAL_FILE).is_file():  # a replay has only that of another run
+            return None
+        try:
+            with open_run(self._folder) as run:
+                # of all others the scheduler has kept enough for a late joiner
+                return run.overview([one.name for one in wire.declared() if one.in_past], problems)
+        except (AfspmError, ImportError) as error:
+            self._log.debug("the earlier part of the run can't be read: %s", error)
+            return None
+
+    def frame(self, time_ns: int, channel: str) -> ChannelFrame | None:
+        """Return a finished channel by its time; None if it is not in the record, or there is none."""
+        if self._folder is None:
+            return None
+        key = (time_ns, channel)
+        with self._lock:
+            if key in self._read:
+                self._read.move_to_end(key)
+                return self._read[key]
+            try:
+                frame = _find(self._folder, time_ns, channel)
+            except (AfspmError, ImportError, KeyError) as error:
+                self._log.debug("a scan can't be read: %s", error)
+                return None
+            if frame is not None:
+                self._read[key] = frame
+                while len(self._read) > KEPT:
+                    self._read.popitem(last=False)
+            return frame
+
+    def spectrum(self, time_ns: int) -> Spectrum | None:
+        """Return a spectrum by its time; None if it is not in the record, or there is none."""
+        if self._folder is None:
+            return None
+        try:
+            with open_run(self._folder) as run:
+                row = next((row for row in reversed(run.spectra) if row.time_ns == time_ns), None)
+                return None if row is None else run.spectrum(row)
+        except (AfspmError, ImportError) as error:
+            self._log.debug("a spectrum can't be read: %s", error)
+            return None
+
+
+def allowed_region(folder: Path) -> Region | None:
+    """Return the region of [limits] in the expanded experiment file, in tip coordinates; None if there is none."""
+    try:
+        box = _section(folder, "limits").get("region")
+        return None if box is None else _region(box)
+    except (ValueError, KeyError, TypeError, AttributeError, AfspmError):
+        return None  # it is only drawn: the scheduler, which enforces it, has read it by itself
+
+
+def adjustable_parameters(folder: Path) -> tuple[str, ...]:
+    """Return what [control] adjustable of the expanded experiment file offers; the scheduler decides about it."""
+    offered = _section(folder, "control").get("adjustable", ())
+    return tuple(map(str, offered)) if isinstance(offered, list) else ()
+
+
+def _section(folder: Path, name: str) -> Plain:
+    try:
+        section = tomllib.loads((folder / EXPERIMENT_FILE).read_text(encoding="utf-8")).get(name)
+    except (OSError, ValueError):
+        return {}
+    return section if isinstance(section, dict) else {}
+
+
+def _region(box: Plain) -> Region:
+    if "x" in box:
+        (left, right), (low, high) = (tuple(si(v, "m") for v in box[axis]) for axis in "xy")
+        return Region(((left + right) / 2, (low + high) / 2), (right - left, high - low))
+    center, size = (tuple(si(v, "m") for v in box[key]) for key in ("center", "size"))
+    return Region((center[0], center[1]), (size[0], size[1]), si(box.get("angle", 0.0), "rad"))
+
+
+def _find(folder: Path, time_ns: int, channel: str) -> ChannelFrame | None:
+    with open_run(folder) as run:
+        row = run.scan_at(time_ns, channel)
+        return None if row is None or not row.file else _frame(run.scan(row)[channel], time_ns)
+
+
+def _frame(scan: Scan, time_ns: int) -> ChannelFrame:
+    """Return a frame with a number below all of what comes now, and the same for the same scan."""
+    number = -1 - (hash((time_ns, scan.channel)) & (2**52 - 1))
+    return ChannelFrame(number, scan.channel, scan.unit, scan.region, scan.values, time_ns, None, scan.shape[0])

@@ -1,0 +1,217 @@
+"""`afspm dashboard`: the page of an experiment that runs already, here or on another computer; and of `afspm run`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from afspm.basics.plain_data import Plain, PlainMapping
+from afspm.cli.arguments import MEANWHILE, RUNS, Where, opt
+
+if TYPE_CHECKING:
+    from afspm.experiment import Experiment
+    from afspm.plugins.web.dashboard.recorded import RecordedSettings
+    from afspm.supervisor.resume import ResumableRun
+
+NAME_OF_CLASS = "Dashboard"
+
+app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=MEANWHILE)
+
+
+@app.command()
+def dashboard(
+    where: Where = RUNS,
+    host: Annotated[
+        str, typer.Option(help="The address to listen at; others than this computer's own need a password.")
+    ] = "127.0.0.1",
+    port: Annotated[int | None, opt("By default 8080, or any that is free.")] = None,
+    certificate: Annotated[Path | None, opt("PEM file, for https.")] = None,
+    certificate_key: Annotated[Path | None, opt("PEM file, its key.")] = None,
+    people: Annotated[
+        Path | None, opt('TOML file with a line for each person who may steer: Ada = "scrypt:…".')
+    ] = None,
+    make_password: Annotated[
+        bool, typer.Option("--make-password", help="Ask for a name and a password, print their line, and end.")
+    ] = False,
+) -> None:
+    """Show an experiment in the browser: steer one that runs, look through one that has ended.
+
+    It joins the run as a notebook would: the experiment does not notice when it comes and goes. When it ends, the page
+    stays, with a slider through the night, until Ctrl-C; so it is shown for a run that has ended. With an experiment
+    file of which nothing was started here it connects to where the file says that the scheduler is. A password for
+    those who only look may be in the environment: AFSPM_DASHBOARD_PASSWORD.
+    """
+    from afspm.record.run_lock import goes_on
+
+    if make_password:
+        _print_password()
+        return
+    settings: dict[str, object] = {
+        "host": host, "port": port, "certificate": certificate, "certificate_key": certificate_key,
+        "people": None if people is None else _people_in(people),
+    }  # fmt: skip
+    folder = _run_here(where)
+    if folder is None:
+        raise typer.Exit(_start_part(where))
+    typer.echo(f"opening the page of {folder.name} …")  # before what takes seconds to load
+    if goes_on(folder):
+        raise typer.Exit(_join(folder, settings))
+    _serve_recorded(folder, settings)
+
+
+def stay(folder: Path, name: str, settings: PlainMapping) -> None:
+    """Show a run that has ended until Ctrl-C.
+
+    Args:
+        name: of the dashboard that it had, with its settings.
+    """
+    import subprocess
+    import sys
+
+    line = f"{_recorded(folder, name, settings).to_json()}\n"
+    command = [sys.executable, "-P", "-m", "afspm.plugins.web.dashboard.recorded"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, text=True, encoding="utf-8") as process:
+        assert process.stdin is not None
+        process.stdin.write(line)
+        process.stdin.flush()
+        with suppress(KeyboardInterrupt):
+            process.wait()
+        # leaving closes its standard input, which ends the page if Ctrl-C has not
+
+
+def page_of(experiment: Experiment, started: Sequence[str]) -> tuple[str, PlainMapping] | None:
+    """Return name and settings of a dashboard among the processes that were started here; None: there is none."""
+    for process in experiment.resolved.processes.values():
+        if process.class_path.rpartition(".")[2] == NAME_OF_CLASS and process.name in started:
+            return process.name, process.settings
+    return None
+
+
+def with_page(files: list[Path]) -> Experiment:
+    """Return the experiment, with a dashboard if its file has none."""
+    from afspm.experiment import load
+
+    experiment = load(*files)
+    return experiment if _has_dashboard(experiment) else load(*files, _overlay())
+
+
+def resumed_with_page(found: ResumableRun) -> ResumableRun:
+    """Return the run that is to go on, with a dashboard if it has none."""
+    return found if _has_dashboard(found.experiment) else found.with_overlay(_overlay())
+
+
+def _has_dashboard(experiment: Experiment) -> bool:
+    return NAME_OF_CLASS in {
+        process.class_path.rpartition(".")[2] for process in experiment.resolved.processes.values()
+    }
+
+
+def _overlay() -> Path:
+    """Return the file that is laid over an experiment to give it a dashboard."""
+    from afspm.plugins.web import dashboard
+
+    return Path(dashboard.__file__).with_name("assets") / "dashboard.toml"
+
+
+def _print_password() -> None:
+    from afspm.plugins.web.passwords import check_name, hashed
+
+    person = check_name(typer.prompt("Name (empty: a password for all who look)", default="", show_default=False))
+    password = typer.prompt("Password", hide_input=True, confirmation_prompt=True)
+    typer.echo(f'people."{person}" = "{hashed(password)}"' if person else f'password_hash = "{hashed(password)}"')
+
+
+def _people_in(file: Path) -> dict[str, str]:
+    """Return the names and hashes in a file of `--people`, with or without a leading `people.`."""
+    import tomllib
+
+    from afspm.basics.errors import ConfigError
+
+    try:
+        found = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"can't be read: {error}", where=str(file), hint='lines like Ada = "scrypt:…"') from error
+    table = found.get("people", found)
+    if not isinstance(table, dict) or not all(isinstance(kept, str) for kept in table.values()):
+        raise ConfigError(
+            "that is not a table of names and hashes", where=str(file), hint='lines like Ada = "scrypt:…"'
+        )
+    return table
+
+
+def _run_here(where: Path) -> Path | None:
+    """Return the folder of the run that is meant; None: the file is of one that was started elsewhere."""
+    from afspm.basics.errors import FileError
+    from afspm.client.connect import find_run
+
+    try:
+        return find_run(where)
+    except FileError:
+        if where.suffix == ".toml" and where.is_file():
+            return None
+        raise
+
+
+def _join(folder: Path, settings: Plain) -> int:
+    import logging
+    import sys
+
+    from afspm.basics.exit_codes import ExitCode
+    from afspm.basics.requirements import require
+    from afspm.cli.joining import looking
+    from afspm.experiment.process_starts import DASHBOARD
+    from afspm.plugins.web.dashboard import Dashboard
+    from afspm.plugins.web.dashboard.joining import join, url_in
+    from afspm.record.run_json import read_run_json
+
+    url = url_in(read_run_json(folder).get("processes"), folder, DASHBOARD)
+    if url is not None:
+        typer.echo(f"this run has a dashboard already: {url}")
+        return 0
+    require(Dashboard)
+    with looking(folder):
+        pass  # somebody is there
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
+    code = join(folder, Dashboard(**settings), DASHBOARD)
+    if code == ExitCode.ENDED:
+        stay(folder, DASHBOARD, settings)
+    return 0 if code in (ExitCode.ENDED, ExitCode.DONE, ExitCode.ORPHAN) else 1
+
+
+def _serve_recorded(folder: Path, settings: Plain) -> None:
+    from afspm.basics.requirements import require
+    from afspm.experiment.process_starts import DASHBOARD
+    from afspm.plugins.web.dashboard import Dashboard
+    from afspm.plugins.web.dashboard.recorded import serve
+
+    require(Dashboard)
+    serve(_recorded(folder, DASHBOARD, settings), typer.echo)
+
+
+def _recorded(folder: Path, name: str, settings: PlainMapping) -> RecordedSettings:
+    from afspm.plugins.web.dashboard.recorded import RecordedSettings
+
+    given: Plain = {k: str(v) if isinstance(v, Path) else v for k, v in settings.items() if v is not None}
+    return RecordedSettings(str(folder.resolve()), name, **given)
+
+
+def _start_part(file: Path) -> int:
+    """Run the dashboard of an experiment whose scheduler runs elsewhere, as `afspm run --only` would start it."""
+    import sys
+
+    from afspm.basics.errors import ConfigError
+    from afspm.supervisor import run as running
+
+    experiment = with_page([file])
+    names = [one.name for one in experiment.resolved.processes.values() if one.class_path.endswith(f".{NAME_OF_CLASS}")]
+    try:
+        running.dry_run(experiment, running.RunOptions(only=tuple(names)))
+    except ConfigError as error:
+        what = f"nothing of it runs here, and where its scheduler would be is not in the file: {error.what}"
+        raise ConfigError(what, where=str(file), hint="start it with `afspm run`") from error
+    ended = running.run(experiment, running.RunOptions(only=tuple(names)), terminal=sys.stdout)
+    return ended.outcome.exit_code

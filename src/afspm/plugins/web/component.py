@@ -1,0 +1,98 @@
+"""`WebComponent`: a component that serves pages or an API beside its subscriptions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from afspm.basics.errors import ConfigError
+from afspm.client.component import Component
+from afspm.plugins.web.archive import Archive
+from afspm.plugins.web.server import STALLED_S, WebServer, listening, url_of
+from afspm.plugins.web.watch import Watch
+from afspm.record.run_lock import cut_off_message
+from afspm.transport.process.priority import step_back
+
+if TYPE_CHECKING:
+    import socket
+
+    from afspm.plugins.web.asgi import AsgiApp
+    from afspm.transport.process.context import ProcessContext
+
+
+class WebComponent(Component):
+    """Keeps what was published, and serves it. It asks for nothing by itself: all others have the processor first.
+
+    Attributes:
+        served: the name of what is served, in log lines and errors.
+        usual_port: if none is given.
+        stalled_s: as of `WebServer`.
+
+    Args:
+        host: the address to listen at.
+        port: 0 for any that is free; None: the usual one, or any if that is taken. A restart takes the same one.
+        certificate, certificate_key: PEM files, for https.
+
+    Raises:
+        ConfigError: a certificate without its key, or a key without its certificate.
+    """
+
+    served: ClassVar[str]
+    usual_port: ClassVar[int]
+    has_people = True
+    listens = ("",)
+    stalled_s: ClassVar[float] = STALLED_S
+    longest_step_s = 60.0  # the first import of everything, on a busy computer
+
+    def __init__(self, host: str, port: int | None, certificate: Path | None, certificate_key: Path | None) -> None:
+        if (certificate is None) != (certificate_key is None):
+            raise ConfigError("certificate and certificate_key belong together", where=self.served)
+        self._host, self._port = host, port
+        self._certificate = None if certificate is None else Path(certificate)
+        self._certificate_key = None if certificate_key is None else Path(certificate_key)
+        self._server: WebServer | None = None
+
+    @property
+    def encrypted(self) -> bool:
+        return self._certificate is not None
+
+    def run_process(self, context: ProcessContext) -> int:
+        step_back()
+        self._context = context
+        return super().run_process(context)
+
+    def state_file(self, ending: str) -> Path | None:
+        """Return the file of this component in the state folder, or None without one."""
+        folder = self._context.launch.state_dir
+        return Path(folder) / f"{self.name}.{ending}" if folder else None
+
+    def open_port(self) -> socket.socket:
+        """Return the socket to serve at: the port of the last start, where a client looks for us, before any other."""
+        before = self.memory.get("port")
+        earlier = (before,) if isinstance(before, int) else ()
+        usual = earlier if self._port == 0 else (*earlier, self.usual_port)
+        return listening(self._host, self._port or None, usual, what=self.served)
+
+    def watch_run(self) -> tuple[Archive, Watch]:
+        """Return the record of the run so far, and what is published from now on."""
+        archive = Archive(self.run_dir if self._context.launch.run_dir else None)
+        problems = self._context.problems
+        watch = Watch(self.clock, problems, archive.past(problems), lambda: cut_off_message(self.run_dir))
+        return archive, watch
+
+    def serve(self, app: AsgiApp, bound: socket.socket, *, most_requests: int | None = None) -> None:
+        """Start to serve, and note where."""
+        self._server = WebServer(
+            app, bound, self._certificate, self._certificate_key,
+            most_requests=most_requests, stalled_s=self.stalled_s,
+        )  # fmt: skip
+        self._server.start()
+        port = bound.getsockname()[1]
+        url = url_of(self._host, port, encrypted=self.encrypted)
+        self.memory.update({"port": port, "url": url})
+        self.memory.save()
+        self.log.info("the %s is at %s", self.served, url)
+
+    def packet_time_ns(self) -> int:
+        """Return when the message in hand was published."""
+        return self.packet.time_ns if self.packet and self.packet.time_ns is not None else self.clock.now_ns()

@@ -1,0 +1,114 @@
+"""Access to the dashboard: who may look or steer, by a cookie or by a password shown with a request."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from afspm.basics.errors import ConfigError
+from afspm.plugins.web.dashboard.sessions import Sessions
+from afspm.plugins.web.passwords import Passwords, check_name, hashed
+
+PASSWORD = "AFSPM_DASHBOARD_PASSWORD"
+
+
+@dataclass(frozen=True)
+class Visitor:
+    """A viewer of the page.
+
+    Attributes:
+        person: the name; empty: only looks.
+        cookie: of the session; empty for a program that shows its password with each request.
+        recorded: what is shown is a recorded night, in which nothing can be steered.
+    """
+
+    person: str = ""
+    cookie: str = ""
+    recorded: bool = False
+
+    @property
+    def may_steer(self) -> bool:
+        return bool(self.person) and not self.recorded
+
+
+class Access:
+    """Decides whom the dashboard lets look, and whom it lets steer; see `Passwords`.
+
+    Args:
+        host: the address that is listened at.
+        password_hash: of the common password; the password itself may be in the environment instead
+            (AFSPM_DASHBOARD_PASSWORD).
+        people: the hash of each person's password.
+        now_s: the time in real seconds, for sessions and for how often an address may try.
+        sessions: who has signed in.
+
+    Raises:
+        ConfigError: other computers could reach it, and there is no password; or a hash or a name is none.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        password_hash: str,
+        people: Mapping[str, str],
+        now_s: Callable[[], float],
+        sessions: Sessions,
+        environment: Mapping[str, str] = os.environ,
+    ) -> None:
+        password = environment.get(PASSWORD, "")
+        self._passwords = Passwords(host, hashed(password) if password else password_hash, people, now_s)
+        if self._passwords.is_unprotected:
+            raise ConfigError(
+                f"other computers can reach the dashboard at {host}, and it has no password", where="dashboard",
+                hint="set people or password_hash (`afspm dashboard --make-password`), or "
+                f"{PASSWORD} in the environment; or listen on 127.0.0.1",
+            )  # fmt: skip
+        self._sessions = sessions
+
+    @property
+    def is_open(self) -> bool:
+        """True if a name alone is enough to steer."""
+        return self._passwords.is_open
+
+    @property
+    def lets_look(self) -> bool:
+        """True if everybody may look."""
+        return self._passwords.lets_look
+
+    def visitor(self, cookie: str | None) -> Visitor | None:
+        """Return who shows a cookie; None: nobody who may come in."""
+        session = self._sessions.find(cookie or "")
+        if session is not None and session.proof == self._passwords.proof_of(session.person):
+            return Visitor(session.person, cookie or "")
+        return Visitor() if self.lets_look else None
+
+    def is_signed_in(self, visitor: Visitor) -> bool:
+        """Return whether the session of a visitor goes on: it ends when the person signs out anywhere."""
+        return not visitor.cookie or self._sessions.find(visitor.cookie) is not None
+
+    def person_of(self, visitor: Visitor) -> str:
+        """Return the name of a visitor who has signed in and not out again; empty for all others."""
+        return check_name(visitor.person) if self.is_signed_in(visitor) else ""
+
+    def by_password(self, person: str, password: str, address: str) -> Visitor | None:
+        """Return who shows a name and a password with a request; None if that is wrong, or was wrong too often."""
+        return Visitor(person) if self._passwords.proves(person, password, address) else None
+
+    def wait_s(self, person: str, address: str) -> float:
+        """Return the real seconds until a password of a person is looked at again from an address; 0: it is now."""
+        return self._passwords.wait_s(person, address)
+
+    def enter(self, person: str, password: str, address: str) -> str | None:
+        """Sign in; returns the cookie, None if the password is wrong (then `wait_s` may be above zero)."""
+        if not self._passwords.proves(person, password, address):
+            return None
+        return self.cookie(person)
+
+    def cookie(self, person: str) -> str:
+        """Begin a session; returns what the browser shows next time."""
+        return self._sessions.begin(person, self._passwords.proof_of(person))
+
+    def leave(self, cookie: str | None, *, everywhere: bool = False) -> None:
+        """End a session, or all of its person."""
+        self._sessions.end(cookie or "", everywhere=everywhere)

@@ -1,0 +1,249 @@
+"""Actions of a person on a running experiment: requests to the scheduler, which may refuse them."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+
+from afspm import wire
+from afspm.basics.errors import AfspmError, UnitError
+from afspm.basics.formatting import counted, quantity, typeset_position
+from afspm.basics.units import parse_quantity
+from afspm.client.parameter_text import from_parameter
+from afspm.model import ControlMode, ControlResponse, Region, Response, names
+from afspm.model.geometry import XY
+from afspm.plugins.web.dashboard.access import Access, Visitor
+from afspm.plugins.web.person_commands import PersonCommands
+from afspm.plugins.web.persons import Persons
+from afspm.plugins.web.watch import Watch
+
+_PAGE = ".page"  # no name of a person begins so
+
+
+@dataclass(frozen=True)
+class ActionResult:
+    """The result of an action.
+
+    Attributes:
+        text: for the person, with the reason of a refusal.
+        each: of an action on several parameters, the result for each by its name.
+    """
+
+    text: str
+    ok: bool = True
+    each: Mapping[str, ActionResult] = field(default_factory=dict)
+
+
+_NOT_SIGNED_IN = ActionResult("Sign in first: the record keeps the name with each action.", ok=False)
+
+
+def not_signed_in() -> Future[ActionResult]:
+    """Return the answer to a person who has not signed in."""
+    done: Future[ActionResult] = Future()
+    done.set_result(_NOT_SIGNED_IN)
+    return done
+
+
+class Actions:
+    """Actions in the name of one person, for one thread. None raises for a refusal; it is in the result."""
+
+    def __init__(self, commands: PersonCommands, watch: Watch) -> None:
+        self._commands = commands
+        self._watch = watch
+
+    # --- the experiment ---
+
+    def set_mode(self, mode: ControlMode) -> ActionResult:
+        """Set MANUAL or AUTOMATED."""
+        return _result(self._commands.set_mode(mode), f"The mode is {mode.name}")
+
+    def end(self) -> ActionResult:
+        """End the experiment for everybody."""
+        return _result(self._commands.end(), "The experiment is ending")
+
+    def flag(self, problem: int) -> ActionResult:
+        """Flag a problem."""
+        return _result(self._commands.flag(problem), f"{self._watch.problems.name(problem)} is flagged")
+
+    def clear(self, problem: int) -> ActionResult:
+        """Remove the flag of a problem."""
+        return _result(self._commands.clear(problem), f"{self._watch.problems.name(problem)} is cleared")
+
+    def clear_all(self, problems: Sequence[int]) -> ActionResult:
+        """Remove the flags of these problems; the first refusal ends it."""
+        for problem in problems:
+            if not (result := self.clear(problem)).ok:
+                return result
+        return ActionResult(f"Cleared {counted(len(problems), 'problem')}")
+
+    def restart(self, process: str) -> ActionResult:
+        """Have a process ended and started anew."""
+        return _result(self._commands.restart(process), f"{process} is being restarted")
+
+    def note(self, text: str, scan_ns: int | None = None, time_ns: int | None = None) -> ActionResult:
+        """Write a note on a scan, on a moment, or on now."""
+        return _result(self._commands.note(text, scan_ns, time_ns), "Noted")
+
+    # --- the microscope, in MANUAL ---
+
+    def stop_scan(self, *, by_manual: bool = False) -> ActionResult:
+        """Stop the scan or spectrum that runs.
+
+        Args:
+            by_manual: switch to MANUAL before, which alone lets a person command the microscope.
+        """
+        if by_manual:
+            result = self.set_mode(ControlMode.MANUAL)
+            if not result.ok:
+                return result
+        what = "spectrum" if self._commands.measures_spectrum else "scan"
+        return _result(self._commands.stop(), f"The {what} is stopped")
+
+    def read(self, parameters: Iterable[str]) -> ActionResult:
+        """Return the values of parameters that are in force, with their units; one that is refused is not ok."""
+        return ActionResult("", each={name: self._read(name) for name in parameters})
+
+    def set(self, wanted: Mapping[str, str], shown: Mapping[str, str]) -> ActionResult:
+        """Set parameters to quantities as a person writes them: "0.5 V", "2 um/s", "12". Each is asked for by itself.
+
+        If one of them can't be what is meant, nothing is sent.
+
+        Args:
+            shown: the values that the person saw, with their units.
+        """
+        checked = {name: unclear(name, text, shown.get(name, "")) for name, text in wanted.items()}
+        if wrong := {name: ActionResult(why, ok=False) for name, why in checked.items() if why}:
+            text = " ".join(("Nothing was set.", *(one.text for one in wrong.values())))
+            return ActionResult(text, ok=False, each=wrong)
+        each = {name: self._set(name, text.strip()) for name, text in wanted.items()}
+        refused = [one.text for one in each.values() if not one.ok]
+        return ActionResult(" ".join(refused or [one.text for one in each.values()]), ok=not refused, each=each)
+
+    def scan(self, region: Region | None = None, shape: tuple[int, int] | None = None) -> ActionResult:
+        """Begin a scan; `region` and `shape` None: as they are set. It is done when the scan has begun."""
+        if (refused := self._commands.prepare_scan(region, shape)) is not None:
+            return _result(refused, "")
+        where = "" if region is None else f" at {typeset_position(region.center_m)}"
+        return _result(self._commands.act_when_free(names.START_SCAN), f"The scan{where} begins")
+
+    def spectrum(self, at_m: XY | None = None) -> ActionResult:
+        """Begin a spectrum at (x, y); None: where the probe stands. It is done when it has begun."""
+        if (refused := self._commands.prepare_spectrum(at_m)) is not None:
+            return _result(refused, "")
+        where = "" if at_m is None else f" at {typeset_position(at_m)}"
+        return _result(self._commands.act_when_free(names.START_SPEC), f"The spectrum{where} begins")
+
+    # --- within ---
+
+    def _read(self, parameter: str) -> ActionResult:
+        response = self._commands.get(parameter)
+        return ActionResult(_in_force(parameter, response)) if response.ok else _result(response, "")
+
+    def _set(self, parameter: str, text: str) -> ActionResult:
+        response = self._commands.set(parameter, _number_or(text))
+        if not response.ok:
+            which = "" if parameter in response.reason else f"{parameter}: "
+            return ActionResult(f"{which}{refusal(response)}.", ok=False)
+        now = _in_force(parameter, response) if response.payload else text
+        return ActionResult(f"{parameter} is now {now}.")
+
+
+def _result(response: Response, done: str) -> ActionResult:
+    return ActionResult(f"{done}.") if response.ok else ActionResult(refusal(response), ok=False)
+
+
+def refusal(response: Response) -> str:
+    """Return why something was not done, for a person."""
+    code = ControlResponse(response.code).name if response.code in ControlResponse._value2member_map_ else response.code
+    return f"Refused: {response.reason or 'no reason given'} ({code})"
+
+
+def _in_force(parameter: str, response: Response) -> str:
+    """Return a value in SI where it has a unit, with the prefix that reads well."""
+    if not response.payload:
+        return "not told"
+    said = wire.decode_parameter(response.payload)
+    value = from_parameter(said, None)
+    unit = names.BASE_PARAMETERS.get(parameter) or said.unit or ""
+    if isinstance(value, bool) or not isinstance(value, float | int):
+        return str(value)
+    return f"{math.degrees(value):.6g} deg" if unit == "rad" else quantity(value, unit, 6)
+
+
+def unclear(parameter: str, text: str, shown: str) -> str:
+    """Return why a text can't be the value of a parameter; empty: it can. A number must have its unit, if there is one.
+
+    >>> unclear("scan-speed", "8", "4 µm/s")
+    'scan-speed: write the unit as well, for example "8 µm/s".'
+    """
+    unit = _unit_of(shown) or names.BASE_PARAMETERS.get(parameter)
+    if not text.strip():
+        return f"{parameter}: write a value."
+    try:
+        _, given = parse_quantity(text)
+    except UnitError as error:
+        return f"{parameter}: {error}." if unit is not None else ""
+    if given or not unit or unit == "px":
+        return ""
+    return f'{parameter}: write the unit as well, for example "{text.strip()} {unit}".'
+
+
+def _unit_of(shown: str) -> str:
+    try:
+        return parse_quantity(shown)[1]
+    except UnitError:
+        return ""
+
+
+def _number_or(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+Action = Callable[[Actions], ActionResult]
+
+
+class Steering:
+    """Carries out what persons ask for, each in the own name, one thing after the other for each.
+
+    Args:
+        access: knows who has signed in.
+    """
+
+    def __init__(self, persons: Persons, watch: Watch, access: Access) -> None:
+        self._persons = persons
+        self._access = access
+        self._watch = watch
+        self._log = logging.getLogger("afspm.plugins.web.dashboard")
+
+    def do(self, visitor: Visitor, action: Action) -> Future[ActionResult]:
+        """Carry out an action in the name of a person, who must have one and not have signed out."""
+        person = self._access.person_of(visitor)
+        return self._submit(person, action) if person else not_signed_in()
+
+    def read(self, action: Action) -> Future[ActionResult]:
+        """Carry out an action that only reads, in the name of the page itself."""
+        return self._submit(_PAGE, action)
+
+    def close(self) -> None:
+        """End all connections; what is under way ends without an answer."""
+        self._persons.close()
+
+    def _submit(self, person: str, action: Action) -> Future[ActionResult]:
+        return self._persons.submit(person, lambda commands: self._carry_out(person, commands, action))
+
+    def _carry_out(self, person: str, commands: PersonCommands, action: Action) -> ActionResult:
+        try:
+            result = action(Actions(commands, self._watch))
+        except AfspmError as error:
+            result = ActionResult(str(error), ok=False)
+        except Exception as error:
+            self._log.exception("an action of %s failed", person)
+            result = ActionResult(f"The action failed: {type(error).__name__}: {error}", ok=False)
+        self._log.debug("%s: %s%s", person, result.text, "" if result.ok else " (not done)")
+        return result

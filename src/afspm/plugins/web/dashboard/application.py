@@ -1,0 +1,70 @@
+"""The web application: NiceGUI's page, what it fetches by itself, the page to sign in, and the guard before it all."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import AsyncIterator, Callable
+
+from fastapi import FastAPI
+from fastapi.staticfiles import StaticFiles
+from nicegui import app as nicegui
+from nicegui import ui
+
+from afspm.plugins.web.archive import Archive
+from afspm.plugins.web.asgi import AsgiApp
+from afspm.plugins.web.dashboard.access import Visitor
+from afspm.plugins.web.dashboard.live import Live
+from afspm.plugins.web.dashboard.page import ASSETS, Page, Services
+from afspm.plugins.web.dashboard.sign_in import VISITOR, Guard, add_sign_in
+from afspm.plugins.web.passwords import is_loopback
+from afspm.plugins.web.watch import Bell
+
+
+def application(
+    services: Services,
+    archive: Archive,
+    *,
+    host: str,
+    encrypted: bool,
+    page: Callable[[Services, Visitor], object] = Page,
+    more: Callable[[FastAPI], None] = lambda _: None,
+) -> tuple[AsgiApp, Callable[[float], None]]:
+    """Return the application, made once a process, and what waits until all pages know the end, within seconds.
+
+    Args:
+        page: makes the page of a viewer.
+        more: adds what else is served.
+    """
+    bell, access, title = Bell(), services.access, services.title
+    services.watch.on_change(bell.ring)
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        bell.attach()
+        yield
+
+    app = FastAPI(lifespan=lifespan, openapi_url=None)
+    add_sign_in(app, access, title, encrypted=encrypted, only_here=is_loopback(host))
+    live = Live(services.watch, bell, archive, services.conditions)
+    live.add_to(app)
+    more(app)
+    app.mount("/assets", StaticFiles(directory=ASSETS))
+
+    def root() -> None:
+        request = ui.context.client.request
+        page(services, getattr(request.state, VISITOR, Visitor()))
+
+    nicegui.on_exception(_log_error)
+    ui.run_with(app, root=root, title=title, show_welcome_message=False, tailwind=False, reconnect_timeout=10.0)
+
+    def wait_told(within_s: float) -> None:
+        services.audience.wait_told(within_s)
+        live.close()
+
+    return Guard(app, access, host), wait_told
+
+
+def _log_error(error: Exception) -> None:
+    """Log an error of a page, which is no reason to end."""
+    logging.getLogger("afspm.plugins.web.dashboard").error("the page has an error", exc_info=error)

@@ -1,0 +1,54 @@
+"""Conditions of scans: parameters that are read when each begins, as no message tells them."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+
+from afspm.model import names
+from afspm.plugins.web.dashboard.actions import Action, ActionResult
+from afspm.plugins.web.watch import Watch
+from afspm.record.overview import RunningScan
+
+LABELS = {names.TIP_BIAS_VOLTAGE: "Bias", names.SCAN_SPEED: "Speed", names.ZCTRL_SETPOINT: "Setpoint"}
+KEPT = 2_000
+
+
+class Conditions:
+    """Asks for a few parameters once a scan has begun: one such question at a time, and a scan meanwhile has none.
+
+    Args:
+        ask: carries out an action in the name of the page, and waits for nothing.
+    """
+
+    def __init__(self, watch: Watch, ask: Callable[[Action], Future[ActionResult]]) -> None:
+        self._watch = watch
+        self._ask = ask
+        self._seen: RunningScan | None = None
+        self._asking = False
+        self._read: OrderedDict[int, Mapping[str, str]] = OrderedDict()
+        watch.on_change(self._look)
+
+    def at(self, began_ns: int | None) -> Mapping[str, str]:
+        """Return labels and values of the scan that began then; empty if they were not read."""
+        return {} if began_ns is None else self._read.get(began_ns, {})
+
+    def _look(self) -> None:
+        """Take note of a scan that has begun. With the watch's lock held."""
+        running = self._watch.overview.running
+        if running is None or running is self._seen or running.began_ns is None or self._asking:
+            return
+        self._seen, self._asking = running, True
+        began_ns = running.began_ns
+        asked = self._ask(lambda actions: actions.read(tuple(LABELS)))
+        asked.add_done_callback(lambda done: self._keep(began_ns, done))
+
+    def _keep(self, began_ns: int, done: Future[ActionResult]) -> None:
+        self._asking = False
+        if done.cancelled() or done.exception() is not None:
+            return  # the dashboard ends
+        told = done.result().each
+        self._read[began_ns] = {LABELS[name]: one.text for name, one in told.items() if one.ok}
+        while len(self._read) > KEPT:
+            self._read.popitem(last=False)

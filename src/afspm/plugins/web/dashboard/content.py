@@ -1,0 +1,313 @@
+"""The content of the page, as HTML made once for all viewers."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from html import escape
+
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.formatting import duration_text, time_of_day, typeset_area
+from afspm.model import ControlMode, JournalEntry, LogLine, Note, ProcessCondition, ProcessState, Region
+from afspm.model.events import PERSON
+from afspm.plugins.web.dashboard.charts import Chart, drift_chart
+from afspm.plugins.web.dashboard.flags import Flag, flags
+from afspm.plugins.web.dashboard.sample_map import MapContent, map_html, picture_url
+from afspm.plugins.web.watch import Watch
+from afspm.record.drawing.timeline import TimelineRow, timeline_html, tint_class
+from afspm.record.overview import OVER, Overview, ScanSummary
+from afspm.record.timeline import Span, Timeline
+
+ANEW_S = 0.4  # at most that often, however much is published
+SLOWLY_S = 2.0  # for what takes longer to make
+OLD_AFTER_S = 8.0  # a supervisor tells of its processes every 2 s
+NOT_HEARD_OF = "never heard from"
+_STARTING = "starting"
+_AS_USUAL = {_STARTING, "alive", "ended"}
+
+
+@dataclass(frozen=True)
+class SlowContent:
+    """The parts that take longer to make.
+
+    Attributes:
+        sample_map_near: only where something was measured.
+        time_line_unfolded: with a row for each process.
+    """
+
+    sample_map: str = ""
+    sample_map_near: str = ""
+    time_line: str = ""
+    time_line_unfolded: str = ""
+    drift: Chart = field(default_factory=lambda: Chart(""))
+
+
+@dataclass(frozen=True)
+class Content:
+    """The page at one moment.
+
+    Attributes:
+        trouble: why it should not be trusted; empty: it may be.
+        unheard: for how long, in ns, a process has not been told of while others are.
+    """
+
+    status: str = ""
+    trouble: str = ""
+    slow: SlowContent = field(default_factory=SlowContent)
+    refusals: str = ""
+    notes: str = ""
+    channels: tuple[str, ...] = ()
+    problems: tuple[Flag, ...] = ()
+    processes: tuple[ProcessState, ...] = ()
+    unheard: Mapping[str, int] = field(default_factory=dict)
+    log: tuple[LogLine, ...] = ()
+    is_manual: bool = False
+    adjustable: tuple[str, ...] = ()
+    ended: bool = False
+
+
+class Contents:
+    """Makes the content; from the page's thread.
+
+    Args:
+        limits: where scans may lie at all, in tip coordinates; None if it is not known.
+        adjustable: parameters that a person may set in AUTOMATED, too.
+        pictures: the address under which there are small pictures of scans.
+    """
+
+    def __init__(
+        self, watch: Watch, limits: Region | None, adjustable: tuple[str, ...] = (), pictures: str = ""
+    ) -> None:
+        self._watch = watch
+        self._adjustable = adjustable
+        self._limits = limits
+        self._pictures = pictures
+        self._lock = threading.Lock()
+        self._content = Content()
+        self._made_s = self._drawn_s = -math.inf
+        self._revision = 0
+
+    def get(self) -> Content:
+        """Return how it is now, or was a moment ago."""
+        with self._lock:
+            now_s, revision = self._watch.clock.monotonic_s(), self._watch.revision
+            if revision != self._revision:
+                self._revision, self._made_s, self._drawn_s = revision, -math.inf, -math.inf
+            if now_s - self._made_s >= ANEW_S or self._watch.ended != self._content.ended:
+                self._made_s = now_s
+                self._content = self._make(now_s)
+            return self._content
+
+    def _make(self, now_s: float) -> Content:
+        watch, slow = self._watch, self._content.slow
+        with watch.reading() as overview:
+            silent = unheard(watch, overview)
+            if now_s - self._drawn_s >= SLOWLY_S:
+                self._drawn_s = now_s
+                slow = self._draw(overview, silent)
+            control = overview.control
+            return Content(
+                status=status_html(watch, overview),
+                trouble=trouble(watch),
+                slow=slow,
+                refusals=refusals_html(overview.refusals),
+                notes=notes_html(overview),
+                channels=watch.frames.channels,
+                problems=tuple(flags(overview)),
+                processes=tuple(processes_of(watch, overview)),
+                unheard=silent,
+                log=tuple(overview.log),
+                is_manual=control is not None and control.mode is ControlMode.MANUAL,
+                adjustable=self._adjustable,
+                ended=watch.ended,
+            )
+
+    def _draw(self, overview: Overview, silent: Mapping[str, int]) -> SlowContent:
+        parameters = overview.scan_parameters
+        newest = overview.scans[-1] if overview.scans else None
+        content = MapContent(
+            overview.scans,
+            overview.spectra,
+            parameters.region if parameters and isinstance(parameters.region, Region) else None,
+            self._limits,
+            self._watch.tip_to_sample,
+            overview.probe_position.xy_m if overview.probe_position else None,
+            newest.time_ns if newest else None,
+            overview.targets,
+            self._pictures,
+        )
+        now_ns = _now_ns(self._watch, overview)
+        folded, unfolded = (
+            timeline_html(rows_of(overview, silent, unfolded=unfolded), None, now_ns, pictures=self._strip(overview))
+            for unfolded in (False, True)
+        )
+        return SlowContent(
+            map_html(content), map_html(content, whole=False), folded, unfolded, drift_chart(overview.drift)
+        )
+
+    def _strip(self, overview: Overview) -> Iterator[tuple[int, str]]:
+        """Yield a picture of each scan for the time line."""
+        number = 0
+        for one in overview.scans:
+            if one.number != number and self._pictures and not one.interrupted:
+                number = one.number
+                title = escape(f"no. {number}: {typeset_area(one.region.size_m)} at {time_of_day(one.time_ns)}")
+                yield (
+                    one.time_ns,
+                    (
+                        f'<img src="{picture_url(self._pictures, one)}" alt="{title}" title="{title}" '
+                        f'data-time="{one.time_ns}" data-channel="{escape(one.channel)}">'
+                    ),
+                )
+
+
+def _now_ns(watch: Watch, overview: Overview) -> int:
+    return overview.newest_ns if watch.ended else watch.clock.now_ns()
+
+
+def unheard(watch: Watch, overview: Overview) -> dict[str, int]:
+    """Return for how long, in ns, each process has not been told of while others are: its computer is gone."""
+    if watch.ended:
+        return {}
+    speed = 1.0 / watch.clock.real_s(1.0)
+    running = [state.name for state in overview.processes.values() if state.condition not in OVER]
+    return {name: ns for name in running if (ns := overview.unheard_ns(name, speed)) is not None}
+
+
+def processes_of(watch: Watch, overview: Overview) -> Iterator[ProcessState]:
+    """Yield the processes; in a run that is over none is alive, though the last report may say so."""
+    for state in overview.processes.values():
+        if not watch.is_over or state.condition in OVER:
+            yield state
+        else:
+            since_ns = max(state.since_ns, overview.ended_ns or overview.newest_ns)
+            yield replace(state, condition=ProcessCondition.ENDED, since_ns=since_ns, step_age_s=0.0)
+
+
+def trouble(watch: Watch) -> str:
+    """Return why what is shown may not be how it is; empty if it is."""
+    if watch.ended:
+        return "The experiment has ended. This page shows its final state."
+    if not watch.connected:
+        return "Waiting for the first message of the experiment."
+    silent_s = watch.silent_s()
+    if silent_s > OLD_AFTER_S:
+        why = f" {said[0].upper()}{said[1:]}." if (said := watch.cut_off()) else ""
+        return f"The experiment has been silent for {duration_text(silent_s)}: this page is that old.{why}"
+    return ""
+
+
+def rows_of(overview: Overview, silent: Mapping[str, int], *, unfolded: bool = True) -> Iterator[TimelineRow]:
+    """Yield the rows of the time line: control, mode, scope state, each problem, processes.
+
+    Args:
+        unfolded: a row for each process; else one for all that have not failed.
+    """
+    yield TimelineRow("control", overview.controls.spans, tint_class)
+    if overview.notes:
+        yield TimelineRow("notes", overview.note_spans, lambda _: "marked")
+    yield TimelineRow("mode", overview.modes.spans, lambda label: f"mode-{label}")
+    yield TimelineRow("microscope", overview.states.spans, lambda label: f"state-{label.replace('_', '-')}")
+    for number, lane in sorted(overview.problem_timelines.items()):
+        if lane.spans:
+            is_routine = all(map(overview.is_routine, lane.spans))
+            style = (lambda _: "marked") if is_routine else (lambda _: "problem")
+            yield TimelineRow(overview.problems.name(number), lane.spans, style)
+    rows = {
+        name: tuple(_until_told(lane, overview.processes_told_ns[name]) if name in silent else lane.spans)
+        for name, lane in overview.process_timelines.items()
+    }
+    fine = [] if unfolded else [name for name, spans in rows.items() if not _has_failed(spans)]
+    for name, spans in rows.items():
+        if name not in fine:
+            yield TimelineRow(name, spans, lambda label: f"process-{label.replace(' ', '-')}")
+    if fine:
+        start_ns = min(span.start_ns for name in fine for span in rows[name])
+        span = Span(f"{len(fine)} without failures", start_ns)
+        yield TimelineRow("processes", (span,), lambda _: "process-alive")
+
+
+def _has_failed(spans: Sequence[Span]) -> bool:
+    """Return whether a process was ever anything else than started once, alive and done."""
+    return any(span.label not in _AS_USUAL for span in spans) or any(span.label == _STARTING for span in spans[1:])
+
+
+def _until_told(lane: Timeline, told_ns: int) -> Iterator[Span]:
+    for span in lane.spans:
+        yield replace(span, end_ns=max(told_ns, span.start_ns)) if span.end_ns is None else span
+    if lane.now is not None:
+        yield Span(NOT_HEARD_OF, told_ns)
+
+
+def status_html(watch: Watch, overview: Overview) -> str:
+    """Return mode, holder, the microscope's state, problems, and what time it is in the experiment."""
+    control = overview.control
+    if control is None:
+        return '<span class="chip">waiting for the scheduler</span>'
+    since_ns, now_ns = overview.control_since_ns, _now_ns(watch, overview)
+    since = "" if since_ns is None else f" for {duration_text((now_ns - since_ns) / NS_PER_S)}"
+    mode = control.mode.name
+    holder = overview.in_control
+    who = f'<b class="{tint_class(holder)}">{escape(holder)}</b>' if holder else "nobody"
+    parts = [
+        _chip(mode, "mode", f"mode-{mode.lower()}"),
+        _chip(f"{who} is in control<small>{since}</small>", "holder"),
+        *_microscope(overview, now_ns),
+    ]
+    for name, (done, of) in overview.progress.items():
+        parts.append(_chip(f"<b>{escape(name)}</b> {done} of {of}", "progress"))
+    zone = datetime.fromtimestamp(now_ns / NS_PER_S).astimezone().tzname()
+    parts.append(_chip(f"{time_of_day(now_ns, seconds=False)} {zone}", "clock", "time"))
+    return "".join(parts)
+
+
+def _chip(html: str, part: str, style: str = "") -> str:
+    return f'<span class="{f"chip {style}".strip()}" data-part="{part}">{html}</span>'
+
+
+def _microscope(overview: Overview, now_ns: int) -> Iterator[str]:
+    """Yield its state, how far the scan is, where the probe stands, and its feedback."""
+    status = overview.status
+    state = status.state.name.lower().replace("_", " ") if status else NOT_HEARD_OF
+    paused = " (paused)" if status and status.paused else ""
+    done = overview.scan_progress(now_ns)
+    far = "" if done is None else f" {100 * done[0]:.0f} %<small>ends {time_of_day(now_ns + done[1])}</small>"
+    yield _chip(f"microscope {state}{paused}{far}", "state", f"state-{state.replace(' ', '-')}")
+    if overview.feedback is not None and overview.feedback.on is False:
+        yield _chip("FEEDBACK OFF", "feedback", "problem")
+
+
+def refusals_html(refusals: Iterable[JournalEntry], most: int = 40) -> str:
+    """Return the last refusals, newest first."""
+    newest = list(refusals)[-most:][::-1]
+    if not newest:
+        return '<p class="nothing">Nothing has been refused.</p>'
+    rows = "".join(
+        f'<li><time>{time_of_day(one.time_ns)}</time> <b class="{tint_class(one.who)}">{escape(one.who)}</b> '
+        f"{escape(one.what)}<q>{escape(one.reason) or 'no reason given'}</q></li>"
+        for one in newest
+    )
+    return f'<ul class="refusals">{rows}</ul>'
+
+
+def notes_html(overview: Overview) -> str:
+    """Return the notes, that of the latest moment first."""
+    scans = {scan.time_ns: scan for scan in reversed(overview.scans)} if overview.notes else {}
+    notes = sorted(overview.notes, key=lambda note: -note.time_ns)
+    rows = "".join(_note(note, scans.get(note.scan_ns or 0)) for note in notes)
+    return f'<ul class="notes">{rows}</ul>' if rows else '<p class="nothing">No notes yet.</p>'
+
+
+def _note(note: Note, scan: ScanSummary | None) -> str:
+    who = note.who.partition(PERSON)[2] or note.who
+    on = ""
+    if scan is not None:
+        data = f'data-time="{scan.time_ns}" data-channel="{escape(scan.channel)}"'
+        on = f'<button type="button" {data}>scan {scan.number}</button>'
+    return (
+        f'<li><time>{time_of_day(note.time_ns)}</time> <b class="{tint_class(note.who)}">{escape(who)}</b> {on} '
+        f"<span>{escape(note.text)}</span></li>"
+    )

@@ -1,0 +1,103 @@
+"""`Dashboard`: the component that shows an experiment in the browser, and steers it."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated
+
+from afspm.basics.addresses import Listens
+from afspm.basics.clock import ExperimentClock
+from afspm.plugins.web.archive import adjustable_parameters, allowed_region
+from afspm.plugins.web.component import WebComponent
+from afspm.plugins.web.dashboard.access import Access
+from afspm.plugins.web.dashboard.sessions import Sessions
+from afspm.plugins.web.passwords import is_loopback
+from afspm.plugins.web.server import USUAL_PORT
+from afspm.plugins.web.watch import Audience
+from afspm.record.run_json import experiment_name
+
+TOLD_WITHIN_S = 1.5  # how long the pages may take to be told of the end
+
+
+class Dashboard(WebComponent):
+    """Serves one page. It only subscribes, and asks through the scheduler in the names of persons; all others have the
+    processor first.
+
+    Args:
+        host: the address to listen at. At any other than this computer's own a password is needed.
+        port: 0 for any that is free; None: 8080, or any if that is taken. A restart takes the same one.
+        people: who may steer: the hash of each person's password, as `afspm dashboard --make-password` prints it.
+        password_hash: of a common password, with which one may look. The password itself may be in the environment:
+            AFSPM_DASHBOARD_PASSWORD.
+        certificate, certificate_key: PEM files, for https.
+
+    Raises:
+        ConfigError: others could come in without a password, the port is taken …
+    """
+
+    served = "dashboard"
+    usual_port = USUAL_PORT
+    operates = True
+    requires = ("afspm[dashboard]",)
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: Annotated[int | None, Listens(host="host", keyed=False)] = None,
+        people: Mapping[str, str] | None = None,
+        password_hash: str = "",
+        certificate: Path | None = None,
+        certificate_key: Path | None = None,
+    ) -> None:
+        super().__init__(host, port, certificate, certificate_key)
+        self._people, self._password_hash = dict(people or {}), password_hash
+
+    def on_start(self) -> None:
+        from afspm.plugins.web.dashboard.actions import Steering
+        from afspm.plugins.web.dashboard.application import application
+        from afspm.plugins.web.dashboard.conditions import Conditions
+        from afspm.plugins.web.dashboard.content import Contents
+        from afspm.plugins.web.dashboard.page import Services
+        from afspm.plugins.web.persons import Persons
+
+        now_s = ExperimentClock.real().now_s
+        access = Access(
+            self._host, self._password_hash, self._people, now_s, Sessions(self.state_file("sessions"), now_s)
+        )
+        bound = self.open_port()
+        archive, self._watch = self.watch_run()
+        self._steering = Steering(Persons(self._context.launch, self.clock, self._watch), self._watch, access)
+        services = Services(
+            self._watch,
+            Contents(
+                self._watch,
+                allowed_region(self.run_dir),
+                adjustable_parameters(self.run_dir),
+                f"/live/thumbnail/{secrets.token_hex(4)}",
+            ),
+            self._steering,
+            Audience(),
+            access,
+            experiment_name(self.run_dir, "afspm"),
+            self.simulated,
+            Conditions(self._watch, self._steering.read),
+        )
+        app, self._wait_told = application(services, archive, host=self._host, encrypted=self.encrypted)
+        self.serve(app, bound)
+        if not self.encrypted and not is_loopback(self._host):
+            self.log.warning(
+                "other computers can reach the dashboard without encryption: set certificate and certificate_key"
+            )
+
+    def on_message(self, envelope: str, message: object) -> None:
+        self._watch.take(envelope.partition("_")[0], message, self.packet_time_ns(), envelope)
+
+    def on_end(self) -> None:
+        if self._server is None:
+            return
+        self._watch.end()
+        self._wait_told(TOLD_WITHIN_S)
+        self._steering.close()
+        self._server.stop()

@@ -1,0 +1,176 @@
+"""Requests of the browser's scripts: pictures as they come, values, profiles.
+
+The browser asks for the next picture when it has drawn the last, and gets the newest: what it was too slow for is left
+out, and nothing waits for it here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from fastapi import Depends, FastAPI, Response
+from fastapi.responses import PlainTextResponse
+
+from afspm.plugins.web.archive import Archive
+from afspm.plugins.web.dashboard.conditions import Conditions
+from afspm.plugins.web.dashboard.pictures import Look, PictureCache, RenderedFrame, Thumbnails
+from afspm.plugins.web.dashboard.scan_facts import Facts, began_ns, scan_facts
+from afspm.plugins.web.frames import ChannelFrame, number_or_none
+from afspm.plugins.web.watch import Bell, Watch
+from afspm.record.drawing.curves import profile
+from afspm.record.drawing.palette import DIVERGING, LEVELS, PALETTES
+from afspm.record.drawing.raster import png
+
+POLL_S = 20.0  # then the browser asks anew: what is in between may close connections that say nothing for longer
+GROWING_S = 0.2  # between two pictures of a growing scan
+FINISHED_S = 0.004  # between two of finished ones, for each who looks on, and ten times that at least
+
+
+@dataclass(frozen=True)
+class PictureRequest:
+    """The picture that is meant.
+
+    Attributes:
+        time: in ns, of a finished scan; 0: the newest.
+        beside: that of another scan with which it is compared: both get the same range of values; 0: none.
+    """
+
+    channel: str = ""
+    time: int = 0
+    beside: int = 0
+    levelling: str = ""
+    contrast: str = ""
+    palette: str = ""
+
+
+Asked = Annotated[PictureRequest, Depends()]
+
+
+class Live:
+    """Answers the requests of the browser's scripts.
+
+    Args:
+        archive: where scans are that are not in memory any more.
+        conditions: what was set when each scan began.
+    """
+
+    def __init__(self, watch: Watch, bell: Bell, archive: Archive, conditions: Conditions) -> None:
+        self._conditions = conditions
+        self._watch = watch
+        self._bell = bell
+        self._archive = archive
+        self._cache = PictureCache()
+        self._thumbnails = Thumbnails(self._finished)
+        self._waiting = 0
+        self._closing = False
+
+    def close(self) -> None:
+        """Answer all requests that wait for a picture, and let none wait any more. From any thread."""
+        self._closing = True
+        self._bell.ring()
+
+    def add_to(self, app: FastAPI) -> None:
+        """Serve /live/image, /live/thumbnail, /live/value, /live/profile and /live/palette."""
+        app.get("/live/thumbnail/{start}/{time}", response_model=None)(self._thumbnail)
+        app.get("/live/palette/{name}.png", response_model=None)(self._palette)
+        app.get("/live/image", response_model=None)(self._image)
+        app.get("/live/value", response_model=None)(self._value)
+        app.get("/live/profile", response_model=None)(self._profile)
+
+    async def _image(self, asked: Asked, after: int = 0) -> Response:
+        """Answer with a picture newer than number `after`, or of one finished scan. 204: nothing new yet."""
+        if not asked.time and not await self._wait_for_newer(asked.channel, after):
+            return Response(status_code=204)
+        drawn = await asyncio.to_thread(self._drawn, asked)
+        if drawn is None:
+            return PlainTextResponse("the values of this scan are no longer kept here", 404)
+        headers = {"X-Frame": drawn.head(self._facts(drawn.frame)), "Cache-Control": "no-store"}
+        return Response(drawn.png, media_type="image/png", headers=headers)
+
+    async def _value(self, asked: Asked, column: int, row: int) -> dict[str, object]:
+        """Answer with the value of one pixel, as published and as levelled."""
+        drawn = await asyncio.to_thread(self._drawn, asked)
+        if drawn is None or not (0 <= row < drawn.values.shape[0] and 0 <= column < drawn.values.shape[1]):
+            return {"value": None, "levelled": None, "unit": ""}
+        return {
+            "value": number_or_none(float(drawn.frame.values[row, column])),
+            "levelled": number_or_none(float(drawn.values[row, column])),
+            "unit": drawn.frame.unit,
+            "number": drawn.frame.number,
+        }
+
+    async def _profile(self, asked: Asked, x0: float, y0: float, x1: float, y1: float) -> dict[str, object]:
+        """Answer with levelled values along a line between two (column, row)."""
+        drawn = await asyncio.to_thread(self._drawn, asked)
+        if drawn is None:
+            return {"distances_m": [], "values": [], "unit": ""}
+        distances_m, values = profile(drawn.values, drawn.frame.region.size_m, (x0, y0), (x1, y1))
+        return {
+            "distances_m": distances_m.tolist(),
+            "values": [number_or_none(value) for value in values.tolist()],
+            "unit": drawn.frame.unit,
+        }
+
+    async def _thumbnail(self, start: str, time: int, channel: str) -> Response:
+        """Answer with a small picture of a finished scan, which the browser keeps.
+
+        `start` differs from start to start of the dashboard: another simulated night may have the same times.
+        """
+        found = await asyncio.to_thread(self._thumbnails.png, time, channel)
+        if found is None:
+            return PlainTextResponse("the values of this scan are no longer kept here", 404)
+        headers = {"Cache-Control": "private, max-age=86400, immutable"}
+        return Response(found, media_type="image/png", headers=headers)
+
+    async def _palette(self, name: str) -> Response:
+        """Answer with a colour map as a picture one pixel wide, the highest value on top."""
+        if name not in (*PALETTES, DIVERGING):
+            return Response(status_code=404)
+        return Response(png(np.arange(LEVELS, dtype=np.uint8)[:, None], name), media_type="image/png")
+
+    async def _wait_for_newer(self, channel: str, after: int) -> bool:
+        loop = asyncio.get_running_loop()
+        now_s = loop.time()
+        end_s, growing_s = now_s + POLL_S, now_s + GROWING_S
+        self._waiting += 1
+        try:
+            # many viewers at full speed get fewer pictures each, and not the experiment less time
+            finished_s = now_s + FINISHED_S * max(10, self._waiting)
+            while True:
+                number, complete = self._newest(channel)
+                due_s = now_s if not after else finished_s if complete else growing_s
+                now_s = loop.time()
+                if number > after and now_s >= due_s:
+                    return True
+                if now_s >= end_s or self._closing:
+                    return False
+                await self._bell.wait((due_s if number > after else end_s) - now_s)
+        finally:
+            self._waiting -= 1
+
+    def _newest(self, channel: str) -> tuple[int, bool]:
+        with self._watch.reading():
+            return self._watch.frames.newest_number(channel or None)
+
+    def _drawn(self, asked: PictureRequest) -> RenderedFrame | None:
+        if asked.time:
+            frame = self._finished(asked.time, asked.channel)
+        else:
+            with self._watch.reading():
+                frame = self._watch.frames.newest(asked.channel or None)
+        look = Look.named(asked.levelling, asked.contrast, asked.palette)
+        other = self._finished(asked.beside, asked.channel) if asked.beside else None
+        return None if frame is None else self._cache.draw(frame, look, other)
+
+    def _facts(self, frame: ChannelFrame) -> Facts:
+        with self._watch.reading() as overview:
+            conditions = self._conditions.at(began_ns(frame, overview))
+            return scan_facts(frame, overview, conditions, self._watch.clock.now_ns())
+
+    def _finished(self, time_ns: int, channel: str) -> ChannelFrame | None:
+        with self._watch.reading():
+            frame = self._watch.frames.kept(time_ns, channel)
+        return frame or self._archive.frame(time_ns, channel)

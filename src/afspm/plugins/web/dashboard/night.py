@@ -1,0 +1,208 @@
+"""A recorded night at any of its moments: what the page of a running experiment would have shown then."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from afspm.basics.errors import FileError
+from afspm.model import Note, Scan
+from afspm.model.geometry import XY
+from afspm.model.line_levelling import Array
+from afspm.plugins.web.frames import FrameStore
+from afspm.plugins.web.watch import SpectrumStore, Watch
+from afspm.record.overview import Overview
+from afspm.record.packets import RecordPlayback
+from afspm.record.run import Run, open_run
+
+SPECTRA = 8
+"""The spectra before a moment that are read."""
+
+
+@dataclass(frozen=True, slots=True)
+class NightEvent:
+    """Something that was published; a note counts at the moment that it is about."""
+
+    time_ns: int
+    message: str
+    thing: Any
+    envelope: str
+
+
+@dataclass(frozen=True, slots=True)
+class DriftedScan:
+    """The centre of a scan in coordinates of the tip, and of the sample, as drift correction found it."""
+
+    tip_m: XY
+    sample_m: XY
+
+
+class Night:
+    """The record of a run: all that was published, without the values of scans.
+
+    Args:
+        folder: of the run.
+
+    Raises:
+        FileError: there is no record, or it is damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        with open_run(folder) as run:
+            self.folder = run.folder
+            self.title, self.simulated, self.problems = run.name, run.simulated, run.problem_names
+            self.speed = float((run.facts.get("clock") or {}).get("speed", 1.0))
+        self.reload()
+
+    def reload(self) -> None:
+        """Read the record anew, since a note was added."""
+        with open_run(self.folder) as run:
+            self.scans = [row for row in run.scans if row.file]
+            self.events = sorted(_events(run), key=lambda event: event.time_ns)
+
+    @property
+    def begin_ns(self) -> int:
+        return self.events[0].time_ns if self.events else 0
+
+    @property
+    def end_ns(self) -> int:
+        return self.events[-1].time_ns if self.events else 0
+
+    def published_ns(self) -> dict[int, int]:
+        """Return when the last channel of each scan was published, by the time at which the scan was finished."""
+        return {event.thing.time_ns: event.time_ns for event in self.events if event.message == "Scan2d"}
+
+    def spectra_until(self, time_ns: int) -> SpectrumStore:
+        """Read the last spectra before a time."""
+        store = SpectrumStore()
+        with open_run(self.folder) as run:
+            for row in [row for row in run.spectra if row.time_ns <= time_ns][-SPECTRA:]:
+                with suppress(FileError):  # its file is missing or damaged
+                    store.take(run.spectrum(row), row.time_ns)
+        return store
+
+    def drifted(self) -> dict[int, DriftedScan]:
+        """Return the scans of which drift correction knows where they were, by number; empty without one."""
+        by_time = {row.time_ns: row for row in self.scans}
+        found: dict[int, DriftedScan] = {}
+        mapping: Any = None
+        for event in self.events:
+            if event.message == "DriftMapping":
+                mapping = event.thing
+            elif event.message == "Scan2d" and mapping is not None and len(mapping.center) == 2:
+                row = by_time.get(event.thing.time_ns)
+                if row is not None:
+                    x, y = _matrix(mapping) @ (*mapping.center, 1.0)
+                    found.setdefault(row.number, DriftedScan(tuple(mapping.center), (float(x), float(y))))
+        return found
+
+
+class NightWatch(Watch):
+    """A night as it was at one moment, for one viewer."""
+
+    def __init__(self, night: Night) -> None:
+        self.moment = StoppedClock(night.end_ns, night.speed)
+        super().__init__(self.moment, night.problems)
+        self._night = night
+        self._events: Sequence[NightEvent] = ()
+        self._playback: RecordPlayback[NightEvent] = RecordPlayback(())
+        self.go(night.end_ns)
+
+    @property
+    def moment_ns(self) -> int | None:
+        return self.moment.time_ns
+
+    @property
+    def is_over(self) -> bool:
+        return self.moment.time_ns >= (self.overview.ended_ns or self._night.end_ns)
+
+    @property
+    def revision(self) -> int:
+        if not self.is_current:
+            self.go(self.moment.time_ns)
+        return self.changes
+
+    @property
+    def is_current(self) -> bool:
+        """False once a note was added."""
+        return self._events is self._night.events
+
+    @contextmanager
+    def reading(self) -> Iterator[Overview]:
+        with super().reading():
+            if not self.is_current:
+                self._go(self.moment.time_ns)
+            yield self.overview
+
+    def go(self, time_ns: int) -> None:
+        """Show the night as it was at a time."""
+        with super().reading():
+            self._go(time_ns)
+
+    def _go(self, time_ns: int) -> None:
+        if time_ns < self.moment.time_ns or not self.is_current:
+            self._events = self._night.events
+            self._playback = RecordPlayback(self._events)
+            self.overview, self.frames = Overview(self.problems), ChannelNames()
+            self.tip_to_sample = None
+        self.moment.time_ns = time_ns
+        for event in self._playback.due(time_ns):
+            self.take(event.message, event.thing, event.time_ns, event.envelope)
+        self.spectra = self._night.spectra_until(time_ns)
+        self.connected = True
+        self.changes += 1
+
+
+class ChannelNames(FrameStore):
+    """The channels of a night, and no pictures: those are in the record."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._names: dict[str, None] = {}
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        return tuple(self._names)
+
+    def take_scan(self, scan: Scan, time_ns: int) -> None:
+        self._names[scan.channel] = None
+
+
+class StoppedClock:
+    """A clock that shows one moment."""
+
+    def __init__(self, time_ns: int, speed: float) -> None:
+        self.time_ns = time_ns
+        self._speed = speed
+
+    def now_ns(self) -> int:
+        return self.time_ns
+
+    def now_s(self) -> float:
+        return self.time_ns * 1e-9
+
+    def monotonic_s(self) -> float:
+        return 0.0
+
+    def real_s(self, experiment_s: float) -> float:
+        return experiment_s / self._speed
+
+    def late(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+
+def _events(run: Run) -> Iterator[NightEvent]:
+    for number, (packet, message, thing) in enumerate(run.messages()):
+        if isinstance(thing, Note):
+            yield NightEvent(thing.time_ns, message, thing, f"{message}_{number}")  # two may be about one moment
+        else:
+            yield NightEvent(packet.time_ns or 0, message, thing, packet.envelope)
+
+
+def _matrix(mapping: Any) -> Array:
+    return np.array(mapping.matrix, dtype=np.float64).reshape(2, 3)

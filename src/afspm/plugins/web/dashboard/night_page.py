@@ -1,0 +1,251 @@
+"""The page of a recorded night: that of a running experiment at one moment, with a slider through all of them.
+
+Beside it what its scripts ask for (its scans, the difference of two, its report), and the one action: to write notes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import math
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from datetime import datetime
+from html import escape
+from typing import ClassVar
+
+import numpy as np
+from fastapi import FastAPI, Response
+from fastapi.responses import FileResponse, PlainTextResponse
+from nicegui import events, ui
+
+from afspm.basics.clock import NS_PER_S, ExperimentClock
+from afspm.basics.errors import AfspmError, InvalidValue
+from afspm.basics.formatting import time_of_day, typeset_area, typeset_position
+from afspm.basics.plain_data import Plain
+from afspm.model import Region
+from afspm.model.events import PERSON
+from afspm.model.line_levelling import Array, Levelling, levelled
+from afspm.plugins.drift.estimators import estimator
+from afspm.plugins.drift.registration import DriftScan
+from afspm.plugins.web.archive import Archive, allowed_region
+from afspm.plugins.web.dashboard.access import Access, Visitor
+from afspm.plugins.web.dashboard.actions import Action, ActionResult, Actions, Steering, not_signed_in
+from afspm.plugins.web.dashboard.content import Content, Contents
+from afspm.plugins.web.dashboard.night import Night, NightWatch
+from afspm.plugins.web.dashboard.page import ASSETS, TABS, Page, Services, section
+from afspm.plugins.web.dashboard.pictures import Look, RenderedFrame
+from afspm.plugins.web.frames import ChannelFrame
+from afspm.record.drawing.palette import DIVERGING
+from afspm.record.drawing.raster import ValueRange, indices, png, value_range
+from afspm.record.notes import append_note
+from afspm.record.report import REPORT_FILE, write
+from afspm.record.run_lock import describe_state
+from afspm.record.tables import ScanRow
+
+_ALIKE = 1e-3
+_HEAD = """<link rel="stylesheet" href="/assets/night.css"><script type="module" src="/assets/night.js"></script>"""
+
+
+class NightPage(Page):
+    """The page of one viewer, who has a moment of the own."""
+
+    tabs: ClassVar = {**TABS, "two": "Compare"}
+
+    def __init__(self, night: Night, pictures: str, services: Services, visitor: Visitor) -> None:
+        self._night = night
+        self._watch = NightWatch(night)
+        contents = Contents(self._watch, allowed_region(night.folder), pictures=pictures)
+        ui.add_head_html(_HEAD)
+        super().__init__(replace(services, watch=self._watch, contents=contents), replace(visitor, recorded=True))
+        ui.on("moment", self._go)
+
+    def _header(self) -> None:
+        super()._header()
+        ended = escape(describe_state(self._night.folder))
+        report = '<a href="/night/report" target="_blank">Report of the night</a>'
+        ui.html(f'<p class="how-ended">Recorded: {ended}. {report}</p>{_asset("scrubber")}', sanitize=False)
+
+    def _add_more(self) -> None:
+        with ui.element("div").classes("further more"):
+            with section("Two scans", "two"):
+                ui.html(_asset("compare"), sanitize=False)
+            if self._night.drifted():
+                with section("Before and after drift correction", "flip"):
+                    ui.html(_asset("flipbook"), sanitize=False)
+
+    def _state(self, content: Content) -> dict[str, object]:
+        return super()._state(content) | {"moment": str(self._watch.moment_ns)}
+
+    async def _go(self, event: events.GenericEventArguments) -> None:
+        """Show another moment."""
+        self._watch.go(int(event.args["time"]))
+        await self._refresh()
+
+
+def _asset(name: str) -> str:
+    return (ASSETS / f"{name}.html").read_text(encoding="utf-8")
+
+
+class NightRequests:
+    """Answers what only the page of a recorded night asks for."""
+
+    def __init__(self, night: Night, archive: Archive) -> None:
+        self._night = night
+        self._archive = archive
+
+    def add_to(self, app: FastAPI) -> None:
+        """Serve /night/scans, /night/difference and /night/report."""
+        app.get("/night/scans", response_model=None)(self._scans)
+        app.get("/night/difference", response_model=None)(self._difference)
+        app.get("/night/report", response_model=None)(self._report)
+
+    async def _scans(self) -> Plain:
+        """Answer with the ends of the night, its scans and notes. Times are texts: JSON has no numbers of 64 bits."""
+        night = self._night
+        drifted = night.drifted()
+        offset = datetime.fromtimestamp(night.end_ns / NS_PER_S).astimezone().utcoffset()
+        published_ns = night.published_ns()
+        scans = [_scan(row) for row in night.scans if row.region is not None and row.shape is not None]
+        for scan in scans:
+            scan["seen"] = str(published_ns.get(int(scan["time"]), scan["time"]))
+            if (places := drifted.get(scan["number"])) is not None:
+                scan |= {"tip": places.tip_m, "sample": places.sample_m}
+        return {
+            "begin": str(night.begin_ns),
+            "end": str(night.end_ns),
+            "offset_s": offset.total_seconds() if offset is not None else 0.0,
+            "scans": scans,
+            "notes": [
+                {"time": str(one.time_ns), "text": one.thing.text} for one in night.events if one.message == "Note"
+            ],
+        }
+
+    async def _difference(self, first: int, second: int, channel: str, levelling: str = "plane") -> Response:
+        """Answer with second minus first as a picture, and in its head how they were laid over each other."""
+        how = Levelling(levelling) if levelling in Levelling._value2member_map_ else Levelling.PLANE
+        return await asyncio.to_thread(self._compared, first, second, channel, how)
+
+    def _compared(self, first: int, second: int, channel: str, how: Levelling) -> Response:
+        one, other = self._archive.frame(first, channel), self._archive.frame(second, channel)
+        if one is None or other is None:
+            return PlainTextResponse("the values of one of the two scans can't be read", 404)
+        try:
+            change, words = difference(one, other, how)
+        except InvalidValue as error:
+            return PlainTextResponse(error.what, 422)
+        found = value_range(change.values)
+        most = max(abs(found.low), abs(found.high))
+        span = ValueRange(-most, most)  # white is no difference
+        look = Look(how, palette=DIVERGING)
+        drawn = RenderedFrame(change, look, change.values, span, png(indices(change.values, span), DIVERGING))
+        headers = {"X-Frame": drawn.head([]), "X-Words": json.dumps(words), "Cache-Control": "no-store"}
+        return Response(drawn.png, media_type="image/png", headers=headers)
+
+    async def _report(self) -> Response:
+        """Answer with the report of the night."""
+        file = self._night.folder / REPORT_FILE
+        if not file.is_file():
+            return PlainTextResponse(f"the run has no report yet: `afspm report {self._night.folder}` writes it", 404)
+        return FileResponse(file, media_type="text/html")
+
+
+def _scan(row: ScanRow) -> Plain:
+    assert row.region is not None
+    cut = ", interrupted" if row.interrupted else ""
+    return {
+        "time": str(row.time_ns),
+        "number": row.number,
+        "text": f"{time_of_day(row.time_ns)}, {typeset_area(row.region.size_m)}{cut}",
+        "channels": [name for name, _ in row.channels],
+        "size": row.region.size_m,
+        "angle": row.region.angle_rad,
+        "shape": row.shape,
+    }
+
+
+class NightActions(Actions):
+    """The actions of one person on a recorded night."""
+
+    def __init__(self, night: Night, who: str) -> None:
+        self._night = night
+        self._who = who
+
+    def note(self, text: str, scan_ns: int | None = None, time_ns: int | None = None) -> ActionResult:
+        """Append a note to the record; the report is then written again."""
+        written_ns = ExperimentClock.real().now_ns()
+        append_note(self._night.folder, self._who, text, written_ns, scan_ns, time_ns)
+        self._night.reload()
+        if (self._night.folder / REPORT_FILE).exists():
+            write(self._night.folder)
+        return ActionResult("Noted.")
+
+
+class NightSteering(Steering):
+    """Carries out notes, one after the other."""
+
+    def __init__(self, night: Night, access: Access, name: str) -> None:
+        self._night = night
+        self._access = access
+        self._name = name
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="notes")
+        self._log = logging.getLogger("afspm.plugins.web.dashboard")
+
+    def do(self, visitor: Visitor, action: Action) -> Future[ActionResult]:
+        person = self._access.person_of(visitor)
+        return self._thread.submit(self._note, f"{self._name}{PERSON}{person}", action) if person else not_signed_in()
+
+    def close(self) -> None:
+        self._thread.shutdown()
+
+    def _note(self, who: str, action: Action) -> ActionResult:
+        try:
+            return action(NightActions(self._night, who))
+        except AfspmError as error:
+            return ActionResult(str(error), ok=False)
+
+
+def difference(first: ChannelFrame, second: ChannelFrame, how: Levelling) -> tuple[ChannelFrame, str]:
+    """Return second minus first as a frame at the place of the first, and in words how they were laid over each other.
+
+    What both have in common is found by registration, where their sizes match; it has NaN where only one was measured.
+
+    Raises:
+        InvalidValue: they have not the same pixels, or other units.
+    """
+    if first.values.shape != second.values.shape:
+        (rows, columns), (others, along) = first.values.shape, second.values.shape
+        raise InvalidValue(f"{columns} × {rows} and {along} × {others} pixels can't be subtracted")
+    if first.unit != second.unit:
+        raise InvalidValue(f"values in {first.unit or '1'} and {second.unit or '1'} can't be subtracted")
+    before, after = levelled(first.values, how), levelled(second.values, how)
+    moved_m, words = _displacement(first.region, second.region, before, after)
+    change = _moved(after, first.region, moved_m) - before
+    if np.isfinite(change).any():
+        change -= np.nanmedian(change)
+    return replace(first, number=first.number ^ second.number, values=change), words
+
+
+def _displacement(first: Region, second: Region, before: Array, after: Array) -> tuple[tuple[float, float], str]:
+    """Return by how much the second picture lies elsewhere than the first, within the frame; and that in words."""
+    unmoved = (0.0, 0.0)
+    if not all(math.isclose(a, b, rel_tol=_ALIKE) for a, b in zip(first.size_m, second.size_m, strict=True)):
+        return unmoved, "not registered, because the sizes differ: compared pixel by pixel"
+    frame = Region((0.0, 0.0), first.size_m)
+    found = estimator("correlation").register(DriftScan(before, frame, 0.0, 1.0), DriftScan(after, frame, 2.0, 3.0))
+    if not found.accepted:
+        return unmoved, f"not registered ({found.reason}): compared pixel by pixel"
+    x, y = map(float, found.displacement_m)
+    return (x, y), f"registered: the second scan was moved by {typeset_position((-x, -y))}"
+
+
+def _moved(values: Array, region: Region, displacement_m: tuple[float, float]) -> Array:
+    """Return values with a displacement taken back; NaN where nothing is known."""
+    from scipy import ndimage
+
+    if displacement_m == (0.0, 0.0):
+        return values
+    pixels_m = (side / max(n - 1, 1) for side, n in zip(region.size_m[::-1], values.shape, strict=True))
+    shift = [-d / pixel for d, pixel in zip(displacement_m[::-1], pixels_m, strict=True)]
+    return np.asarray(ndimage.shift(values, shift, order=1, cval=np.nan))

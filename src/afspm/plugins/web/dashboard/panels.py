@@ -1,0 +1,208 @@
+"""Parts of the page that keep something of their own for one viewer: the log's filter, rows of processes, spectra."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+
+from nicegui import events, ui
+
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.formatting import duration_text, time_of_day
+from afspm.model import LogLine, ProcessCondition, ProcessState
+from afspm.plugins.web.dashboard.charts import Chart, spectrum_chart
+from afspm.plugins.web.dashboard.content import NOT_HEARD_OF
+from afspm.plugins.web.dashboard.steering_panel import ask_restart
+from afspm.plugins.web.dashboard.steering_session import SteeringSession
+from afspm.plugins.web.watch import Watch
+from afspm.record.drawing.timeline import tint_class
+
+MOST_LINES = 300
+LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
+_EVERYTHING = "all"
+_BAD = {ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.GIVEN_UP}
+
+
+class ChartPanel:
+    """A line of text and a chart below it, which is sent again only when it has changed."""
+
+    def __init__(self) -> None:
+        self._words = ui.html("", sanitize=False)
+        self._chart = ui.echart({}, renderer="svg").classes("chart")
+        self._shown = Chart("")
+        self._chart.set_visibility(False)
+
+    def show(self, chart: Chart) -> None:
+        """Bring it up to date."""
+        if chart == self._shown:
+            return
+        self._shown = chart
+        self._words.set_content(chart.words)
+        self._chart.set_visibility(chart.options is not None)
+        if chart.options is not None:
+            self._chart.options.clear()
+            self._chart.options.update(chart.options)
+            self._chart.update()
+
+
+class SpectraPanel:
+    """The newest spectrum with those before it, or the one picked in the map."""
+
+    def __init__(self, watch: Watch) -> None:
+        self._watch = watch
+        self._picked_ns: int | None = None
+        self._shown: tuple[object, ...] = ()
+        self._variable = ui.select([], label="variable", on_change=self.show).props("dense outlined")
+        self._chart = ChartPanel()
+        ui.on("spectrum_picked", self._pick)
+
+    def show(self) -> bool:
+        """Bring it up to date; returns whether there is a spectrum."""
+        with self._watch.reading():
+            store = self._watch.spectra
+            picked = None if self._picked_ns is None else store.at(self._picked_ns)
+            spectra = store.newest(8) if picked is None or self._picked_ns is None else [(self._picked_ns, picked)]
+        names = list(spectra[-1][1].names[1:]) if spectra else []
+        if self._variable.options != names:
+            self._variable.set_options(names, value=names[0] if names else None)
+        self._variable.set_visibility(bool(spectra))
+        wanted = (*(time_ns for time_ns, _ in spectra), self._variable.value)
+        if wanted != self._shown:
+            self._shown = wanted
+            self._chart.show(spectrum_chart(spectra, str(self._variable.value or "")))
+        return bool(spectra)
+
+    def _pick(self, event: events.GenericEventArguments) -> None:
+        self._picked_ns = int(event.args["time"])
+        self.show()
+
+
+class LogPanel:
+    """The log, newest lines first, filtered as one viewer wants it."""
+
+    def __init__(self) -> None:
+        self._shown: tuple[object, ...] = ()
+        self._lines: Sequence[LogLine] = ()
+        with ui.element("div").classes("tools"):
+            self._name = ui.select([_EVERYTHING], value=_EVERYTHING, label="component", on_change=self._draw)
+            self._level = ui.select(list(LEVELS), value="INFO", label="at least", on_change=self._draw)
+            self._text = ui.input("contains", on_change=self._draw)
+        for element in (self._name, self._level, self._text):
+            element.props("dense outlined").classes("field")
+        self._html = ui.html("", sanitize=False).classes("scrolled").props('tabindex="0" role="log" aria-live="off"')
+
+    def show(self, lines: Sequence[LogLine], names: Iterable[str]) -> None:
+        """Bring it up to date."""
+        every = [_EVERYTHING, *sorted({*names, *(line.name for line in lines)})]
+        if every != self._name.options:
+            self._name.set_options(every, value=self._name.value)
+        self._lines = lines
+        self._draw()
+
+    def _draw(self) -> None:
+        newest = self._lines[-1] if self._lines else None
+        wanted = (newest, len(self._lines), self._name.value, self._level.value, self._text.value)
+        if wanted == self._shown:
+            return
+        self._shown = wanted
+        names = frozenset() if self._name.value == _EVERYTHING else frozenset({str(self._name.value)})
+        self._html.set_content(log_html(self._lines, names, str(self._level.value), str(self._text.value or "")))
+
+
+def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: str = "") -> str:
+    """Return log lines, newest first.
+
+    Args:
+        names: of components; empty: all.
+        level: the least that is shown.
+        text: that a line has to contain, in lower or upper case.
+    """
+    least = LEVELS.index(level) if level in LEVELS else 0
+    wanted = [
+        line
+        for line in lines
+        if (not names or line.name in names)
+        and (LEVELS.index(line.level) if line.level in LEVELS else 1) >= least
+        and text.lower() in line.text.lower()
+    ]
+    if not wanted:
+        return '<p class="nothing">No such line.</p>'
+    rows = "".join(
+        f'<li class="level-{escape(line.level.lower())}"><time>{time_of_day(line.time_ns)}</time>'
+        f'<b class="{tint_class(line.name)}">{escape(line.name)}</b>'
+        f"<div>{_level_html(line.level)}<span>{escape(line.text)}</span></div></li>"
+        for line in wanted[: -MOST_LINES - 1 : -1]
+    )
+    return f'<ul class="log">{rows}</ul>'
+
+
+def _level_html(level: str) -> str:
+    """Return the level of a line that is not as usual."""
+    return "" if level == "INFO" else f"<i>{escape(level)}</i> "
+
+
+class HealthPanel:
+    """A row for each process, which stays while its words change: a button must not move under the finger."""
+
+    def __init__(self, session: SteeringSession) -> None:
+        self._session = session
+        self._rows: dict[str, HealthRow] = {}
+        self._nothing = ui.html("No process has reported yet.", sanitize=False).classes("nothing")
+        self._list = ui.element("div").classes("processes").props('role="table" aria-label="Processes"')
+
+    def show(self, processes: Sequence[ProcessState], unheard: Mapping[str, int]) -> None:
+        """Bring the rows up to date; `unheard` as in `Content`."""
+        self._nothing.set_visibility(not processes)
+        for state in processes:
+            row = self._rows.get(state.name)
+            if row is None:
+                with self._list:
+                    row = self._rows[state.name] = HealthRow(state.name, self._session)
+            row.show(state, unheard.get(state.name))
+
+
+class HealthRow:
+    """The condition of one process, and a button to restart it."""
+
+    def __init__(self, name: str, session: SteeringSession) -> None:
+        with ui.element("div").classes("process").props('role="row"'):
+            self._dot = ui.element("span").classes("dot")
+            ui.label(name).classes("name").props('role="rowheader"')
+            self._cells = [ui.label().props('role="cell"') for _ in range(3)]
+            for cell in self._cells[1:]:
+                cell.classes("quiet")
+            self._button = ui.button("Restart", on_click=lambda: ask_restart(session, name))
+            self._button.props("flat dense no-caps")
+            self._button.props["aria-label"] = f"Restart {name}"  # as text of properties a name could set others
+        self._session = session
+        self._style = ""
+
+    def show(self, state: ProcessState, unheard_ns: int | None) -> None:
+        """Bring it up to date."""
+        words = process_words(state, unheard_ns)
+        for cell, text in zip(self._cells, words, strict=True):
+            cell.set_text(text)
+        style = "bad" if state.condition in _BAD or words[0] == NOT_HEARD_OF else words[0].replace(" ", "-")
+        if style != self._style:
+            self._dot.classes(remove=f"is-{self._style}", add=f"is-{style}")
+            self._style = style
+        self._button.set_visibility(self._session.may_steer)
+
+
+def process_words(state: ProcessState, unheard_ns: int | None = None) -> tuple[str, str, str]:
+    """Return (condition, since when or busy for how long, restarts) of a process, in words.
+
+    Args:
+        unheard_ns: for how long it has not been told of, if others are told of.
+    """
+    condition = state.condition.name.lower().replace("_", " ")
+    since = f"since {time_of_day(state.since_ns)}"
+    if unheard_ns is not None:
+        gone = f"for {duration_text(unheard_ns / NS_PER_S)}: its supervisor has ended or can't be reached"
+        condition, since = NOT_HEARD_OF, gone
+    elif state.step_age_s >= 1.0:
+        since = f"in the same step for {duration_text(state.step_age_s)}"
+    restarts = "" if state.starts <= 1 else f"restarted {state.starts - 1} time{'s' if state.starts > 2 else ''}"
+    if state.last_exit and state.starts > 1:
+        restarts += f" (last: {state.last_exit})"
+    return condition, since, restarts

@@ -1,0 +1,80 @@
+"""The parameters of the microscope with their values: those that were edited are set together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from nicegui import ui
+
+from afspm.model import names
+from afspm.plugins.web.dashboard.actions import ActionResult
+from afspm.plugins.web.dashboard.steering_session import SteeringSession, button
+
+PARAMETERS = tuple(names.BASE_PARAMETERS)
+
+
+class ParameterForm:
+    """A field for each parameter that the microscope has: all in MANUAL, in AUTOMATED those that may be adjusted."""
+
+    def __init__(self, session: SteeringSession) -> None:
+        self._session = session
+        self._offered: tuple[str, ...] = ()
+        self._in_force: dict[str, str] = {}
+        self._fields: dict[str, ui.input] = {}
+        with ui.element("div").classes("parameters") as self._box:
+            self._rows = ui.element("div").classes("fields")
+            with ui.element("div").classes("acts"):
+                button("Set", self._set, "primary")
+                button("Read again", self._read)
+        self._box.set_visibility(False)
+
+    async def show(self) -> None:
+        """Offer what may be set now."""
+        content = self._session.content
+        offered = () if content.ended else PARAMETERS if content.is_manual else content.adjustable
+        if offered == self._offered:
+            return
+        self._offered = offered
+        self._box.set_visibility(bool(offered))
+        self._rows.clear()
+        self._fields, self._in_force = {}, {}
+        if offered:
+            await self._read()
+
+    async def _read(self) -> None:
+        offered = self._offered
+        result = await self._session.carry_out(lambda a: a.read(offered))
+        if offered == self._offered and not self._rows.is_deleted:
+            self._take(result.each)
+
+    def _take(self, told: Mapping[str, ActionResult]) -> None:
+        """Show values that were told; a parameter that is refused is none that this microscope has."""
+        for name, one in told.items():
+            if not one.ok:
+                continue
+            if name not in self._fields:
+                with self._rows:
+                    self._fields[name] = ui.input(name).props("dense outlined").on("keydown.enter", self._set)
+            self._in_force[name] = one.text
+            self._fields[name].set_value(one.text)
+            self._fields[name].props(remove="error error-message")
+
+    async def _set(self) -> None:
+        wanted = {
+            name: text
+            for name, field in self._fields.items()
+            if (text := str(field.value or "").strip()) != self._in_force[name]
+        }
+        if not wanted:
+            self._session.say(ActionResult("Nothing was changed: edit a value first.", ok=False))
+            return
+        shown = dict(self._in_force)
+        result = await self._session.carry_out(lambda a: a.set(wanted, shown))
+        if self._rows.is_deleted:
+            return
+        self._session.say(result)
+        for name, one in result.each.items():
+            if not one.ok:
+                self._fields[name].props("error").props["error-message"] = one.text
+        done = tuple(name for name, one in result.each.items() if one.ok)
+        self._take((await self._session.carry_out(lambda a: a.read(done))).each)

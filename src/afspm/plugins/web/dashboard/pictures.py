@@ -1,0 +1,124 @@
+"""Frames as pictures for the browser, each made once for all viewers; small ones for the map and the time line."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+from afspm.model.line_levelling import Array, Levelling, flattened, levelled
+from afspm.plugins.web.dashboard.scan_facts import Facts
+from afspm.plugins.web.frames import ChannelFrame
+from afspm.record.drawing.image_html import shown
+from afspm.record.drawing.palette import PALETTES
+from afspm.record.drawing.raster import Contrast, ValueRange, indices, png, shared_range
+
+KEPT, THUMBNAILS_KEPT = 8, 600
+SIDE_PX = 128
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Levelling, contrast and colours in which a viewer wants to see a scan."""
+
+    levelling: Levelling = Levelling.PLANE
+    contrast: Contrast = Contrast.ROBUST
+    palette: str = PALETTES[0]
+
+    @classmethod
+    def named(cls, levelling: str, contrast: str, palette: str) -> Look:
+        """Return the look that the page names; what it doesn't name, or is not known, is as by default."""
+        usual = cls()
+        return cls(
+            Levelling(levelling) if levelling in Levelling._value2member_map_ else usual.levelling,
+            Contrast(contrast) if contrast in Contrast._value2member_map_ else usual.contrast,
+            palette if palette in PALETTES else usual.palette,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class RenderedFrame:
+    """A frame as a viewer sees it.
+
+    Attributes:
+        values: levelled, [y, x].
+        png: highest y on top.
+    """
+
+    frame: ChannelFrame
+    look: Look
+    values: Array
+    span: ValueRange
+    png: bytes
+
+    def head(self, facts: Facts) -> str:
+        """Return what has to be known to draw it with axes, and facts to show beside it, as ASCII JSON in SI."""
+        frame, region = self.frame, self.frame.region
+        return json.dumps(
+            {
+                "number": frame.number,
+                "channel": frame.channel,
+                "unit": frame.unit,
+                "center": region.center_m,
+                "size": region.size_m,
+                "angle": region.angle_rad,
+                "shape": frame.values.shape,
+                "low": self.span.low,
+                "high": self.span.high,
+                "time_ns": None if frame.time_ns is None else str(frame.time_ns),
+                "rows": frame.rows,
+                "newest_row": frame.newest_row,
+                "levelling": self.look.levelling.value,
+                "palette": self.look.palette,
+                "facts": facts,
+            }
+        )
+
+
+class PictureCache:
+    """Draws, from any thread; keeps the newest few pictures. A frame is known by its number."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._drawn = lru_cache(KEPT)(_draw)
+
+    def draw(self, frame: ChannelFrame, look: Look, beside: ChannelFrame | None = None) -> RenderedFrame:
+        """Return the picture of a frame; with the same range of values as that of a frame beside it."""
+        with self._lock:  # two that want the same wait for one; two that want others share a core anyway
+            return self._drawn(frame, look, beside)
+
+
+def _draw(frame: ChannelFrame, look: Look, beside: ChannelFrame | None) -> RenderedFrame:
+    values = levelled(frame.values, look.levelling)
+    compared = [] if beside is None or beside.unit != frame.unit else [levelled(beside.values, look.levelling)]
+    span = shared_range([values, *compared], look.contrast)
+    return RenderedFrame(frame, look, values, span, png(indices(values, span), look.palette))
+
+
+class Thumbnails:
+    """Draws, from any thread, and keeps the newest few hundred; a finished scan never changes.
+
+    Args:
+        frame: returns a finished channel by time and name; None if its values are not kept.
+    """
+
+    def __init__(self, frame: Callable[[int, str], ChannelFrame | None]) -> None:
+        self._frame = frame
+        self._lock = threading.Lock()
+        self._kept = lru_cache(THUMBNAILS_KEPT)(self._draw)
+
+    def png(self, time_ns: int, channel: str) -> bytes | None:
+        """Return the picture of a scan, flattened; None if its values are not kept."""
+        with self._lock:
+            try:
+                return self._kept(time_ns, channel)
+            except LookupError:
+                return None
+
+    def _draw(self, time_ns: int, channel: str) -> bytes:
+        frame = self._frame(time_ns, channel)
+        if frame is None:
+            raise LookupError(time_ns)
+        return shown(flattened(frame.values), SIDE_PX).image

@@ -1,0 +1,90 @@
+"""Facts beside the picture of a scan: its number, time and place, and what was set when it was taken."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.formatting import duration_text, scale, time_of_day, typeset, typeset_area
+from afspm.model.geometry import XY
+from afspm.plugins.web.frames import ChannelFrame
+from afspm.record.overview import Overview, ScanSummary
+
+Facts = list[tuple[str, str]]
+"""Pairs of label and text."""
+
+
+def scan_facts(frame: ChannelFrame, overview: Overview, conditions: Mapping[str, str], now_ns: int) -> Facts:
+    """Return what a person wants to know of a scan.
+
+    Args:
+        conditions: label and text of the parameters that were read when it began; empty where no page was open then.
+    """
+    region, (rows, columns) = frame.region, frame.values.shape
+    size = ("Size", typeset_area(region.size_m))
+    angle = [("Angle", f"{math.degrees(region.angle_rad):.4g}°")] if region.angle_rad else []
+    return [
+        *_when(frame, overview, now_ns),
+        size,
+        ("Centre", _centre(region.center_m)),
+        *angle,
+        ("Pixels", f"{columns} × {rows}"),
+        *(conditions or _recorded(frame, overview)).items(),
+        *(("Note", note.text) for note in overview.notes if frame.time_ns and note.scan_ns == frame.time_ns),
+    ]
+
+
+def _when(frame: ChannelFrame, overview: Overview, now_ns: int) -> Facts:
+    if frame.time_ns is None:
+        return _growing(frame, overview, now_ns)
+    summary = summary_of(frame.time_ns, overview)
+    facts = [("Scan", "" if summary is None else f"no. {summary.number}"), ("Finished", time_of_day(frame.time_ns))]
+    if summary is not None and summary.began_ns is not None:
+        facts.append(("Took", duration_text((summary.time_ns - summary.began_ns) / NS_PER_S)))
+    if summary is not None and summary.holder:
+        facts.append(("By", summary.holder))
+    return [fact for fact in facts if fact[1]]
+
+
+def _recorded(frame: ChannelFrame, overview: Overview) -> Mapping[str, str]:
+    """Return what the record has of the parameters: a number without a unit, which no message tells."""
+    summary = None if frame.time_ns is None else summary_of(frame.time_ns, overview)
+    return {} if summary is None or summary.setpoint is None else {"Setpoint": f"{summary.setpoint:.4g}"}
+
+
+def began_ns(frame: ChannelFrame, overview: Overview) -> int | None:
+    """Return when the scan of a frame began; None if that was not seen."""
+    if frame.time_ns is not None:
+        summary = summary_of(frame.time_ns, overview)
+    elif overview.running is not None:
+        return overview.running.began_ns
+    else:
+        summary = overview.scans[-1] if overview.scans and overview.scans[-1].interrupted else None
+    return None if summary is None else summary.began_ns
+
+
+def _centre(xy_m: XY) -> str:
+    factor, unit = scale(max(*map(abs, xy_m), 1e-9), "m")
+    return typeset(f"({xy_m[0] * factor:.4g}, {xy_m[1] * factor:.4g}) {unit}")
+
+
+def _growing(frame: ChannelFrame, overview: Overview, now_ns: int) -> Facts:
+    # one that was interrupted is in the list already
+    number = (overview.scans[-1].number if overview.scans else 0) + (overview.running is not None)
+    facts = [("Scan", f"no. {number}")]
+    if frame.began_ns is not None:
+        facts.append(("Began", time_of_day(frame.began_ns)))
+    if (progress := overview.scan_progress(now_ns)) is not None:
+        facts.append(("Ends", ends_text(progress[1], now_ns)))
+    return [*facts, ("Lines", f"{frame.rows} of {frame.values.shape[0]}")]
+
+
+def ends_text(left_ns: int, now_ns: int) -> str:
+    """Return when something ends, and in how long: "22:14 (in 12 min)"."""
+    return f"{time_of_day(now_ns + left_ns, seconds=left_ns < 600 * NS_PER_S)} (in {duration_text(left_ns / NS_PER_S)})"
+
+
+def summary_of(time_ns: int, overview: Overview) -> ScanSummary | None:
+    """Return the summary of the finished scan of a time; None if there is none."""
+    return next((one for one in reversed(overview.scans) if one.time_ns == time_ns), None)

@@ -1,0 +1,156 @@
+"""Buttons and dialogs for what a person can do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from html import escape
+
+from nicegui import events, ui
+
+from afspm.basics.formatting import time_of_day, typeset_position
+from afspm.model import ControlMode
+from afspm.plugins.web.dashboard.actions import Actions
+from afspm.plugins.web.dashboard.content import Content
+from afspm.plugins.web.dashboard.flags import Flag
+from afspm.plugins.web.dashboard.parameter_form import ParameterForm
+from afspm.plugins.web.dashboard.scan_dialog import ScanDialog
+from afspm.plugins.web.dashboard.steering_session import SteeringSession, asked, button
+from afspm.record.drawing.timeline import tint_class
+
+_MANUAL = "Scan here and Spectrum here, beside the scan, measure where you point."
+_TAKE_OVER = "In MANUAL you can set parameters, scan and take spectra here."
+_ADJUST = "Changes hold from the next line on. In MANUAL you can set all parameters, and scan."
+
+
+class ModeButtons:
+    """Take over and hand back, which are always to be seen."""
+
+    def __init__(self, session: SteeringSession) -> None:
+        self._session = session
+        self._manual = self._automated = None
+        if session.signed_in:
+            self._manual = button("Take over: MANUAL", lambda: self._set(ControlMode.MANUAL), "primary")
+            self._automated = button("Hand back: AUTOMATED", lambda: self._set(ControlMode.AUTOMATED), "primary")
+            self._automated.set_visibility(False)
+
+    def show(self) -> None:
+        """Bring them up to date."""
+        if self._manual is not None and self._automated is not None:
+            is_manual, may = self._session.content.is_manual, self._session.may_steer
+            self._manual.set_visibility(may and not is_manual)
+            self._automated.set_visibility(may and is_manual)
+
+    def _set(self, mode: ControlMode) -> None:
+        self._session.do(lambda a: a.set_mode(mode))
+
+
+class ProblemBar:
+    """A line for each flagged problem: what to do about it, and a button to clear it."""
+
+    def __init__(self, session: SteeringSession) -> None:
+        self._session = session
+        self._shown: tuple[object, ...] = ()
+        self._box = ui.element("div").classes("problems").props('role="alert"')
+        self._box.set_visibility(False)
+
+    def show(self) -> None:
+        """Bring it up to date."""
+        flags, may = self._session.content.problems, self._session.may_steer
+        if (flags, may) == self._shown:
+            return
+        self._shown = (flags, may)
+        self._box.set_visibility(bool(flags))
+        self._box.clear()
+        with self._box:
+            for flag in flags:
+                with ui.element("div").classes("flag"):
+                    ui.html(_flag_html(flag), sanitize=False)
+                    if may:
+                        clear = button("Clear", partial(self._clear, [flag]))
+                        clear.props["aria-label"] = f"Clear {flag.name}"  # as text a name could set other properties
+                    if may and flag is flags[-1] and len(flags) > 1:
+                        button("Clear all problems", partial(self._clear, flags)).classes("all")
+
+    def _clear(self, flags: Sequence[Flag]) -> None:
+        numbers = [flag.number for flag in flags]
+        if len(numbers) == 1:
+            self._session.do(lambda a: a.clear(numbers[0]))
+        else:
+            self._session.do(lambda a: a.clear_all(numbers))
+
+
+def _flag_html(flag: Flag) -> str:
+    by = f'flagged by <i class="{tint_class(flag.by)}">{escape(flag.by)}</i>' if flag.by else "flagged"
+    since = f" at {time_of_day(flag.since_ns)}" if flag.since_ns is not None else ""
+    return (
+        f'<b data-part="problem">{escape(flag.name)}</b> <small>{by}{since}</small>'
+        f'<span class="advice">{escape(flag.advice)}</span>'
+    )
+
+
+class SteeringPanel:
+    """The buttons for a viewer who has signed in."""
+
+    def __init__(self, session: SteeringSession) -> None:
+        self._session = session
+        with ui.element("div").classes("acts"):
+            button("Stop the scan", self._ask_stop)
+            self._by_hand = [
+                button("Scan as set", lambda: session.do(lambda a: a.scan())),
+                button("Spectrum at the probe", lambda: session.do(lambda a: a.spectrum())),
+            ]
+        self._hint = ui.label().classes("quiet")
+        session.results()
+        self._parameters = ParameterForm(session)
+        ui.html("<h3>Flag a problem</h3>", sanitize=False)
+        with ui.element("div").classes("acts"):
+            options = {number: name for name, number in session.watch.problems.items()}
+            self._problem = ui.select(options, label="problem", value=next(iter(options))).props("dense outlined")
+            button("Flag", lambda: session.do(partial(Actions.flag, problem=int(self._problem.value))))
+        with ui.element("div").classes("acts"):
+            button("End the experiment …", self._ask_end, "negative").props("outline")
+        ui.on("scan_here", self._ask_scan)
+        ui.on("spectrum_here", self._ask_spectrum)
+
+    async def show(self, content: Content) -> None:
+        """Bring it up to date."""
+        for one in self._by_hand:
+            one.set_visibility(content.is_manual)
+        self._hint.set_text(_MANUAL if content.is_manual else _ADJUST if content.adjustable else _TAKE_OVER)
+        await self._parameters.show()
+
+    async def _ask_end(self) -> None:
+        if await asked("End the experiment?", "All components stop. All measurements are kept.", "End it") and (
+            await asked("Really?", "The experiment can't be continued from here.", "Yes, end the experiment")
+        ):
+            self._session.do(lambda a: a.end())
+
+    async def _ask_stop(self) -> None:
+        if self._session.content.is_manual:
+            self._session.do(lambda a: a.stop_scan())
+        elif await asked(
+            "Stop the scan?",
+            "A component is in control. This sets the mode to MANUAL, then stops the scan; components go on when you "
+            "hand back.",
+            "Set MANUAL and stop",
+        ):
+            self._session.do(lambda a: a.stop_scan(by_manual=True))
+
+    async def _ask_scan(self, event: events.GenericEventArguments) -> None:
+        dialog = ScanDialog.of_place(event.args)
+        wanted = await dialog.ask()
+        ui.run_javascript("window.afspm?.image?.want(null)")
+        if wanted is not None:
+            self._session.do(lambda a: a.scan(*wanted))
+
+    async def _ask_spectrum(self, event: events.GenericEventArguments) -> None:
+        at_m = (float(event.args["x"]), float(event.args["y"]))
+        if await asked("Spectrum here?", f"The probe moves to {typeset_position(at_m)}.", "Take it"):
+            self._session.do(lambda a: a.spectrum(at_m))
+
+
+async def ask_restart(session: SteeringSession, name: str) -> None:
+    """Start a process anew, after a question."""
+    if await asked(f"Restart {name}?", "The process is ended and restarted. Its data on disk is kept.", "Restart"):
+        session.do(lambda a: a.restart(name))

@@ -1,0 +1,111 @@
+"""The actions that one viewer may do now; all panels of the page share them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from html import escape
+
+from nicegui import background_tasks, context, ui
+
+from afspm.basics.formatting import time_of_day
+from afspm.plugins.web.dashboard.access import Visitor
+from afspm.plugins.web.dashboard.actions import Action, ActionResult, Steering
+from afspm.plugins.web.dashboard.content import Content
+from afspm.plugins.web.watch import Watch
+
+_CLOSE = [{"label": "Close", "color": "white"}]
+
+
+class SteeringSession:
+    """Carries out what a viewer asks for, and shows the result, with the reason of a refusal."""
+
+    def __init__(self, watch: Watch, steering: Steering, visitor: Visitor) -> None:
+        self.watch = watch
+        self.content = Content()
+        self._steering = steering
+        self._visitor = visitor
+        self._client = context.client
+        self._results: ui.html | None = None
+
+    @property
+    def signed_in(self) -> bool:
+        return self._visitor.may_steer
+
+    @property
+    def may_steer(self) -> bool:
+        """True if the viewer has signed in, and the experiment goes on."""
+        return self.signed_in and not self.content.ended
+
+    @property
+    def may_measure(self) -> bool:
+        """True if the viewer can ask the microscope for something."""
+        return self.may_steer and self.content.is_manual
+
+    def results(self) -> None:
+        """Make the element that shows the last result."""
+        self._results = ui.html("", sanitize=False).classes("outcomes").props('role="status" aria-live="polite"')
+
+    def do(self, action: Action) -> None:
+        """Carry out an action and show its result; the page goes on meanwhile."""
+
+        async def doing() -> None:
+            result = await self.carry_out(action)
+            if not self._client.is_deleted:
+                with self._client:
+                    self.say(result)
+
+        background_tasks.create(doing())
+
+    async def carry_out(self, action: Action) -> ActionResult:
+        """Carry out an action, and return its result."""
+        return await asyncio.wrap_future(self._steering.do(self._visitor, action))
+
+    def say(self, result: ActionResult) -> None:
+        """Show a result."""
+        style = "done" if result.ok else "refused"
+        time = time_of_day(self.watch.clock.now_ns())
+        if self._results is not None:
+            self._results.set_content(f'<p class="{style}"><time>{time}</time> {escape(result.text)}</p>')
+        if result.ok:
+            ui.notify(result.text, position="bottom-right", timeout=4000, classes="toast done")
+        else:  # stays until it is read
+            ui.notify(result.text, position="bottom-right", timeout=0, classes="toast refused", actions=_CLOSE)
+
+
+def button(text: str, on_click: Callable[..., object], colour: str | None = None) -> ui.button:
+    """Return a button; `colour` "primary" makes it a filled one."""
+    return ui.button(text, on_click=on_click, color=colour).props(
+        f"no-caps {'unelevated' if colour == 'primary' else 'outline'}"
+    )
+
+
+async def asked(title: str, text: str, yes: str) -> bool:
+    """Ask the viewer, in a dialog that Escape leaves; False also if the browser is closed."""
+
+    def body() -> None:
+        ui.label(text)
+
+    return await ask_in_dialog(title, body, yes)
+
+
+async def ask_in_dialog(
+    title: str, body: Callable[[], object], yes: str, may: Callable[[], bool] = lambda: True
+) -> bool:
+    """Ask the viewer in a dialog with a body of its own, which can only be agreed to while `may()`."""
+
+    def agree() -> None:
+        if may():
+            dialog.submit(yes)
+
+    with ui.dialog() as dialog, ui.card().classes("question").props('role="alertdialog"'):
+        ui.html(f"<h3>{escape(title)}</h3>", sanitize=False)
+        body()
+        with ui.element("div").classes("acts"):
+            ui.button("Cancel", on_click=lambda: dialog.submit(None), color=None).props("no-caps flat autofocus")
+            ui.button(yes, on_click=agree).props("no-caps unelevated")
+    answer = await dialog
+    if not dialog.is_deleted:  # it is with the page, if the browser was closed
+        dialog.clear()
+        dialog.delete()
+    return bool(answer)

@@ -1,0 +1,99 @@
+"""The web application: routes by what they are about, and the same model for every refusal."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import AsyncIterator, Collection
+from http import HTTPStatus
+from importlib import metadata
+
+from fastapi import FastAPI
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.middleware.cors import CORSMiddleware
+from starlette.requests import Request
+from starlette.responses import Response
+
+from afspm.basics.plain_data import Plain
+from afspm.plugins.web.asgi import AsgiApp
+from afspm.plugins.web.gateway.command_routes import CommandRoutes
+from afspm.plugins.web.gateway.guard import GatewayGuard, answer
+from afspm.plugins.web.gateway.problems import RefusalCode, RefusalModel, RefusedRequest, of_error
+from afspm.plugins.web.gateway.reading_routes import ReadingRoutes
+from afspm.plugins.web.gateway.services import GatewayServices
+from afspm.plugins.web.passwords import Passwords
+
+PREFIX = "/v1"
+ABOUT = """The experiment over HTTP. Everybody who may look reads; to command, send a name and its token, request
+control, and renew its lease. The scheduler decides about each request as it does for every component: limits hold, and
+what is done is in the record under `<gateway>:<name>`. Everything is in SI units."""
+_REFUSED: dict[int | str, dict[str, object]] = {
+    "4XX": {"model": RefusalModel, "description": "It was not done, and why."},
+    "5XX": {"model": RefusalModel, "description": "No answer, or a fault."},
+    422: {"model": RefusalModel, "description": "The request makes no sense, or a limit refuses it."},
+}
+
+
+def application(
+    services: GatewayServices, passwords: Passwords, *, host: str, origins: Collection[str] = ()
+) -> AsgiApp:
+    """Return the application, with the guard before it."""
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        services.bell.attach()
+        yield
+
+    app = FastAPI(
+        title="afspm gateway", version=metadata.version("afspm"), description=ABOUT, lifespan=lifespan,
+        docs_url=None, redoc_url=None, responses=_REFUSED, generate_unique_id_function=lambda route: route.name,
+    )  # fmt: skip
+    for routes in (ReadingRoutes(services), CommandRoutes(services)):
+        app.include_router(routes.router(), prefix=PREFIX)
+    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(HTTPException, _no_route)
+    for error in (RefusedRequest, Exception):
+        app.add_exception_handler(error, _refused)
+    guarded: AsgiApp = GatewayGuard(app, passwords, host, origins)
+    if not origins:
+        return guarded
+    methods, headers = ("GET", "POST", "PUT", "DELETE"), ("Authorization", "Content-Type", "Last-Event-ID")
+    allowing: AsgiApp = CORSMiddleware(
+        guarded,
+        allow_origins=tuple(origins),
+        allow_methods=methods,
+        allow_headers=headers,
+        expose_headers=("Location",),
+    )
+    return allowing
+
+
+async def _refused(_: Request, error: Exception) -> Response:
+    return answer(of_error(error))
+
+
+async def _invalid(_: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    wrong = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
+    return answer(RefusedRequest(RefusalCode.INVALID, "; ".join(wrong)[:1000]))
+
+
+async def _no_route(asked: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    code = {
+        HTTPStatus.NOT_FOUND: RefusalCode.NOT_FOUND,
+        HTTPStatus.METHOD_NOT_ALLOWED: RefusalCode.METHOD_NOT_ALLOWED,
+    }.get(HTTPStatus(error.status_code), RefusalCode.INVALID)
+    response = answer(RefusedRequest(code, f"{asked.method} {asked.url.path[:200]}: {error.detail}"))
+    if code is RefusalCode.METHOD_NOT_ALLOWED:
+        response.headers["Allow"] = ", ".join(_methods(asked.app.openapi()["paths"], asked.url.path))
+    return response
+
+
+def _methods(paths: Plain, path: str) -> list[str]:
+    """Return the methods of a path, of which each has a route of its own."""
+    for template, of_path in paths.items():
+        if re.fullmatch(re.sub(r"{\w+}", "[^/]+", template), path):
+            return [method.upper() for method in of_path]
+    return []

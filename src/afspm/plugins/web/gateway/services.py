@@ -1,0 +1,88 @@
+"""The services that the routes of the gateway share."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from starlette.requests import Request
+
+from afspm.model import Frame, Response
+from afspm.plugins.web.archive import Archive
+from afspm.plugins.web.gateway.events import EventHistory
+from afspm.plugins.web.gateway.guard import PERSON
+from afspm.plugins.web.gateway.measurements import Measurements
+from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest, of_error, refused
+from afspm.plugins.web.gateway.stream import StreamCount
+from afspm.plugins.web.person_commands import PersonCommands
+from afspm.plugins.web.persons import Persons
+from afspm.plugins.web.watch import Bell, Watch
+from afspm.transport.process.parent import StopRequested
+
+T = TypeVar("T")
+MOST_WAITING = 16
+"""Requests of one name that wait for their turn."""
+READER = ".reader"
+"""Asks for values in nobody's name; no name of a person begins so."""
+
+
+@dataclass
+class GatewayServices:
+    """The parts that the routes share, and the ways in which they ask."""
+
+    watch: Watch
+    bell: Bell
+    archive: Archive
+    history: EventHistory
+    measurements: Measurements
+    persons: Persons
+    experiment: str
+    simulated: bool
+    frame: Frame
+    streams: StreamCount = field(default_factory=StreamCount)
+    waiting: Counter[str] = field(default_factory=Counter)
+
+    def person_of(self, asked: Request) -> str:
+        """Return the name that a request was sent with; empty: it only looks."""
+        person: str = getattr(asked.state, PERSON, "")
+        return person
+
+    def who(self, asked: Request) -> str:
+        """Return the name by which the scheduler knows who asks. Raises RefusedRequest for who has none."""
+        if not (person := self.person_of(asked)):
+            raise RefusedRequest(RefusalCode.NAME_NEEDED, "what is done is in the record with a name")
+        return self.persons.name_of(person)
+
+    async def do(self, asked: Request, action: Callable[[PersonCommands], T]) -> T:
+        """Have an action carried out in the name of who asks. Raises RefusedRequest."""
+        self.who(asked)
+        return await self._carry_out(self.person_of(asked), action)
+
+    async def command(self, asked: Request, action: Callable[[PersonCommands], Response]) -> Response:
+        """Carry out a request to the scheduler. Raises RefusedRequest where it is no success."""
+        return _success(await self.do(asked, action))
+
+    async def read(self, action: Callable[[PersonCommands], T]) -> T:
+        """Have the microscope asked for what anybody may know."""
+        return await self._carry_out(READER, action)
+
+    async def _carry_out(self, person: str, action: Callable[[PersonCommands], T]) -> T:
+        if self.waiting[person] >= MOST_WAITING and person != READER:
+            raise RefusedRequest(RefusalCode.TOO_MANY, f"{MOST_WAITING} requests of {person} wait already")
+        self.waiting[person] += 1
+        try:
+            # a client that goes away in between does not call off what the scheduler is asked for
+            return await asyncio.shield(asyncio.wrap_future(self.persons.submit(person, action)))
+        except (Exception, StopRequested) as error:  # the second: the experiment ended meanwhile
+            raise of_error(error) from error
+        finally:
+            self.waiting[person] -= 1
+
+
+def _success(response: Response) -> Response:
+    if not response.ok:
+        raise refused(response)
+    return response

@@ -1,0 +1,139 @@
+"""From what was published to the documents of the gateway."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm import wire
+from afspm.basics.clock import iso_utc
+from afspm.client.parameter_text import from_parameter
+from afspm.model import Region, Response, names
+from afspm.model.line_levelling import Levelling, levelled
+from afspm.plugins.web.frames import number_or_none
+from afspm.plugins.web.gateway.models import (
+    ArrayModel,
+    ChannelModel,
+    MicroscopeModel,
+    ParameterModel,
+    RegionModel,
+    ScanModel,
+    SpectrumModel,
+)
+from afspm.record.drawing.raster import indices, png, value_range
+from afspm.record.overview import Overview, ScanSummary, SpectrumSummary
+
+CHUNK_BYTES = 3 << 16  # a multiple of three, so that pieces of base64 fit together
+
+
+def region_model(region: Region) -> RegionModel:
+    """Return a region; what the microscope says is not judged."""
+    return RegionModel.model_construct(
+        center_m=list(region.center_m), size_m=list(region.size_m), angle_rad=region.angle_rad
+    )
+
+
+def microscope(overview: Overview) -> MicroscopeModel:
+    """Return what the microscope does."""
+    parameters, probe, feedback = overview.scan_parameters, overview.probe_position, overview.feedback
+    region = None if parameters is None or not isinstance(parameters.region, Region) else parameters.region
+    shape = None if parameters is None or not isinstance(parameters.shape, tuple) else parameters.shape
+    return MicroscopeModel.model_construct(
+        state="UNDEFINED" if overview.status is None else overview.status.state.name,
+        region=None if region is None else region_model(region),
+        shape=None if shape is None else list(shape),
+        probe_m=None if probe is None else list(probe.xy_m),
+        feedback_on=None if feedback is None else feedback.on,
+        setpoint=None if feedback is None or feedback.setpoint is None else number_or_none(feedback.setpoint),
+    )
+
+
+def scans(overview: Overview) -> list[list[ScanSummary]]:
+    """Return the scans in the order in which they came, each as its channels."""
+    return [list(channels) for _, channels in groupby(overview.scans, lambda scan: scan.number)]
+
+
+def scan_id(channels: Sequence[ScanSummary]) -> str:
+    """Return the id of a scan: the time of its first channel, which a restart does not change."""
+    return str(channels[0].time_ns)
+
+
+def scan_model(channels: Sequence[ScanSummary]) -> ScanModel:
+    """Return a scan by its channels."""
+    first = channels[0]
+    return ScanModel.model_construct(
+        id=scan_id(channels),
+        number=first.number,
+        began=None if first.began_ns is None else iso_utc(first.began_ns),
+        finished=iso_utc(channels[-1].time_ns),
+        region=region_model(first.region),
+        shape=list(first.shape),
+        channels=[ChannelModel(name=one.channel, unit=one.unit) for one in channels],
+        holder=first.holder,
+        interrupted=first.interrupted,
+        file=first.filename,
+    )
+
+
+def spectrum_model(spectrum: SpectrumSummary) -> SpectrumModel:
+    """Return a spectrum without its values."""
+    return SpectrumModel.model_construct(
+        id=str(spectrum.time_ns),
+        finished=iso_utc(spectrum.time_ns),
+        kind=spectrum.kind,
+        position_m=None if spectrum.position_m is None else list(spectrum.position_m),
+        variables=[
+            ChannelModel(name=name, unit=unit) for name, unit in zip(spectrum.names, spectrum.units, strict=True)
+        ],
+        holder=spectrum.holder,
+    )
+
+
+def parameter_model(name: str, response: Response, asked: Any = None) -> ParameterModel:
+    """Return the value that a response reports; where it reports none, the one that was asked for."""
+    if not response.payload:
+        return ParameterModel(name=name, value=asked, unit=names.BASE_PARAMETERS.get(name) or "")
+    said = wire.decode_parameter(response.payload)
+    value = from_parameter(said, None)
+    is_number = isinstance(value, float) and not isinstance(value, bool)
+    return ParameterModel(
+        name=name,
+        value=number_or_none(value) if is_number and isinstance(value, float) else value,
+        unit=names.BASE_PARAMETERS.get(name) or said.unit or "",
+    )
+
+
+def as_npy(values: NDArray[np.float64]) -> Iterator[bytes]:
+    """Yield an array as a .npy file, piece by piece: it may be large, and many may want it."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": values.shape})
+    yield header.getvalue()
+    yield from _pieces(values)
+
+
+def as_base64(values: NDArray[np.float64], units: Sequence[str]) -> Iterator[bytes]:
+    """Yield an array as an `ArrayModel`, piece by piece."""
+    model = ArrayModel.model_construct(shape=list(values.shape), units=list(units), base64="")
+    head, tail = model.model_dump_json().rsplit('""', 1)
+    yield f'{head}"'.encode()
+    for piece in _pieces(values):
+        yield base64.b64encode(piece)
+    yield f'"{tail}'.encode()
+
+
+def as_png(values: NDArray[np.float64], levelling: Levelling) -> bytes:
+    """Return a scan as a picture, highest y on top."""
+    flat = levelled(values, levelling)
+    return png(indices(flat, value_range(flat)))
+
+
+def _pieces(values: NDArray[np.float64]) -> Iterator[bytes]:
+    flat = np.ascontiguousarray(values, dtype="<f8").reshape(-1).view(np.uint8)
+    for start in range(0, flat.size, CHUNK_BYTES):
+        yield flat[start : start + CHUNK_BYTES].tobytes()

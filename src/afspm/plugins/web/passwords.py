@@ -1,0 +1,199 @@
+"""Names and passwords of those who may look at an experiment, or steer it, over HTTP."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import hmac
+import ipaddress
+import os
+import re
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Callable, Mapping
+
+from afspm.basics.errors import ConfigError
+
+LONGEST_NAME = 40
+_COST = {"n": 2**14, "r": 8, "p": 1}
+_NAME = re.compile(r"[\w][\w .'-]*", re.UNICODE)
+_TRIES, _TRIES_WITHIN_S = 5, 60.0
+AGAIN_S = 3.0
+"""Real time between two tries that are looked at, after too many wrong ones. To refuse all would lock out the owner of
+the right password: anyone on the same computer could be wrong five times a minute in the same name."""
+_MOST_REMEMBERED = 1000
+
+
+def hashed(password: str) -> str:
+    """Return a password as it may be written down: "scrypt:<salt>:<hash>"."""
+    salt = os.urandom(16)
+    return f"scrypt:{_text(salt)}:{_text(_scrypt(password, salt))}"
+
+
+def matches(password: str, kept: str) -> bool:
+    """Return whether a password is the one of `kept`, a result of `hashed`."""
+    _, salt, digest = kept.split(":")
+    return hmac.compare_digest(_scrypt(password, base64.b64decode(salt)), base64.b64decode(digest))
+
+
+def is_hash(text: str) -> bool:
+    """Return whether a text is what `hashed` makes."""
+    return re.fullmatch(r"scrypt:[A-Za-z0-9+/=]{24}:[A-Za-z0-9+/=]{44,88}", text) is not None
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether an address to listen at is reached from this computer only."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def check_name(name: str) -> str:
+    """Return the name of a person as it may stand in the record; empty if it may not."""
+    name = " ".join(name.split())
+    return name if len(name) <= LONGEST_NAME and _NAME.fullmatch(name) else ""
+
+
+class Passwords:
+    """Decides whom a server lets look, and whom it believes a name.
+
+    On loopback without passwords everybody may look, and any name is believed. Where there is a common password, only
+    those who know it may look. Where there are persons, only they have names, each with a password of the own.
+
+    Args:
+        host: the address that is listened at.
+        password_hash: of the common password, see `hashed`.
+        people: the hash of each person's password.
+        now_s: the time in real seconds, for how often an address may try.
+
+    Raises:
+        ConfigError: a hash or a name is none.
+    """
+
+    def __init__(self, host: str, password_hash: str, people: Mapping[str, str], now_s: Callable[[], float]) -> None:
+        for person, kept in {"": password_hash, **people}.items():
+            _require_hash(person, kept)
+        # "" is the name of those who only look
+        self._hashes = {**people, "": password_hash}
+        self._local = is_loopback(host)
+        self._now_s = now_s
+        self._lock = threading.Lock()
+        self._tries: OrderedDict[_Prover, _Tries] = OrderedDict()
+        self._proved: OrderedDict[bytes, None] = OrderedDict()
+
+    @property
+    def is_unprotected(self) -> bool:
+        """True if other computers can come in without a password."""
+        return not self._local and not any(self._hashes.values())
+
+    @property
+    def is_open(self) -> bool:
+        """True if a name alone is enough to steer."""
+        return self._local and not any(self._hashes.values())
+
+    @property
+    def lets_look(self) -> bool:
+        """True if everybody may look."""
+        return self._local and not self._hashes[""]
+
+    def wait_s(self, person: str, address: str) -> float:
+        """Return the real seconds until a password of a person is looked at again from an address; 0: it is now."""
+        with self._lock:
+            tries = self._tries.get(self._prover(person, address))
+            return 0.0 if tries is None else tries.wait_s(self._now_s())
+
+    def proves(self, person: str, password: str, address: str) -> bool:
+        """Return whether a password is that of a person; False also if it is not looked at yet (see `wait_s`).
+
+        It takes some hundredths of a second. A password that was right before, from the same address, is right at
+        once, however often others were wrong there.
+        """
+        if self.is_open or (not person and self.lets_look):
+            return True
+        shown = hashlib.sha256(f"{address}\0{person}\0{password}".encode()).digest()
+        prover = self._prover(person, address)
+        with self._lock:
+            if shown in self._proved:
+                self._proved.move_to_end(shown)
+                return True
+            if not self._may_try(prover):
+                return False
+        # for a name that nobody has it takes as long as for the others
+        kept = self._hashes.get(person) or _NOBODYS
+        if not matches(password, kept) or kept is _NOBODYS:
+            return False
+        with self._lock:
+            self._tries.pop(prover, None)
+            self._proved[shown] = None
+            if len(self._proved) > _MOST_REMEMBERED:
+                self._proved.popitem(last=False)
+        return True
+
+    def proof_of(self, person: str) -> str:
+        """Return what stands for a person's password: with another one it is another."""
+        if self.is_open:
+            return ""
+        return hashlib.sha256(self._hashes.get(person, "nobody").encode()).hexdigest()
+
+    def _prover(self, person: str, address: str) -> _Prover:
+        # wrong passwords slow down neither other persons at the same address, nor the same person elsewhere
+        return address, person if person in self._hashes else None
+
+    def _may_try(self, prover: _Prover) -> bool:
+        # a try counts as wrong until its password is found to be right: many may come at once
+        tries = self._tries.setdefault(prover, _Tries())
+        self._tries.move_to_end(prover)
+        if len(self._tries) > _MOST_REMEMBERED:
+            self._tries.popitem(last=False)
+        now_s = self._now_s()
+        if tries.wait_s(now_s):
+            return False
+        tries.add(now_s)
+        return True
+
+
+_Prover = tuple[str, str | None]
+"""An address, and the person whose password is shown there; None: a name that nobody has."""
+
+
+class _Tries:
+    """The last tries, in real seconds."""
+
+    def __init__(self) -> None:
+        self._at_s: deque[float] = deque(maxlen=_TRIES + 1)
+
+    def wait_s(self, now_s: float) -> float:
+        """Return how long the next try has to wait; 0: not at all."""
+        lately = [at_s for at_s in self._at_s if now_s - at_s < _TRIES_WITHIN_S]
+        return max(0.0, lately[-1] + AGAIN_S - now_s) if len(lately) > _TRIES else 0.0
+
+    def add(self, now_s: float) -> None:
+        self._at_s.append(now_s)
+
+
+def _require_hash(person: str, kept: str) -> None:
+    setting = f"people, {person!r}" if person else "password_hash"
+    if person != check_name(person):
+        raise ConfigError(
+            f"{setting}: this is not a valid name",
+            hint=f"letters, digits, spaces, - . and ', at most {LONGEST_NAME}",
+        )  # fmt: skip
+    if (kept or person) and not is_hash(kept):
+        raise ConfigError(
+            f"{setting} is not the hash of a password",
+            hint="`afspm dashboard --make-password` makes one; do not write the password itself into the file",
+        )  # fmt: skip
+
+
+def _scrypt(password: str, salt: bytes) -> bytes:
+    return hashlib.scrypt(password.encode(), salt=salt, dklen=32, maxmem=64 << 20, **_COST)
+
+
+def _text(data: bytes) -> str:
+    return base64.b64encode(data).decode()
+
+
+_NOBODYS = f"scrypt:{_text(bytes(16))}:{_text(bytes(32))}"

@@ -1,0 +1,169 @@
+"""Requests of one person to the scheduler, which may refuse them. Dashboard and gateway ask by these."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from afspm import wire
+from afspm.client.experiment_link import ExperimentLink
+from afspm.client.parameter_text import Value, to_parameter
+from afspm.model import (
+    LEASE_REQUEST,
+    RELAY_REQUEST,
+    RESTART_REQUEST,
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Note,
+    Parameter,
+    ProbePosition,
+    Region,
+    RelayedMessage,
+    Response,
+    ScanParameters,
+    ScopeState,
+    names,
+)
+from afspm.model.geometry import XY
+from afspm.plugins.web.watch import Watch
+from afspm.record.overview import Overview
+
+ANSWER_S = 20.0  # real time that an answer may take
+FREE_S = 60.0  # that the microscope may take to get to a place
+SETTLED_S = 2.0  # what was set is published by then, if it changed anything
+
+
+class PersonCommands:
+    """The requests of one person, for one thread. Each returns the response, also where that is a refusal."""
+
+    def __init__(self, link: ExperimentLink, watch: Watch) -> None:
+        self._link = link
+        self._watch = watch
+
+    # --- the experiment ---
+
+    def request_control(self, problem: int = 0) -> Response:
+        """Ask for control, to solve a problem (0: none)."""
+        return self._ask(ControlRequest.REQUEST_CTRL, problem)
+
+    def renew(self, lease_s: float) -> Response:
+        """Keep control for so long (real) without another command or renewal."""
+        return self._ask(LEASE_REQUEST, lease_s)
+
+    def release_control(self) -> Response:
+        """Give control back."""
+        return self._ask(ControlRequest.RELEASE_CTRL)
+
+    def set_mode(self, mode: ControlMode) -> Response:
+        """Set MANUAL or AUTOMATED."""
+        return self._ask(ControlRequest.SET_CONTROL_MODE, int(mode))
+
+    def end(self) -> Response:
+        """End the experiment for everybody."""
+        return self._ask(ControlRequest.END_EXPERIMENT)
+
+    def flag(self, problem: int) -> Response:
+        """Raise a problem."""
+        return self._ask(ControlRequest.ADD_EXP_PRBLM, problem)
+
+    def clear(self, problem: int) -> Response:
+        """Remove the flag of a problem."""
+        return self._ask(ControlRequest.RMV_EXP_PRBLM, problem)
+
+    def restart(self, process: str) -> Response:
+        """Have a process ended and started anew."""
+        return self._ask(RESTART_REQUEST, process)
+
+    def note(self, text: str, scan_ns: int | None = None, time_ns: int | None = None) -> Response:
+        """Write a note on a scan, on a moment, or on now."""
+        now_ns = self._link.clock.now_ns()
+        about_ns = next(one for one in (time_ns, scan_ns, now_ns) if one is not None)
+        note = Note(about_ns, self._link.name, text, scan_ns, now_ns)
+        return self._ask(RELAY_REQUEST, RelayedMessage(*wire.encode(note)))
+
+    # --- the microscope ---
+
+    def get(self, parameter: str) -> Response:
+        """Ask for the value of a parameter."""
+        return self._ask(ControlRequest.PARAM, Parameter(parameter))
+
+    def set(self, parameter: str, value: Value, unit: str | None = None) -> Response:
+        """Set a parameter to a number, a quantity as text or a word."""
+        return self._ask(ControlRequest.PARAM, to_parameter(parameter, value, unit))
+
+    def supports(self, action: str) -> Response:
+        """Ask whether the microscope has an action."""
+        return self._ask(ControlRequest.ACTION_SUPPORT, action)
+
+    def act(self, action: str) -> Response:
+        """Have the microscope do something by its name."""
+        return self._ask(ControlRequest.ACTION, action)
+
+    def prepare_scan(self, region: Region | None, shape: tuple[int, int] | None) -> Response | None:
+        """Set where the next scan is taken, and wait until that is published. Returns a refusal; None: it is set."""
+        if region is None and shape is None:
+            return None
+        wanted = ScanParameters(region, shape)
+        response = self._ask(ControlRequest.SET_SCAN_PARAMS, wanted)
+        if not response.ok:
+            return response
+        self._settle(lambda o: o.scan_parameters is not None and _fits(o.scan_parameters, wanted))
+        return None
+
+    def prepare_spectrum(self, at_m: XY | None) -> Response | None:
+        """Move the probe to (x, y), and wait until that is published. Returns a refusal; None: it stands there."""
+        if at_m is None:
+            return None
+        response = self._ask(ControlRequest.SET_PROBE_POS, ProbePosition(at_m))
+        if not response.ok:
+            return response
+        self._settle(lambda o: o.probe_position is not None and _near(o.probe_position.xy_m, at_m))
+        return None
+
+    def act_when_free(self, action: str, next_id: Callable[[], str] = str) -> Response:
+        """Ask for an action, again and again while the microscope is not free.
+
+        Args:
+            next_id: returns the id of the next attempt, under which it is done once, however often it is asked for.
+        """
+        until_s = self._link.clock.monotonic_s() + FREE_S
+        while True:
+            self._watch.wait_free(until_s - self._link.clock.monotonic_s())
+            with self._watch.reading():
+                seen = self._watch.changes
+            response = self._ask(ControlRequest.ACTION, action, next_id())
+            if response.code != ControlResponse.NOT_FREE or self._link.clock.monotonic_s() >= until_s:
+                return response
+            self._watch.wait_for(lambda _, n=seen: self._watch.changes != n, 1.0)  # type: ignore[misc]
+
+    def stop(self) -> Response:
+        """Stop the scan or spectrum that runs."""
+        return self.act(names.STOP_SPEC if self.measures_spectrum else names.STOP_SCAN)
+
+    @property
+    def measures_spectrum(self) -> bool:
+        """True while the microscope measures a spectrum."""
+        with self._watch.reading() as overview:
+            return overview.status is not None and overview.status.state is ScopeState.SPEC
+
+    # --- within ---
+
+    def _ask(self, kind: int, subject: object = None, request_id: str = "") -> Response:
+        self._link.pump(0.0)  # what has come of the connection since we asked last
+        return self._link.request(kind, subject, request_id=request_id, until_s=self._link.until(ANSWER_S))
+
+    def _settle(self, done: Callable[[Overview], bool]) -> None:
+        """Wait until what was set is published; it is not where nothing changed."""
+        self._watch.wait_for(done, SETTLED_S)
+
+
+def _fits(now: ScanParameters, wanted: ScanParameters) -> bool:
+    if wanted.shape is not None and now.shape != wanted.shape:
+        return False
+    a, b = now.region, wanted.region
+    return b is None or (isinstance(a, Region) and isinstance(b, Region) and _near(a.center_m, b.center_m))
+
+
+def _near(a: XY, b: XY) -> bool:
+    return math.dist(a, b) < 1e-3 * max(math.hypot(*b), 1e-9)

@@ -1,0 +1,88 @@
+"""Connections to the scheduler in the names of persons, and a thread for each."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TypeVar
+
+from afspm.basics.clock import Clock
+from afspm.basics.launch import Launch
+from afspm.client.experiment_link import ExperimentLink
+from afspm.model.events import PERSON
+from afspm.plugins.web.person_commands import PersonCommands
+from afspm.plugins.web.watch import Watch
+from afspm.transport.network import Network
+from afspm.transport.port import ParentGone
+from afspm.transport.process.context import new_session
+from afspm.transport.zmq_port import ZmqPort
+
+MOST_PERSONS = 32
+T = TypeVar("T")
+
+
+@dataclass
+class _Person:
+    """A person's connection to the scheduler, used by one thread."""
+
+    thread: ThreadPoolExecutor
+    commands: PersonCommands | None = None
+    port: ZmqPort | None = None
+
+    def close(self) -> None:
+        if self.port is not None:
+            self.port.wake_up(ParentGone())
+            self.thread.submit(self.port.close)
+        self.thread.shutdown(wait=False)
+
+
+class Persons:
+    """Asks the scheduler for persons, each in the own name, one thing after the other for each. From any thread.
+
+    Args:
+        launch: the line that the component was started with; persons reach the scheduler as it does, with its keys.
+    """
+
+    def __init__(self, launch: Launch, clock: Clock, watch: Watch) -> None:
+        self._launch = launch
+        self._clock = clock
+        self._watch = watch
+        self._lock = threading.Lock()
+        self._persons: OrderedDict[str, _Person] = OrderedDict()
+
+    def submit(self, person: str, action: Callable[[PersonCommands], T]) -> Future[T]:
+        """Have an action carried out in the name of a person."""
+        with self._lock:
+            one = self._persons.get(person)
+            if one is None:
+                while len(self._persons) >= MOST_PERSONS:
+                    self._persons.popitem(last=False)[1].close()
+                one = self._persons[person] = _Person(ThreadPoolExecutor(1, thread_name_prefix="person"))
+            self._persons.move_to_end(person)
+            return one.thread.submit(self._carry_out, person, one, action)
+
+    def name_of(self, person: str) -> str:
+        """Return whom the scheduler knows a person as."""
+        return f"{self._launch.name}{PERSON}{person}"
+
+    def close(self) -> None:
+        """End all connections; what is under way ends without an answer."""
+        with self._lock:
+            persons, self._persons = list(self._persons.values()), OrderedDict()
+        for one in persons:
+            one.close()
+
+    def _carry_out(self, person: str, one: _Person, action: Callable[[PersonCommands], T]) -> T:
+        if one.commands is None:
+            one.port, one.commands = self._connect(person)
+        return action(one.commands)
+
+    def _connect(self, person: str) -> tuple[ZmqPort, PersonCommands]:
+        launch, name = self._launch, self.name_of(person)
+        network = Network.from_launch(launch.name, launch.keys)
+        port = ZmqPort(network, name, self._clock, control=launch.sockets.control)
+        link = ExperimentLink.of_launch(launch, port, new_session(launch.run), name=name)
+        return port, PersonCommands(link, self._watch)

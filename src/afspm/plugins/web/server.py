@@ -1,0 +1,266 @@
+"""Serves an ASGI application, in a thread of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import logging
+import socket
+import threading
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from afspm.basics.errors import ConfigError
+
+if TYPE_CHECKING:
+    from afspm.plugins.web.asgi import AsgiApp, Message, Receive, Send
+
+USUAL_PORT = 8080
+_STOPPED_S = 3.0
+STALLED_S = 60.0
+"""Real time after which a client is disconnected that takes nothing of an answer, or sends no more of a body."""
+HEAD_S = 10.0
+"""Real time that a client has for the head of a request: before that is there, no password can be asked for."""
+MOST_HEAD_BYTES = 64 << 10
+MOST_UNFINISHED = 200
+"""Connections without a finished TLS handshake, or without a request; with one more, the oldest is closed."""
+
+
+def listening(
+    host: str, port: int | None, wanted: Iterable[int] = (USUAL_PORT,), *, what: str = "dashboard"
+) -> socket.socket:
+    """Return a socket that listens at `host`.
+
+    Args:
+        port: None: the first of `wanted` that is free, or any.
+        what: listens, for the error.
+
+    Raises:
+        ConfigError: no such address, or the port is taken.
+    """
+    for attempt in (*wanted, 0) if port is None else (port,):
+        try:
+            return _bound(host, attempt)
+        except OSError as error:
+            failed = error
+    raise ConfigError(
+        f"the {what} can't listen at {host}, port {port}: {failed.strerror or failed}",
+        where=what,
+        hint="another program may use it; set another port, or leave port out",
+    ) from failed
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    bound = socket.socket(family, kind, protocol)
+    try:
+        if hasattr(socket, "SO_EXCLUSIVEADDRUSE"):  # Windows, where the other option would let two have it
+            bound.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
+        else:
+            bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.bind(address)
+        bound.listen(128)
+    except OSError:
+        bound.close()
+        raise
+    return bound
+
+
+def url_of(host: str, port: int, *, encrypted: bool) -> str:
+    """Return where the page is found, from other computers too if it listens at all addresses of this one."""
+    with contextlib.suppress(ValueError):  # a name
+        if ipaddress.ip_address(host).is_unspecified:
+            host = socket.gethostname()
+    return f"{'https' if encrypted else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"
+
+
+class _TlsListener(socket.socket):
+    """A listening socket that ends connections whose TLS handshake takes too long, or is the oldest of too many.
+
+    The server learns of a connection only when its handshake is done, and asyncio waits a minute for that: a client
+    that never begins would use up the files that the process may open. (On Windows, whose event loop accepts
+    connections by itself, asyncio's minute remains.)
+    """
+
+    def __init__(self, bound: socket.socket, within_s: float) -> None:
+        super().__init__(bound.family, bound.type, bound.proto, fileno=bound.dup().detach())
+        self._within_s = within_s
+        self._unfinished: dict[int, socket.socket] = {}
+
+    def accept(self) -> tuple[socket.socket, object]:
+        """Accept the next connection. Called by the event loop."""
+        connection, address = super().accept()
+        descriptor = connection.fileno()
+        self._unfinished.pop(descriptor, None)  # of a connection that is closed
+        self._unfinished[descriptor] = connection
+        asyncio.get_running_loop().call_later(self._within_s, self._end, descriptor, connection)
+        if len(self._unfinished) > MOST_UNFINISHED:
+            self._end(*next(iter(self._unfinished.items())))  # handshakes of honest clients last for milliseconds
+        return connection, address
+
+    def finished(self, descriptor: int) -> None:
+        """Note that a connection has finished its handshake."""
+        self._unfinished.pop(descriptor, None)
+
+    def _end(self, descriptor: int, connection: socket.socket) -> None:
+        if self._unfinished.get(descriptor) is connection:
+            del self._unfinished[descriptor]
+            with contextlib.suppress(OSError):  # closed already
+                connection.shutdown(socket.SHUT_RDWR)
+
+
+def _impatient(stalled_s: float, head_s: float, listener: _TlsListener | None) -> type[asyncio.Protocol]:
+    """Return uvicorn's protocol, which disconnects clients that stall: they would keep their connections for ever."""
+    import h11
+
+    # the one that is written in Python: it bounds the head of a request, which its C sibling takes in without end
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+
+    waiting: dict[ImpatientProtocol, None] = {}
+
+    class ImpatientProtocol(H11Protocol):
+        _stalled: asyncio.TimerHandle | None = None
+        _unfinished: asyncio.TimerHandle | None = None
+        _awaited: object = None
+
+        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+            super().connection_made(transport)
+            if listener is not None:
+                listener.finished(transport.get_extra_info("socket").fileno())
+            self._await(h11.IDLE)
+
+        def data_received(self, data: bytes) -> None:
+            if self._awaited is None and self.conn.their_state is h11.IDLE:
+                self._await(h11.IDLE)  # the first bytes of the next request
+            super().data_received(data)
+            is_upgraded = self.transport.get_protocol() is not self
+            state = None if is_upgraded else self.conn.their_state
+            if state is not self._awaited:
+                self._await(state if state is h11.SEND_BODY else None)
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            self._await(None)
+            super().connection_lost(exc)
+
+        def pause_writing(self) -> None:
+            super().pause_writing()
+            self._stalled = asyncio.get_running_loop().call_later(stalled_s, self.transport.abort)
+
+        def resume_writing(self) -> None:
+            if self._stalled is not None:
+                self._stalled.cancel()
+            super().resume_writing()
+
+        def _await(self, state: object) -> None:
+            # IDLE: the rest of a head; SEND_BODY: that of a body; None: nothing
+            self._awaited = state
+            if self._unfinished is not None:
+                self._unfinished.cancel()
+                self._unfinished = None
+            waiting.pop(self, None)
+            if state is not None:
+                within_s = head_s if state is h11.IDLE else stalled_s
+                self._unfinished = asyncio.get_running_loop().call_later(within_s, self.transport.abort)
+                waiting[self] = None
+            if len(waiting) > MOST_UNFINISHED:
+                oldest = next(iter(waiting))  # those of honest clients last for milliseconds
+                oldest._await(None)
+                oldest.transport.abort()
+
+    return ImpatientProtocol
+
+
+def _limited(app: AsgiApp, most: int) -> AsgiApp:
+    # connections that have asked for nothing yet do not count: anybody could open them, and keep all others out
+    running = 0
+
+    async def limited(scope: Message, receive: Receive, send: Send) -> None:
+        nonlocal running
+        if scope["type"] != "http":
+            await app(scope, receive, send)
+            return
+        if running >= most:
+            headers = [(b"content-type", b"text/plain"), (b"retry-after", b"1"), (b"connection", b"close")]
+            await send({"type": "http.response.start", "status": 503, "headers": headers})
+            await send({"type": "http.response.body", "body": f"{most} requests are being answered".encode()})
+            return
+        running += 1
+        try:
+            await app(scope, receive, send)
+        finally:
+            running -= 1
+
+    return limited
+
+
+class WebServer:
+    """Serves an ASGI application until it is stopped.
+
+    Args:
+        certificate, key: PEM files, for https; None: http.
+        most_requests: at a time; those beyond are answered 503. None: any number.
+        stalled_s, head_s: real; see `STALLED_S` and `HEAD_S`.
+
+    Raises:
+        ConfigError: the files are no certificate and its key.
+    """
+
+    def __init__(
+        self,
+        app: AsgiApp,
+        bound: socket.socket,
+        certificate: Path | None,
+        key: Path | None,
+        *,
+        most_requests: int | None = None,
+        stalled_s: float = STALLED_S,
+        head_s: float = HEAD_S,
+    ) -> None:
+        import uvicorn
+
+        logging.getLogger("uvicorn").setLevel(logging.ERROR)  # what clients do wrong is theirs
+        self._bound = bound
+        listener = None if certificate is None else _TlsListener(bound, head_s)
+        self._listener = listener or bound
+        config = uvicorn.Config(
+            app if most_requests is None else _limited(app, most_requests),
+            loop="auto" if listener is None else "asyncio",  # uvloop accepts connections past the listener
+            log_config=None,
+            access_log=False,
+            lifespan="on",
+            proxy_headers=False,  # what a request says of its origin is anybody's word, and passwords are tried by it
+            timeout_graceful_shutdown=1,
+            http=_impatient(stalled_s, head_s, listener),
+            h11_max_incomplete_event_size=MOST_HEAD_BYTES,
+            ssl_certfile=certificate,
+            ssl_keyfile=key,
+        )
+        try:
+            config.load()
+        except (OSError, ValueError) as error:
+            self._listener.close()
+            raise ConfigError(
+                f"certificate or certificate_key can't be loaded: {error}", hint="both must be PEM files"
+            ) from error
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(target=self._run, name="web", daemon=True)
+
+    def start(self) -> None:
+        """Begin to serve; requests that came before are answered then."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop, within seconds; whoever is connected is cut off."""
+        self._server.should_exit = True
+        self._thread.join(_STOPPED_S)
+        for one in (self._listener, self._bound):
+            with contextlib.suppress(OSError):
+                one.close()
+
+    def _run(self) -> None:
+        try:
+            self._server.run(sockets=[self._listener])
+        except SystemExit:  # that is how it tells that it couldn't start
+            logging.getLogger("afspm.plugins.web").error("nothing can be served")

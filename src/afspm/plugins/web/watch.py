@@ -1,0 +1,204 @@
+"""The state that the component's thread writes and the page's thread reads."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from afspm.basics.clock import Clock
+from afspm.model import ProblemNames, Scan, ScanLines, ScopeState, Spectrum
+from afspm.model.line_levelling import Array
+from afspm.plugins.web.frames import FrameStore
+from afspm.record.overview import Overview
+
+MOST_SPECTRA, SPECTRA_BYTES = 200, 64 << 20
+
+
+class SpectrumStore:
+    """The newest spectra, in the order in which they came. Not for several threads at once."""
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[int, Spectrum]] = deque()
+        self._bytes = 0
+        self._newest_ns = -1
+
+    def take(self, spectrum: Spectrum, time_ns: int) -> None:
+        """Add one that was published; what is not newer (a replay) is passed over."""
+        if time_ns <= self._newest_ns:
+            return
+        self._newest_ns = time_ns
+        self._kept.append((spectrum.time_ns or time_ns, spectrum))
+        self._bytes += spectrum.values.nbytes
+        while len(self._kept) > MOST_SPECTRA or (self._bytes > SPECTRA_BYTES and len(self._kept) > 1):
+            self._bytes -= self._kept.popleft()[1].values.nbytes
+
+    def newest(self, count: int = 1) -> list[tuple[int, Spectrum]]:
+        """Return (time_ns, spectrum), newest last."""
+        return list(self._kept)[-count:]
+
+    def at(self, time_ns: int) -> Spectrum | None:
+        """Return the one of that time; None if it is not kept any more."""
+        return next((spectrum for at_ns, spectrum in self._kept if at_ns == time_ns), None)
+
+
+class Watch:
+    """The overview, the newest pictures and spectra, and when anything was heard last.
+
+    Args:
+        clock: of the experiment.
+        past: what was so before; None: nothing is known of that.
+        cut_off: returns what to say if nothing runs the experiment any more, else an empty text.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        problems: ProblemNames | None = None,
+        past: Overview | None = None,
+        cut_off: Callable[[], str] = str,
+    ) -> None:
+        self.clock = clock
+        self.problems = problems or ProblemNames()
+        self.cut_off = cut_off
+        self.overview = past or Overview(self.problems)
+        self.frames = FrameStore()
+        self.spectra = SpectrumStore()
+        self.tip_to_sample: Array | None = None
+        """The newest mapping of drift, 2 x 3; None where nothing corrects drift."""
+        self.connected = False
+        self.ended = False
+        self.changes = 0
+        self._heard_s = clock.monotonic_s()
+        self._changed = threading.Condition()
+        self._callbacks: list[Callable[[], None]] = []
+
+    @property
+    def moment_ns(self) -> int | None:
+        """The recorded moment that is shown; None: it is now."""
+        return None
+
+    @property
+    def revision(self) -> int:
+        """Differs after a jump to another moment: all that was made of the one before is made again."""
+        return 0
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing of the run is left at the moment that is shown."""
+        return self.ended
+
+    @contextlib.contextmanager
+    def reading(self) -> Iterator[Overview]:
+        """Keep everything as it is while in the block; be brief in it."""
+        with self._changed:
+            yield self.overview
+
+    def take(self, message: str, thing: Any, time_ns: int, envelope: str = "") -> None:
+        """Take in what was published."""
+        with self._changed:
+            self.overview.take(message, thing, time_ns, envelope)
+            if isinstance(thing, Scan):
+                self.frames.take_scan(thing, time_ns)
+            elif isinstance(thing, ScanLines):
+                self.frames.take_lines(thing)
+            elif isinstance(thing, Spectrum):
+                self.spectra.take(thing, time_ns)
+            elif message == "DriftMapping":
+                is_mapping = len(thing.matrix) == 6 and thing.correcting
+                self.tip_to_sample = np.array(thing.matrix, dtype=np.float64).reshape(2, 3) if is_mapping else None
+            self._heard_s = self.clock.monotonic_s()
+            self.connected = True
+            self._announce()
+
+    def end(self) -> None:
+        """Note that the experiment has ended."""
+        with self._changed:
+            self.ended = True
+            self._announce()
+
+    def silent_s(self) -> float:
+        """Return the real seconds since anything was heard."""
+        return self.clock.monotonic_s() - self._heard_s
+
+    def on_change(self, callback: Callable[[], None]) -> None:
+        """Call `callback` after each change, in the thread that brings it; it must not wait for anything."""
+        self._callbacks.append(callback)
+
+    def wait_for(self, condition: Callable[[Overview], bool], within_s: float) -> bool:
+        """Wait in another thread until `condition`; return False when the time is up."""
+        with self._changed:
+            return self._changed.wait_for(lambda: condition(self.overview), within_s)
+
+    def wait_free(self, within_s: float) -> bool:
+        """Wait until the microscope says that it is free."""
+        return self.wait_for(lambda o: o.status is not None and o.status.state is ScopeState.FREE, within_s)
+
+    def _announce(self) -> None:
+        self.changes += 1
+        self._changed.notify_all()
+        for callback in self._callbacks:
+            callback()
+
+
+class Bell:
+    """Wakes tasks of the page's loop from any thread. However often it rings, each is woken once."""
+
+    def __init__(self) -> None:
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._event = asyncio.Event()
+        self._is_ringing = False
+
+    def attach(self) -> None:
+        """Wake tasks of the running loop from now on."""
+        self._loop = asyncio.get_running_loop()
+
+    def ring(self) -> None:
+        """Wake all tasks that wait. From any thread; never waits."""
+        if self._loop is None or self._is_ringing:
+            return
+        self._is_ringing = True
+        with contextlib.suppress(RuntimeError):  # the loop has just been closed
+            self._loop.call_soon_threadsafe(self._wake)
+
+    def _wake(self) -> None:
+        self._is_ringing = False
+        self._event.set()
+        self._event = asyncio.Event()
+
+    async def wait(self, timeout_s: float) -> bool:
+        """Wait until it rings; return False when the time is up."""
+        try:
+            await asyncio.wait_for(self._event.wait(), timeout_s)
+        except TimeoutError:
+            return False
+        return True
+
+
+class Audience:
+    """The pages that are open, so that all hear of the end before the server goes. From any thread."""
+
+    def __init__(self) -> None:
+        self._pages: set[int] = set()
+        self._changed = threading.Condition()
+
+    def join(self, page: object) -> None:
+        """Add a page that was opened."""
+        with self._changed:
+            self._pages.add(id(page))
+
+    def leave(self, page: object) -> None:
+        """Remove a page that was closed, or has been told of the end."""
+        with self._changed:
+            self._pages.discard(id(page))
+            self._changed.notify_all()
+
+    def wait_told(self, within_s: float) -> bool:
+        """Wait until no page is left that has not been told; return False when the time is up."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._pages, within_s)

@@ -1,0 +1,129 @@
+"""Arrays as pictures: the range of values that is shown, indices into a colour map, PNG."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import Enum
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.record.drawing.palette import LEVELS, PALETTES, UNMEASURED, colour_map
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+Array = NDArray[np.float64]
+_SAMPLED = 65_536  # values that the range is found from, of a larger picture evenly chosen ones
+_OUTLIERS_PERCENT = 1.0
+_FAST = 1  # of zlib: pictures are made by the dozen, and looked at once
+_QUALITY = 80
+
+
+class Contrast(Enum):
+    """The values that the ends of the colour map stand for: all but the outer percents, or all."""
+
+    ROBUST = "robust"
+    FULL = "full"
+
+
+@dataclass(frozen=True, slots=True)
+class ValueRange:
+    """The values at the ends of the colour map."""
+
+    low: float
+    high: float
+
+
+def value_range(values: Array, contrast: Contrast = Contrast.ROBUST) -> ValueRange:
+    """Return the range of the finite values: 0 to 1 if there are none, a range around a single one."""
+    stride = max(1, values.size // _SAMPLED)
+    # a stride that shares no divisor with the width, or it would look at a few columns only
+    while stride > 1 and np.gcd(stride, max(values.shape[-1], 1)) != 1:
+        stride += 1
+    some = values.ravel()[::stride] if contrast is Contrast.ROBUST else values.ravel()
+    finite = some[np.isfinite(some)]
+    if not finite.size:
+        finite = values[np.isfinite(values)]
+    if not finite.size:
+        return ValueRange(0.0, 1.0)
+    if contrast is Contrast.FULL:
+        low, high = float(finite.min()), float(finite.max())
+    else:
+        low, high = (float(v) for v in np.percentile(finite, (_OUTLIERS_PERCENT, 100.0 - _OUTLIERS_PERCENT)))
+    if not high > low:
+        around = abs(low) * 1e-3 or 0.5
+        low, high = low - around, high + around
+    return ValueRange(low, high)
+
+
+def shared_range(pictures: Iterable[Array], contrast: Contrast = Contrast.ROBUST) -> ValueRange:
+    """Return the range for pictures that are compared: no smaller than that of any."""
+    spans = [value_range(values, contrast) for values in pictures]
+    return ValueRange(min(span.low for span in spans), max(span.high for span in spans))
+
+
+def indices(values: Array, span: ValueRange) -> NDArray[np.uint8]:
+    """Return the index of each value in the colour map; UNMEASURED where it is not finite."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        scaled = (values - span.low) * ((LEVELS - 1) / (span.high - span.low))
+        np.clip(scaled, 0.0, LEVELS - 1, out=scaled)
+        scaled += 0.5
+        measured = np.isfinite(values)
+        if not measured.all():
+            scaled[~measured] = UNMEASURED
+        return scaled.astype(np.uint8)
+
+
+def png(levels: NDArray[np.uint8], palette: str = PALETTES[0]) -> bytes:
+    """Return indices [y, x], y ascending, as a PNG with the highest y on top; UNMEASURED is transparent."""
+    written = io.BytesIO()
+    opacity = b"\xff" * LEVELS + b"\0"
+    _image(levels, palette).save(written, "PNG", compress_level=_FAST, transparency=opacity)
+    return written.getvalue()
+
+
+def webp(levels: NDArray[np.uint8], palette: str = PALETTES[0]) -> bytes:
+    """Return the same in a third of the bytes, where exact colours don't matter."""
+    written = io.BytesIO()
+    image = _image(levels, palette)
+    image.info["transparency"] = UNMEASURED
+    image.convert("RGBA").save(written, "WEBP", quality=_QUALITY)
+    return written.getvalue()
+
+
+def reduced(values: Array, largest_px: int, *, each_side: bool = False) -> Array:
+    """Return the means of blocks of pixels, so that at most `largest_px` a side are left; NaN counts for nothing.
+
+    Args:
+        each_side: reduce each side by itself, for pictures that are drawn in the proportions of their region; else
+            blocks are squares of pixels.
+    """
+    steps = [max(1, -(-count // largest_px)) for count in values.shape]
+    if max(steps) == 1:
+        return values
+    # a few long lines are not put together beyond their number
+    across, along = steps if each_side else (min(max(steps), count) for count in values.shape)
+    rows, columns = values.shape[0] // across, values.shape[1] // along
+    blocks = values[: rows * across, : columns * along].reshape(rows, across, columns, along)
+    measured = np.isfinite(blocks)
+    count = measured.sum(axis=(1, 3))
+    total = np.where(measured, blocks, 0.0).sum(axis=(1, 3))
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _image(levels: NDArray[np.uint8], palette: str) -> Image.Image:
+    from PIL import Image
+
+    picture = Image.fromarray(np.ascontiguousarray(levels[::-1]), "L")
+    picture.putpalette(_table(palette))
+    return picture
+
+
+@lru_cache(16)
+def _table(palette: str) -> bytes:
+    return colour_map(palette).tobytes() + b"\0\0\0"

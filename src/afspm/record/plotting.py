@@ -1,0 +1,118 @@
+"""A scan drawn with matplotlib: as an image, as contour lines or as a surface."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, cast
+
+import numpy as np
+
+from afspm.basics.errors import InvalidValue
+from afspm.basics.formatting import scale, typeset_length
+from afspm.record.drawing.image_html import round_length_m
+from afspm.record.drawing.palette import PALETTES, colour_map
+from afspm.record.drawing.raster import value_range
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from afspm.model.scan import Scan
+
+KINDS: Final = ("image", "contour", "surface")
+_LEVELS: Final = 12
+
+
+def draw(
+    scan: Scan,
+    kind: str = "image",
+    axes: Axes | None = None,
+    *,
+    colorbar: bool = True,
+    vmin: float | None = None,
+    vmax: float | None = None,
+) -> Axes:
+    """Draw a scan; see `Scan.plot`."""
+    if kind not in KINDS:
+        raise InvalidValue(f"a scan can't be drawn as {kind!r}", hint=f"one of {', '.join(KINDS)}")
+    if not scan.values.size or not np.isfinite(scan.values).any():
+        raise InvalidValue(f"the scan {scan.channel!r} has no values to draw")
+    span = value_range(scan.values)
+    low, high = span.low if vmin is None else vmin, span.high if vmax is None else vmax
+    if not low <= high:
+        raise InvalidValue(f"colours from {low:g} to {high:g} {scan.unit}", hint="vmin is below vmax")
+    import matplotlib.pyplot as plt
+
+    given: Any = axes
+    if given is None:
+        given = plt.figure(layout="constrained").add_subplot(projection="3d" if kind == "surface" else None)
+        given.set_title(_title(scan), fontsize=9)
+    is_first = not given.has_data()
+    factor, unit = scale(max(abs(low), abs(high)), scan.unit)
+    drawn = _fill(scan, kind, given, factor, (low, high))
+    if is_first:
+        _explain(scan, drawn, given, f"{scan.channel} / {unit}" if unit else scan.channel, colorbar=colorbar)
+    return cast("Axes", given)
+
+
+def _fill(scan: Scan, kind: str, axes: Any, factor: float, ends: tuple[float, float]) -> object:
+    """Draw the values, times a factor, over the places of their pixels, in m."""
+    x, y = scan.region.pixels_m(scan.shape)
+    values = np.ma.masked_invalid(scan.values * factor)
+    look = {"cmap": gold(), "vmin": ends[0] * factor, "vmax": ends[1] * factor}
+    match kind:
+        case "surface":
+            return axes.plot_surface(x, y, values, **look)
+        case "contour":
+            return axes.contour(x, y, values, _LEVELS, **look)
+        case _:
+            return axes.pcolormesh(x, y, values, shading="nearest", **look)
+
+
+def _explain(scan: Scan, drawn: object, axes: Any, label: str, *, colorbar: bool) -> None:
+    """Add what the first scan in axes needs: units, a colour bar, a scale bar. Others lie over it as they are."""
+    factor, length_unit = scale(max(scan.region.size_m), "m")
+    for axis, name in ((axes.xaxis, "x"), (axes.yaxis, "y")):
+        axis.set_major_formatter(lambda place_m, _: f"{place_m * factor:.6g}".replace("-", "−"))
+        axis.set_label_text(f"{name} / {length_unit}")
+    if hasattr(axes, "set_zlabel"):
+        axes.set_zlabel(label)
+        return
+    axes.set_facecolor("0.6")  # what was not measured, and behind contour lines
+    axes.set_aspect("equal")
+    if colorbar:  # in axes within these: as high as the picture, which is rarely as high as its place in the figure
+        axes.figure.colorbar(drawn, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), label=label)
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    draw_scale_bar(axes, (right - left, high - low), (left, low), 1.0)
+
+
+def draw_scale_bar(
+    axes: Any, size_m: tuple[float, float], corner: tuple[float, float], length: float, *,
+    font: float | None = None, named: bool = True,
+) -> None:  # fmt: skip
+    """Draw a bar of round length into the lower left corner of a picture.
+
+    Args:
+        corner: where the picture begins in the axes.
+        length: a metre in the axes.
+        font: size of the label; None: matplotlib's.
+        named: with its length above it.
+    """
+    bar_m = round_length_m(size_m[0] / 4.0)
+    left, low = corner[0] + 0.05 * size_m[0] * length, corner[1] + 0.05 * size_m[1] * length
+    for color, line in (("black", 6.0), ("white", 3.0)):
+        axes.plot([left, left + bar_m * length], [low, low], color=color, linewidth=line, solid_capstyle="butt")
+    if named:
+        axes.text(
+            left, low + 0.025 * size_m[1] * length, typeset_length(bar_m), color="white", va="bottom", fontsize=font,
+            bbox={"facecolor": "black", "alpha": 0.5, "pad": 1.5, "edgecolor": "none"},
+        )  # fmt: skip
+
+
+def gold() -> Any:
+    """Return the colours of heights as a colour map of matplotlib."""
+    from matplotlib.colors import ListedColormap
+
+    return ListedColormap(colour_map(PALETTES[0]) / 255.0)
+
+
+def _title(scan: Scan) -> str:
+    return f"{scan.channel}, {scan.time:%Y-%m-%d %H:%M:%S} UTC" if scan.time else scan.channel

@@ -1,0 +1,392 @@
+"""The arbitration table: who may control the microscope, as data, and the one function that applies it.
+
+`TABLE` is read from the top: the first row of an event whose condition holds applies, and each event's last row always
+does. Nothing but a row changes who is in control, the mode or the flagged problems.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from types import MappingProxyType
+from typing import ClassVar
+
+from afspm.basics.frozen import replace
+from afspm.basics.plain_data import SECTION
+from afspm.model import ControlMode, ControlResponse, ControlState, Problem, ProblemNames, component_of
+
+_NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
+
+
+class ArbitrationEvent(Enum):
+    """An event on which control depends: the requests, by kind, and two that time brings."""
+
+    REQUEST_CONTROL = "asks for control"
+    RELEASE_CONTROL = "gives control back"
+    FLAG = "flags a problem"
+    CLEAR = "removes a flag"
+    SET_MODE = "sets the mode"
+    END = "ends the experiment"
+    COMMAND = "commands the microscope"
+    ADJUST = "sets a parameter of [control] adjustable"
+    READ = "asks the microscope for a value"
+    DEAD = "is dead"
+    IDLE = "has let its lease run out"
+
+
+class ControlChange(Enum):
+    """A change that a row makes."""
+
+    GRANT = auto()
+    """The asker gets control, to solve the problem it named (or none)."""
+    TAKE = auto()
+    """Whoever is in control no longer is."""
+    FLAG = auto()
+    UNFLAG = auto()
+    SET_MODE = auto()
+    END = auto()
+    FORWARD = auto()
+    """The translator answers."""
+
+
+class Cause(Enum):
+    """Why control was taken from its holder."""
+
+    RELEASED = "it gave control back"
+    PROBLEM = "a problem was flagged"
+    SOLVED = "the problem it solved was cleared"
+    MANUAL = "the mode changed to MANUAL"
+    DEAD = "its process died"
+    IDLE = "it did nothing for longer than its lease"
+    ENDED = "the experiment ended"
+
+
+@dataclass(frozen=True)
+class ArbitrationState:
+    """The state that control is in.
+
+    Attributes:
+        solving: the flagged problem that the holder is in control for; 0 for none.
+        problems: the flagged problems, each with who flagged it.
+        ended: the experiment is over.
+    """
+
+    mode: ControlMode = ControlMode.AUTOMATED
+    holder: str | None = None
+    solving: int = 0
+    problems: Mapping[int, str] = field(default_factory=lambda: _NO_PROBLEMS)
+    ended: bool = False
+
+    @property
+    def sees_to_tip(self) -> bool:
+        """Somebody is there for a microscope that is not as it should be: a person, or who solves that."""
+        return self.mode is ControlMode.MANUAL or (
+            self.holder is not None and self.solving == Problem.DEVICE_MALFUNCTION
+        )
+
+    def published(self) -> ControlState:
+        """Return the state as all peers are told it."""
+        return ControlState(self.mode, self.holder, tuple(sorted(self.problems)))
+
+
+@dataclass(frozen=True)
+class RoleTable:
+    """The components and people with a role. Without the key, everyone has the role.
+
+    A person who acts through a component ("dashboard:Ada") has the roles of the component and those given to that
+    person there.
+
+    Attributes:
+        end_experiment: end the experiment.
+        set_mode: switch between MANUAL and AUTOMATED.
+        clear_problems: clear problems that others flagged. A component may always clear a problem that it flagged
+            itself, or is in control to solve.
+        operate: command the microscope in MANUAL mode, and set what is `adjustable`. Without the key: the dashboard,
+            and other components by which a person commands the microscope.
+        restart: restart a process.
+    """
+
+    end_experiment: tuple[str, ...] | None = None
+    set_mode: tuple[str, ...] | None = None
+    clear_problems: tuple[str, ...] | None = None
+    operate: tuple[str, ...] | None = None
+    restart: tuple[str, ...] | None = None
+
+    __pydantic_config__: ClassVar[object] = SECTION
+
+
+@dataclass(frozen=True)
+class Rules:
+    """The part of the experiment file that the table needs.
+
+    Attributes:
+        problems: those that are known.
+        adjustable: parameters that a person may set while a component is in control.
+        end_on: problems that end the experiment.
+    """
+
+    roles: RoleTable = RoleTable()
+    problems: ProblemNames = field(default_factory=ProblemNames)
+    adjustable: frozenset[str] = frozenset()
+    end_on: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True)
+class ControlInput:
+    """An event of `who`; `number` is the problem or mode that it is about."""
+
+    event: ArbitrationEvent
+    who: str
+    number: int = 0
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Something that may hold of a state and an ask, with words for it."""
+
+    text: str
+    holds: Callable[[ArbitrationState, ControlInput, Rules], bool]
+
+
+@dataclass(frozen=True)
+class Transition:
+    """One line of the table.
+
+    Attributes:
+        response: of a request; None where the translator answers, or nobody asked.
+        why: why it is so. Of a refusal it is the reason given, with {who}, {holder}, {number}, {problem} and {problems}
+            filled in.
+        cause: why control is taken, where it is.
+    """
+
+    when: Condition
+    response: ControlResponse | None
+    do: tuple[ControlChange, ...]
+    why: str
+    cause: Cause | None = None
+
+
+def may(role: Collection[str] | None, who: str) -> bool:
+    """Return whether `who` has a role."""
+    return role is None or who in role or component_of(who) in role
+
+
+def _may_clear(control: ArbitrationState, ask: ControlInput, rules: Rules) -> bool:
+    flagged_by = control.problems.get(ask.number, ask.who)
+    solves = control.holder == ask.who and control.solving == ask.number
+    return flagged_by == ask.who or solves or may(rules.roles.clear_problems, ask.who)
+
+
+OTHERWISE = Condition("otherwise", lambda c, a, r: True)
+IS_MANUAL = Condition("the mode is manual", lambda c, a, r: c.mode is ControlMode.MANUAL)
+IS_OPERATOR = Condition(
+    "the mode is manual and it has the role `operate`",
+    lambda c, a, r: c.mode is ControlMode.MANUAL and may(r.roles.operate or (), a.who),
+)
+IS_ADJUSTER = Condition(
+    "it has the role `operate` and no problem is flagged",
+    lambda c, a, r: may(r.roles.operate or (), a.who) and not c.problems,
+)
+ASKER_HOLDS = Condition("it is in control", lambda c, a, r: c.holder == a.who)
+OTHER_HOLDS = Condition("another component is in control", lambda c, a, r: c.holder not in (None, a.who))
+SOLVES_NONE = Condition("problems are flagged and it names none", lambda c, a, r: not a.number and bool(c.problems))
+SOLVES_UNFLAGGED = Condition(
+    "it names a problem that is not flagged", lambda c, a, r: bool(a.number) and a.number not in c.problems
+)
+SOLVES_OTHER_THAN_MALFUNCTION = Condition(
+    "device-malfunction is flagged and it names another problem",
+    lambda c, a, r: a.number not in (0, Problem.DEVICE_MALFUNCTION) and Problem.DEVICE_MALFUNCTION in c.problems,
+)
+UNKNOWN_PROBLEM = Condition("the experiment knows no such problem", lambda c, a, r: a.number not in r.problems.values())
+IS_FLAGGED = Condition("it is flagged already", lambda c, a, r: a.number in c.problems)
+ENDS_EXPERIMENT = Condition("[control] end_on names it", lambda c, a, r: a.number in r.end_on)
+NOT_FLAGGED = Condition("it is not flagged", lambda c, a, r: a.number not in c.problems)
+HOLDER_SOLVES_NOTHING = Condition(
+    "a component is in control that solves no problem", lambda c, a, r: c.holder is not None and not c.solving
+)
+MALFUNCTION_IS_NEW_TO_HOLDER = Condition(
+    "it is device-malfunction and a component is in control",
+    lambda c, a, r: a.number == Problem.DEVICE_MALFUNCTION and c.holder is not None,
+)
+HOLDER_SOLVES_IT = Condition(
+    "a component is in control to solve it", lambda c, a, r: c.holder is not None and c.solving == a.number
+)
+MAY_NOT_CLEAR = Condition(
+    "another component flagged it, and the asker does not have the role `clear_problems`",
+    lambda c, a, r: not _may_clear(c, a, r),
+)
+MAY_NOT_SET_MODE = Condition(
+    "the asker does not have the role `set_mode`", lambda c, a, r: not may(r.roles.set_mode, a.who)
+)
+MAY_NOT_END = Condition(
+    "the asker does not have the role `end_experiment`", lambda c, a, r: not may(r.roles.end_experiment, a.who)
+)
+NO_SUCH_MODE = Condition(
+    "neither manual nor automated", lambda c, a, r: a.number not in (ControlMode.MANUAL, ControlMode.AUTOMATED)
+)
+SAME_MODE = Condition("that is the mode", lambda c, a, r: a.number == c.mode)
+TO_MANUAL = Condition("to manual", lambda c, a, r: a.number == ControlMode.MANUAL)
+
+_R, _D = ControlResponse, ControlChange
+
+
+def _refuse(when: Condition, response: ControlResponse, why: str) -> Transition:
+    return Transition(when, response, (), why)
+
+
+def _accept(when: Condition, do: tuple[ControlChange, ...], why: str, cause: Cause | None = None) -> Transition:
+    return Transition(when, ControlResponse.SUCCESS, do, why, cause)
+
+
+def _happen(when: Condition, do: tuple[ControlChange, ...], why: str, cause: Cause | None = None) -> Transition:
+    """A row without an answer of the scheduler's: the translator answers, or nobody asked."""
+    return Transition(when, None, do, why, cause)
+
+
+TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
+    ArbitrationEvent.REQUEST_CONTROL: (
+        _refuse(IS_MANUAL, _R.WRONG_CONTROL_MODE, "the mode is MANUAL: a person is in control"),
+        _refuse(SOLVES_UNFLAGGED, _R.WRONG_EXP_PROBLEM, "{problem} is not flagged; flagged: {problems}"),
+        _refuse(
+            SOLVES_OTHER_THAN_MALFUNCTION,
+            _R.WRONG_EXP_PROBLEM,
+            "flagged: {problems}; until device-malfunction is cleared, only components that solve it get control",
+        ),
+        _refuse(
+            SOLVES_NONE,
+            _R.WRONG_EXP_PROBLEM,
+            "flagged: {problems}; until that is cleared, only components that solve it get control",
+        ),
+        _refuse(OTHER_HOLDS, _R.ALREADY_UNDER_CONTROL, "{holder} is in control"),
+        _accept(ASKER_HOLDS, (_D.GRANT,), "asked for again: it stays in control, for the problem it now names"),
+        _accept(OTHERWISE, (_D.GRANT,), "nobody is in control: the first to ask gets it"),
+    ),
+    ArbitrationEvent.RELEASE_CONTROL: (
+        _accept(ASKER_HOLDS, (_D.TAKE,), "its own decision", Cause.RELEASED),
+        _refuse(OTHERWISE, _R.NOT_IN_CONTROL, "{who} is not in control, {holder} is; nothing changed"),
+    ),
+    ArbitrationEvent.FLAG: (
+        _refuse(UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, "this experiment knows no problem with the number {number}"),
+        _accept(IS_FLAGGED, (), "it is flagged already: two components may notice the same"),
+        _accept(ENDS_EXPERIMENT, (_D.FLAG, _D.END), "the experiment ends instead of waiting for a solver"),
+        _accept(
+            HOLDER_SOLVES_NOTHING,
+            (_D.FLAG, _D.TAKE),
+            "from now on only components that solve a flagged problem get control",
+            Cause.PROBLEM,
+        ),
+        _accept(
+            MALFUNCTION_IS_NEW_TO_HOLDER,
+            (_D.FLAG, _D.TAKE),
+            "nothing else can be solved while the microscope can't be used, or after its tip was in danger",
+            Cause.PROBLEM,
+        ),
+        _accept(OTHERWISE, (_D.FLAG,), "a solver stays in control while its own problem is flagged"),
+    ),
+    ArbitrationEvent.CLEAR: (
+        _refuse(UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, "this experiment knows no problem with the number {number}"),
+        _accept(NOT_FLAGGED, (), "nothing to clear: classifier and corrector may both clear"),
+        _refuse(
+            MAY_NOT_CLEAR,
+            _R.FAILURE,
+            "{who} did not flag {problem}, and does not have the role clear_problems ([control.roles])",
+        ),
+        _accept(
+            HOLDER_SOLVES_IT,
+            (_D.UNFLAG, _D.TAKE),
+            "solved: its solver has no more reason to be in control",
+            Cause.SOLVED,
+        ),
+        _accept(OTHERWISE, (_D.UNFLAG,), "a component that solves another problem stays in control"),
+    ),
+    ArbitrationEvent.SET_MODE: (
+        _refuse(MAY_NOT_SET_MODE, _R.FAILURE, "{who} does not have the role set_mode ([control.roles])"),
+        _refuse(NO_SUCH_MODE, _R.WRONG_CONTROL_MODE, "there is no control mode {number}: 1 manual, 2 automated"),
+        _accept(SAME_MODE, (), "nothing changes"),
+        _accept(
+            TO_MANUAL,
+            (_D.SET_MODE, _D.TAKE),
+            "a person takes over, and the holder loses control",
+            Cause.MANUAL,
+        ),
+        _accept(OTHERWISE, (_D.SET_MODE,), "components ask for control again, and go on"),
+    ),
+    ArbitrationEvent.END: (
+        _refuse(MAY_NOT_END, _R.FAILURE, "{who} does not have the role end_experiment ([control.roles])"),
+        _accept(OTHERWISE, (_D.END,), "all receivers close"),
+    ),
+    ArbitrationEvent.COMMAND: (
+        _happen(ASKER_HOLDS, (_D.FORWARD,), "the holder of control commands the microscope"),
+        _happen(IS_OPERATOR, (_D.FORWARD,), "in MANUAL mode a person may, through a component"),
+        _refuse(OTHERWISE, _R.NOT_IN_CONTROL, "{who} is not in control, {holder} is"),
+    ),
+    ArbitrationEvent.ADJUST: (
+        _happen(ASKER_HOLDS, (_D.FORWARD,), "the holder of control commands the microscope"),
+        _happen(IS_OPERATOR, (_D.FORWARD,), "in MANUAL mode a person may, through a component"),
+        _happen(IS_ADJUSTER, (_D.FORWARD,), "the experiment file lets a person adjust it beside the holder"),
+        _refuse(
+            OTHERWISE,
+            _R.NOT_IN_CONTROL,
+            "{who} is not in control, {holder} is; beside it only the role operate may adjust this,"
+            " and while no problem is flagged",
+        ),
+    ),
+    ArbitrationEvent.READ: (_happen(OTHERWISE, (_D.FORWARD,), "reading disturbs nothing, and is always allowed"),),
+    ArbitrationEvent.DEAD: (
+        _happen(ASKER_HOLDS, (_D.TAKE,), "a component that has died does not keep control", Cause.DEAD),
+        _happen(OTHERWISE, (), "it was not in control"),
+    ),
+    ArbitrationEvent.IDLE: (
+        _happen(ASKER_HOLDS, (_D.TAKE,), "an idle component must not block the others", Cause.IDLE),
+        _happen(OTHERWISE, (), "it was not in control"),
+    ),
+}
+
+
+def row_for(control: ArbitrationState, ask: ControlInput, rules: Rules) -> Transition:
+    """The row of the table that applies."""
+    for row in TABLE[ask.event]:
+        if row.when.holds(control, ask, rules):
+            return row
+    raise AssertionError(f"the table has no last row for {ask.event}")
+
+
+def apply(row: Transition, control: ArbitrationState, ask: ControlInput) -> ArbitrationState:
+    """The state after a row."""
+    for do in row.do:
+        control = _APPLY[do](control, ask)
+    return control
+
+
+def reason(row: Transition, control: ArbitrationState, ask: ControlInput, rules: Rules) -> str:
+    """The reason given with a refusal; empty for a success."""
+    if row.response in (None, ControlResponse.SUCCESS):
+        return ""
+    return row.why.format(
+        who=ask.who,
+        holder=control.holder or "nobody",
+        number=ask.number,
+        problem=rules.problems.name(ask.number),
+        problems=", ".join(map(rules.problems.name, sorted(control.problems))) or "none",
+    )
+
+
+def _flag(control: ArbitrationState, ask: ControlInput) -> ArbitrationState:
+    return replace(control, problems=MappingProxyType({**control.problems, ask.number: ask.who}))
+
+
+def _unflag(control: ArbitrationState, ask: ControlInput) -> ArbitrationState:
+    rest = {number: who for number, who in control.problems.items() if number != ask.number}
+    return replace(control, problems=MappingProxyType(rest))
+
+
+_APPLY: dict[ControlChange, Callable[[ArbitrationState, ControlInput], ArbitrationState]] = {
+    ControlChange.GRANT: lambda control, ask: replace(control, holder=ask.who, solving=ask.number),
+    ControlChange.TAKE: lambda control, ask: replace(control, holder=None, solving=0),
+    ControlChange.FLAG: _flag,
+    ControlChange.UNFLAG: _unflag,
+    ControlChange.SET_MODE: lambda control, ask: replace(control, mode=ControlMode(ask.number)),
+    ControlChange.END: lambda control, ask: replace(control, ended=True),
+    ControlChange.FORWARD: lambda control, ask: control,
+}

@@ -1,0 +1,173 @@
+"""Decisions about control: the arbitration table is applied, and what follows from a change of it is done."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from afspm.basics.frozen import replace
+from afspm.model import ControlMode, ControlRequest, ControlResponse, Problem, ResponseDetail
+from afspm.model.idempotency_cache import RequestStatus
+from afspm.model.microscope_status import feedback_of
+from afspm.model.sessions import token_of
+from afspm.scheduler.control.arbitration import (
+    ArbitrationState,
+    Cause,
+    ControlChange,
+    ControlInput,
+    Transition,
+    apply,
+    reason,
+    row_for,
+)
+from afspm.scheduler.control.descriptions import is_routine, said
+from afspm.scheduler.events import RequestIn
+from afspm.scheduler.publishing.event_log import control_entries
+from afspm.scheduler.publishing.own_packets import publish_control
+from afspm.scheduler.requests import answers
+from afspm.scheduler.safety import safety_commands
+from afspm.scheduler.state import StateDraft
+
+TRANSLATOR = "translator"
+"""Who flags a microscope that is lost: the translator asks for nothing, so it is done in its name."""
+
+
+@dataclass(frozen=True)
+class _Change:
+    """A change of control: by whom, and by which row of the table.
+
+    Attributes:
+        had_died: the ask is of a holder in another life than that in which it got control.
+    """
+
+    before: ArbitrationState
+    after: ArbitrationState
+    ask: ControlInput
+    row: Transition
+    had_died: bool
+
+    @property
+    def cause(self) -> Cause | None:
+        """Why the microscope may be left to itself: why control was taken, or that the experiment ends."""
+        # a person at the microscope sees to it also when the experiment ends
+        if self.after.ended and self.before.mode is not ControlMode.MANUAL:
+            return Cause.ENDED
+        return self.row.cause
+
+
+def decide(draft: StateDraft, ask: ControlInput, event: RequestIn | None = None) -> bool:
+    """Apply the table. Returns whether the request is the translator's to answer.
+
+    Args:
+        event: the request, if somebody asked.
+    """
+    before, rules = draft.control, draft.env.settings.rules
+    row = row_for(before, ask, rules)
+    if ControlChange.FORWARD in row.do:
+        return True
+    draft.control = after = apply(row, before, ask)
+    token = None if event is None else token_of(ask.who, event.request.id)
+    if before.holder is None and after.holder is not None:
+        draft.lease = replace(draft.lease, token=token)
+    if after != before:
+        granted_to = draft.lease.token
+        is_other_life = None not in (token, granted_to) and token != granted_to
+        _follow(draft, _Change(before, after, ask, row, is_other_life and ask.who == before.holder))
+    if after.ended and not before.ended:
+        begin_end(draft)
+    if event is not None and row.response is not None:
+        answer_unless_ending(draft, event, row.response, reason(row, before, ask, rules))
+    return False
+
+
+def begin_end(draft: StateDraft) -> None:
+    """Begin the end of the experiment, which waits for the tip."""
+    draft.watchdog = draft.watchdog.hurry(draft.now_s)
+    settings = draft.env.settings
+    draft.end = draft.end.begin(draft.now_s + settings.control.request_timeout_s + settings.waits.answer_s)
+
+
+def answer_unless_ending(
+    draft: StateDraft,
+    event: RequestIn,
+    code: ControlResponse,
+    why: str,
+    detail: ResponseDetail = ResponseDetail.NONE,
+) -> None:
+    """Answer a request, now or when the tip is seen to."""
+    if (kept := draft.end.keep((event, code, why, detail))) is not None:
+        draft.end = kept
+        # asked again meanwhile, it gets this answer, and not one more
+        draft.idempotency = draft.idempotency.noted(event.name, event.request, RequestStatus.PENDING)
+    else:
+        answers.answer(draft, event, code, why, detail=detail)
+
+
+def _follow(draft: StateDraft, change: _Change) -> None:
+    """Act and tell, before whoever asked is answered."""
+    before, after = change.before, change.after
+    problems = draft.env.settings.rules.problems
+    entries = control_entries(draft.now_ns, before, after, change.ask, change.row, problems)
+    draft.event_log = draft.event_log.add(draft.now_s, *entries)
+    draft.lease = draft.lease.held_by(after.holder, draft.now_ns)
+    _tell_people(draft, change, _have_watched(draft, change))
+    if after.ended:
+        answers.call_back(draft, None, Cause.ENDED)
+    elif before.holder is not None and after.holder is None:
+        answers.call_back(draft, before.holder, change.row.cause)
+    elif before.mode is ControlMode.MANUAL and after.mode is not ControlMode.MANUAL:
+        answers.call_back(draft, None, None)
+    safety_commands.send(draft)
+    if after.published() != before.published():
+        publish_control(draft)
+
+
+def _have_watched(draft: StateDraft, change: _Change) -> list[str]:
+    """Have the watchdog see to a microscope that may be left to itself. Returns what it wants because of that."""
+    cause, former, ask = change.cause, change.before.holder, change.ask
+    malfunction = Problem.DEVICE_MALFUNCTION
+    if malfunction in change.before.problems.keys() - change.after.problems.keys() and ask.who != TRANSLATOR:
+        # somebody says that the tip is well again: it may be at the surface, where it can be endangered anew
+        draft.watchdog = draft.watchdog.seen_to()
+        draft.microscope = draft.microscope.with_tip(away=False)
+    if cause is None or (former is None and cause not in (Cause.MANUAL, Cause.ENDED)):
+        return []
+    flight = draft.forwarder.flight
+    feedback = None if flight is None else feedback_of(flight.request)
+    if feedback is not None and feedback.on is False:
+        draft.microscope = draft.microscope.feedback_may_be_off()
+    in_flight = None
+    if flight is not None and flight.request.kind == ControlRequest.ACTION:
+        in_flight = str(flight.request.subject)
+    before = draft.watchdog
+    draft.watchdog = before.control_taken(
+        cause,
+        in_flight,
+        draft.microscope,
+        had_died=change.had_died,
+        by_holder=ask.who == former,
+        was_seen_to=change.before.sees_to_tip,
+    )
+    return draft.watchdog.newly_wanted(before)
+
+
+def _tell_people(draft: StateDraft, change: _Change, wanted: list[str]) -> None:
+    before, after, ask, cause = change.before, change.after, change.ask, change.cause
+    routine = is_routine(before, after, ask, draft.lease.announced)
+    draft.log("DEBUG" if routine else "INFO", said(before, after, ask, change.row, draft.env.settings.rules))
+    draft.lease = replace(draft.lease, announced=after.holder or draft.lease.announced)
+    is_sent = "is sent to the microscope" if draft.forwarder.up else "will be sent when the translator is back"
+    for action in wanted:
+        why = f"{before.holder} had died in control" if change.had_died else cause.value if cause else ""
+        draft.log("WARNING", f"{action} {is_sent}, since {why}")
+    from_hand = before.mode is ControlMode.MANUAL and after.mode is not ControlMode.MANUAL
+    if from_hand:
+        draft.by_hand, left = draft.by_hand.handed_back()
+        if left:
+            draft.log("WARNING", f"set by hand, and still in force: {', '.join(left)}")
+    if (cause is None and not from_hand) or draft.watchdog.owes_retract:
+        return
+    draft.microscope, danger = draft.microscope.telling()
+    if danger is not None:
+        expected = cause in (None, Cause.RELEASED, Cause.SOLVED, Cause.MANUAL)
+        why = cause.value if cause else "the mode is automated again"
+        draft.log("WARNING" if expected else "CRITICAL", f"{danger}, and no component is in control: {why}")

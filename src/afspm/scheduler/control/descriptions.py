@@ -1,0 +1,160 @@
+"""Requests and changes of control in words, for people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from afspm.basics.formatting import PREFIXABLE, area_text, lengths_text, position_text, quantity, unit_text
+from afspm.model import (
+    LEASE_REQUEST,
+    RESTART_REQUEST,
+    ControlMode,
+    ControlRequest,
+    Feedback,
+    Parameter,
+    PositionChange,
+    ProbePosition,
+    ProblemNames,
+    Region,
+    RegionChange,
+    Request,
+    ScanParameters,
+    ShapeChange,
+    request_name,
+)
+from afspm.scheduler.control.arbitration import (
+    ArbitrationEvent,
+    ArbitrationState,
+    Cause,
+    ControlInput,
+    Rules,
+    Transition,
+)
+
+
+def is_routine(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, holder_told: str | None) -> bool:
+    """Return whether a change is routine: control is given back, or taken again by the holder logged last."""
+    if (after.problems, after.mode, after.ended) != (before.problems, before.mode, before.ended) or after.problems:
+        return False
+    return ask.event is ArbitrationEvent.RELEASE_CONTROL if after.holder is None else after.holder == holder_told
+
+
+def said(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, row: Transition, rules: Rules) -> str:
+    """A change of control in words, for the log."""
+    parts = []
+    if after.holder != before.holder and after.holder is not None:
+        parts.append(f"{after.holder} is in control")
+        if after.solving:
+            parts.append(f"to solve {rules.problems.name(after.solving)}")
+    for number in sorted(after.problems.keys() ^ before.problems.keys()):
+        done = "flagged" if number in after.problems else "cleared"
+        parts.append(f"{ask.who} {done} {rules.problems.name(number)};")
+    if after.mode is not before.mode:
+        parts.append(f"{ask.who} switched to {after.mode.name};")
+    if after.ended and not before.ended:
+        parts.append(f"{ask.who} ended the experiment;")
+    if before.holder is not None and after.holder is None and row.cause is not None:
+        parts.append(_ended_control(before.holder, row.cause))
+    return " ".join(parts).rstrip(";") or f"{ask.who} {ask.event.value}"
+
+
+def _ended_control(holder: str, cause: Cause) -> str:
+    """Return how a holder lost control; what caused it stands before, unless it is its own end."""
+    match cause:
+        case Cause.RELEASED:
+            return f"{holder} gave control back"
+        case Cause.DEAD | Cause.IDLE:
+            return f"{holder} lost control: {cause.value}"
+        case _:
+            return f"{holder} lost control"
+
+
+def asked(request: Request, problems: ProblemNames) -> str:
+    """A request in words, with units; those that flag a problem begin with "flags", and name it."""
+    words = _WORDS.get(request.kind)
+    return request_name(request.kind) if words is None else words(request.subject, problems)
+
+
+def _control(problem: Any, problems: ProblemNames) -> str:
+    return f"asks for control to solve {problems.name(int(problem))}" if problem else "asks for control"
+
+
+def _parameter(subject: object, problems: ProblemNames) -> str:
+    if not isinstance(subject, Parameter):
+        return f"parameter {subject}"
+    if subject.value is None:
+        return f"reads {subject.name}"
+    return f"{subject.name} = {_value(subject.value, subject.unit or '')}"
+
+
+def _value(text: str, unit: str) -> str:
+    """Return a value with a prefix that reads well where its unit is SI, else in the unit that was sent."""
+    try:
+        return quantity(float(text), unit, 6) if unit in PREFIXABLE else f"{text} {unit_text(unit)}".strip()
+    except ValueError:
+        return f"{text} {unit_text(unit)}".strip()
+
+
+def _scan_parameters(subject: object, problems: ProblemNames) -> str:
+    if not isinstance(subject, ScanParameters):
+        return "scan parameters"
+    region, shape = subject.region, subject.shape
+    parts = []
+    if isinstance(region, Region):
+        parts.append(f"{area_text(region.size_m)} at {position_text(region.center_m)}")
+        if region.angle_rad:
+            parts.append(f"turned by {math.degrees(region.angle_rad):.5g} deg")
+    elif isinstance(region, RegionChange):
+        given = {"left": region.left_m, "low": region.low_m, "width": region.width_m, "height": region.height_m}
+        parts += [f"{name} {lengths_text([value_m])}" for name, value_m in given.items() if value_m is not None]
+        if region.angle_rad is not None:
+            parts.append(f"angle {math.degrees(region.angle_rad):.5g} deg")
+    if isinstance(shape, ShapeChange):
+        parts += [f"{name} {n}" for name, n in (("rows", shape.rows), ("columns", shape.columns)) if n is not None]
+    elif shape is not None:
+        parts.append(f"{shape[1]} x {shape[0]}")
+    return f"scan parameters: {', '.join(parts)}" if parts else "scan parameters"
+
+
+def _feedback(subject: object, problems: ProblemNames) -> str:
+    if not isinstance(subject, Feedback):
+        return "feedback"
+    gains = {"P": subject.proportional_gain, "I": subject.integral_gain, "setpoint": subject.setpoint}
+    parts = [] if subject.on is None else ["on" if subject.on else "off"]
+    parts += [f"{name} = {value:g}" for name, value in gains.items() if value is not None]
+    return f"feedback: {', '.join(parts)}" if parts else "feedback"
+
+
+def _position(subject: Any, problems: ProblemNames) -> str:
+    if isinstance(subject, ProbePosition):
+        return f"probe position: {position_text(subject.xy_m)}"
+    if isinstance(subject, PositionChange):
+        given = {"x": subject.x_m, "y": subject.y_m}
+        parts = [f"{name} = {lengths_text([value_m])}" for name, value_m in given.items() if value_m is not None]
+        return f"probe position: {', '.join(parts)}"
+    return "probe position"
+
+
+def _mode(subject: Any, problems: ProblemNames) -> str:
+    name = next((mode.name for mode in ControlMode if mode == subject), subject)
+    return f"sets the mode {name}"
+
+
+_WORDS: dict[int, Callable[[Any, ProblemNames], str]] = {
+    int(ControlRequest.ACTION): lambda subject, problems: str(subject),
+    int(ControlRequest.PARAM): _parameter,
+    int(ControlRequest.SET_SCAN_PARAMS): _scan_parameters,
+    int(ControlRequest.SET_ZCTRL_PARAMS): _feedback,
+    int(ControlRequest.SET_PROBE_POS): _position,
+    int(ControlRequest.REQUEST_CTRL): _control,
+    int(ControlRequest.RELEASE_CTRL): lambda subject, problems: "gives control back",
+    int(ControlRequest.ADD_EXP_PRBLM): lambda subject, problems: f"flags {problems.name(int(subject or 0))}",
+    int(ControlRequest.RMV_EXP_PRBLM): lambda subject, problems: f"clears {problems.name(int(subject or 0))}",
+    int(ControlRequest.SET_CONTROL_MODE): _mode,
+    int(ControlRequest.END_EXPERIMENT): lambda subject, problems: "ends the experiment",
+    int(ControlRequest.ACTION_SUPPORT): lambda subject, problems: f"asks whether there is {subject}",
+    LEASE_REQUEST: lambda subject, problems: f"keeps control for {subject:g} s",
+    RESTART_REQUEST: lambda subject, problems: f"restart {subject}",
+}

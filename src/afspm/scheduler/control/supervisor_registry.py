@@ -1,0 +1,178 @@
+"""The registry of supervisors: which has which processes, and what each is still to be ordered."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from afspm.basics.formatting import duration_text
+from afspm.basics.frozen import replace
+from afspm.model import (
+    LogLines,
+    Note,
+    ProcessCondition,
+    ProcessState,
+    ProcessStates,
+    Progress,
+    RelayedMessage,
+    component_of,
+    is_process_name,
+)
+from afspm.model.events import LONGEST_ANNOUNCEMENT, LONGEST_PROCESS_NAME, PERSON, SUPERVISOR
+from afspm.scheduler.events import Codec, RequestIn
+from afspm.scheduler.saved_state import SavedSupervisor
+
+SILENT_S = 10.0
+"""A supervisor that has not been heard of for so long, real time, is given no more orders."""
+_MOST = 64  # supervisors
+OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
+"""Conditions of a process that does not run and is not started again."""
+
+
+@dataclass(frozen=True)
+class KnownSupervisor:
+    """A supervisor; `told_s` is None for one that was known before a restart of ours.
+
+    Attributes:
+        orders: processes that it is to start anew.
+        over: of its processes those that are over, with how often each was started before and since when that is known.
+        states: as it told them last.
+    """
+
+    processes: tuple[str, ...] = ()
+    told_s: float | None = None
+    orders: tuple[str, ...] = ()
+    over: Mapping[str, tuple[int, float]] = field(default_factory=dict)
+    states: tuple[ProcessState, ...] = ()
+
+
+@dataclass(frozen=True)
+class SupervisorRegistry:
+    """The supervisors by the names they ask under; the one heard of last is last."""
+
+    supervisors: Mapping[str, KnownSupervisor] = field(default_factory=dict)
+
+    def saved(self) -> dict[str, SavedSupervisor]:
+        return {
+            name: SavedSupervisor(
+                one.processes, one.orders, {process: starts for process, (starts, _) in one.over.items()}
+            )
+            for name, one in self.supervisors.items()
+        }
+
+    @classmethod
+    def restored(cls, saved: Mapping[str, SavedSupervisor]) -> SupervisorRegistry:
+        """Take up what `saved` gave: since when a process is over is not known any more."""
+        return cls(
+            {
+                name: KnownSupervisor(
+                    one.processes,
+                    None,
+                    one.orders,
+                    {process: (starts, -math.inf) for process, starts in one.over.items()},
+                )
+                for name, one in saved.items()
+            }
+        )
+
+    def states_of(self, supervisor: str) -> tuple[ProcessState, ...]:
+        """Return the states of a supervisor's processes, as it told them last."""
+        known = self.supervisors.get(supervisor)
+        return known.states if known is not None else ()
+
+    def over_since_s(self, process: str) -> float | None:
+        """Return since when, real time, a process is known to have ended or be given up, and not started again.
+
+        -inf: that was known before a restart of ours. None: it is not so, or a supervisor that was heard of lately has
+        a process of this name that is not over.
+        """
+        having = [one for one in self.supervisors.values() if process in one.processes]
+        since_s = max((one.over[process][1] for one in having if process in one.over), default=None)
+        if since_s is None:
+            return None
+        others = [one for one in having if process not in one.over]
+        goes_on = any(one.told_s is None or one.told_s > since_s - SILENT_S for one in others)
+        return None if goes_on else since_s
+
+    def orders_for(self, supervisor: str) -> tuple[SupervisorRegistry, tuple[str, ...]]:
+        """Return the processes that a supervisor is to start anew, and forget that order: it is given now."""
+        known = self.supervisors.get(supervisor)
+        if known is None or not known.orders:
+            return self, ()
+        return replace(self, supervisors={**self.supervisors, supervisor: replace(known, orders=())}), known.orders
+
+    def order(self, process: str, now_s: float) -> tuple[SupervisorRegistry, str]:
+        """Have a process started anew. Returns also why that can't be, or ""."""
+        having = {name: one for name, one in self.supervisors.items() if process in one.processes}
+        if not having:
+            known = sorted({process for one in self.supervisors.values() for process in one.processes})
+            return self, f"there is no process {process!r}; known: {', '.join(known) or 'none'}"
+        name, newest = max(having.items(), key=lambda item: now_s if item[1].told_s is None else item[1].told_s)
+        if newest.told_s is not None and now_s - newest.told_s > SILENT_S:
+            return self, f"the supervisor of {process} has not been heard of for {duration_text(now_s - newest.told_s)}"
+        if process in newest.orders:
+            return self, ""
+        ordered = replace(newest, orders=(*newest.orders, process))
+        return replace(self, supervisors={**self.supervisors, name: ordered}), ""
+
+    def told(self, name: str, states: tuple[ProcessState, ...], now_s: float) -> SupervisorRegistry:
+        """Take the states of its processes from a supervisor."""
+        known = self.supervisors.get(name, KnownSupervisor())
+        over: dict[str, tuple[int, float]] = {}
+        # without keys anybody may tell, for all to see; that changes control only if it comes from a supervisor
+        for state in states if component_of(name) == SUPERVISOR else ():
+            if state.condition in OVER:
+                starts, since_s = known.over.get(state.name, (-1, now_s))
+                over[state.name] = (state.starts, since_s if starts == state.starts else now_s)
+        newest = KnownSupervisor(tuple(state.name for state in states), now_s, known.orders, over, states)
+        others = [(other, one) for other, one in self.supervisors.items() if other != name]
+        return replace(self, supervisors=dict([*others, (name, newest)][-_MOST:]))
+
+
+@dataclass(frozen=True)
+class Announcement:
+    """Something that a process wants to be published.
+
+    Attributes:
+        envelope: empty: it is not published.
+        why: the reason then.
+        states: of a supervisor's processes, where it tells them.
+    """
+
+    envelope: str
+    why: str = ""
+    states: tuple[ProcessState, ...] | None = None
+
+
+def announcement(event: RequestIn, codec: Codec) -> Announcement:
+    """Check something that is to be published for a process: who may speak of what."""
+    told = event.request.subject
+    if not isinstance(told, RelayedMessage):
+        return Announcement("", "an empty announcement")
+    if len(told.payload) > LONGEST_ANNOUNCEMENT:
+        return Announcement("", f"an announcement of {len(told.payload)} bytes: at most {LONGEST_ANNOUNCEMENT}")
+    thing = codec.decode_packet(told.message, told.payload)
+    if isinstance(thing, Progress) and told.message == "Progress":
+        mine = thing.name in (event.name, component_of(event.name))
+        return _named(told.message, thing.name) if mine else Announcement("", f"{event.name} is not {thing.name}")
+    if isinstance(thing, Note) and told.message == "Note":
+        mine = thing.who == event.name
+        return Announcement(told.message) if mine else Announcement("", f"{event.name} is not {thing.who[:80]!r}")
+    if not isinstance(thing, ProcessStates | LogLines) or type(thing).__name__ != told.message:
+        return Announcement("", f"a {told.message[:80]} can't be relayed, or can't be read")
+    if event.user not in (None, SUPERVISOR):
+        return Announcement("", f"only the key of {SUPERVISOR!r} may report processes, not that of {event.user}")
+    spoken_of = thing.lines if isinstance(thing, LogLines) else thing.processes
+    if wrong := [one.name for one in spoken_of if not is_process_name(one.name)]:
+        return Announcement("", f"{wrong[0][:LONGEST_PROCESS_NAME]!r} can't be the name of a process")
+    if isinstance(thing, LogLines):
+        return Announcement(told.message)
+    named = _named(told.message, thing.supervisor)
+    return named if named.why else replace(named, states=thing.processes)
+
+
+def _named(message: str, whose: str) -> Announcement:
+    if not all(map(is_process_name, whose.split(PERSON))):
+        return Announcement("", f"a {message} does not name its owner: {whose[:LONGEST_PROCESS_NAME]!r}")
+    return Announcement(f"{message}_{whose}")

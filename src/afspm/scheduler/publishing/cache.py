@@ -1,0 +1,206 @@
+"""The packets published lately, for late joiners: ordered, bounded, without duplicates."""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+
+from afspm.model import LoggedPacket, Packet, PacketHeader
+from afspm.scheduler.publishing.envelopes import Envelopes
+
+TIME_STEP_NS = 1_000
+"""The least time between two packets: peers that reckon in microseconds must see them in order."""
+
+_OVERHEAD_BYTES = 300  # of a kept packet beside its payload, so that a flood of empty ones is bounded too
+_TIMES_REMEMBERED = 4096
+_RECENT = 64
+_NEVER_NS = 0
+"""The time, among those that a restart remembers, of what was passed over: it is not published then either."""
+_NEWEST = 16
+_FUTURE_NS = 3600 * 10**9  # a translator's clock further ahead of ours than that is not believed
+
+
+@dataclass(slots=True)
+class Kept:
+    """A packet in the cache, with its size in bytes."""
+
+    logged: LoggedPacket
+    size: int
+
+    @property
+    def packet(self) -> Packet:
+        return self.logged.packet
+
+
+class PacketCache:
+    """The latest packets of each envelope, oldest first over all of them.
+
+    Args:
+        envelopes: how packets are named and how many of each name are kept.
+        max_bytes: of all together. Beyond it, older packets go first while their envelope has a newer one.
+    """
+
+    def __init__(self, envelopes: Envelopes | None = None, max_bytes: int = 512 * 2**20) -> None:
+        self._envelopes = envelopes or Envelopes()
+        self._max_bytes = max_bytes
+        self._kept: dict[int, Kept] = {}  # by time, which increases: insertion order is the order in time
+        self._times: dict[str, deque[int]] = {}
+        self._several = 0  # envelopes with more than one packet
+        self._bytes = 0
+        self._last_ns = 0
+        self._sources: OrderedDict[int, None] = OrderedDict()
+        self._newest_source_ns = -1
+        self._recent: deque[tuple[int, int]] = deque(maxlen=_RECENT)
+        self._first_times: dict[int, int] = {}
+
+    @property
+    def last_ns(self) -> int:
+        """The time of the newest packet."""
+        return self._last_ns
+
+    @property
+    def newest_source_ns(self) -> int:
+        """The translator's time of the packet that it published last, as far as we have it; -1: none yet."""
+        return self._newest_source_ns
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return self._bytes
+
+    def take(self, packet: Packet, header: PacketHeader, now_ns: int) -> tuple[Packet, int] | None:
+        """A packet of the translator's as it is to be published, and how many of its envelope are kept (0: not this).
+
+        Its time is the translator's, or later where that would not be after what was published before (a clock that
+        was set back or is far ahead, a peer that says no time). None: we have had it.
+        """
+        source_ns = packet.time_ns
+        if source_ns is not None:
+            if source_ns in self._sources:
+                return None
+            self._saw(source_ns)
+        envelope, history = self._envelopes.of(header)
+        first_ns = None if source_ns is None else self._first_times.pop(source_ns, None)
+        if first_ns == _NEVER_NS:
+            return None
+        if source_ns is not None and first_ns is not None:
+            return self._again(Packet(envelope, packet.payload, first_ns), source_ns, history)
+        said = source_ns is not None and source_ns <= now_ns + _FUTURE_NS
+        out = Packet(envelope, packet.payload, self._next_ns(source_ns if said and source_ns is not None else now_ns))
+        kept = self._keep(out, source_ns, history)
+        if source_ns is not None and out.time_ns is not None and history:
+            self._recent.append((source_ns, out.time_ns))
+        return out, kept
+
+    def pass_over(self, packet: Packet) -> bool:
+        """Take note of a packet of the translator's that is not published; False: we have had it."""
+        if packet.time_ns is None:
+            return True
+        is_new = packet.time_ns not in self._sources and self._first_times.pop(packet.time_ns, None) != _NEVER_NS
+        self._saw(packet.time_ns)
+        self._recent.append((packet.time_ns, _NEVER_NS))
+        return is_new
+
+    def recent(self) -> list[tuple[int, int]]:
+        """(translator's time, ours) of the packets published last, for a restarted scheduler's `remember`."""
+        return [*self._first_times.items(), *self._recent]
+
+    def remember(self, recent: Iterable[tuple[int, int]]) -> None:
+        """These have been published already, before we were killed. Should they come again since they could not be
+        written down any more, they keep their first times, by which subscribers know that they have had them."""
+        self._first_times = {source_ns: first_ns for source_ns, first_ns in recent if source_ns not in self._sources}
+
+    def stamp(self, envelope: str, payload: bytes, now_ns: int) -> tuple[Packet, int]:
+        """A packet of the scheduler's own, kept under its envelope."""
+        out = Packet(envelope, payload, self._next_ns(now_ns))
+        message = envelope.partition("_")[0]  # no message of the scheduler has an underscore in its name
+        return out, self._keep(out, None, self._envelopes.history(message))
+
+    def restore(self, packets: Iterable[LoggedPacket]) -> None:
+        """Take up what was kept before a restart, oldest first."""
+        newest_ns = next(reversed(self._kept), 0)
+        for packet, source_ns, history in packets:
+            if packet.time_ns is None or packet.time_ns <= newest_ns:
+                continue
+            newest_ns = packet.time_ns
+            self.not_before(newest_ns)
+            if source_ns is not None:
+                self._saw(source_ns)
+            self._keep(packet, source_ns, history)
+
+    def holds(self, envelope: str, payload: bytes) -> bool:
+        """Return whether one of the newest packets of an envelope is just this."""
+        newest = islice(reversed(self._times.get(envelope, ())), _NEWEST)
+        return any(self._kept[time_ns].packet.payload == payload for time_ns in newest)
+
+    def not_before(self, time_ns: int) -> None:
+        """Publish nothing from here on with a time before this."""
+        self._last_ns = max(self._last_ns, time_ns)
+
+    def replay(self, prefixes: Iterable[str], since_ns: int) -> tuple[Packet, ...]:
+        """Return the packets kept under the prefixes and newer than `since_ns`, oldest first over all envelopes."""
+        starts = tuple(prefixes)
+        return tuple(
+            kept.packet
+            for time_ns, kept in self._kept.items()
+            if time_ns > since_ns and kept.packet.envelope.startswith(starts)
+        )
+
+    def _again(self, packet: Packet, source_ns: int, history: int) -> tuple[Packet, int]:
+        assert packet.time_ns is not None
+        self._recent.append((source_ns, packet.time_ns))
+        kept = self._keep(packet, source_ns, history)
+        self._kept = dict(sorted(self._kept.items()))
+        for envelope, times in self._times.items():
+            self._times[envelope] = deque(sorted(times))
+        return packet, kept
+
+    def __iter__(self) -> Iterator[LoggedPacket]:
+        return iter([kept.logged for kept in self._kept.values()])
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def _next_ns(self, time_ns: int) -> int:
+        self._last_ns = max(time_ns, self._last_ns + TIME_STEP_NS)
+        return self._last_ns
+
+    def _saw(self, source_ns: int) -> None:
+        self._newest_source_ns = source_ns
+        self._sources[source_ns] = None
+        if len(self._sources) > _TIMES_REMEMBERED:
+            self._sources.popitem(last=False)
+
+    def _keep(self, packet: Packet, source_ns: int | None, history: int) -> int:
+        payload = packet.payload
+        size = (payload.nbytes if isinstance(payload, memoryview) else len(payload)) + _OVERHEAD_BYTES
+        if size > self._max_bytes or not history:
+            return 0
+        assert packet.time_ns is not None
+        self._kept[packet.time_ns] = Kept(LoggedPacket(packet, source_ns, history), size)
+        self._bytes += size
+        times = self._times.setdefault(packet.envelope, deque())
+        times.append(packet.time_ns)
+        self._several += len(times) == 2
+        while len(times) > history:
+            self._drop(times[0])
+        while self._bytes > self._max_bytes:
+            self._drop(self._least_needed())
+        return history
+
+    def _least_needed(self) -> int:
+        """The oldest packet that its envelope has a newer one of; else the oldest."""
+        if self._several:
+            return next(t for t, kept in self._kept.items() if len(self._times[kept.packet.envelope]) > 1)
+        return next(iter(self._kept))
+
+    def _drop(self, time_ns: int) -> None:
+        kept = self._kept.pop(time_ns)
+        self._bytes -= kept.size
+        times = self._times[kept.packet.envelope]
+        times.popleft()
+        self._several -= len(times) == 1
+        if not times:
+            del self._times[kept.packet.envelope]

@@ -1,0 +1,194 @@
+"""Under which envelope the scheduler publishes and caches a packet, and how many of them it keeps."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from afspm import wire
+from afspm.basics.errors import ConfigError, InvalidValue, WireError
+from afspm.basics.plain_data import SECTION, Count
+from afspm.basics.units import Length
+from afspm.model import PacketHeader
+from afspm.wire.messages import SCAN, SPECTRUM
+
+EnvelopeMapping = Callable[[PacketHeader], str]
+
+
+def default_envelope(header: PacketHeader) -> str:
+    """The wire format's: "Scan2d_2000.0_Height", "Spec1d_IV", or else the name of the message."""
+    if header.message == SCAN.name and header.size_m is not None:
+        return f"{SCAN.name}_{size_text(header.size_m[0])}_{header.channel or ''}"
+    if header.message == SPECTRUM.name and header.kind:
+        return f"{SPECTRUM.name}_{header.kind}"
+    return header.message
+
+
+def tells(envelope: str, message: str) -> bool:
+    """Return whether an envelope begins with the name of its message, as subscribers must know it."""
+    return envelope == message or envelope.startswith(f"{message}_")
+
+
+def size_text(size_m: float) -> str:
+    """A length in nm, rounded, as a decimal number; below 1 nm with its digits, since all of them would be 0.0 or 1.0.
+
+    >>> size_text(2e-6), size_text(2.5e-10)
+    ('2000.0', '0.25')
+    """
+    size_nm = size_m * 1e9
+    if not math.isfinite(size_nm):
+        return str(size_nm)
+    if abs(size_nm) < 1.0:
+        return str(float(f"{size_nm:.6g}"))
+    return str(float(round(size_nm)))
+
+
+@dataclass(frozen=True)
+class CacheRule:
+    """A rule of [cache]: the first that matches a packet decides its envelope, and how many are kept.
+
+    Attributes:
+        message: the name of the message; without the key: any.
+        channel: of a scan; without the key: any.
+        kind: of a spectrum; without the key: any.
+        above_m: the region is wider than this.
+        up_to_m: the region is not wider than this.
+        envelope: text in which {message}, {channel}, {kind} and {size} (nm) are filled in; without the key: the
+            default. It must begin with the name of its message, from which subscribers know its type, for example
+            `Scan2d_wide_{channel}`.
+        history: number of packets kept; without the key: the default.
+
+    Raises:
+        InvalidValue: no packet could match, or no subscriber could read the envelope.
+    """
+
+    message: str | None = None
+    channel: str | None = None
+    kind: str | None = None
+    above_m: Length | None = None
+    up_to_m: Length | None = None
+    envelope: str | None = None
+    history: Count | None = None
+
+    __pydantic_config__: ClassVar[object] = SECTION
+
+    def __post_init__(self) -> None:
+        if self.history is not None and self.history < 1:
+            raise InvalidValue(f"a history of {self.history} keeps nothing", where="[cache]", hint="1 or more")
+        if self.envelope is not None:
+            message = self.message or "AnyMessage"
+            if not tells(self.name(PacketHeader(message, "", (0.0, 0.0), "")), message):
+                raise InvalidValue(
+                    f"the envelope {self.envelope!r} does not begin with the name of its message: nobody could read it",
+                    where="[cache]",
+                    hint=f"e.g. {self.message or '{message}'}_{self.envelope}",
+                )
+        if self.above_m is not None and self.up_to_m is not None and self.above_m >= self.up_to_m:
+            raise InvalidValue("empty range: above must be less than up_to", where="[cache]")
+
+    def fits(self, header: PacketHeader) -> bool:
+        wanted = ((self.message, header.message), (self.channel, header.channel), (self.kind, header.kind))
+        if any(want is not None and want != have for want, have in wanted):
+            return False
+        if self.above_m is None and self.up_to_m is None:
+            return True
+        if header.size_m is None:
+            return False
+        return (self.above_m is None or header.size_m[0] > self.above_m) and (
+            self.up_to_m is None or header.size_m[0] <= self.up_to_m
+        )
+
+    def name(self, header: PacketHeader) -> str:
+        """The envelope of a packet that fits."""
+        if self.envelope is None:
+            return default_envelope(header)
+        size = "" if header.size_m is None else size_text(header.size_m[0])
+        try:
+            return self.envelope.format(
+                message=header.message, channel=header.channel or "", kind=header.kind or "", size=size
+            )
+        except (KeyError, IndexError, ValueError) as error:
+            raise InvalidValue(
+                f"{self.envelope!r} can't be filled in: {error}",
+                where="[cache]",
+                hint="use {message}, {channel}, {kind} and {size}",
+            ) from error
+
+
+@dataclass(frozen=True)
+class CacheSettings:
+    """The packets that the scheduler keeps for late joiners.
+
+    Attributes:
+        history: number of packets kept for each envelope, by message: `{ Scan2d = 10 }`.
+        rules: list of tables; the first that matches a packet names the envelope under which it is published and kept.
+        mapping: `"module.function"`: names the envelope of a packet from its header (`message`, `channel`, `size_m`,
+            `kind`), instead of the rules.
+    """
+
+    history: Mapping[str, Count] = field(default_factory=dict)
+    rules: tuple[CacheRule, ...] = ()
+    mapping: str | None = None
+
+    __pydantic_config__: ClassVar[object] = SECTION
+
+    @property
+    def envelopes(self) -> tuple[str, ...]:
+        """The beginnings of the rules' envelopes, as far as they are fixed."""
+        return tuple(re.split(r"[{}]", rule.envelope)[0] for rule in self.rules if rule.envelope)
+
+
+class Envelopes:
+    """The envelopes of the experiment file.
+
+    Args:
+        rules: tried in their order; then the defaults.
+        mapping: a function of the user's own that names the envelope instead of rules and defaults.
+        history: how many packets to keep, by message, instead of the number in the declaration.
+    """
+
+    def __init__(
+        self,
+        rules: Sequence[CacheRule] = (),
+        mapping: EnvelopeMapping | None = None,
+        history: Mapping[str, int] | None = None,
+    ) -> None:
+        self._rules = tuple(rules)
+        self._mapping = mapping
+        self._history = history or {}
+
+    def of(self, header: PacketHeader) -> tuple[str, int]:
+        """The envelope of a packet, and how many of that envelope are kept."""
+        rule = next((rule for rule in self._rules if rule.fits(header)), None)
+        history = self.history(header.message)
+        if rule is not None and rule.history is not None:
+            history = rule.history
+        if self._mapping is not None:
+            envelope = self._mapped(self._mapping, header)
+            if not isinstance(envelope, str) or "\0" in envelope or not tells(envelope, header.message):
+                raise ConfigError(
+                    f"the mapping of envelopes gave {envelope!r} for {header.message}: nobody could read it",
+                    where="[cache]",
+                    hint=f"a text without NUL: {header.message}, or what begins with {header.message}_",
+                )
+            return envelope, history
+        return (default_envelope(header) if rule is None else rule.name(header)), history
+
+    def history(self, message: str) -> int:
+        """Return how many packets of a message are kept where no rule says otherwise."""
+        if (own := self._history.get(message)) is not None:
+            return own
+        try:
+            return wire.declaration(message).history
+        except WireError:
+            return 1
+
+    @staticmethod
+    def _mapped(mapping: EnvelopeMapping, header: PacketHeader) -> object:
+        try:
+            return mapping(header)
+        except Exception as error:  # it is the user's own
+            raise ConfigError(f"the mapping of envelopes fails: {error!r}", where="[cache]") from error

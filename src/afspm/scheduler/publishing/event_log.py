@@ -1,0 +1,221 @@
+"""The event log: what was asked and answered, who is in control, orders; published some at a time.
+
+To add an entry costs next to nothing, since nobody waits longer for an answer because of it: words are found when it
+is published.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+from afspm.basics.frozen import replace
+from afspm.model import (
+    CLOCK_REQUEST,
+    RELAY_REQUEST,
+    RESTART_REQUEST,
+    ControlEvent,
+    ControlRequest,
+    ControlResponse,
+    JournalEntries,
+    JournalEntry,
+    ProblemNames,
+    Request,
+    Response,
+    names,
+)
+from afspm.model.sessions import key_of
+from afspm.scheduler.control.arbitration import ArbitrationState, ControlInput, Transition
+from afspm.scheduler.control.descriptions import asked
+
+PERIOD_S = 0.1
+"""Real time between two publications, at least."""
+MOST = 1000
+"""Requests written down within that time; of more it is only said how many there were."""
+LONGEST = 1000
+"""Characters of what was asked, and of the reason."""
+
+REQUEST, CONTROL, ORDER = "request", "control", "order"
+LATE = "late: the client had been told that there was no answer"
+"""Of an answer of the translator that came after all."""
+SCHEDULER = "scheduler"
+"""Who asks for what nobody else did."""
+_UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})
+_STARTS = frozenset({names.START_SCAN, names.START_SPEC})
+_STARTS_KEPT = 16
+"""Starts kept over a restart: many more than can be passed on while one entry waits to be published."""
+_CUT_OFF = "the scheduler was restarted before the answer was written down"
+
+
+class AnsweredRequest(NamedTuple):
+    """A request with its answer, not in words yet.
+
+    Attributes:
+        took_s: real time from the question to the answer.
+        late: the answer came after the client had been told that there was none.
+        sent_ns: when it was passed on to the translator; None: it was not.
+    """
+
+    time_ns: int
+    who: str
+    request: Request
+    response: Response
+    took_s: float
+    late: bool = False
+    sent_ns: int | None = None
+
+    def entry(self, problems: ProblemNames) -> JournalEntry:
+        kind = ORDER if self.request.kind == RESTART_REQUEST else REQUEST
+        what = asked(self.request, problems)[:LONGEST]
+        reason = "; ".join(filter(None, (LATE if self.late else "", self.response.reason[:LONGEST])))
+        flags = (ControlRequest.ADD_EXP_PRBLM, ControlRequest.RMV_EXP_PRBLM)
+        return JournalEntry(
+            self.time_ns,
+            kind,
+            self.who,
+            what,
+            self.response.code,
+            reason,
+            self.took_s,
+            request=self.request.kind,
+            problem=int(self.request.subject or 0) if self.request.kind in flags else None,
+            late=self.late,
+            sent_ns=self.sent_ns,
+            key=key_of(self.who, self.request.id),
+        )
+
+
+@dataclass(frozen=True)
+class SentStart:
+    """The start of a measurement, saved before it is passed on: the measurement has its key from the entry of it.
+
+    Attributes:
+        sent_ns: when it was passed on for the first time.
+    """
+
+    who: str
+    action: str
+    request_id: str
+    sent_ns: int
+
+    def entry(self, now_ns: int) -> JournalEntry:
+        """Return the entry of a start whose answer was lost with the scheduler's process."""
+        return JournalEntry(
+            now_ns,
+            REQUEST,
+            self.who,
+            self.action,
+            int(ControlResponse.NO_RESPONSE),
+            _CUT_OFF,
+            request=int(ControlRequest.ACTION),
+            sent_ns=self.sent_ns,
+            key=key_of(self.who, self.request_id),
+        )
+
+
+@dataclass(frozen=True)
+class EventLog:
+    """The entries that are still to be published.
+
+    Attributes:
+        due_s: when, in real monotonic time, they are to be published; None: there are none.
+        left_out: requests beyond `most`.
+        starts: the last that were passed on, saved before they are: a kill loses the entries that were gathered.
+    """
+
+    most: int = MOST
+    due_s: float | None = None
+    gathered: tuple[AnsweredRequest | JournalEntry, ...] = ()
+    left_out: int = 0
+    starts: tuple[SentStart, ...] = ()
+
+    def add(self, now_s: float, *entries: AnsweredRequest | JournalEntry) -> EventLog:
+        if not entries:
+            return self
+        due_s = now_s + PERIOD_S if self.due_s is None else self.due_s
+        return replace(self, due_s=due_s, gathered=(*self.gathered, *entries))
+
+    def add_request(self, now_s: float, entry: AnsweredRequest | JournalEntry) -> EventLog:
+        """Add one of those of which there may be any number."""
+        if isinstance(entry, AnsweredRequest) and entry.request.kind in _UNWRITTEN:
+            return self
+        if len(self.gathered) >= self.most:
+            return replace(self, left_out=self.left_out + 1)
+        return self.add(now_s, entry)
+
+    def sent_ns(self, who: str, request: Request, now_ns: int) -> int:
+        """Return when a request was passed on for the first time: now, unless it is a start that is repeated."""
+        known = (one.sent_ns for one in self.starts if (one.who, one.request_id) == (who, request.id) and request.id)
+        return next(known, now_ns)
+
+    def sending(self, who: str, request: Request, sent_ns: int) -> EventLog:
+        """Remember a request that is passed on, if it starts a measurement."""
+        if request.kind != ControlRequest.ACTION or request.subject not in _STARTS:
+            return self
+        start = SentStart(who, str(request.subject), request.id, sent_ns)
+        return self if start in self.starts else replace(self, starts=(*self.starts, start)[-_STARTS_KEPT:])
+
+    def restored(
+        self, starts: Sequence[SentStart], published: Iterable[JournalEntry], now_s: float, now_ns: int
+    ) -> EventLog:
+        """Take up the starts of the life before; those without a published entry get one.
+
+        Args:
+            published: entries that outlived the restart.
+        """
+        known = {(entry.who, entry.sent_ns) for entry in published}
+        lost = [one.entry(now_ns) for one in starts if (one.who, one.sent_ns) not in known]
+        return replace(self, starts=tuple(starts)).add(now_s, *lost)
+
+    def take(self, problems: ProblemNames, now_ns: int) -> tuple[EventLog, JournalEntries]:
+        """Return the entries in words, oldest first: they are the caller's to publish."""
+        entries = [one if isinstance(one, JournalEntry) else one.entry(problems) for one in self.gathered]
+        if self.left_out:
+            entries.append(JournalEntry(now_ns, REQUEST, SCHEDULER, f"{self.left_out} more requests are left out"))
+        return EventLog(self.most, starts=self.starts), JournalEntries(tuple(entries))
+
+
+def unreadable_entry(now_ns: int, who: str, response: Response) -> JournalEntry:
+    """Return the entry of a request that could not be read."""
+    return JournalEntry(now_ns, REQUEST, who, "an unreadable request", response.code, response.reason[:LONGEST], 0.0)
+
+
+def start_entry(now_ns: int, control: ArbitrationState, *, is_restart: bool) -> JournalEntry:
+    """Return the entry of the scheduler's start."""
+    if not is_restart:
+        return JournalEntry(now_ns, CONTROL, SCHEDULER, "started", event=ControlEvent.STARTED)
+    what = f"started again; {control.holder or 'nobody'} is in control"
+    return JournalEntry(now_ns, CONTROL, SCHEDULER, what, event=ControlEvent.RESTARTED)
+
+
+def control_entries(
+    now_ns: int,
+    before: ArbitrationState,
+    after: ArbitrationState,
+    ask: ControlInput,
+    row: Transition,
+    problems: ProblemNames,
+) -> list[JournalEntry]:
+    """Return an entry for each change of control, mode and problems: in whose name it was, and why."""
+    name, entry = problems.name, partial(JournalEntry, now_ns, CONTROL)
+    entries = []
+    if before.holder is not None and after.holder != before.holder:
+        cause = row.cause.value if row.cause is not None else ""
+        entries.append(entry(before.holder, "lost control", reason=cause, event=ControlEvent.CONTROL_LOST))
+    for number in sorted(after.problems.keys() - before.problems.keys()):
+        flagged = ControlEvent.PROBLEM_FLAGGED
+        entries.append(entry(ask.who, f"flagged {name(number)}", event=flagged, problem=number))
+    for number in sorted(before.problems.keys() - after.problems.keys()):
+        why, cleared = f"it was flagged by {before.problems[number]}", ControlEvent.PROBLEM_CLEARED
+        entries.append(entry(ask.who, f"cleared {name(number)}", reason=why, event=cleared, problem=number))
+    if after.mode is not before.mode:
+        entries.append(entry(ask.who, f"mode {after.mode.name}", event=ControlEvent.MODE_CHANGED, mode=after.mode))
+    if after.holder is not None and (after.holder, after.solving) != (before.holder, before.solving):
+        solving, gained = f" to solve {name(after.solving)}" if after.solving else "", ControlEvent.CONTROL_GAINED
+        problem = after.solving or None
+        entries.append(entry(after.holder, f"in control{solving}", event=gained, problem=problem))
+    if after.ended and not before.ended:
+        entries.append(entry(ask.who, "ended the experiment", event=ControlEvent.EXPERIMENT_ENDED))
+    return entries

@@ -1,0 +1,95 @@
+"""Packets of the translator: each gets its envelope, its time and its coordinates, and tells of the microscope."""
+
+from __future__ import annotations
+
+from afspm import wire
+from afspm.basics.errors import AfspmError
+from afspm.model import (
+    ControlMode,
+    Feedback,
+    Packet,
+    PacketHeader,
+    ProbePosition,
+    Problem,
+    Role,
+    ScanParameters,
+    ScopeState,
+    ScopeStatus,
+)
+from afspm.scheduler.control import control_change
+from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlInput
+from afspm.scheduler.control.control_change import TRANSLATOR
+from afspm.scheduler.events import PacketIn, Publish
+from afspm.scheduler.safety import safety_commands
+from afspm.scheduler.state import StateDraft
+from afspm.wire.messages import CONTROL_STATE
+
+_MOST_LOGGED = 1000
+_STATE, _TRANSLATOR = wire.MessageKind.STATE, Role.TRANSLATOR
+
+
+def take_packet(draft: StateDraft, event: PacketIn) -> None:
+    """Publish a packet, and learn from it what the microscope does."""
+    message, codec, move = event.header.message, draft.env.codec, draft.pending.move
+    # all other messages pass unread: they change nothing that the scheduler decides by
+    told = codec.decode_packet(message, event.packet.payload) if _is_state(message) else None
+    if move is not None and move.hides(told):
+        if draft.env.cache.pass_over(event.packet):
+            _learn(draft, told)
+        return
+    published = _published(draft, event.packet, event.header)
+    if published is None:
+        return
+    draft.effects.append(published)
+    if told is not None:
+        _learn(draft, told)
+
+
+def _is_state(message: str) -> bool:
+    known = wire.declaration(message)
+    return known.kind is _STATE and known.source is _TRANSLATOR
+
+
+def _published(draft: StateDraft, packet: Packet, header: PacketHeader) -> Publish | None:
+    env, source_ns = draft.env, packet.time_ns
+    if header.message == CONTROL_STATE.name:
+        _log_once(draft, "WARNING", "the translator publishes a ControlState, which is the scheduler's: dropped")
+        return None
+    try:
+        draft.frame, packet = draft.frame.incoming(packet, header, draft.now_ns)
+        taken = env.cache.take(packet, header, draft.now_ns)
+    except AfspmError as error:
+        _log_once(draft, "ERROR", f"{header.message} is not published: {error}")
+        return None
+    return None if taken is None else Publish(taken[0], source_ns, taken[1])
+
+
+def _log_once(draft: StateDraft, level: str, text: str) -> None:
+    if text not in draft.logged and len(draft.logged) < _MOST_LOGGED:
+        draft.logged |= {text}
+        draft.log(level, text)
+
+
+def _learn(draft: StateDraft, told: object) -> None:
+    if isinstance(told, ScopeStatus):
+        _take_state(draft, told.state)
+    elif isinstance(told, Feedback):
+        before, draft.microscope = draft.microscope, draft.microscope.with_feedback(told)
+        is_manual = draft.control.mode is ControlMode.MANUAL
+        draft.by_hand = draft.by_hand.published(told, is_manual=is_manual)
+        if draft.microscope.risk != before.risk:
+            safety_commands.send(draft)
+    if isinstance(told, Feedback | ScanParameters | ProbePosition):
+        draft.limits = draft.limits.published(told, draft.now_ns)
+
+
+def _take_state(draft: StateDraft, state: ScopeState) -> None:
+    was_free = draft.microscope.is_free
+    draft.microscope = draft.microscope.with_state(state, draft.now_s)
+    draft.watchdog = draft.watchdog.state_told(draft.microscope)
+    if draft.microscope.is_free != was_free:
+        draft.lease = draft.lease.used(draft.now_ns)
+    flagged_by = draft.control.problems.get(Problem.DEVICE_MALFUNCTION)
+    if draft.microscope.lost_since_s is None and flagged_by == TRANSLATOR:
+        control_change.decide(draft, ControlInput(ArbitrationEvent.CLEAR, TRANSLATOR, Problem.DEVICE_MALFUNCTION))
+    safety_commands.send(draft)

@@ -1,0 +1,104 @@
+"""The answers to requests: each request gets one, which is remembered under its id and written to the event log."""
+
+from __future__ import annotations
+
+from afspm.basics.frozen import replace
+from afspm.model import ControlResponse, Request, Response, ResponseDetail
+from afspm.model.idempotency_cache import RequestStatus
+from afspm.scheduler.control.arbitration import Cause
+from afspm.scheduler.events import Reply, RequestIn
+from afspm.scheduler.publishing.event_log import AnsweredRequest
+from afspm.scheduler.requests.forwarder import ForwardedRequest
+from afspm.scheduler.requests.pending_requests import refused_again
+from afspm.scheduler.state import StateDraft
+
+
+def answer(
+    draft: StateDraft,
+    event: RequestIn,
+    code: ControlResponse,
+    reason: str = "",
+    payload: bytes = b"",
+    detail: ResponseDetail = ResponseDetail.NONE,
+) -> None:
+    """Answer a request by ourselves, once and for all."""
+    response = Response(int(code), payload, reason, event.request.id, detail)
+    draft.idempotency = draft.idempotency.noted(event.name, event.request, response)
+    reply(draft, event, response)
+
+
+def reply(draft: StateDraft, event: RequestIn, response: Response) -> None:
+    """Answer a request this time; asked again, it is decided anew."""
+    draft.effects.append(Reply(event.connection, event.name, response, event.request.kind))
+    write_down(draft, event.name, event.request, response, event.heard_s)
+
+
+def refuse_peer(draft: StateDraft, event: RequestIn, why: str, code: int = ControlResponse.FAILURE) -> None:
+    """Refuse a peer that may not speak for its name; that is logged once for each connection."""
+    draft.pending, was_refused = refused_again(draft.pending, event.connection)
+    if not was_refused:
+        draft.log("WARNING", f"refused a request of {event.name or 'a nameless peer'}: {why}")
+    reply(draft, event, Response(int(code), b"", why, event.request.id))
+
+
+def answer_unsent(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
+    """Answer a request that is not sent. Of a repeated one it stays unknown whether it was carried out before."""
+    unknown = ResponseDetail.OUTCOME_UNKNOWN
+    if job.is_repeated:
+        reason = f"outcome unknown: it was sent once, and is not sent again ({response.reason})"
+        response = Response(int(ControlResponse.NO_RESPONSE), b"", reason, job.request.id, unknown)
+        finish(draft, job, response, RequestStatus.UNKNOWN)
+    elif response.code == ControlResponse.NO_RESPONSE:
+        draft.idempotency = draft.idempotency.forgotten(job.client, job.request)
+        answer_job(draft, job, Response(response.code, b"", response.reason, job.request.id, ResponseDetail.NOT_SENT))
+    else:
+        finish(draft, job, Response(response.code, b"", response.reason, job.request.id))
+
+
+def finish(draft: StateDraft, job: ForwardedRequest, response: Response, status: RequestStatus | None = None) -> None:
+    """Remember the answer to a request, or that its outcome is unknown, and give it."""
+    draft.idempotency = draft.idempotency.noted(job.client, job.request, response if status is None else status)
+    if job.sent_s is not None and status is None and not response.ok:
+        take_back(draft, job)  # what was refused does not count as used; what nobody knows of does
+    answer_job(draft, job, response)
+
+
+def take_back(draft: StateDraft, job: ForwardedRequest) -> None:
+    """Take back what a request has used of its limits."""
+    mapped = job.mapped
+    draft.limits = draft.limits.not_done(job.client, job.outgoing, None if mapped is None else mapped.names)
+
+
+def answer_job(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
+    """Answer over the newest connection of the client; without an id only over the one that it asked by."""
+    write_down(draft, job.client, job.request, response, job.heard_s, sent_ns=job.sent_ns)
+    connection = draft.peers.sessions.connection_of(job.client)
+    if connection is not None and (job.request.id or connection == job.connection):
+        draft.effects.append(Reply(connection, job.client, response, job.request.kind))
+
+
+def call_back(draft: StateDraft, former: str | None, cause: Cause | None) -> None:
+    """Answer the commands of a former holder (None: of anybody) that have not been sent: they are not sent any more."""
+    reason = f"control was taken before this was sent: {cause.value if cause else 'the mode was changed'}"
+    draft.forwarder, jobs = draft.forwarder.called_back(lambda job: job.command and former in (None, job.client))
+    for job in jobs:
+        answer_unsent(draft, job, Response(int(ControlResponse.NOT_IN_CONTROL), b"", reason, job.request.id))
+
+
+def write_down(
+    draft: StateDraft,
+    who: str,
+    request: Request,
+    response: Response,
+    heard_s: float,
+    *,
+    sent_ns: int | None = None,
+    late: bool = False,
+) -> None:
+    """Add an answer to the event log."""
+    answered = AnsweredRequest(draft.now_ns, who, request, response, draft.now_s - heard_s, late, sent_ns)
+    draft.event_log = draft.event_log.add_request(draft.now_s, answered)
+
+
+def with_id(response: Response, request: Request) -> Response:
+    return response if response.id == request.id else replace(response, id=request.id)

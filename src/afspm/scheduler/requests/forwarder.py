@@ -1,0 +1,263 @@
+"""The line to the translator: one request in flight, the others wait, each has a deadline, and every one is answered.
+
+A translator serves one request after the other and says nothing while it does. So one is in flight; the
+others wait here, where they can still be called back, and a request that waited too long is answered unsent. The line
+keeps the order and the times; whether a request is sent, and as what, is decided as its turn comes
+(`request_pipeline.send_next`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from typing import NamedTuple
+
+from afspm.basics.frozen import replace
+from afspm.model import ControlResponse, Request, Response, ResponseDetail
+from afspm.scheduler.coordinate_frame import MappedRequest
+from afspm.scheduler.events import Forward, RequestIn
+
+
+@dataclass(frozen=True, slots=True)
+class ReadForTurn:
+    """The value of `name` is read before the request `number` is decided."""
+
+    number: int
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class MoveForTurn:
+    """The microscope is moved before the action `number`."""
+
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReadAhead:
+    """The value of `name` is read when a translator comes."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class AskForFrame:
+    """The coordinate frame asked, for a purpose that it knows."""
+
+    purpose: object
+
+
+OwnPurpose = ReadForTurn | MoveForTurn | ReadAhead | AskForFrame
+
+
+class ForwardedRequest(NamedTuple):
+    """A request for the translator.
+
+    Attributes:
+        client: who asked; empty for the scheduler's own.
+        command: whether it is a command, which only who is in control may give.
+        deadline_s: when (real) it must be answered at the latest; 0: none yet.
+        sent_s: when it was sent; None while it waits.
+        answered: the client has been told that there was no response in time.
+        connection: the one it was asked by.
+        states_seen: how many states the microscope had told when it was sent.
+        mapped: what is sent in place of `request`, where the microscope has other coordinates.
+        heard_s: when it was asked, real.
+        sent_ns: when it was sent, experiment time; None: it was not.
+        is_repeated: it was sent before under its id, with an unknown outcome.
+        purpose: of one of the scheduler's own; None: it is for the tip's safety.
+    """
+
+    client: str
+    request: Request
+    command: bool
+    number: int = 0
+    deadline_s: float = 0.0
+    sent_s: float | None = None
+    answered: bool = False
+    connection: int = -1
+    states_seen: int = 0
+    mapped: MappedRequest | None = None
+    heard_s: float = 0.0
+    sent_ns: int | None = None
+    is_repeated: bool = False
+    purpose: OwnPurpose | None = None
+
+    @classmethod
+    def of(cls, event: RequestIn, *, command: bool = True, is_repeated: bool = False) -> ForwardedRequest:
+        return cls(
+            event.name, event.request, command,
+            connection=event.connection, heard_s=event.heard_s, is_repeated=is_repeated,
+        )  # fmt: skip
+
+    @property
+    def outgoing(self) -> Request:
+        """The request as the microscope gets it."""
+        return self.request if self.mapped is None else self.mapped.request
+
+
+class ForwardOutcome(Enum):
+    """The end of a forwarded request."""
+
+    ANSWERED = auto()
+    NOT_SENT = auto()
+    UNKNOWN = auto()
+    LATE = auto()
+    """The true answer, after the client was told that none had come."""
+
+
+class SettledRequest(NamedTuple):
+    job: ForwardedRequest
+    end: ForwardOutcome
+    response: Response
+
+
+Settled = tuple[SettledRequest, ...]
+
+
+@dataclass(frozen=True)
+class Forwarder:
+    """The one line to the translator.
+
+    Attributes:
+        timeout_s: how long (real) a client waits for an answer.
+        patience_s: how much longer the line is kept for an answer that is overdue, before the next is sent.
+        longest_queue: how many may wait.
+        up: the translator is connected.
+        flight: the request that is with the translator.
+        own, queue: waiting requests in their order: of the scheduler, which go first, and of clients.
+        overdue: those whose answer may still come, by number.
+        outbox: to be sent now; the caller empties it.
+    """
+
+    timeout_s: float = 5.0
+    patience_s: float = 5.0
+    longest_queue: int = 64
+    up: bool = False
+    number: int = 0
+    flight: ForwardedRequest | None = None
+    own: tuple[ForwardedRequest, ...] = ()
+    queue: tuple[ForwardedRequest, ...] = ()
+    overdue: Mapping[int, ForwardedRequest] = field(default_factory=dict)
+    outbox: tuple[Forward, ...] = ()
+
+    def connected(self) -> tuple[Forwarder, Settled]:
+        """Open the line. A reconnection is a loss before it."""
+        forwarder, settled = self.lost() if self.up else (self, ())
+        return replace(forwarder, up=True), settled
+
+    def lost(self) -> tuple[Forwarder, Settled]:
+        """Answer all at once: the translator is gone."""
+        waiting = tuple(_not_sent(job, "the translator is not connected") for job in (*self.own, *self.queue))
+        if self.flight is not None and not self.flight.answered:
+            why = "the connection to the translator was lost before it answered"
+            waiting = (_unknown(self.flight, why), *waiting)
+        return replace(self, up=False, flight=None, own=(), queue=()), waiting
+
+    @property
+    def is_free(self) -> bool:
+        """True while a request can be sent."""
+        return self.up and self.flight is None
+
+    def ask(self, job: ForwardedRequest, now_s: float) -> tuple[Forwarder, SettledRequest | None]:
+        """Have a client's request wait for its turn. Returns also its refusal, if it was refused."""
+        if not self.up:
+            return self, _not_sent(job, "the translator is not connected")
+        if len(self.queue) >= self.longest_queue:
+            return self, _not_sent(job, f"{self.longest_queue} requests wait for the translator already")
+        job = job._replace(number=self.number + 1, deadline_s=now_s + self.timeout_s)
+        return replace(self, number=job.number, queue=(*self.queue, job)), None
+
+    def ask_own(
+        self, request: Request, now_s: float, purpose: OwnPurpose | None = None, mapped: MappedRequest | None = None
+    ) -> tuple[Forwarder, ForwardedRequest | None]:
+        """Have a request of the scheduler's own sent before all that wait. None: the translator is not connected."""
+        if not self.up:
+            return self, None
+        number, deadline_s = self.number + 1, now_s + self.timeout_s
+        job = ForwardedRequest(
+            "", request, command=True, number=number, deadline_s=deadline_s,
+            mapped=mapped, heard_s=now_s, purpose=purpose,
+        )  # fmt: skip
+        return replace(self, number=number, own=(*self.own, job)), job
+
+    def sent(self, job: ForwardedRequest, now_s: float) -> Forwarder:
+        """Send a request that waited."""
+        assert self.is_free
+        rest = self.without(job.number)
+        return replace(
+            rest, flight=job._replace(sent_s=now_s), outbox=(*self.outbox, Forward(job.number, job.outgoing))
+        )
+
+    def without(self, number: int) -> Forwarder:
+        """Remove a waiting request."""
+        own, queue = (tuple(job for job in jobs if job.number != number) for jobs in (self.own, self.queue))
+        return replace(self, own=own, queue=queue)
+
+    def waiting(self, number: int) -> ForwardedRequest | None:
+        """Return a client's request that waits, by its number; None: it was sent, answered or called back."""
+        return next((job for job in self.queue if job.number == number), None)
+
+    def answered(self, number: int, response: Response) -> tuple[Forwarder, SettledRequest | None]:
+        """Take an answer of the translator. None: it belongs to no request that is open."""
+        job = self.flight
+        if job is not None and job.number == number:
+            outcome = ForwardOutcome.LATE if job.answered else ForwardOutcome.ANSWERED
+            return replace(self, flight=None), SettledRequest(job, outcome, response)
+        late = self.overdue.get(number)
+        if late is None:
+            return self, None
+        rest = {other: one for other, one in self.overdue.items() if other != number}
+        return replace(self, overdue=rest), SettledRequest(late, ForwardOutcome.LATE, response)
+
+    def expired(self, now_s: float) -> tuple[Forwarder, Settled]:
+        """Answer those that have waited too long."""
+        settled, flight = list[SettledRequest](), self.flight
+        if flight is not None and not flight.answered and now_s >= flight.deadline_s:
+            flight = flight._replace(answered=True)
+            settled.append(_unknown(flight, f"the translator did not answer within {self.timeout_s:g} s"))
+        late = [job for job in (*self.own, *self.queue) if now_s >= job.deadline_s]
+        settled += [_not_sent(job, f"the translator was busy for {self.timeout_s:g} s") for job in late]
+        own, queue = (tuple(job for job in jobs if now_s < job.deadline_s) for jobs in (self.own, self.queue))
+        forwarder = replace(self, flight=flight, own=own, queue=queue)
+        if flight is not None and flight.answered and now_s >= self._patience_ends_s(flight):
+            overdue = [*self.overdue.items(), (flight.number, flight)][-self.longest_queue :]
+            forwarder = replace(forwarder, overdue=dict(overdue), flight=None)
+        return forwarder, tuple(settled)
+
+    def asked_again(self, client: str, request_id: str, now_s: float) -> Forwarder | None:
+        """Wait once more for an overdue request that its client repeats; None: it is not at the translator."""
+        job = self.flight
+        if job is None or job.client != client or job.request.id != request_id:
+            return None
+        return replace(self, flight=job._replace(answered=False, deadline_s=now_s + self.timeout_s))
+
+    def called_back(self, which: Callable[[ForwardedRequest], bool]) -> tuple[Forwarder, list[ForwardedRequest]]:
+        """Take back requests that wait and have not been sent; the caller answers them."""
+        called = [job for job in self.queue if which(job)]
+        return replace(self, queue=tuple(job for job in self.queue if job not in called)), called
+
+    def deadline_s(self) -> float | None:
+        """Return when `expired` has something to do."""
+        times = [jobs[0].deadline_s for jobs in (self.own, self.queue) if jobs]
+        if self.flight is not None:
+            times.append(self._patience_ends_s(self.flight) if self.flight.answered else self.flight.deadline_s)
+        return min(times, default=None)
+
+    def _patience_ends_s(self, job: ForwardedRequest) -> float:
+        assert job.sent_s is not None
+        return job.sent_s + self.timeout_s + self.patience_s
+
+
+def _not_sent(job: ForwardedRequest, why: str) -> SettledRequest:
+    return SettledRequest(job, ForwardOutcome.NOT_SENT, _no_response(job, "not sent: " + why, ResponseDetail.NOT_SENT))
+
+
+def _unknown(job: ForwardedRequest, why: str) -> SettledRequest:
+    response = _no_response(job, "outcome unknown: " + why, ResponseDetail.OUTCOME_UNKNOWN)
+    return SettledRequest(job, ForwardOutcome.UNKNOWN, response)
+
+
+def _no_response(job: ForwardedRequest, reason: str, detail: ResponseDetail) -> Response:
+    return Response(int(ControlResponse.NO_RESPONSE), b"", reason, job.request.id, detail)

@@ -1,0 +1,132 @@
+"""The request whose turn it is, while reads or a move come before it; and requests of unclear connections."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from afspm.basics.frozen import replace
+from afspm.model import Parameter, ScopeState, ScopeStatus
+from afspm.model.microscope_status import MicroscopeStatus
+from afspm.scheduler.events import RequestIn
+from afspm.scheduler.requests.forwarder import ForwardedRequest
+
+SETTLED_WITHIN_S = 2.0
+"""Real time for which a microscope that tells nothing of a move is waited for after it."""
+_UNCLEAR_S = 0.5  # real; the closing of a connection is seen within milliseconds
+
+
+@dataclass(frozen=True)
+class PrePositioner:
+    """The move before an action whose place has moved in the microscope's coordinates.
+
+    Attributes:
+        move: the request that moves the microscope.
+        states_seen: states told before the move.
+        settled_at_s: until when (real) the microscope is waited for after the move; None: it has not moved yet.
+    """
+
+    move: ForwardedRequest
+    states_seen: int
+    settled_at_s: float | None = None
+
+    def hides(self, told: object) -> bool:
+        """Return whether a state is only that of the move, and not published.
+
+        The action, which its client knows to be under way, would seem to be over before it began.
+        """
+        return isinstance(told, ScopeStatus) and told.state in (ScopeState.MOVING, ScopeState.FREE)
+
+    def moved(self, now_s: float) -> PrePositioner:
+        """Wait until the microscope is free: the move has succeeded."""
+        return replace(self, settled_at_s=min(now_s + SETTLED_WITHIN_S, self.move.deadline_s))
+
+    def is_ready(self, microscope: MicroscopeStatus, now_s: float) -> bool:
+        """Return whether the action may be sent: while the microscope moves it would refuse."""
+        if self.settled_at_s is None:
+            return False
+        is_free = microscope.state is ScopeState.FREE and microscope.states_seen > self.states_seen
+        return is_free or now_s >= self.settled_at_s
+
+
+@dataclass(frozen=True)
+class Turn:
+    """The turn of one request: values are read, and the microscope is moved, before it is sent.
+
+    Attributes:
+        number: of the request, in the forwarder's queue.
+        awaited: parameters that are being read; None: the reading has not begun.
+        values: by parameter; None where the microscope answered no value.
+        move: the move before an action; None: there was none.
+    """
+
+    number: int
+    awaited: frozenset[str] | None = None
+    values: Mapping[str, Parameter | None] = field(default_factory=dict)
+    move: PrePositioner | None = None
+
+    def reading(self, names: frozenset[str]) -> Turn:
+        return replace(self, awaited=names, values={})
+
+    def was_read(self, name: str, told: Parameter | None) -> Turn:
+        """Take the value of a parameter; None: the microscope answered none."""
+        return replace(self.lacks(name), values={**self.values, name: told})
+
+    def lacks(self, name: str) -> Turn:
+        """Go on without a parameter, which the microscope does not have."""
+        return replace(self, awaited=(self.awaited or frozenset()) - {name})
+
+    def moving(self, move: PrePositioner) -> Turn:
+        """Wait for a move, after which values are read again."""
+        return Turn(self.number, move=move)
+
+    def is_ready(self, microscope: MicroscopeStatus, now_s: float) -> bool:
+        """Return whether the request can be decided now."""
+        return not self.awaited and (self.move is None or self.move.is_ready(microscope, now_s))
+
+
+@dataclass(frozen=True)
+class PendingRequests:
+    """All that waits.
+
+    Attributes:
+        turn: of the request that waits for reads or a move.
+        unclear: requests from a second connection under a name, by that name, and until when they are not answered.
+        refused: connections that were refused, which is logged once for each.
+    """
+
+    turn: Turn | None = None
+    unclear: Mapping[str, tuple[RequestIn, float]] = field(default_factory=dict)
+    refused: frozenset[int] = frozenset()
+
+    @property
+    def move(self) -> PrePositioner | None:
+        return None if self.turn is None else self.turn.move
+
+    def with_unclear(self, event: RequestIn, now_s: float) -> PendingRequests:
+        return replace(self, unclear={**self.unclear, event.name: (event, now_s + _UNCLEAR_S)})
+
+    def clear_up(self, name: str) -> tuple[PendingRequests, RequestIn | None]:
+        """Return the request parked while an older connection with this name was closing."""
+        if name not in self.unclear:
+            return self, None
+        rest = {other: one for other, one in self.unclear.items() if other != name}
+        return replace(self, unclear=rest), self.unclear[name][0]
+
+    def still_unclear(self, now_s: float) -> list[str]:
+        """Return the names for which both connections go on: they are two."""
+        return [name for name, (_, until_s) in self.unclear.items() if now_s >= until_s]
+
+    def due_s(self, *, line_is_free: bool) -> float | None:
+        """Return when, in real time, there is something to do; before that the forwarder watches over the move."""
+        dues = [until_s for _, until_s in self.unclear.values()]
+        if line_is_free and self.move is not None and self.move.settled_at_s is not None:
+            dues.append(self.move.settled_at_s)
+        return min(dues, default=None)
+
+
+def refused_again(pending: PendingRequests, connection: int) -> tuple[PendingRequests, bool]:
+    """Return whether a connection was refused before; from now on it was."""
+    if connection in pending.refused:
+        return pending, True
+    return replace(pending, refused=pending.refused | {connection}), False

@@ -1,0 +1,590 @@
+"""A request from its arrival to its answer, in five stages, from top to bottom of this module.
+
+| stage | decided | by |
+| --- | --- | --- |
+| 1. admitted | at arrival | session, idempotency |
+| 2. authorised | at arrival, and again when it is sent | the arbitration table |
+| 3. queued | at arrival | the forwarder: one line to the translator, in order |
+| 4. within limits | as its turn comes, right before it is sent | limits, coordinate frame, the microscope itself |
+| 5. settled | at the answer, or when it is overdue | |
+
+Nothing is done twice, and every request gets an answer.
+
+**Why limits are decided at the fourth stage.** Limits compare a request with values in force, and requests before it
+in the queue change these. So a request is decided as its turn comes: no other command is on its way, all earlier ones
+have settled, and the scheduler first reads the values from the microscope. A request of unknown outcome needs no
+special case: the values that it may have changed are read before the next request that depends on them, or that one is
+refused. An overdue request may still be carried out; since the translator serves one request after the other, a value
+that it answers later is newer. A turn takes up to three steps: values are read, the microscope is moved to where the
+place is in its coordinates, values are read again. Meanwhile requests that only read pass, and the scheduler's own
+(`safety_commands`) always go first.
+"""
+
+from __future__ import annotations
+
+import json
+
+from afspm.basics.frozen import replace
+from afspm.model import (
+    CLOCK_REQUEST,
+    HAS_ENDED,
+    LEASE_REQUEST,
+    OTHER_RUN_RESPONSE,
+    RELAY_REQUEST,
+    RESTART_REQUEST,
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Parameter,
+    ProbePosition,
+    Request,
+    Response,
+    ResponseDetail,
+    component_of,
+    names,
+)
+from afspm.model.idempotency_cache import TOO_OLD, RequestStatus
+from afspm.model.microscope_status import feedback_of
+from afspm.model.sessions import Hearing, run_of
+from afspm.scheduler.control import control_change
+from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlChange, ControlInput, Rules, reason, row_for
+from afspm.scheduler.coordinate_frame import MappedRequest
+from afspm.scheduler.events import FrameAnswered, Reply, RequestIn
+from afspm.scheduler.publishing import own_packets as publishing
+from afspm.scheduler.publishing.event_log import SCHEDULER
+from afspm.scheduler.requests import answers
+from afspm.scheduler.requests.forwarder import (
+    AskForFrame,
+    ForwardedRequest,
+    ForwardOutcome,
+    MoveForTurn,
+    OwnPurpose,
+    ReadAhead,
+    ReadForTurn,
+    SettledRequest,
+)
+from afspm.scheduler.requests.pending_requests import PrePositioner, Turn
+from afspm.scheduler.safety import safety_commands
+from afspm.scheduler.safety.limit_checker import is_get
+from afspm.scheduler.state import StateDraft
+
+_ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
+_ANOTHER_RUN = "this is the scheduler of another run: two experiments have the same address"
+_TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of its own"
+_LACKING = (ControlResponse.PARAM_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED)
+"""The answers of a translator that has no such parameter, or none at all."""
+_CONTROL_EVENTS = {
+    int(ControlRequest.REQUEST_CTRL): ArbitrationEvent.REQUEST_CONTROL,
+    int(ControlRequest.RELEASE_CTRL): ArbitrationEvent.RELEASE_CONTROL,
+    int(ControlRequest.ADD_EXP_PRBLM): ArbitrationEvent.FLAG,
+    int(ControlRequest.RMV_EXP_PRBLM): ArbitrationEvent.CLEAR,
+    int(ControlRequest.SET_CONTROL_MODE): ArbitrationEvent.SET_MODE,
+    int(ControlRequest.END_EXPERIMENT): ArbitrationEvent.END,
+}
+"""The requests that may change control, by their numbers. All others are for the microscope."""
+
+
+def handle(draft: StateDraft, event: RequestIn) -> None:
+    """Take a request through the stages that are decided at its arrival."""
+    if event.heard_s < 0.0:
+        event = replace(event, heard_s=draft.now_s)
+    if admit(draft, event) and authorise(draft, event):
+        enqueue(draft, event)
+
+
+# --- 1. admitted: the peer may speak for its name, and the request is new -------------------------------------------
+
+
+def admit(draft: StateDraft, event: RequestIn) -> bool:
+    """Return whether a request is new and to be decided; if not, it was answered, or waits."""
+    if event.request.kind in _CONTROL_EVENTS and (barrier := draft.barrier.keep(event)) is not None:
+        draft.barrier = barrier
+        return False
+    if not _may_speak(draft, event):
+        return False
+    outcome = draft.idempotency.look_up(event.name, event.request)
+    return outcome is None or not _repeated(draft, event, outcome)
+
+
+def _may_speak(draft: StateDraft, event: RequestIn) -> bool:
+    name, request_id, run = event.name, event.request.id, draft.env.settings.run.name
+    if not name:
+        answers.refuse_peer(draft, event, "a client without a name: set the socket's identity to the component's name")
+        return False
+    if event.user is not None and event.user != component_of(name):
+        answers.refuse_peer(draft, event, f"the key is that of {event.user}, not of {name}")
+        return False
+    if run and run_of(name, request_id) not in ("", run):
+        answers.refuse_peer(draft, event, _ANOTHER_RUN, OTHER_RUN_RESPONSE)
+        return False
+    pending, known = draft.pending, draft.peers.sessions
+    sessions, hearing = known.hear(event.connection, name, request_id, draft.now_s)
+    if sessions is not known:
+        draft.peers = replace(draft.peers, sessions=sessions)
+    if hearing is Hearing.UNCLEAR and name not in pending.unclear and event.connection not in pending.refused:
+        draft.pending = pending.with_unclear(event, draft.now_s)
+    elif hearing in (Hearing.TAKEN, Hearing.UNCLEAR):
+        refuse_second(draft, event)
+    return hearing is Hearing.ACCEPTED
+
+
+def refuse_second(draft: StateDraft, event: RequestIn) -> None:
+    """Refuse a second process under one name."""
+    answers.refuse_peer(draft, event, _TWO_OF_A_NAME.format(name=event.name))
+
+
+def _repeated(draft: StateDraft, event: RequestIn, outcome: RequestStatus | Response) -> bool:
+    """Answer a request that comes again with its id, without doing it again. False: it may be done."""
+    name, request = event.name, event.request
+    if isinstance(outcome, Response):
+        draft.effects.append(Reply(event.connection, name, outcome, request.kind))
+        return True
+    if outcome is RequestStatus.PENDING:
+        return True  # its answer will go to the newest connection
+    if (waiting := draft.forwarder.asked_again(name, request.id, draft.now_s)) is not None:
+        draft.forwarder = waiting
+        draft.idempotency = draft.idempotency.noted(name, request, RequestStatus.PENDING)
+        return True
+    if outcome is RequestStatus.FORGOTTEN:
+        answers.reply(draft, event, _unknown(request, TOO_OLD))
+        return True
+    # the translator, which knows its id, answers what became of it
+    if draft.control.holder == name or reads(request):
+        return False
+    answers.reply(draft, event, _unknown(request, "it was sent once, and is not sent again"))
+    return True
+
+
+def _unknown(request: Request, why: str) -> Response:
+    detail = ResponseDetail.OUTCOME_UNKNOWN
+    return Response(int(ControlResponse.NO_RESPONSE), b"", f"outcome unknown: {why}", request.id, detail)
+
+
+# --- 2. authorised: the scheduler answers by itself, or who asks may command the microscope -------------------------
+
+
+def authorise(draft: StateDraft, event: RequestIn) -> bool:
+    """Return whether a request is for the translator, and its client may ask for it; if not, it was answered."""
+    kind, subject = event.request.kind, event.request.subject
+    if kind == RELAY_REQUEST:  # a supervisor's last words come after the end
+        publishing.publish_for_process(draft, event)
+    elif draft.control.ended:
+        control_change.answer_unless_ending(
+            draft, event, ControlResponse.FAILURE, HAS_ENDED, ResponseDetail.EXPERIMENT_ENDED
+        )
+        if kind == ControlRequest.ADD_EXP_PRBLM:  # seen too late to be flagged: the record is to show it
+            publishing.publish_entries(draft)
+    elif kind == RESTART_REQUEST:
+        publishing.order_restart(draft, event)
+    elif kind == CLOCK_REQUEST:
+        _tell_time(draft, event)
+    elif kind == LEASE_REQUEST:
+        _renew_lease(draft, event)
+    elif kind <= 0:
+        why = f"there is no request with the number {kind}"
+        answers.answer(draft, event, ControlResponse.CMD_NOT_SUPPORTED, why)
+    elif (control_event := _CONTROL_EVENTS.get(kind)) is not None:
+        return control_change.decide(draft, ControlInput(control_event, event.name, int(subject or 0)), event)
+    else:
+        wanted = _microscope_event(event.request, draft.env.settings.rules)
+        return control_change.decide(draft, ControlInput(wanted, event.name), event)
+    return False
+
+
+def _microscope_event(request: Request, rules: Rules) -> ArbitrationEvent:
+    if reads(request):
+        return ArbitrationEvent.READ
+    is_adjustable = request.kind == _PARAM and request.subject.name in rules.adjustable
+    return ArbitrationEvent.ADJUST if is_adjustable else ArbitrationEvent.COMMAND
+
+
+def _renew_lease(draft: StateDraft, event: RequestIn) -> None:
+    """Begin the lease of the holder anew; that is not written down, as it is done again and again."""
+    name, holder = event.name, draft.control.holder
+    if name != holder:
+        why = f"{name} is not in control, {holder or 'nobody'} is"
+        answers.answer(draft, event, ControlResponse.NOT_IN_CONTROL, why)
+        return
+    draft.lease = draft.lease.asked(event.request.subject, draft.now_s)
+    response = Response(int(ControlResponse.SUCCESS), b"", "", event.request.id)
+    draft.effects.append(Reply(event.connection, name, response, LEASE_REQUEST))
+
+
+def _tell_time(draft: StateDraft, event: RequestIn) -> None:
+    """Tell what all parts of an experiment have in common: the run, what time it is, and how it passes."""
+    run = draft.env.settings.run
+    common = {"run": run.name, "simulated": run.simulated, "now_ns": draft.now_ns, "in_use": _in_use(draft)}
+    told = json.dumps({**run.clock, **common, "versions": dict(run.versions)}).encode()
+    response = Response(int(ControlResponse.SUCCESS), told, "", event.request.id)
+    draft.effects.append(Reply(event.connection, event.name, response, CLOCK_REQUEST))
+
+
+def _in_use(draft: StateDraft) -> str:
+    """Return why an experiment without a plan is not to end now; empty: nothing keeps it."""
+    if draft.control.mode is ControlMode.MANUAL:
+        return "the mode is MANUAL"
+    return f"{draft.control.holder} is in control" if draft.control.holder else ""
+
+
+# --- 3. queued: it waits for its turn -------------------------------------------------------------------------------
+
+
+def enqueue(draft: StateDraft, event: RequestIn) -> None:
+    """Queue a request, or refuse it if nothing can be sent now."""
+    name, request, is_command = event.name, event.request, not reads(event.request)
+    if is_command and (why := _tip_comes_first(draft)) is not None:
+        answers.answer(draft, event, ControlResponse.NOT_FREE, why)
+        return
+    is_repeated = draft.idempotency.look_up(name, request) is RequestStatus.UNKNOWN
+    job = ForwardedRequest.of(event, command=is_command, is_repeated=is_repeated)
+    draft.forwarder, refused = draft.forwarder.ask(job, draft.now_s)
+    if refused is None:
+        draft.idempotency = draft.idempotency.noted(name, request, RequestStatus.PENDING)
+    else:
+        answers.answer_unsent(draft, job, refused.response)
+
+
+# --- 4. within limits: as its turn comes, nothing forbids it, and the microscope is where it has to be ---------------
+
+
+def send_next(draft: StateDraft) -> None:
+    """Decide and send waiting requests in their order, until one is in flight."""
+    turn = draft.pending.turn
+    if turn is not None and draft.forwarder.waiting(turn.number) is None:
+        draft.pending = replace(draft.pending, turn=None)  # it was called back, or its time was up
+    send_own(draft)
+    while draft.forwarder.is_free and (job := _next_job(draft)) is not None:
+        _decide(draft, job)
+        send_own(draft)
+
+
+def send_own(draft: StateDraft) -> None:
+    """Send the first of the scheduler's own requests, which are decided already."""
+    forwarder = draft.forwarder
+    if forwarder.is_free and forwarder.own:
+        draft.forwarder = forwarder.sent(forwarder.own[0], draft.now_s)
+
+
+def _next_job(draft: StateDraft) -> ForwardedRequest | None:
+    queue, turn = draft.forwarder.queue, draft.pending.turn
+    if turn is None:
+        return queue[0] if queue else None
+    if turn.is_ready(draft.microscope, draft.now_s):
+        return draft.forwarder.waiting(turn.number)
+    return next((job for job in queue if not job.command), None)
+
+
+def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
+    if not job.command:
+        if not isinstance(mapped := _mapped(draft, job), Response):
+            _send(draft, job, mapped)
+        return
+    if (refusal := _not_allowed_now(draft, job)) is not None:
+        _answer_unsent(draft, job, refusal)
+        return
+    turn = draft.pending.turn or Turn(job.number)
+    if turn.awaited is None and _reads_first(draft, job, turn):
+        return
+    _take_values(draft, turn)
+    mapped = _mapped(draft, job)
+    if isinstance(mapped, Response) or not _is_within_limits(draft, job, mapped):
+        return
+    if job.request.kind == _ACTION:
+        if turn.move is None and _moves_first(draft, job, turn):
+            return
+        if (refusal := draft.limits.check_place(job.request)) is not None:
+            _refuse(draft, job, refusal)
+            return
+    _send(draft, job, mapped)
+
+
+def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None) -> None:
+    name, request = job.client, job.request
+    sent_ns = draft.event_log.sent_ns(name, request, draft.now_ns)
+    job = job._replace(mapped=mapped, states_seen=draft.microscope.states_seen, sent_ns=sent_ns)
+    draft.event_log = draft.event_log.sending(name, request, sent_ns)
+    if job.command:
+        draft.limits = draft.limits.sending(name, job.outgoing, draft.now_ns, _names_meant(job))
+        draft.pending = replace(draft.pending, turn=None)
+        _use_lease(draft, name)
+    draft.forwarder = draft.forwarder.sent(job, draft.now_s)
+    if not request.id:
+        return
+    is_kept = request.kind == _ACTION and draft.frame.is_moving
+    if is_kept or (job.command and draft.limits.counts(job.outgoing)):
+        draft.idempotency = draft.idempotency.sent(name, request)
+    elif mapped is not None:
+        draft.save()  # with what it was mapped to: asked again, it is sent the same
+
+
+def _refuse(draft: StateDraft, job: ForwardedRequest, refusal: Response) -> None:
+    draft.log("WARNING", f"refused {job.client}: {refusal.reason}")
+    _answer_unsent(draft, job, refusal)
+
+
+def _answer_unsent(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
+    draft.forwarder = draft.forwarder.without(job.number)
+    if job.command:
+        draft.pending = replace(draft.pending, turn=None)
+    answers.answer_unsent(draft, job, response)
+
+
+def _use_lease(draft: StateDraft, client: str) -> None:
+    """Begin the lease anew; what a person adjusts beside the holder is no sign of life of the holder."""
+    if client == draft.control.holder:
+        draft.lease = draft.lease.commanded(draft.now_ns, draft.now_s)
+
+
+def _not_allowed_now(draft: StateDraft, job: ForwardedRequest) -> Response | None:
+    rules = draft.env.settings.rules
+    ask = ControlInput(_microscope_event(job.request, rules), job.client)
+    row = row_for(draft.control, ask, rules)
+    if ControlChange.FORWARD not in row.do:
+        code = ControlResponse.NOT_IN_CONTROL if row.response is None else row.response
+        return Response(int(code), b"", reason(row, draft.control, ask, rules), job.request.id)
+    if (why := _tip_comes_first(draft)) is not None:
+        return Response(int(ControlResponse.NOT_FREE), b"", why, job.request.id)
+    return None
+
+
+def _tip_comes_first(draft: StateDraft) -> str | None:
+    """Return why nobody commands, since the tip was left in danger; None: whoever is in control may."""
+    dog, sees_to_tip = draft.watchdog, draft.control.sees_to_tip
+    if dog.tip.may_come and draft.forwarder.up:
+        return "a retract of before the scheduler's restart may still be carried out, until the translator answers"
+    if not (dog.owes_retract and draft.forwarder.up):
+        if not dog.left_to_people or sees_to_tip:
+            return None
+        return "the tip was in danger; a person brings it back to the surface, then clears device-malfunction"
+    if not dog.put_off:
+        return "the tip is being retracted, as it was left in danger"
+    if sees_to_tip:
+        return None
+    return (
+        "the tip is in danger and not retracted yet; until then only components that solve device-malfunction may act"
+    )
+
+
+def _mapped(draft: StateDraft, job: ForwardedRequest) -> MappedRequest | Response | None:
+    draft.frame, outgoing = draft.frame.outgoing(job.client, job.request, draft.now_ns)
+    if isinstance(outgoing, Response):
+        _refuse(draft, job, outgoing)
+    return outgoing  # None: it is sent as it is
+
+
+def _is_within_limits(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None) -> bool:
+    check, now_ns = draft.limits.check, draft.now_ns
+    if mapped is None:
+        refusal = check(job.client, job.request, now_ns, is_repeated=job.is_repeated)
+    else:
+        refusal = check(job.client, mapped.request, now_ns, mapped.names, is_repeated=job.is_repeated)
+        if refusal is not None:
+            refusal = replace(refusal, reason=f"{refusal.reason}; {mapped.said}")
+    if refusal is not None:
+        _refuse(draft, job, refusal)
+    return refusal is None
+
+
+def _reads_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
+    needed = draft.limits.depends_on(job.request, is_mapped=draft.frame.maps(draft.now_ns))
+    if not needed:
+        return False
+    draft.pending = replace(draft.pending, turn=turn.reading(frozenset(needed)))
+    for name in needed:
+        _read(draft, name, ReadForTurn(job.number, name))
+    return True
+
+
+def _was_read(draft: StateDraft, number: int, name: str, response: Response) -> None:
+    turn, job = draft.pending.turn, draft.forwarder.waiting(number)
+    if turn is None or job is None or turn.number != number:
+        return  # it was called back
+    if response.code == ControlResponse.NO_RESPONSE:
+        _answer_unsent(draft, job, _failed_before(response))
+    elif response.code in _LACKING:
+        draft.limits = draft.limits.forget(name)
+        draft.pending = replace(draft.pending, turn=turn.lacks(name))
+    else:
+        told = draft.env.codec.decode_parameter(response.payload) if response.ok and response.payload else None
+        told = told if told is not None and told.name == name else None
+        draft.pending = replace(draft.pending, turn=turn.was_read(name, told))
+
+
+def _take_values(draft: StateDraft, turn: Turn) -> None:
+    # only now: packets that arrived while the values were read may be older than these
+    if not turn.values:
+        return
+    draft.limits = draft.limits.was_read(turn.values, draft.now_ns)
+    position = draft.limits.state.position
+    if position.region is not None and names.SCAN_SIZE_X in turn.values:
+        draft.frame = draft.frame.in_force(position.region, draft.now_ns)
+    if position.probe_m is not None and names.PROBE_POS_X in turn.values:
+        draft.frame = draft.frame.in_force(ProbePosition(position.probe_m), draft.now_ns)
+
+
+def _failed_before(response: Response) -> Response:
+    return replace(response, reason=f"not sent: what had to come before it failed ({response.reason})")
+
+
+def read_ahead(draft: StateDraft) -> None:
+    """Ask for the values of which it counts for how long they hold."""
+    for name in draft.limits.to_be_known():
+        _read(draft, name, ReadAhead(name))
+
+
+def _read(draft: StateDraft, name: str, purpose: OwnPurpose) -> None:
+    parameter = Parameter(name)
+    request = Request(_PARAM, parameter)
+    draft.forwarder, _ = draft.forwarder.ask_own(request, draft.now_s, purpose)
+
+
+def _moves_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
+    if draft.idempotency.was_sent(job.client, job.request):
+        return False
+    draft.frame, move = draft.frame.move_before(str(job.request.subject), draft.now_ns)
+    if move is None:
+        return False
+    if not _is_within_limits(draft, job, move):
+        return True
+    draft.limits = draft.limits.sending(job.client, move.request, draft.now_ns, ())
+    draft.forwarder, own = draft.forwarder.ask_own(move.request, draft.now_s, MoveForTurn(job.number), move)
+    assert own is not None  # the line is free
+    own = own._replace(deadline_s=job.deadline_s)
+    draft.pending = replace(draft.pending, turn=turn.moving(PrePositioner(own, draft.microscope.states_seen)))
+    draft.save()  # with where it is sent: what is told of it is then known after a restart
+    return True
+
+
+def _moved(draft: StateDraft, number: int, response: Response) -> None:
+    turn, job = draft.pending.turn, draft.forwarder.waiting(number)
+    if turn is None or turn.move is None or job is None or turn.number != number:
+        return  # the action was called back
+    if response.ok:
+        draft.pending = replace(draft.pending, turn=replace(turn, move=turn.move.moved(draft.now_s)))
+    elif response.code == ControlResponse.NO_RESPONSE:
+        _answer_unsent(draft, job, _failed_before(response))
+    else:
+        _answer_unsent(draft, job, response)
+
+
+# --- 5. settled: the translator has answered, or did not in time ----------------------------------------------------
+
+
+def settle(draft: StateDraft, settled: SettledRequest) -> None:
+    """Take the end of a request: tell, and remember, its outcome."""
+    job, end, response = settled.job, settled.end, settled.response
+    if end in (ForwardOutcome.ANSWERED, ForwardOutcome.LATE):
+        response = answers.with_id(response, job.request)
+        if response.ok and (job.command or job.request.kind == _PARAM):
+            response = _learn(draft, job, response)
+    if job.command and end is not ForwardOutcome.NOT_SENT and _is_unknown(response):
+        draft.limits = draft.limits.unknown(job.outgoing)
+    if not job.client:
+        _settle_own(draft, job, end, response)
+    elif end is ForwardOutcome.NOT_SENT:
+        answers.answer_unsent(draft, job, response)
+    elif end is ForwardOutcome.ANSWERED and _was_not_sent(response):
+        draft.idempotency = draft.idempotency.not_sent(job.client, job.request)
+        answers.take_back(draft, job)
+        answers.answer_job(draft, job, response)
+    elif end is ForwardOutcome.LATE:
+        _settle_late(draft, job, response)
+    else:
+        if end is ForwardOutcome.UNKNOWN and job.request.kind == _ACTION:
+            _action_started(draft, job, is_certain=False)
+        _see_feedback(draft, job, response)
+        answers.finish(draft, job, response, _unknown_status(response))
+
+
+def _settle_own(draft: StateDraft, job: ForwardedRequest, end: ForwardOutcome, response: Response) -> None:
+    if not reads(job.request):
+        answers.write_down(draft, SCHEDULER, job.request, response, job.heard_s)
+    if job.purpose is None:
+        safety_commands.settle(draft, job, end, response)
+    elif end is not ForwardOutcome.LATE:  # its purpose had the answer before that none had come
+        _serve_purpose(draft, job.purpose, response)
+
+
+def _serve_purpose(draft: StateDraft, purpose: OwnPurpose, response: Response) -> None:
+    match purpose:
+        case ReadForTurn():
+            _was_read(draft, purpose.number, purpose.name, response)
+        case MoveForTurn():
+            _moved(draft, purpose.number, response)
+        case AskForFrame():
+            draft.raised.append(FrameAnswered(purpose.purpose, response))
+        case ReadAhead() if not response.ok:
+            draft.limits = draft.limits.forget(purpose.name)
+
+
+def _settle_late(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
+    """Take an answer after its client was told that none had come: asked again, it gets that answer."""
+    _see_feedback(draft, job, response)
+    status = _unknown_status(response)
+    draft.idempotency = draft.idempotency.noted(job.client, job.request, status or response)
+    if status is None and not response.ok:
+        answers.take_back(draft, job)
+    answers.write_down(draft, job.client, job.request, response, job.heard_s, sent_ns=job.sent_ns, late=True)
+    draft.log("WARNING", f"the translator answered {job.client} late; the answer is kept for its retry")
+
+
+def _see_feedback(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
+    feedback = feedback_of(job.request)
+    if feedback is None or feedback.on is not False or response.ok:
+        return
+    if response.code == ControlResponse.NO_RESPONSE:
+        draft.microscope = draft.microscope.feedback_may_be_off()
+    else:
+        draft.microscope = draft.microscope.feedback_was_left()
+
+
+def _learn(draft: StateDraft, job: ForwardedRequest, response: Response) -> Response:
+    """Take what a success changed, or told. Returns the answer, in the coordinates of its client."""
+    request, now_ns = job.request, draft.now_ns
+    told = None
+    if request.kind == _PARAM and response.payload:
+        told = draft.env.codec.decode_parameter(response.payload)
+    draft.limits = draft.limits.carried_out(job.outgoing, now_ns, told, _names_meant(job), job.client)
+    draft.frame = draft.frame.carried_out(job.outgoing, told, now_ns)
+    is_asked = request.kind == _PARAM and bool(job.client)  # the scheduler itself needs the microscope's values
+    if is_asked and (mapped := draft.frame.answer(request, told, now_ns)) is not None:
+        response = replace(response, payload=draft.env.codec.encode(mapped))
+    if request.kind == _ACTION:
+        _action_started(draft, job, is_certain=True)
+    elif (feedback := feedback_of(request)) is not None:
+        draft.microscope = draft.microscope.with_feedback(feedback)
+    if job.command:
+        _use_lease(draft, job.client)
+        if draft.control.mode is ControlMode.MANUAL:
+            draft.by_hand = draft.by_hand.requested(request)
+    return response
+
+
+def _action_started(draft: StateDraft, job: ForwardedRequest, *, is_certain: bool) -> None:
+    action = str(job.request.subject)
+    draft.watchdog = draft.watchdog.started(action, job.states_seen, draft.microscope)
+    is_away = is_certain and action == draft.watchdog.settings.retract
+    draft.microscope = draft.microscope.after_action(action, is_away=is_away)
+
+
+def _names_meant(job: ForwardedRequest) -> tuple[str, ...] | None:
+    """Return the parameters that the asker means to set; None: all that are sent."""
+    return None if job.mapped is None else tuple(job.mapped.names)
+
+
+def _is_unknown(response: Response) -> bool:
+    return response.code == ControlResponse.NO_RESPONSE and response.detail is not ResponseDetail.NOT_SENT
+
+
+def _was_not_sent(response: Response) -> bool:
+    return response.code == ControlResponse.NO_RESPONSE and response.detail is ResponseDetail.NOT_SENT
+
+
+def _unknown_status(response: Response) -> RequestStatus | None:
+    """Return UNKNOWN where the controller did not answer its translator: that one can say more when asked again."""
+    return RequestStatus.UNKNOWN if response.code == ControlResponse.NO_RESPONSE else None
+
+
+def reads(request: Request) -> bool:
+    """Return whether a request disturbs nothing."""
+    return request.kind == ControlRequest.ACTION_SUPPORT or (request.kind == _PARAM and is_get(request))

@@ -1,0 +1,427 @@
+"""Checks requests against the limits of an experiment.
+
+Nothing is clamped. A refusal names the parameter, the value, the limit and where the limit was set.
+
+A check is right only for the moment at which it is made: steps, rates and places are measured from the values in
+force. So a request is checked right before it is sent, after everything before it has settled, and `depends_on` names
+the values that are read from the microscope for that check.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from afspm.basics.errors import InvalidValue
+from afspm.basics.formatting import lengths_text, position_text, quantity
+from afspm.basics.frozen import replace
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Parameter,
+    PositionChange,
+    ProbePosition,
+    Region,
+    RegionChange,
+    Request,
+    Response,
+    ScanParameters,
+    ShapeChange,
+    component_of,
+    names,
+)
+from afspm.model.geometry import XY
+from afspm.model.names import BASE_PARAMETERS
+from afspm.model.positions import (
+    PROBE_CHANGES,
+    REGION_CHANGES,
+    SHAPE_CHANGES,
+    KnownPosition,
+    changes_by,
+    moved,
+)
+from afspm.scheduler.safety.limit_state import LastUse, LimitState, Usage
+from afspm.scheduler.safety.limits import ExperimentLimits, Limit
+from afspm.scheduler.safety.parameter_values import ParameterValue, ParameterValueError, numbers, values_of
+
+_REACH = 1e-9  # relative: what lies on the border, to the precision of the arithmetic, is inside
+_TOLD_REACH = 1e-3  # the same of a place that the controller tells: in steps of its own, and in single precision
+_PLACES = ((frozenset(REGION_CHANGES), frozenset({names.START_SCAN})), (frozenset(PROBE_CHANGES), names.AT_PROBE))
+"""The parameters of each place, with the actions that happen there."""
+
+
+class _Breach(Exception):
+    """A limit is broken. Never leaves this module."""
+
+    def __init__(self, code: ControlResponse, reason: str) -> None:
+        super().__init__(reason)
+        self.code = code
+        self.reason = reason
+
+
+class _Use(NamedTuple):
+    who: str
+    request_id: str
+    now_ns: int
+    is_repeated: bool
+
+
+@dataclass(frozen=True)
+class LimitChecker:
+    """Checks requests against the limits, and keeps in mind what steps and rates are measured from."""
+
+    limits: ExperimentLimits = field(default_factory=ExperimentLimits)
+    state: LimitState = field(default_factory=LimitState)
+
+    def check(
+        self,
+        who: str,
+        request: Request,
+        now_ns: int,
+        used: Collection[str] | None = None,
+        *,
+        is_repeated: bool = False,
+    ) -> Response | None:
+        """Return the refusal of a request that breaks a limit or has no meaning; None: it may be sent.
+
+        Args:
+            used: the parameters that `who` means to set; the others of the request only change with them. None: all.
+            is_repeated: this very request was sent before, and its outcome is unknown: it is no second use.
+        """
+        try:
+            self._check(_Use(who, request.id, now_ns, is_repeated), request, used)
+        except _Breach as breach:
+            return Response(int(breach.code), b"", breach.reason, request.id)
+        except (ParameterValueError, InvalidValue) as error:
+            return Response(int(ControlResponse.PARAM_ERROR), b"", str(error), request.id)
+        return None
+
+    def check_place(self, request: Request) -> Response | None:
+        """Return the refusal of an action where the scan, or the probe, is now: a person may have moved it."""
+        try:
+            self._check_place(str(request.subject))
+        except _Breach as breach:
+            reason = f"{request.subject}: {breach.reason}"
+            return Response(int(ControlResponse.ACTION_ERROR), b"", reason, request.id)
+        return None
+
+    def depends_on(self, request: Request, *, is_mapped: bool = False) -> list[str]:
+        """Return the parameters to be read before a request is checked: it is measured from their values.
+
+        The value set or published last is not enough: a request of unknown outcome or a person at the panel may have
+        changed it, and an old packet may arrive after the answer to a newer request.
+
+        Args:
+            is_mapped: a place is mapped and sent as a whole, whichever part of it was asked for.
+        """
+        given = self._names_set_by(request)
+        needed = [name for name in given if name in self.limits.bounded]
+        if self.limits.region is not None or is_mapped:
+            action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
+            for place, actions in _PLACES:
+                if action in actions or 0 < len(place.intersection(given)) < len(place):
+                    needed += sorted(place)
+        if len(SHAPE_CHANGES.keys() & given) == 1:
+            needed += sorted(SHAPE_CHANGES)
+        return list(dict.fromkeys(needed))
+
+    def to_be_known(self) -> list[str]:
+        """Return the parameters to be read before the first request sets them: a rate takes two looks."""
+        return list(self.limits.rated)
+
+    def was_read(self, values: Mapping[str, Parameter | None], now_ns: int) -> LimitChecker:
+        """Take values that were read for a check.
+
+        Args:
+            values: None where the microscope answered no value. A parameter that it does not have is not among them.
+        """
+        numbers_read = {name: None if told is None else self._number(told) for name, told in values.items()}
+        usage = self.state.usage
+        for name, value in numbers_read.items():
+            if value is None:
+                usage = usage.forget(name)
+            elif name in self.limits.bounded:
+                usage = usage.learn(name, value, now_ns, was_read=True)
+        return replace(self, state=LimitState(usage, self.state.position.was_read(numbers_read)))
+
+    def unknown(self, request: Request) -> LimitChecker:
+        """Forget the values that a request of unknown outcome may have changed."""
+        given = self._names_set_by(request)
+        usage = self.state.usage
+        for name in given:
+            usage = usage.forget(name)
+        return replace(self, state=LimitState(usage, self.state.position.without(given)))
+
+    def forget(self, name: str) -> LimitChecker:
+        """Drop the value of a parameter that could not be read."""
+        return self._using(self.state.usage.forget(name))
+
+    def sending(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> LimitChecker:
+        """Count what a request uses: it was checked, and is about to be sent.
+
+        The time of a change is unknown until the request has settled, so a limited rate is not measured from it.
+        """
+        usage = self.state.usage
+        for name in self._uses(request, used):
+            usage = usage.use_sent(name, LastUse(now_ns, who, request.id))
+        for name in self.limits.rated.intersection(self._names_set_by(request)) if self.limits.rated else ():
+            usage = usage.changing(name)
+        return self._using(usage)
+
+    def counts(self, request: Request) -> bool:
+        """Return whether the interval between two such requests is limited."""
+        return bool(self._uses(request, None))
+
+    def not_done(self, who: str, request: Request, used: Collection[str] | None = None) -> LimitChecker:
+        """Take back what a request used: it was not carried out, for sure."""
+        usage = self.state.usage
+        for name in self._uses(request, used):
+            usage = usage.use_undone(name, who, request.id)
+        for name in self._names_set_by(request):
+            usage = usage.unchanged(name)
+        return self._using(usage)
+
+    def carried_out(
+        self,
+        request: Request,
+        now_ns: int,
+        told: Parameter | None = None,
+        used: Collection[str] | None = None,
+        who: str = "",
+    ) -> LimitChecker:
+        """Take a request that succeeded; `told` is the parameter as the translator answered it."""
+        if is_get(request):
+            if told is None or not _tells_of(told, request.subject):
+                return self.forget(request.subject.name)
+            return self.in_force(told, now_ns, was_read=True)
+        usage = self.state.usage
+        for name in self._uses(request, used):
+            usage = usage.use_done(name, LastUse(now_ns, who, request.id))
+        checker = self._using(usage)
+        for subject in self._set_by(request):
+            # what was set is what the microscope says it is now
+            said = told if isinstance(subject, Parameter) and told is not None and _tells_of(told, subject) else subject
+            checker = checker.in_force(said, now_ns)
+        return checker
+
+    def published(self, subject: object, now_ns: int) -> LimitChecker:
+        """Learn places, and the times at which values with a limited rate change, from a published message."""
+        usage = self.state.usage
+        for name, value in numbers(self._sensible(subject)):
+            if name in self.limits.rated:
+                usage = usage.learn(name, value, now_ns)
+        return self._with(usage, self.state.position.learn(subject))
+
+    def in_force(self, subject: object, now_ns: int, *, was_read: bool = False) -> LimitChecker:
+        """Learn values that were set or read: a ScanParameters, Feedback, Parameter …"""
+        values, usage, position = numbers(self._sensible(subject)), self.state.usage, self.state.position
+        if isinstance(subject, Parameter):
+            if not values:  # what a microscope tells is not ours to judge
+                usage = usage.forget(subject.name)
+            position = position.learn_values(values)
+        for name, value in values:
+            if name in self.limits.bounded:
+                usage = usage.learn(name, value, now_ns, was_read=was_read)
+        return self._with(usage, position.learn(subject))
+
+    def _with(self, usage: Usage, position: KnownPosition) -> LimitChecker:
+        if usage is self.state.usage and position is self.state.position:
+            return self
+        return replace(self, state=LimitState(usage, position))
+
+    def _using(self, usage: Usage) -> LimitChecker:
+        return self if usage is self.state.usage else replace(self, state=replace(self.state, usage=usage))
+
+    def _uses(self, request: Request, used: Collection[str] | None) -> list[str]:
+        """Return what a request uses of that which may be used every so often only."""
+        counted = self.limits.counted
+        if not counted:
+            return []
+        uses = [name for name in self._names_set_by(request) if used is None or name in used]
+        if request.kind == ControlRequest.ACTION:
+            uses.append(str(request.subject))
+        return [name for name in uses if name in counted]
+
+    def _names_set_by(self, request: Request) -> list[str]:
+        """Return the parameters that a request sets, each once; none if it makes no sense."""
+        values = [value for subject in self._set_by(request) for value in self._sensible(subject)]
+        return list(dict.fromkeys(value.name for value in values))
+
+    def _sensible(self, subject: object) -> list[ParameterValue]:
+        try:
+            return values_of(subject, self.limits.parameters)
+        except ParameterValueError:
+            return []
+
+    def _number(self, told: Parameter) -> float | None:
+        return next((value.number for value in self._sensible(told)), None)
+
+    # --- checks ---
+
+    def _check(self, use: _Use, request: Request, used: Collection[str] | None) -> None:
+        if request.kind == ControlRequest.ACTION:
+            action = str(request.subject)
+            self._check_use(use, action, self.limits.actions.get(action), "action")
+            try:
+                self._check_settings(use, request, used)
+            except (_Breach, ParameterValueError, InvalidValue) as breach:
+                raise _Breach(ControlResponse.ACTION_ERROR, f"{action}: {breach}") from breach
+        else:
+            self._check_settings(use, request, used)
+
+    def _check_settings(self, use: _Use, request: Request, used: Collection[str] | None) -> None:
+        subjects = self._set_by(request)
+        values = [value for subject in subjects for value in values_of(subject, self.limits.parameters)]
+        # parameters may move or turn the scan, or make it too many pixels, as well; several do so together
+        are_parameters = all(isinstance(subject, Parameter) for subject in subjects)
+        for place in changes_by(numbers(values)) if are_parameters else subjects:
+            if isinstance(place, ScanParameters):
+                self._check_scan(place)
+            elif isinstance(place, ProbePosition):
+                self._check_point(place.xy_m)
+            elif isinstance(place, PositionChange):
+                self._check_move(place)
+        for name, value in values:
+            limit = self.limits.parameters.get(name)
+            if used is None or name in used:
+                self._check_use(use, name, limit, "parameter")
+            if limit is not None and value is not None:
+                self._check_value(name, value, limit, use.now_ns)
+
+    def _set_by(self, request: Request) -> Collection[object]:
+        """Return what a request sets: its subject, or for an action what the microscope does as that."""
+        if request.kind == ControlRequest.ACTION:
+            return self.limits.sets.get(str(request.subject), ())
+        return () if is_get(request) else (request.subject,)
+
+    def _check_use(self, use: _Use, name: str, limit: Limit | None, what: str) -> None:
+        if limit is None:
+            return
+        who, now_ns = use.who, use.now_ns
+        error = ControlResponse.ACTION_ERROR if what == "action" else ControlResponse.PARAM_ERROR
+        if limit.only is not None and not {who, component_of(who)} & set(limit.only):
+            rule = f"only {', '.join(sorted(limit.only))} may" if limit.only else "no component may"
+            raise _Breach(error, f"{who} may not use the {what} {name}: {rule} ({limit.source})")
+        last_ns = self.state.usage.last_ns(name, (who, use.request_id) if use.is_repeated else None)
+        if limit.interval_s is not None and last_ns is not None and now_ns - last_ns < limit.interval_s * 1e9:
+            ago_s = (now_ns - last_ns) / 1e9
+            raise _Breach(
+                error,
+                f"{name} was used {ago_s:.3g} s ago, its shortest interval is {limit.interval_s:g} s ({limit.source})",
+            )
+
+    def _check_value(self, name: str, value: float, limit: Limit, now_ns: int) -> None:
+        def text(amount: float, digits: int = 6) -> str:
+            return quantity(amount, limit.unit or BASE_PARAMETERS.get(name) or "", digits)
+
+        said = f"{name} = {text(value)}"
+        if limit.low is not None and value < limit.low - abs(limit.low) * _REACH:
+            raise _param_error(f"{said} is below the lowest allowed, {text(limit.low)} ({limit.source})")
+        if limit.high is not None and value > limit.high + abs(limit.high) * _REACH:
+            raise _param_error(f"{said} is above the highest allowed, {text(limit.high)} ({limit.source})")
+        if not limit.bounds_changes:
+            return
+        known = self.state.usage.known.get(name)
+        if known is None:
+            raise _param_error(
+                f"{said}: the microscope does not tell the value now, so the step can't be checked ({limit.source})"
+            )
+        change = abs(value - known.value)
+        if limit.step is not None and change > limit.step * (1 + _REACH):
+            raise _param_error(
+                f"{said} is a step of {text(change)}, the largest allowed is {text(limit.step)} ({limit.source})"
+            )
+        if limit.rate_per_s is None:
+            return
+        allowed = limit.rate_per_s * (now_ns - known.since_ns) / 1e9
+        moved_since = change + abs(known.value - known.origin)
+        if moved_since > allowed * (1 + _REACH):
+            ago_s = (now_ns - known.since_ns) / 1e9
+            raise _param_error(
+                f"{said} changes by {text(moved_since)} within {ago_s:.3g} s, allowed is at most {text(allowed, 3)},"
+                f" at {text(limit.rate_per_s)} per second ({limit.source})"
+            )
+
+    def _check_scan(self, wanted: ScanParameters, reach: float = _REACH) -> None:
+        shape, region = wanted.shape, wanted.region
+        if isinstance(shape, ShapeChange):
+            shape = shape.onto(self.state.position.shape or (1, 1))
+        if shape is not None and shape[0] * shape[1] > self.limits.most_pixels:
+            raise _param_error(
+                f"a scan of {shape[1]} x {shape[0]} pixels; the highest number allowed is {self.limits.most_pixels}"
+            )
+        if isinstance(region, RegionChange):
+            region = self._region_after(region)
+        allowed = self.limits.region
+        if region is None or allowed is None:
+            return
+        for x, y in region.corners_m():
+            if not _inside(allowed, (float(x), float(y)), reach):
+                raise _param_error(
+                    f"the scan's corner {position_text((float(x), float(y)))} lies outside the region allowed"
+                    f" ({self.limits.region_source})"
+                )
+
+    def _region_after(self, change: RegionChange) -> Region | None:
+        given = (change.left_m, change.low_m, change.width_m, change.height_m, change.angle_rad)
+        for value in given:
+            if value is not None and not math.isfinite(value):
+                raise _param_error(f"a scan region can't have a {value} in it")
+        for size in (change.width_m, change.height_m):
+            if size is not None and size <= 0:
+                raise _param_error(f"a scan region of size {lengths_text([size])} is empty")
+        if self.state.position.region is not None:
+            return change.onto(self.state.position.region)
+        if self.limits.region is not None:
+            raise _param_error("the microscope has not reported its scan region, so a part of it can't be checked")
+        return None
+
+    def _check_point(self, xy_m: XY, reach: float = _REACH) -> None:
+        if not all(map(math.isfinite, xy_m)):
+            raise _param_error(f"the probe can't go to {xy_m}: not a place")
+        allowed = self.limits.region
+        if allowed is not None and not _inside(allowed, xy_m, reach):
+            raise _param_error(
+                f"the probe position {position_text(xy_m)} lies outside the region allowed"
+                f" ({self.limits.region_source})"
+            )
+
+    def _check_place(self, action: str) -> None:
+        if self.limits.region is None:
+            return
+        if action == names.START_SCAN:
+            if self.state.position.region is None:
+                raise _param_error("the microscope has not reported its scan region")
+            self._check_scan(ScanParameters(self.state.position.region), _TOLD_REACH)
+        elif action in names.AT_PROBE:
+            if self.state.position.probe_m is None:
+                raise _param_error("the microscope has not reported its probe position")
+            self._check_point(self.state.position.probe_m, _TOLD_REACH)
+
+    def _check_move(self, change: PositionChange) -> None:
+        if self.limits.region is None:
+            return
+        if self.state.position.probe_m is None:
+            raise _param_error("the microscope has not reported its probe position, so a part of it can't be checked")
+        self._check_point(moved(self.state.position.probe_m, change))
+
+
+def _param_error(reason: str) -> _Breach:
+    return _Breach(ControlResponse.PARAM_ERROR, reason)
+
+
+def _inside(allowed: Region, xy_m: XY, reach: float) -> bool:
+    grown = (allowed.size_m[0] * (1 + reach), allowed.size_m[1] * (1 + reach))
+    return dataclasses.replace(allowed, size_m=grown).contains(xy_m)
+
+
+def is_get(request: Request) -> bool:
+    """Return whether a parameter is asked for, not set."""
+    return isinstance(request.subject, Parameter) and request.subject.value is None
+
+
+def _tells_of(told: Parameter, asked: Parameter) -> bool:
+    return told.value is not None and told.name == asked.name

@@ -1,0 +1,117 @@
+"""The values in force and the latest uses, from which steps, rates and intervals are measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from afspm.basics.frozen import replace
+from afspm.model.positions import KnownPosition
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class KnownValue:
+    """A value in force.
+
+    Attributes:
+        since_ns: when it was set last, in experiment time, or first heard of.
+        origin: the value then. What was only read since may differ: controllers round, and people are at the panel.
+    """
+
+    value: float
+    since_ns: int
+    origin: float
+
+
+@dataclass(frozen=True)
+class LastUse:
+    """A use of a parameter or action, and the id of the request; empty: it had none."""
+
+    at_ns: int
+    who: str
+    request_id: str
+
+    def is_of(self, repeated: tuple[str, str] | None) -> bool:
+        """Return whether a repeated request (client, id) made this use."""
+        return repeated is not None and bool(self.request_id) and (self.who, self.request_id) == repeated
+
+
+@dataclass(frozen=True)
+class Usage:
+    """Values and uses, by name. Kept over a restart: a scheduler that was killed must not allow anything sooner.
+
+    Attributes:
+        sent: uses of unknown outcome, which count.
+        before: the values from which a rate was measured, before a request that has not settled.
+    """
+
+    known: Mapping[str, KnownValue] = field(default_factory=dict)
+    before: Mapping[str, KnownValue] = field(default_factory=dict)
+    done: Mapping[str, LastUse] = field(default_factory=dict)
+    sent: Mapping[str, LastUse] = field(default_factory=dict)
+
+    def learn(self, name: str, value: float, now_ns: int, *, was_read: bool = False) -> Usage:
+        """Take a value in force.
+
+        Args:
+            was_read: it was asked for, and may have been in force for long.
+        """
+        known = self.known.get(name)
+        if known is not None and known.value == value:
+            return self
+        new = replace(known, value=value) if known is not None and was_read else KnownValue(value, now_ns, value)
+        return replace(self, known={**self.known, name: new}, before=_without(self.before, name))
+
+    def forget(self, name: str) -> Usage:
+        """Drop a value that is not known any more."""
+        if name not in self.known and name not in self.before:
+            return self
+        return replace(self, known=_without(self.known, name), before=_without(self.before, name))
+
+    def changing(self, name: str) -> Usage:
+        """Set a value aside until it is known whether, and when, it was changed."""
+        if name not in self.known:
+            return self
+        return replace(self, known=_without(self.known, name), before={**self.before, name: self.known[name]})
+
+    def unchanged(self, name: str) -> Usage:
+        """Take up a value again: it was not changed."""
+        if name not in self.before:
+            return self
+        return replace(self, known={**self.known, name: self.before[name]}, before=_without(self.before, name))
+
+    def last_ns(self, name: str, repeated: tuple[str, str] | None = None) -> int | None:
+        """Return when it was used last.
+
+        Args:
+            repeated: client and id of a repeated request, whose own use does not count.
+        """
+        uses = (uses.get(name) for uses in (self.done, self.sent))
+        return max((use.at_ns for use in uses if use is not None and not use.is_of(repeated)), default=None)
+
+    def use_sent(self, name: str, use: LastUse) -> Usage:
+        return replace(self, sent={**self.sent, name: use})
+
+    def use_done(self, name: str, use: LastUse) -> Usage:
+        return replace(self, done={**self.done, name: use}, sent=_without(self.sent, name))
+
+    def use_undone(self, name: str, who: str, request_id: str) -> Usage:
+        """Take back a use that was sent, or was to be, and was not carried out."""
+        use = self.sent.get(name)
+        is_it = use is not None and (use.who, use.request_id) == (who, request_id)
+        return replace(self, sent=_without(self.sent, name)) if is_it else self
+
+
+@dataclass(frozen=True)
+class LimitState:
+    """All that requests are checked against beside the limits themselves."""
+
+    usage: Usage = field(default_factory=Usage)
+    position: KnownPosition = field(default_factory=KnownPosition)
+
+
+def _without(uses: Mapping[str, T], name: str) -> dict[str, T]:
+    return {other: use for other, use in uses.items() if other != name}

@@ -1,0 +1,93 @@
+"""Limits of an experiment: which parameters may be set, how far, how fast, where and by which component."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import ClassVar
+
+from afspm.basics.units import PositiveDuration
+from afspm.model import Parameter, Region
+
+_KEYS = {"low": "min", "high": "max", "rate_per_s": "rate", "interval_s": "every"}
+
+
+def limit_key(name: str) -> str:
+    """Return the key in the experiment file of an attribute of a `Limit`."""
+    return _KEYS.get(name, name)
+
+
+@dataclass(frozen=True)
+class Limit:
+    """A limit of one parameter or action. Without a key there is no such limit; an action has `every` and `only` alone.
+
+    Attributes:
+        low: the lowest value allowed.
+        high: the highest value allowed.
+        step: the largest change in one request.
+        rate_per_s: the largest change per experiment time since the parameter last changed, such as `"1 V/s"`.
+        interval_s: the least experiment time between two requests.
+        only: the components that may set it.
+        unit: of the values above (the rate: per second); SI for the base parameters.
+        source: where it was set, e.g. "experiment.toml:42".
+    """
+
+    low: float | None = None
+    high: float | None = None
+    step: float | None = None
+    rate_per_s: float | None = None
+    interval_s: PositiveDuration | None = None
+    only: tuple[str, ...] | None = None
+    unit: str | None = None
+    source: str = "[limits]"
+
+    __pydantic_config__: ClassVar[object] = {"alias_generator": limit_key}
+
+    @property
+    def bounds_changes(self) -> bool:
+        """True where the value in force matters."""
+        return self.step is not None or self.rate_per_s is not None
+
+    @property
+    def is_of_a_number(self) -> bool:
+        """True where the parameter can't be a text."""
+        return self.bounds_changes or self.low is not None or self.high is not None
+
+
+@dataclass(frozen=True)
+class ExperimentLimits:
+    """All limits of an experiment.
+
+    Attributes:
+        parameters: by name of the parameter.
+        actions: by name of the action.
+        region: what scans (with their corners) and the probe must stay in, in m, in tip coordinates. Nothing is done
+            outside, whoever set the place.
+        region_source: where that was set.
+        most_pixels: of a scan.
+        sets: by name of an action, the parameters that the microscope sets at once as that action.
+    """
+
+    parameters: Mapping[str, Limit] = field(default_factory=dict)
+    actions: Mapping[str, Limit] = field(default_factory=dict)
+    region: Region | None = None
+    region_source: str = "[limits] region"
+    most_pixels: int = 8192 * 8192
+    sets: Mapping[str, tuple[Parameter, ...]] = field(default_factory=dict)
+
+    @cached_property
+    def bounded(self) -> frozenset[str]:
+        """The parameters of which the values in force matter."""
+        return frozenset(name for name, limit in self.parameters.items() if limit.bounds_changes)
+
+    @cached_property
+    def rated(self) -> frozenset[str]:
+        """The parameters with a limited rate."""
+        return frozenset(name for name, limit in self.parameters.items() if limit.rate_per_s is not None)
+
+    @cached_property
+    def counted(self) -> frozenset[str]:
+        """The parameters and actions of which it matters when they were used last."""
+        both = {**self.parameters, **self.actions}
+        return frozenset(name for name, limit in both.items() if limit.interval_s is not None)

@@ -1,0 +1,95 @@
+"""The parameters that a request sets, or that the microscope tells, each in one unit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from afspm.basics.errors import AfspmError
+from afspm.basics.units import convert
+from afspm.model import Feedback, Parameter, PositionChange, ProbePosition, ScanParameters, names
+from afspm.model.names import BASE_PARAMETERS
+from afspm.model.positions import scan_values
+from afspm.scheduler.safety.limits import Limit
+
+
+class ParameterValue(NamedTuple):
+    """A value to set: a number in SI, or in the unit of its limit; None: a text or a switch."""
+
+    name: str
+    number: float | None
+
+
+class ParameterValueError(Exception):
+    """A value that its parameter can't have, and why. Never leaves `logic`."""
+
+
+def values_of(subject: object, limits: Mapping[str, Limit]) -> list[ParameterValue]:
+    """All that a subject sets, by the names of the parameters.
+
+    Raises:
+        ParameterValueError: a text where there must be a number, one that is not finite, a unit of another dimension.
+    """
+    if isinstance(subject, Parameter):
+        if subject.value is None:
+            return []
+        return [ParameterValue(subject.name, _number(subject, subject.value, limits.get(subject.name)))]
+    if isinstance(subject, ScanParameters):
+        return [ParameterValue(*one) for one in scan_values(subject)]
+    if isinstance(subject, Feedback):
+        loop = (
+            (names.ZCTRL_SETPOINT, subject.setpoint),
+            (names.ZCTRL_PGAIN, subject.proportional_gain),
+            (names.ZCTRL_IGAIN, subject.integral_gain),
+        )
+        switch = [] if subject.on is None else [ParameterValue(names.FEEDBACK_ON, None)]
+        return switch + [ParameterValue(name, _finite(name, value)) for name, value in loop if value is not None]
+    if isinstance(subject, ProbePosition | PositionChange):
+        x, y = subject.xy_m if isinstance(subject, ProbePosition) else (subject.x_m, subject.y_m)
+        return [
+            ParameterValue(name, value)
+            for name, value in ((names.PROBE_POS_X, x), (names.PROBE_POS_Y, y))
+            if value is not None
+        ]
+    return []
+
+
+def numbers(values: list[ParameterValue]) -> list[tuple[str, float]]:
+    """Those that are numbers."""
+    return [(name, number) for name, number in values if number is not None]
+
+
+def number_of(parameter: Parameter) -> float | None:
+    """Return the value of a single parameter in SI; None if it is not a finite number of the right kind."""
+    try:
+        return _number(parameter, parameter.value or "", None)
+    except ParameterValueError:
+        return None
+
+
+def _number(parameter: Parameter, text: str, limit: Limit | None) -> float | None:
+    """None if it may be a text, and is one."""
+    name = parameter.name
+    try:
+        value = float(text)
+    except ValueError:
+        if name not in BASE_PARAMETERS and not (limit is not None and limit.is_of_a_number):
+            return None
+        raise ParameterValueError(f"{name} = {text!r} is not a number") from None
+    _finite(name, value)
+    unit = limit.unit if limit is not None and limit.unit is not None else BASE_PARAMETERS.get(name)
+    # without a unit an angle is in degrees on the wire, everything else in SI
+    given = parameter.unit or ("deg" if unit == "rad" else unit)
+    if not given or unit is None or given == unit:
+        return value
+    try:
+        return float(convert(value, given, unit))
+    except AfspmError as error:
+        raise ParameterValueError(f"{name} = {text} {given}: {error}") from error
+
+
+def _finite(name: str, value: float) -> float:
+    if not math.isfinite(value):
+        raise ParameterValueError(f"{name} = {value}: not a finite number")
+    return value

@@ -1,0 +1,63 @@
+"""The scheduler's own requests, which go first: what the watchdog wants, and whether the translator can do it."""
+
+from __future__ import annotations
+
+from afspm.model import ControlRequest, ControlResponse, Request, Response
+from afspm.scheduler.requests.forwarder import ForwardedRequest, ForwardOutcome
+from afspm.scheduler.safety.watchdog import SafetyResult, TipDuty
+from afspm.scheduler.state import StateDraft
+
+_ID = "scheduler/does-it-retract"
+
+
+def begin(draft: StateDraft) -> None:
+    """Ask a new translator whether it retracts."""
+    action = draft.watchdog.question
+    request = Request(int(ControlRequest.ACTION_SUPPORT), action, id=_ID)
+    draft.forwarder, _ = draft.forwarder.ask_own(request, draft.now_s)
+    draft.watchdog = draft.watchdog.translator_is_there(draft.now_s)
+    send(draft)
+
+
+def send(draft: StateDraft) -> None:
+    """Send the actions that the watchdog wants."""
+    while True:
+        draft.watchdog, action = draft.watchdog.next_action(draft.microscope)
+        if action is None:
+            return
+        request = Request(int(ControlRequest.ACTION), action)
+        draft.forwarder, job = draft.forwarder.ask_own(request, draft.now_s)
+        if job is None:
+            draft.watchdog = draft.watchdog.unsent(draft.now_s)
+            return
+
+
+def settle(draft: StateDraft, job: ForwardedRequest, end: ForwardOutcome, response: Response) -> None:
+    """Take the end of one of these."""
+    subject, now_s = str(job.request.subject), draft.now_s
+    if end is ForwardOutcome.LATE:
+        if response.ok and job.request.kind == ControlRequest.ACTION:
+            draft.watchdog = draft.watchdog.done_late(subject)
+        return
+    if job.request.kind == ControlRequest.ACTION_SUPPORT:
+        if response.code == ControlResponse.ACTION_NOT_SUPPORTED:
+            draft.watchdog = draft.watchdog.without_retract()
+        return
+    if not draft.forwarder.up:
+        draft.watchdog = draft.watchdog.unsent(now_s)
+        return
+    is_retract = draft.watchdog.tip.duty is TipDuty.ASKED
+    draft.watchdog, result = draft.watchdog.answered(response.code, draft.microscope, now_s)
+    if is_retract and result is SafetyResult.DONE:
+        draft.microscope = draft.microscope.with_tip(away=True)
+    send(draft)
+    if result is SafetyResult.DONE:
+        draft.log("INFO", f"{subject}: done")
+    elif result is SafetyResult.FAILED:
+        due_s = draft.watchdog.due_s
+        again = (
+            ""
+            if due_s is None
+            else f"; it is asked again in {due_s - now_s:.0f} s, unless a component or a person takes over"
+        )
+        draft.log("ERROR", f"the microscope does not {subject}: {response.reason or response.code}{again}")

@@ -1,0 +1,60 @@
+"""The part of a scheduler's state that survives a restart, as `model.snapshot` writes and reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from afspm.basics.frozen import replace
+from afspm.model.idempotency_cache import SentAction
+from afspm.model.microscope_status import TipRisk
+from afspm.scheduler.control.arbitration import ArbitrationState
+from afspm.scheduler.publishing.event_log import SentStart
+from afspm.scheduler.safety.limit_state import LimitState
+from afspm.scheduler.safety.watchdog import RetractState
+
+KIND, VERSION = "scheduler", 2
+"""Of snapshots of `SavedState`."""
+
+
+@dataclass(frozen=True)
+class SavedSupervisor:
+    """The part of a supervisor that survives a restart of the scheduler."""
+
+    processes: tuple[str, ...]
+    orders: tuple[str, ...]
+    over: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class SavedState:
+    """The state that survives a restart.
+
+    Attributes:
+        granted_to: the token of the life of the holder that was granted control.
+        lease_s: that the holder asked for.
+        sessions: the token of each session that was connected.
+        forgotten: see `idempotency_cache.Floors`.
+        last_ns: the time of the newest packet.
+        recent: (translator's time, the scheduler's) of the packets published last.
+        frame: `CoordinateFrame.saved()`; out of a file, the same as plain data.
+    """
+
+    control: ArbitrationState = field(default_factory=ArbitrationState)
+    granted_to: str | None = None
+    lease_s: float | None = None
+    sessions: Mapping[str, str] = field(default_factory=dict)
+    sent_actions: tuple[SentAction, ...] = ()
+    starts: tuple[SentStart, ...] = ()
+    forgotten: Mapping[str, int] = field(default_factory=dict)
+    limits: LimitState = field(default_factory=LimitState)
+    tip: RetractState = field(default_factory=RetractState)
+    tip_risk: TipRisk = field(default_factory=TipRisk)
+    supervisors: Mapping[str, SavedSupervisor] = field(default_factory=dict)
+    last_ns: int = 0
+    recent: tuple[tuple[int, int], ...] = ()
+    frame: object = None
+
+    def without_holder(self) -> SavedState:
+        """Return the state with no holder: an older state does not know the holder of now."""
+        return replace(self, control=replace(self.control, holder=None, solving=0), granted_to=None, lease_s=None)

@@ -1,0 +1,463 @@
+"""`SchedulerCore`: all that a scheduler decides, composed of the parts beside this module."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+from afspm.basics.frozen import replace
+from afspm.model import (
+    ControlMode,
+    ControlState,
+    JournalEntries,
+    JournalEntry,
+    LoggedPacket,
+    Problem,
+    component_of,
+)
+from afspm.scheduler.control import control_change
+from afspm.scheduler.control.arbitration import ArbitrationEvent, ArbitrationState, ControlInput
+from afspm.scheduler.control.control_change import TRANSLATOR
+from afspm.scheduler.coordinate_frame import (
+    TIP_FRAME,
+    AskMicroscope,
+    CoordinateFrame,
+    HoldControl,
+    Reconsider,
+    SaveNow,
+)
+from afspm.scheduler.events import (
+    Announced,
+    Codec,
+    Connected,
+    ControlChanged,
+    Delegate,
+    Disconnected,
+    Effect,
+    FrameAnswered,
+    FrameReported,
+    Greeted,
+    Input,
+    Kill,
+    Log,
+    PacketIn,
+    ProblemSeen,
+    Replay,
+    ReplayRequested,
+    RequestIn,
+    Started,
+    Stopped,
+    Tick,
+    TranslatorCaughtUp,
+    TranslatorDown,
+    TranslatorReply,
+    TranslatorUp,
+    Unreadable,
+)
+from afspm.scheduler.publishing import own_packets as publishing
+from afspm.scheduler.publishing import packet_intake
+from afspm.scheduler.publishing.cache import TIME_STEP_NS, PacketCache
+from afspm.scheduler.publishing.event_log import SCHEDULER, SentStart, start_entry, unreadable_entry
+from afspm.scheduler.requests import answers, request_pipeline
+from afspm.scheduler.requests.forwarder import AskForFrame
+from afspm.scheduler.safety import safety_commands
+from afspm.scheduler.saved_state import SavedState
+from afspm.scheduler.settings import SchedulerSettings
+from afspm.scheduler.state import Environment, SchedulerState, StateDraft, restored_state, saved_state
+from afspm.wire.messages import JOURNAL
+
+_MALFUNCTION = Problem.DEVICE_MALFUNCTION
+_AT_ONCE_S = 0.0  # in real monotonic time: always past
+
+
+def step(
+    state: SchedulerState, event: Input, env: Environment, now_s: float, now_ns: int
+) -> tuple[SchedulerState, list[Effect]]:
+    """Return the state after an event, and what is to be done, in order."""
+    draft = StateDraft(state, env, now_s, now_ns)
+    _take(draft, event)
+    while draft.raised:
+        _take(draft, draft.raised.pop(0))
+    request_pipeline.send_next(draft)
+    if draft.control is not state.control:
+        _take(draft, ControlChanged(state.control, draft.control))
+    _end_when_safe(draft)
+    return draft.finish()
+
+
+def _take(draft: StateDraft, event: Input) -> None:
+    """Have the coordinate frame look at an input first: it may keep it, and add to it."""
+    draft.frame, outputs = draft.frame.step(event, draft.control, draft.now_s, draft.now_ns)
+    for output in outputs:
+        _HANDLERS[type(output)](draft, output)
+
+
+def due_s(state: SchedulerState) -> float | None:
+    """Return when, in real monotonic time, a Tick is due at the latest."""
+    dues = (state.due_s(), _malfunction(state)[0], _entries_due_s(state), _dead_at_s(state), _unrenewed_at_s(state))
+    return min((one_s for one_s in dues if one_s is not None), default=None)
+
+
+class SchedulerCore:
+    """The scheduler without its sockets.
+
+        core = SchedulerCore(settings, codec)
+        core.restore(saved); core.restore_cache(packets)     # after a restart only
+        effects = core.start(now_s, now_ns)                  # then, for each input:
+        effects = core.step(RequestIn(...), now_s, now_ns)
+
+    The host carries out the effects in their order, and steps with `Tick()` when `deadline_s` or `deadline_ns` has
+    come, however much else there is to do.
+
+    Args:
+        frame: the coordinates of components, if they differ from those of the microscope.
+
+    Attributes:
+        state: all that it decides by; replaced by every step.
+    """
+
+    def __init__(self, settings: SchedulerSettings, codec: Codec, frame: CoordinateFrame = TIP_FRAME) -> None:
+        self._env = Environment(settings, codec, PacketCache(settings.envelopes, settings.cache_bytes))
+        self.state = SchedulerState.initial(settings, frame)
+        self._restored: SavedState | None = None
+
+    def start(self, now_s: float, now_ns: int) -> list[Effect]:
+        """Begin. The control state is published as soon as the translator's packets have been caught up with."""
+        draft, is_restart = StateDraft(self.state, self._env, now_s, now_ns), self._restored is not None
+        draft.peers = replace(draft.peers, timeout=replace(draft.peers.timeout, started_s=now_s))
+        draft.watchdog = draft.watchdog.begun(now_s)
+        draft.lease = draft.lease.held_by(draft.control.holder, now_ns)
+        if self._restored is not None:
+            draft.lease = draft.lease.asked(self._restored.lease_s, now_s)
+            self._env.cache.remember(self._restored.recent)
+            starts = self._restored.starts
+            draft.event_log = draft.event_log.restored(starts, self._entries_since(starts), now_s, now_ns)
+        if draft.control.ended:
+            control_change.begin_end(draft)
+            _end_when_safe(draft)
+        else:
+            draft.barrier = draft.barrier.begin(now_s, is_restart=is_restart)
+            entry = start_entry(now_ns, draft.control, is_restart=is_restart)
+            draft.event_log = draft.event_log.add(now_s, entry)
+        _take(draft, Started())
+        self.state, effects = draft.finish()
+        return effects
+
+    def step(self, event: Input, now_s: float, now_ns: int) -> list[Effect]:
+        """Take an event; `now_s` is real and monotonic, `now_ns` the experiment's time."""
+        self.state, effects = step(self.state, event, self._env, now_s, now_ns)
+        return effects
+
+    def _entries_since(self, starts: Sequence[SentStart]) -> Iterator[JournalEntry]:
+        oldest_ns = min((start.sent_ns for start in starts), default=0)
+        for packet, *_ in self._env.cache if starts else ():
+            if packet.envelope == JOURNAL.name and (packet.time_ns or 0) >= oldest_ns:
+                found = self._env.codec.decode_packet(JOURNAL.name, packet.payload)
+                yield from found.entries if isinstance(found, JournalEntries) else ()
+
+    def deadline_s(self) -> float | None:
+        """Return when, in real monotonic time, a Tick is due at the latest; None: no deadline."""
+        return due_s(self.state)
+
+    def deadline_ns(self) -> int | None:
+        """Return when, in experiment time, a Tick is due at the latest; None: no deadline (only a lease makes one)."""
+        return self.state.lease.deadline_ns(is_free=self.state.microscope.is_free)
+
+    def snapshot(self) -> SavedState:
+        """Return what must survive a kill, but for the cache."""
+        return saved_state(self.state, self._env)
+
+    def restore(self, saved: SavedState) -> None:
+        """Take up what `snapshot` gave and a file of plain data returned, before `start`."""
+        self._restored = saved
+        self.state = restored_state(saved, self._env.settings, self.state.frame)
+        self._env.cache.not_before(saved.last_ns)
+
+    def restore_cache(self, packets: Iterable[LoggedPacket]) -> None:
+        """Take up packets that were published (with their `source_ns`), oldest first, before `start`."""
+        logged = list(packets)
+        self._env.cache.restore(logged)
+        self.state = replace(self.state, frame=self.state.frame.recalled(logged))
+
+    def cached(self) -> Iterable[LoggedPacket]:
+        """Return what is cached now (with `source_ns`), oldest first."""
+        return self._env.cache
+
+    @property
+    def newest_source_ns(self) -> int:
+        """The translator's newest packet that was taken in: where to subscribe from; -1 if there is none."""
+        return self._env.cache.newest_source_ns
+
+    @property
+    def leave_at_s(self) -> float:
+        """When, in real monotonic time, the scheduler may leave after the end; inf: it has not ended."""
+        return self.state.end.leave_at_s
+
+    @property
+    def control(self) -> ArbitrationState:
+        """The state of control: its holder, for which problem, and who flagged which."""
+        return self.state.control
+
+    @property
+    def control_state(self) -> ControlState:
+        """The same as all peers are told it."""
+        return self.control.published()
+
+
+# --- peers ----------------------------------------------------------------------------------------------------------
+
+
+def _on_connected(draft: StateDraft, event: Connected) -> None:
+    draft.peers = replace(draft.peers, sessions=draft.peers.sessions.connected(event.connection))
+
+
+def _on_disconnected(draft: StateDraft, event: Disconnected) -> None:
+    draft.pending = replace(draft.pending, refused=draft.pending.refused - {event.connection})
+    sessions, name = draft.peers.sessions.disconnected(event.connection, draft.now_s)
+    draft.peers = replace(draft.peers, sessions=sessions)
+    if name is None:
+        return
+    draft.pending, waiting = draft.pending.clear_up(name)
+    timeout = draft.peers.timeout
+    if waiting is not None:
+        request_pipeline.handle(draft, waiting)
+    elif name == draft.control.holder and draft.now_s >= timeout.told_again_s:
+        draft.peers = replace(draft.peers, timeout=timeout.told(draft.now_s))
+        draft.log(
+            "WARNING", f"lost contact with {name}, which is in control; it has {timeout.grace_s:g} s to come back"
+        )
+
+
+def _on_greeted(draft: StateDraft, event: Greeted) -> None:
+    if event.name and (event.user is None or event.user == component_of(event.name)):
+        sessions, _ = draft.peers.sessions.hear(event.connection, event.name, None, draft.now_s)
+        draft.peers = replace(draft.peers, sessions=sessions)
+
+
+def _on_unreadable(draft: StateDraft, event: Unreadable) -> None:
+    entry = unreadable_entry(draft.now_ns, event.name, event.response)
+    draft.event_log = draft.event_log.add_request(draft.now_s, entry)
+
+
+def _on_subscriber(draft: StateDraft, event: ReplayRequested) -> None:
+    draft.effects.append(Replay(event.subscriber, draft.env.cache.replay(event.prefixes, event.since_ns)))
+
+
+def _on_problem(draft: StateDraft, event: ProblemSeen) -> None:
+    what = ArbitrationEvent.FLAG if event.flagged else ArbitrationEvent.CLEAR
+    control_change.decide(draft, ControlInput(what, event.name, event.problem))
+
+
+def _on_announced(draft: StateDraft, event: Announced) -> None:
+    # what goes before a packet must not put off its time: should that come again after a kill, it is to keep it
+    time_ns = None if event.before_ns is None else event.before_ns - TIME_STEP_NS
+    publishing.publish(draft, event.envelope, event.payload, time_ns)
+
+
+# --- the translator -------------------------------------------------------------------------------------------------
+
+
+def _on_reply(draft: StateDraft, event: TranslatorReply) -> None:
+    draft.forwarder, settled = draft.forwarder.answered(event.number, event.response)
+    if settled is not None:
+        draft.watchdog = draft.watchdog.translator_answered()
+        request_pipeline.settle(draft, settled)
+
+
+def _on_translator_up(draft: StateDraft, event: TranslatorUp) -> None:
+    draft.forwarder, settled = draft.forwarder.connected()
+    for one in settled:
+        request_pipeline.settle(draft, one)
+    safety_commands.begin(draft)
+    request_pipeline.read_ahead(draft)
+
+
+def _on_translator_down(draft: StateDraft, event: TranslatorDown) -> None:
+    draft.forwarder, settled = draft.forwarder.lost()
+    for one in settled:
+        request_pipeline.settle(draft, one)
+
+
+def _on_translator_caught_up(draft: StateDraft, event: TranslatorCaughtUp) -> None:
+    if draft.barrier.until_s is not None:
+        publishing.publish_control(draft)
+
+
+# --- the coordinate frame ------------------------------------------------------------------------------------------
+
+
+def _on_reconsidered(draft: StateDraft, output: Reconsider) -> None:
+    _take(draft, output.event)
+
+
+def _on_frame_asks(draft: StateDraft, output: AskMicroscope) -> None:
+    draft.forwarder, _ = draft.forwarder.ask_own(output.request, draft.now_s, AskForFrame(output.purpose))
+
+
+def _on_hold_control(draft: StateDraft, output: HoldControl) -> None:
+    draft.barrier = draft.barrier.put_off(output.until_s)
+
+
+def _on_save_now(draft: StateDraft, output: SaveNow) -> None:
+    draft.save()
+
+
+def _add_effect(draft: StateDraft, output: Log | Delegate) -> None:
+    draft.effects.append(output)
+
+
+def _on_frame_input(draft: StateDraft, event: Input) -> None:
+    """Inputs that only a coordinate frame acts upon."""
+
+
+# --- the end, and time ----------------------------------------------------------------------------------------------
+
+
+def _on_stopped(draft: StateDraft, event: Stopped) -> None:
+    """See to it that whoever resumes the run finds the tip retracted, or worse. A person in control knows."""
+    if draft.control.mode is ControlMode.MANUAL:
+        return
+    danger = draft.microscope.danger
+    if danger is not None and not draft.forwarder.up:
+        draft.log("CRITICAL", f"the run is stopped, {danger}, and no translator is there to retract the tip")
+    draft.watchdog = draft.watchdog.leave_to_people(draft.microscope)
+    draft.save()
+
+
+def _end_when_safe(draft: StateDraft) -> None:
+    """End the experiment that is over, once the tip is out of danger or that takes too long."""
+    owes_retract, kept = draft.watchdog.owes_retract, draft.end.kept
+    if not draft.end.is_due(draft.now_s, owes_retract=owes_retract):
+        return
+    draft.end = draft.end.ended(draft.now_s)
+    if owes_retract:
+        draft.log("CRITICAL", "the experiment ended with the tip in danger: the microscope did not retract it")
+    for event, code, why, detail in kept:
+        newest = draft.peers.sessions.connection_of(event.name)
+        if event.request.id and newest is not None:  # a client that lost its connection asks again by another
+            event = replace(event, connection=newest)
+        answers.answer(draft, event, code, why, detail=detail)
+    draft.send_forwards()
+    publishing.publish_entries(draft)
+    draft.effects.append(Kill(not owes_retract))
+
+
+def _on_tick(draft: StateDraft, event: Tick) -> None:
+    _see_to_deadlines(draft)
+    entries_due_s = _entries_due_s(draft)
+    if entries_due_s is not None and draft.now_s >= entries_due_s:
+        publishing.publish_entries(draft)
+
+
+def _see_to_deadlines(draft: StateDraft) -> None:
+    # one change of control in a step: it is saved and told before the next is decided
+    for see_to in (_open_barrier, _flag_malfunction, _have_watchdog_look):
+        if see_to(draft):
+            return
+    if (holder := draft.control.holder) is not None and _has_come(_dead_at_s(draft), draft.now_s):
+        control_change.decide(draft, ControlInput(ArbitrationEvent.DEAD, holder))
+    lease_ns = draft.lease.deadline_ns(is_free=draft.microscope.is_free)
+    is_idle = (lease_ns is not None and draft.now_ns >= lease_ns) or _has_come(_unrenewed_at_s(draft), draft.now_s)
+    if (holder := draft.control.holder) is not None and is_idle:
+        control_change.decide(draft, ControlInput(ArbitrationEvent.IDLE, holder))
+    for name in draft.pending.still_unclear(draft.now_s):  # both connections go on: they are two
+        draft.pending, waiting = draft.pending.clear_up(name)
+        if waiting is not None:
+            request_pipeline.refuse_second(draft, waiting)
+    draft.forwarder, settled = draft.forwarder.expired(draft.now_s)
+    for one in settled:
+        request_pipeline.settle(draft, one)
+
+
+def _open_barrier(draft: StateDraft) -> bool:
+    if _has_come(draft.barrier.until_s, draft.now_s):
+        publishing.publish_control(draft)
+        return True
+    draft.barrier, kept = draft.barrier.let_in()
+    if kept is not None:
+        request_pipeline.handle(draft, kept)
+    return kept is not None
+
+
+def _flag_malfunction(draft: StateDraft) -> bool:
+    at_s, told_by = _malfunction(draft)
+    if not _has_come(at_s, draft.now_s):
+        return False
+    if told_by == SCHEDULER:
+        draft.watchdog = draft.watchdog.people_called()
+        draft.log("WARNING", "the tip was in danger: bring it back to the surface, then clear device-malfunction")
+    control_change.decide(draft, ControlInput(ArbitrationEvent.FLAG, told_by, _MALFUNCTION))
+    return True
+
+
+def _have_watchdog_look(draft: StateDraft) -> bool:
+    if not _has_come(draft.watchdog.due_s, draft.now_s):
+        return False
+    is_seen_to = draft.control.sees_to_tip
+    draft.watchdog, told = draft.watchdog.look_again(draft.microscope, draft.now_s, is_seen_to=is_seen_to)
+    if told is not None:
+        draft.log("CRITICAL", told)
+    safety_commands.send(draft)
+    return True
+
+
+def _has_come(due_s: float | None, now_s: float) -> bool:
+    return due_s is not None and now_s >= due_s
+
+
+def _entries_due_s(state: SchedulerState | StateDraft) -> float | None:
+    """Return when the event log is to be published; not while what was before a restart may still come again."""
+    return None if state.barrier.until_s is not None else state.event_log.due_s
+
+
+def _dead_at_s(state: SchedulerState | StateDraft) -> float | None:
+    """Return when control is taken from a holder that is gone, after what was before a restart is told."""
+    holder, told_at_s = state.control.holder, state.barrier.until_s
+    if holder is None:
+        return None
+    dead_at_s = state.peers.dead_at_s(holder)
+    return dead_at_s if dead_at_s is None or told_at_s is None else max(dead_at_s, told_at_s)
+
+
+def _unrenewed_at_s(state: SchedulerState | StateDraft) -> float | None:
+    """Return when control is taken from a holder that does not renew its lease, after what was before a restart."""
+    until_s, told_at_s = state.lease.asked_until_s(), state.barrier.until_s
+    return until_s if until_s is None or told_at_s is None else max(until_s, told_at_s)
+
+
+def _malfunction(state: SchedulerState | StateDraft) -> tuple[float | None, str]:
+    """Return when a problem is made of it that the microscope can't be used, and in whose name; None: it can, or it is
+    flagged already."""
+    if _MALFUNCTION in state.control.problems or state.control.ended:
+        return None, ""
+    return (_AT_ONCE_S, SCHEDULER) if state.watchdog.left_to_people else (state.microscope.lost_at_s, TRANSLATOR)
+
+
+_HANDLERS: dict[type, Callable[[StateDraft, Any], None]] = {
+    RequestIn: request_pipeline.handle,
+    Unreadable: _on_unreadable,
+    TranslatorReply: _on_reply,
+    PacketIn: packet_intake.take_packet,
+    Connected: _on_connected,
+    Disconnected: _on_disconnected,
+    Greeted: _on_greeted,
+    ReplayRequested: _on_subscriber,
+    TranslatorUp: _on_translator_up,
+    TranslatorDown: _on_translator_down,
+    TranslatorCaughtUp: _on_translator_caught_up,
+    ProblemSeen: _on_problem,
+    Announced: _on_announced,
+    Stopped: _on_stopped,
+    Tick: _on_tick,
+    Reconsider: _on_reconsidered,
+    AskMicroscope: _on_frame_asks,
+    HoldControl: _on_hold_control,
+    SaveNow: _on_save_now,
+    Log: _add_effect,
+    Delegate: _add_effect,
+    Started: _on_frame_input,
+    FrameReported: _on_frame_input,
+    FrameAnswered: _on_frame_input,
+    ControlChanged: _on_frame_input,
+}
+"""By the type of an input or of a frame's output."""

@@ -1,0 +1,156 @@
+"""The settings of a scheduler, each described once.
+
+| described here | is |
+| --- | --- |
+| `ControlSettings`, `RoleTable` | the sections [control] and [control.roles] of the experiment file |
+| `CacheSettings`, `CacheRule` | the section [cache] |
+| `ExperimentLimits`, `Limit` | the section [limits], in the units of the microscope's parameters |
+| `Waits`, `RunFacts` | settings that no file holds |
+
+The experiment file is checked against these classes, the tables of the reference are made of them, and a scheduler gets
+them as plain data (`model.snapshot`). The key in the file is the name without its unit: `lease` for `lease_s`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+from afspm.basics.frozen import replace
+from afspm.basics.plain_data import SECTION, Switch, WholeNumber
+from afspm.basics.units import Duration, PositiveDuration
+from afspm.model import ProblemNames
+from afspm.model.events import SUPERVISOR
+from afspm.scheduler.control.arbitration import Cause, RoleTable, Rules
+from afspm.scheduler.publishing.envelopes import Envelopes
+from afspm.scheduler.safety.limits import ExperimentLimits
+from afspm.scheduler.safety.watchdog import WatchdogSettings
+
+DangerousState = Literal["MOVING", "SCANNING", "COARSE_MOTOR", "BUSY_PARAM", "SPEC", "feedback-off"]
+AdjustableParameter = Literal["zctrl-setpoint", "zctrl-pgain", "zctrl-igain", "tip-bias-voltage"]
+"""None of these moves the tip elsewhere, so a person may set it while a component measures."""
+
+
+@dataclass(frozen=True)
+class ControlSettings:
+    """How control is given and taken away.
+
+    Attributes:
+        lease_s: experiment time after which an idle holder loses control.
+        grace_s: real time for which a holder whose connection is gone keeps control, if it will be restarted.
+        malfunction_after_s: real time for which the microscope may be lost before `device-malfunction` is flagged; the
+            flag is cleared when it is back.
+        stop_scan_on_problem: whether to stop a running scan when a problem is flagged.
+        stop_scan_on_manual: whether to stop it when the mode changes to MANUAL.
+        retract: whether to retract the tip when control ends in a dangerous state, if the microscope can.
+        dangerous: list of those states: `MOVING`, `SCANNING`, `COARSE_MOTOR`, `BUSY_PARAM`, `SPEC`, `feedback-off`;
+            without the key `COARSE_MOTOR` and `feedback-off`.
+        request_timeout_s: real time after which a request counts as unanswered.
+        request_retries: how often an unanswered request is sent again; it is never executed twice.
+        adjustable: parameters that a person sets in AUTOMATED as well, beside the component in control: any of
+            `zctrl-setpoint`, `zctrl-pgain`, `zctrl-igain`, `tip-bias-voltage`. The translator sets them during a scan,
+            too; they hold from the next line on.
+        idle: the end of a run in which nothing is left to run: `"end"`, or `"stay"` until a person ends it.
+        solved_by_hand: problems that a person solves: a component may flag them though no component solves them.
+        end_on: problems that end the experiment as soon as they are flagged, such as `["tip-shape-changed"]` where no
+            component repairs the tip.
+        roles: see below.
+    """
+
+    lease_s: PositiveDuration | None = None
+    grace_s: Duration = 5.0
+    malfunction_after_s: Duration = 5.0
+    stop_scan_on_problem: Switch = True
+    stop_scan_on_manual: Switch = True
+    retract: Switch = True
+    dangerous: tuple[DangerousState, ...] | None = None
+    request_timeout_s: PositiveDuration = 5.0
+    request_retries: WholeNumber = 3
+    adjustable: tuple[AdjustableParameter, ...] = ()
+    idle: Literal["end", "stay"] = "end"
+    solved_by_hand: tuple[str, ...] = ("device-malfunction",)
+    end_on: tuple[str, ...] = ()
+    roles: RoleTable = field(default_factory=RoleTable)
+
+    __pydantic_config__: ClassVar[object] = SECTION
+
+    def rules(self, problems: ProblemNames) -> Rules:
+        """Return the part that the table of arbitration needs.
+
+        Raises:
+            InvalidValue: an unknown problem in `end_on`.
+        """
+        roles, end = self.roles, self.roles.end_experiment
+        if end is not None:  # a supervisor ends the experiment when nothing that acts is left
+            roles = replace(roles, end_experiment=(*end, SUPERVISOR))
+        return Rules(roles, problems, frozenset(self.adjustable), frozenset(map(problems.number, self.end_on)))
+
+    def watchdog(self) -> WatchdogSettings:
+        """Return when the watchdog acts."""
+        default = WatchdogSettings()
+        spared = set[Cause]()
+        if not self.stop_scan_on_problem:
+            spared.add(Cause.PROBLEM)
+        if not self.stop_scan_on_manual:
+            spared.add(Cause.MANUAL)
+        return WatchdogSettings(
+            stop_when=frozenset(default.stop_when) - spared,
+            dangerous=default.dangerous if self.dangerous is None else frozenset(self.dangerous),
+            retract=default.retract if self.retract else None,
+        )
+
+
+@dataclass(frozen=True)
+class Waits:
+    """How long the scheduler waits for what may still come, in real time.
+
+    Attributes:
+        restart_grace_s: how long a holder stays in control that was not connected since a restart of the scheduler.
+        answer_s: how much longer the line to the translator is kept for an answer that is overdue.
+        takeover_s: see `Sessions`.
+        catch_up_s: how long a scheduler waits at its start for packets that the translator published before.
+        longest_queue: how many requests may wait for the translator.
+    """
+
+    restart_grace_s: float = 30.0
+    answer_s: float = 5.0
+    takeover_s: float = 3.0
+    catch_up_s: float = 1.0
+    longest_queue: int = 64
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """The facts of a run that the scheduler answers to `CLOCK_REQUEST`.
+
+    Attributes:
+        clock: `ExperimentClock.as_dict()`; empty: real time.
+        name: the identity of the run; empty: it has none.
+        simulated: whether the microscope is.
+        versions: of the programs on this computer.
+    """
+
+    clock: Mapping[str, float] = field(default_factory=dict)
+    name: str = ""
+    simulated: bool = False
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SchedulerSettings:
+    """The settings of a scheduler's decisions.
+
+    Attributes:
+        rules, watchdog: as `control` says; see its methods.
+        cache_bytes: how much is cached at most.
+    """
+
+    control: ControlSettings = field(default_factory=ControlSettings)
+    rules: Rules = field(default_factory=Rules)
+    watchdog: WatchdogSettings = field(default_factory=WatchdogSettings)
+    limits: ExperimentLimits = field(default_factory=ExperimentLimits)
+    envelopes: Envelopes = field(default_factory=Envelopes)
+    cache_bytes: int = 512 * 2**20
+    waits: Waits = field(default_factory=Waits)
+    run: RunFacts = field(default_factory=RunFacts)

@@ -1,0 +1,232 @@
+"""The state of a scheduler: a tree of frozen parts, the draft of its next state, and its way over a restart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+from afspm.basics.frozen import replace
+from afspm.model import component_of
+from afspm.model.idempotency_cache import IdempotencyCache
+from afspm.model.microscope_status import MicroscopeStatus
+from afspm.model.sessions import SessionTable
+from afspm.scheduler.control.arbitration import ArbitrationState
+from afspm.scheduler.control.hand_settings import HandSettings
+from afspm.scheduler.control.holder_timeout import HolderTimeout, Lease
+from afspm.scheduler.control.lifecycle import ExperimentEnd, StartupBarrier
+from afspm.scheduler.control.supervisor_registry import SupervisorRegistry
+from afspm.scheduler.coordinate_frame import TIP_FRAME, CoordinateFrame
+from afspm.scheduler.events import Codec, Effect, FrameAnswered, Log, SaveState
+from afspm.scheduler.publishing.cache import PacketCache
+from afspm.scheduler.publishing.event_log import EventLog
+from afspm.scheduler.requests.forwarder import Forwarder
+from afspm.scheduler.requests.pending_requests import PendingRequests
+from afspm.scheduler.safety.limit_checker import LimitChecker
+from afspm.scheduler.safety.watchdog import Watchdog
+from afspm.scheduler.saved_state import SavedState
+from afspm.scheduler.settings import SchedulerSettings
+
+
+@dataclass(frozen=True)
+class Peers:
+    """The processes of the experiment, as far as they are there.
+
+    Attributes:
+        timeout: the grace period of a holder without a connection.
+        supervisors: report which processes have ended.
+    """
+
+    sessions: SessionTable
+    timeout: HolderTimeout
+    supervisors: SupervisorRegistry = field(default_factory=SupervisorRegistry)
+
+    def dead_at_s(self, holder: str) -> float | None:
+        """Return when (real) control is revoked unless the holder comes back; None while it is connected."""
+        over_since_s = self.supervisors.over_since_s(component_of(holder))
+        return self.timeout.dead_at_s(holder, self.sessions, over_since_s)
+
+
+@dataclass(frozen=True)
+class SchedulerState:
+    """All that a scheduler decides by, but for the packets in its cache.
+
+    Attributes:
+        logged: texts that are logged only once.
+        frame: the coordinates of components.
+    """
+
+    control: ArbitrationState
+    lease: Lease
+    peers: Peers
+    idempotency: IdempotencyCache
+    pending: PendingRequests
+    forwarder: Forwarder
+    limits: LimitChecker
+    microscope: MicroscopeStatus
+    watchdog: Watchdog
+    event_log: EventLog
+    barrier: StartupBarrier
+    end: ExperimentEnd
+    by_hand: HandSettings
+    logged: frozenset[str]
+    frame: CoordinateFrame
+
+    @classmethod
+    def initial(cls, settings: SchedulerSettings, frame: CoordinateFrame = TIP_FRAME) -> SchedulerState:
+        dog, control, waits = settings.watchdog, settings.control, settings.waits
+        return cls(
+            control=ArbitrationState(),
+            lease=Lease(None if control.lease_s is None else round(control.lease_s * 1e9)),
+            peers=Peers(SessionTable(waits.takeover_s), HolderTimeout(control.grace_s, waits.restart_grace_s)),
+            idempotency=IdempotencyCache(),
+            pending=PendingRequests(),
+            forwarder=Forwarder(control.request_timeout_s, waits.answer_s, waits.longest_queue),
+            limits=LimitChecker(settings.limits),
+            microscope=MicroscopeStatus(dog.dangerous, control.malfunction_after_s),
+            watchdog=Watchdog(dog),
+            event_log=EventLog(),
+            barrier=StartupBarrier(waits.catch_up_s),
+            end=ExperimentEnd(),
+            by_hand=HandSettings(),
+            logged=frozenset(),
+            frame=frame,
+        )
+
+    def saved_parts(self) -> tuple[object, ...]:
+        """The parts of which every change is saved before it is told."""
+        saved = self.control, self.lease.token, self.lease.asked_s, self.watchdog.tip, self.microscope.risk
+        return *saved, self.limits.state.usage, self.idempotency.sent_actions, self.event_log.starts
+
+    def due_s(self) -> float | None:
+        """Return when, in real monotonic time, a part has something to do that depends on no other."""
+        dues = (
+            self.forwarder.deadline_s(),
+            self.barrier.due_s(),
+            self.end.by_s,
+            self.pending.due_s(line_is_free=self.forwarder.is_free),
+            self.watchdog.due_s,
+            self.frame.deadline_s(),
+        )
+        return min((due_s for due_s in dues if due_s is not None), default=None)
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Everything that a step needs beside the state.
+
+    Attributes:
+        cache: the packets published lately; the one part that is changed in place, since it holds up to all memory that
+            it may.
+    """
+
+    settings: SchedulerSettings
+    codec: Codec
+    cache: PacketCache
+
+
+class StateParts:
+    """The parts of a state while a step replaces them, one after the other."""
+
+    control: ArbitrationState
+    lease: Lease
+    peers: Peers
+    idempotency: IdempotencyCache
+    pending: PendingRequests
+    forwarder: Forwarder
+    limits: LimitChecker
+    microscope: MicroscopeStatus
+    watchdog: Watchdog
+    event_log: EventLog
+    barrier: StartupBarrier
+    end: ExperimentEnd
+    by_hand: HandSettings
+    logged: frozenset[str]
+    frame: CoordinateFrame
+
+
+_PARTS = tuple(one.name for one in fields(SchedulerState))
+
+
+class StateDraft(StateParts):
+    """One step in progress: the parts of the state so far, the effects so far, and the time.
+
+    Attributes:
+        now_s: real and monotonic, for timeouts.
+        now_ns: of the experiment, for whatever means something in it.
+        raised: inputs that this step has raised itself; the frame takes them within it.
+    """
+
+    def __init__(self, state: SchedulerState, env: Environment, now_s: float, now_ns: int) -> None:
+        self.__dict__.update(state.__dict__)
+        self.env = env
+        self.now_s = now_s
+        self.now_ns = now_ns
+        self.effects: list[Effect] = []
+        self.raised: list[FrameAnswered] = []
+        self._before = state
+        self._is_to_be_saved = False
+
+    def save(self) -> None:
+        """Have the state saved, though no part changed of which every change is."""
+        self._is_to_be_saved = True
+
+    def log(self, level: str, text: str) -> None:
+        self.effects.append(Log(level, text))
+
+    def send_forwards(self) -> None:
+        if self.forwarder.outbox:
+            self.effects += self.forwarder.outbox
+            self.forwarder = replace(self.forwarder, outbox=())
+
+    def finish(self) -> tuple[SchedulerState, list[Effect]]:
+        """Return the new state and the effects: first of all it is saved, and requests are sent last."""
+        self.send_forwards()
+        parts = self.__dict__
+        state = replace(self._before, **{name: parts[name] for name in _PARTS})
+        if self._is_to_be_saved or state.saved_parts() != self._before.saved_parts():
+            self.effects.insert(0, SaveState(saved_state(state, self.env)))
+        return state, self.effects
+
+
+def saved_state(state: SchedulerState, env: Environment) -> SavedState:
+    """Return the part of a state that survives a restart."""
+    return SavedState(
+        control=state.control,
+        granted_to=state.lease.token,
+        lease_s=state.lease.asked_s,
+        sessions=state.peers.sessions.tokens(),
+        sent_actions=state.idempotency.sent_actions,
+        starts=state.event_log.starts,
+        forgotten=state.idempotency.floors.numbers,
+        limits=state.limits.state,
+        tip=state.watchdog.tip,
+        tip_risk=state.microscope.risk,
+        supervisors=state.peers.supervisors.saved(),
+        last_ns=env.cache.last_ns,
+        recent=tuple(env.cache.recent()),
+        frame=state.frame.saved(),
+    )
+
+
+def restored_state(
+    saved: SavedState, settings: SchedulerSettings, frame: CoordinateFrame = TIP_FRAME
+) -> SchedulerState:
+    """Return the state in which a scheduler goes on after a restart.
+
+    Args:
+        frame: as it is without a restart.
+    """
+    state = SchedulerState.initial(settings, frame.restored(saved.frame))
+    sessions, supervisors = (
+        state.peers.sessions.restored(saved.sessions),
+        SupervisorRegistry.restored(saved.supervisors),
+    )
+    return replace(
+        state,
+        control=saved.control,
+        lease=replace(state.lease, token=saved.granted_to),
+        peers=replace(state.peers, sessions=sessions, supervisors=supervisors),
+        idempotency=state.idempotency.restored(saved.sent_actions, saved.forgotten),
+        limits=replace(state.limits, state=saved.limits),
+        watchdog=state.watchdog.restored(saved.tip),
+        microscope=replace(state.microscope, risk=saved.tip_risk),
+    )

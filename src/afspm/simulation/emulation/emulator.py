@@ -1,0 +1,381 @@
+"""`Emulator`: a vendor's controller with the simulated instrument behind it, as a process of an experiment or alone."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import math
+import sys
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from afspm.basics.addresses import Listens
+from afspm.basics.clock import Clock, ExperimentClock
+from afspm.basics.errors import AfspmError, ErrorCollector, TransportError
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.plain_data import PlainMapping
+from afspm.basics.requirements import require
+from afspm.simulation.faults import Fault, Faults
+from afspm.simulation.instrument import Instrument
+from afspm.simulation.truth import Truth
+from afspm.translator.emulated_controller import AddressNotice, notice_file
+from afspm.transport.polling import WakeUp
+from afspm.transport.port import Killed
+from afspm.transport.process.background import in_background
+from afspm.transport.zmq_port import open_port
+
+if TYPE_CHECKING:
+    from afspm.transport.process.context import ProcessContext
+
+LOOPBACK = "127.0.0.1"
+LONGEST_WAIT_S = 60.0
+_AGAIN_S = 1.0
+"""After an error that nobody foresaw, `tick` is called again after so long, experiment time."""
+_TAKEN = {100, 10013, 10048} if sys.platform == "win32" else {errno.EADDRINUSE}
+"""The errors of a port that another program has. On Windows those of its C library, which ZeroMQ hands on, and of its
+sockets: WSAEACCES, where the other has it for itself alone, and WSAEADDRINUSE."""
+_LOOKS_S = 0.2
+"""While a button can be pressed, its file is looked for so often, real time."""
+FAREWELL_S = 0.5
+"""So long, real time, a controller stays there when the experiment has ended: the translator stops the tip first."""
+
+
+class Crashed(AfspmError):
+    """The emulated controller is to vanish without another word, as one that crashes does."""
+
+    code = "emulator-crashed"
+
+
+@dataclass(frozen=True)
+class ScreenButton:
+    """A button on the emulated screen, which a person presses by deleting a file.
+
+    Attributes:
+        pressed: called from the emulator's thread.
+    """
+
+    file: Path
+    pressed: Callable[[], object]
+
+
+class Emulator(ABC):
+    """A vendor's controller, emulated. Write the abstract methods; all are called from one thread::
+
+        class Mine(Emulator):
+            vendor = "Mine"
+            usual = {"port": 1234}
+            fault_kinds = {"no-reply": "a request is not answered"}
+
+            def open(self): ...bind; return f"127.0.0.1:{port}"
+            def serve(self, timeout_s): ...wait for a request or `self.woken`, and answer
+            def tick(self, now_s): ...end scans, write files; return when there is more to do
+
+    Args:
+        port: to listen on; 0: any free one.
+        seed: everything that is left to chance follows from it.
+        faults: each a text as on the command line (`KIND[@SECONDS][,count=N][,duration=SECONDS]`) or a table of
+            `kind`, `at_s`, `count`, `duration_s`.
+        world: `surface`, `tip`, `drift` … of the simulated world, as of the Simulator.
+
+    Attributes:
+        clock, log: of the experiment; given before `open`, as is all of the following.
+        folder: where the controller saves its files.
+        rig: the instrument.
+        faults: to ask at each point where something can go wrong.
+        woken: register its `fileno` with whatever `serve` waits by; it becomes readable when `serve` is to return.
+        listening: to be told of a new address, and of none ("") before the old one is let go of, if it does not listen
+            at one address all along.
+    """
+
+    vendor: ClassVar[str]
+    usual: ClassVar[PlainMapping] = {}
+    """Settings by which it is found where the vendor's own controller is: for `afspm emulate` alone, and on request."""
+    fault_kinds: ClassVar[Mapping[str, str]] = {}
+    """The faults of the maker's program, with the effect of each; `all_faults` has those of all emulators, too."""
+
+    modes: ClassVar[Sequence[str]] = ("amplitude", "current", "frequency-shift")
+    """Of the simulated feedback: those that the controller has."""
+
+    emulated: ClassVar[bool] = True
+    """An experiment with it is a simulated one: its clock may go at another speed than the real one."""
+    listens: ClassVar[tuple[str, ...]] = ()
+    """It takes no part in the experiment but to end with it."""
+
+    clock: Clock
+    log: logging.Logger
+    folder: Path
+    rig: Instrument
+    faults: Faults
+    woken: WakeUp[None]
+    listening: Callable[[str], None]
+
+    def __init__(
+        self,
+        *,
+        port: Annotated[int, Listens()] = 0,
+        seed: int = 1,
+        faults: Sequence[str | PlainMapping | Fault] = (),
+        **world: Any,
+    ) -> None:
+        self.port = port
+        self.seed = seed
+        self._world_settings = world
+        self._faults = [Fault.of(fault) for fault in faults]
+        self._stop = threading.Event()
+        self._leave_at_s = math.inf
+        self._button: ScreenButton | None = None
+
+    def check(self) -> None:
+        """Check the settings.
+
+        Raises:
+            ConfigError: of the world or the faults, or a package is missing. FileError: a sample that can't be read.
+        """
+        from afspm.simulation import World
+        from afspm.simulation.settings import one_of
+
+        errors = ErrorCollector()
+        with errors:
+            require(type(self))
+        with errors:
+            world = World.from_settings(self._world_settings, self.seed, 0.0)
+            one_of(world.settings.feedback.mode, self.modes, "feedback.mode")
+        with errors:
+            Faults(self._faults, self.all_faults(), 0.0)
+        errors.raise_all()
+
+    @classmethod
+    def all_faults(cls) -> dict[str, str]:
+        """Return every fault that there is, with its effect: those of the class, and those of all emulators."""
+        return {**cls.fault_kinds, "hang": "the whole program hangs for the duration (real time)"}
+
+    # -- what one writes
+
+    @abstractmethod
+    def open(self) -> str:
+        """Begin to listen. Returns where: what a client is given as the address."""
+
+    @abstractmethod
+    def serve(self, timeout_s: float) -> None:
+        """Wait up to so many real seconds for clients or `woken`, and answer what has come.
+
+        Answer each request on its own, with an error of the vendor's where anything is raised: what gets as far as the
+        base is logged, and that client goes without an answer.
+
+        Raises:
+            Crashed: to vanish without an answer.
+        """
+
+    def tick(self, now_s: float) -> float | None:
+        """Advance to now, in experiment time: end scans, write files.
+
+        Called before every `serve`, so also right after whatever was served.
+
+        Returns:
+            when something else will, besides what the rig and the faults know of themselves.
+        """
+        return None
+
+    @abstractmethod
+    def close(self) -> None:
+        """Listen no more. Also called if `open` failed."""
+
+    def abandon(self) -> None:
+        """Give up what goes on, after `tick` or `serve` has raised. Extend it where more than the rig is busy."""
+        self.rig.abandon(self.clock.now_s())
+
+    # -- what is there for it
+
+    def show_button(self, name: str, why: str, pressed: Callable[[], object]) -> None:
+        """Show a button until it is pressed or taken away; there is one at a time.
+
+        A person, or a test, presses it by deleting the file `delete-to-NAME.txt` in `folder`: so it can be pressed from
+        any program and any computer that sees the folder, alone as well as in an experiment.
+
+        Args:
+            why: it has to be pressed, for the log and the file.
+        """
+        self.take_button_away()
+        file = self.folder / f"delete-to-{name}.txt"
+        try:
+            file.write_text(f"{why}\nDelete this file to press the button.\n", encoding="utf-8")
+        except OSError as error:
+            self.log.error("the button %s can't be shown, since %s can't be written: %s", name, file, error)
+            return
+        self._button = ScreenButton(file, pressed)
+        self.log.warning("%s: delete %s to press the button", why, file)
+
+    def take_button_away(self) -> None:
+        """Show no button any more."""
+        button, self._button = self._button, None
+        if button is not None:
+            with suppress(OSError):  # a file that can't be deleted presses nothing any more
+                button.file.unlink()
+
+    def run(self, clock: Clock, folder: Path, log: logging.Logger, listening: Callable[[str], None]) -> None:
+        """Be the controller until `stop`.
+
+        Args:
+            listening: told the address, once there is one; empty: none for now.
+
+        Raises:
+            Crashed: it was told to.
+            TransportError: another program listens at its port.
+        """
+        self.clock, self.folder, self.log, self.listening = clock, folder, log, listening
+        truth = Truth(folder / "truth.jsonl")
+        self.rig = Instrument(self._world_settings, self.seed, clock.now_s(), run=in_background, note=truth.note)
+        self.faults = Faults(self._faults, self.all_faults(), clock.now_s())
+        folder.mkdir(parents=True, exist_ok=True)
+        self.woken = WakeUp()
+        self.rig.drawing.wake, self.rig.drawing.log = self.woken.post, log
+        try:
+            listening(self._open())
+            while not self._stop.is_set() and clock.monotonic_s() < self._leave_at_s:
+                self._survive(self.serve, self._wait_s())
+                self.woken.take()
+        finally:
+            self.close()
+            self.take_button_away()
+            self.woken.close()
+
+    def _open(self) -> str:
+        try:
+            return self.open()
+        except Exception as error:
+            if _TAKEN.isdisjoint((getattr(error, "errno", None), getattr(error, "winerror", None))):
+                raise
+            hint = "end that program or choose another port; without --port and --usual a free port is chosen"
+            raise TransportError(
+                f"another program listens at port {self.port or 'of the vendor'}", hint=hint
+            ) from error
+
+    def stop(self) -> None:
+        """End `run` soon. From any thread, also before it began."""
+        self._stop.set()
+        self._wake()
+
+    def _wake(self) -> None:
+        if hasattr(self, "woken"):  # it is made when it runs
+            self.woken.post()
+
+    @contextmanager
+    def running(self, folder: Path, clock: Clock | None = None) -> Iterator[str]:
+        """Run in a thread while in the block, for tests and scripts; gives the address.
+
+        Raises:
+            whatever `run` raised before it listened, or by the end of the block; an emulated crash is none.
+        """
+        opened: list[str] = []
+        failed: list[BaseException] = []
+        settled = threading.Event()
+
+        def listening(address: str) -> None:
+            opened.append(address)
+            settled.set()
+
+        def work() -> None:
+            try:
+                self.run(
+                    clock or ExperimentClock.real(), folder, logging.getLogger(f"emulated {self.vendor}"), listening
+                )
+            except Crashed:
+                pass
+            except BaseException as error:
+                failed.append(error)
+            finally:
+                settled.set()
+
+        thread = threading.Thread(target=work, name=f"emulated {self.vendor}", daemon=True)
+        self._stop.clear()
+        thread.start()
+        settled.wait()
+        try:
+            if opened:
+                yield opened[0]
+        finally:
+            self.stop()
+            thread.join()
+        if failed:
+            raise failed[0]
+
+    def run_process(self, context: ProcessContext) -> int:
+        """Be a process of an experiment (what the host calls): with its clock, and its files in the run's folder."""
+        context.when_stopping(self.stop)
+        threading.Thread(target=self._until_the_end_of, args=(context,), name="experiment", daemon=True).start()
+
+        with ExitStack() as stack:
+            launch, notice = context.launch, None
+            if launch.state_dir:
+                notice = stack.enter_context(
+                    closing(AddressNotice(notice_file(launch.state_dir, launch.name), launch.run))
+                )
+            return self._run_telling(context, notice)
+
+    def _run_telling(self, context: ProcessContext, notice: AddressNotice | None) -> int:
+        def listening(address: str) -> None:
+            if address:
+                context.log.warning("SIMULATED: an emulated %s controller listens at %s", self.vendor, address)
+            if notice is not None:
+                notice.tell(address)
+
+        try:
+            self.run(context.clock, Path(context.launch.run_dir or ".") / context.name, context.log, listening)
+        except Crashed as crash:
+            context.log.warning("an emulated crash: %s", crash)
+            return ExitCode.CRASHED
+        return ExitCode.ORPHAN if self._stop.is_set() else ExitCode.ENDED
+
+    def _until_the_end_of(self, context: ProcessContext) -> None:
+        """Hears of the end of the experiment; in a thread of its own, since `serve` waits for the vendor's clients."""
+        port = open_port(context.launch, context.clock)
+        while not any(isinstance(incoming, Killed) for incoming in port.poll(None)):
+            pass
+        self._leave_at_s = context.clock.monotonic_s() + FAREWELL_S
+        self._wake()
+        port.close()
+
+    def _survive(self, do: Callable[[float], float | None], argument: float) -> float | None:
+        """Call it; an error that nobody foresaw ends what goes on, not the emulator: nothing that a client sends may.
+
+        Raises:
+            Crashed: as it was told to.
+        """
+        try:
+            return do(argument)
+        except Crashed:
+            raise
+        except Exception:
+            self.log.exception("the emulated %s failed and dropped its current activity", self.vendor)
+            self.abandon()
+            return self.clock.now_s() + _AGAIN_S
+
+    def _wait_s(self) -> float:
+        """Real seconds until something happens by itself."""
+        self._look_for_button()
+        hang = self.faults.strikes("hang", self.clock.now_s())
+        if hang is not None:
+            self.log.warning("an emulated fault: %s", hang)
+            self._stop.wait(hang.duration_s)
+        now_s = self.clock.now_s()
+        times = (self._survive(self.tick, now_s), self.rig.next_change_s(now_s), self.faults.next_s(now_s))
+        due_s = min((at_s for at_s in times if at_s is not None), default=math.inf)
+        leave_in_s = self._leave_at_s - self.clock.monotonic_s()
+        longest_s = LONGEST_WAIT_S if self._button is None else _LOOKS_S
+        return max(0.0, min(longest_s, leave_in_s, self.clock.real_s(due_s - now_s)))
+
+    def _look_for_button(self) -> None:
+        button = self._button
+        if button is not None and not button.file.exists():
+            self._button = None
+            self.log.warning("%s was deleted: the button is pressed", button.file.name)
+
+            def press(now_s: float) -> None:
+                button.pressed()
+
+            self._survive(press, self.clock.now_s())

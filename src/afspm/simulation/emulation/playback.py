@@ -1,0 +1,194 @@
+"""Playback of a trace: what to answer to what is asked, and where that first differs from the recording. Pure.
+
+What carries out a request (`TracedExchange.command`) has to be asked as it was recorded, in the same order. What only
+looks at the controller may be asked more or less often and in another order: how often depends on the time that things
+take. The ids that a client counts its questions by are not compared, and secrets are left out: they differ each time.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from afspm.basics.plain_data import Plain
+from afspm.translator.trace import TracedExchange, TracedFile, TraceLine
+
+_IDS: Final = ("messageID", "id")
+_SHOWN: Final = 200
+
+
+class Deviation(Exception):
+    """The client asks something else than what was recorded; the text says where, and both."""
+
+
+@dataclass(frozen=True)
+class PlayedAnswer:
+    """An answer.
+
+    Attributes:
+        line: of the trace, from 1.
+        content: None: the connection was lost here.
+    """
+
+    line: int
+    content: bytes | None
+
+
+@dataclass
+class _Cursor:
+    """How far one connection has got: the index of its next exchange among its own."""
+
+    exchanges: Sequence[tuple[int, TracedExchange]]
+    next: int = 0
+
+
+class Playback:
+    """The state of a playback.
+
+    Args:
+        lines: of the trace (`read_trace`).
+    """
+
+    def __init__(self, lines: Sequence[TraceLine]) -> None:
+        exchanges = [(number, line) for number, line in enumerate(lines, 1) if isinstance(line, TracedExchange)]
+        numbered = [(number, line) for number, line in exchanges if line.asked is not None]
+        self._files = [(number, line) for number, line in enumerate(lines, 1) if isinstance(line, TracedFile)]
+        connections = sorted({one.connection for _, one in exchanges})
+        self._recorded = [[entry for entry in numbered if entry[1].connection == number] for number in connections]
+        self._looks = {_compared(one.asked) for _, one in numbered if not one.command}
+        self._cursors: list[_Cursor] = []
+        self._last_line = numbered[-1][0] if numbered else 0
+        self._reached = 0
+
+    @property
+    def transport(self) -> str:
+        """The transport of the recorded controller; empty: nothing was said."""
+        return next((one[1].transport for exchanges in self._recorded for one in exchanges), "")
+
+    @property
+    def missing(self) -> list[tuple[int, TracedExchange]]:
+        """The recorded exchanges of requests that have not been asked, with their lines."""
+        begun = [entry for cursor in self._cursors for entry in cursor.exchanges[cursor.next :]]
+        unopened = [entry for exchanges in self._recorded[len(self._cursors) :] for entry in exchanges]
+        return [entry for entry in begun + unopened if entry[1].command]
+
+    def connect(self) -> int:
+        """Return the number of a connection that a client has just made."""
+        number = len(self._cursors)
+        self._cursors.append(_Cursor(self._recorded[number] if number < len(self._recorded) else []))
+        return number
+
+    def ask(self, connection: int, content: bytes) -> PlayedAnswer | None:
+        """Return what to answer; None: the answer is to come later, or the question is not whole yet.
+
+        Raises:
+            Deviation: it was recorded otherwise.
+        """
+        cursor = self._cursors[connection]
+        found = self._match(cursor, content)
+        if found is None:
+            if self._may_go_on(cursor, content):
+                return None
+            raise Deviation(self._difference(cursor, content))
+        index, (line, exchange) = found
+        if index >= cursor.next:
+            self._reached = max(self._reached, _line_before(cursor, index))
+            if exchange.after < line - 1 and not self._has_passed(connection, exchange.after, line):
+                return None
+            if exchange.lost and line == self._last_line:
+                return None  # by the end of the recording, and not by the controller
+            cursor.next = index + 1
+            self._reached = max(self._reached, line)
+        if exchange.lost and not exchange.answered:
+            return PlayedAnswer(line, None)
+        return PlayedAnswer(line, _with_ids_of(content, exchange.answered))
+
+    def files(self) -> list[TracedFile]:
+        """Return the files that the controller has written since the last call, by how far the playback has got."""
+        due = [file for file in self._files if self._last_before(*file) <= self._reached]
+        self._files = [file for file in self._files if file not in due]
+        return [file for _, file in due]
+
+    def _last_before(self, line: int, file: TracedFile) -> int:
+        """Return the line of the last exchange before a file was written."""
+        said = [entry for exchanges in self._recorded for entry in exchanges]
+        return max((number for number, one in said if number < line and one.at_s + one.took_s <= file.at_s), default=0)
+
+    def _has_passed(self, connection: int, after: int, line: int) -> bool:
+        """Return True if what was said on other connections between two lines has been said again."""
+        others = [cursor for number, cursor in enumerate(self._cursors) if number != connection]
+        meanwhile = [one for cursor in others for one, _ in cursor.exchanges if after < one < line]
+        return not meanwhile or self._reached >= max(meanwhile)
+
+    def _match(self, cursor: _Cursor, content: bytes) -> tuple[int, tuple[int, TracedExchange]] | None:
+        """Return the recorded exchange that answers: the next, past others that only look; else one of the same look
+        before."""
+        exchanges, wanted = cursor.exchanges, _compared(content)
+        for index in range(cursor.next, len(exchanges)):
+            exchange = exchanges[index][1]
+            if _compared(exchange.asked) == wanted:
+                return index, exchanges[index]
+            if _compared(exchange.asked) not in self._looks:
+                break
+        if wanted in self._looks:
+            for index in [*range(cursor.next - 1, -1, -1), *range(cursor.next, len(exchanges))]:
+                if _compared(exchanges[index][1].asked) == wanted and (
+                    index < cursor.next or not exchanges[index][1].command
+                ):
+                    return min(index, cursor.next - 1), exchanges[index]
+        return None
+
+    def _may_go_on(self, cursor: _Cursor, content: bytes) -> bool:
+        """Return True if more bytes may make this a question that was recorded."""
+        rest = cursor.exchanges[cursor.next :]
+        questions = {one.asked for _, one in cursor.exchanges if one.asked is not None and not one.command}
+        questions |= {one.asked for _, one in rest if one.asked is not None}
+        return any(asked != content and asked.startswith(content) for asked in questions)
+
+    def _difference(self, cursor: _Cursor, content: bytes) -> str:
+        left = cursor.exchanges[cursor.next :]
+        rest = [entry for entry in left if _compared(entry[1].asked or b"") not in self._looks]
+        if not rest:
+            return f"after line {self._reached}: asked {_shown(content)}, and no request was recorded any more"
+        line, exchange = rest[0]
+        recorded = f"{exchange.what} {_shown(exchange.asked or b'')} (of {exchange.command or 'no request'})"
+        return f"line {line}: recorded {recorded}; asked {_shown(content)}"
+
+
+def _line_before(cursor: _Cursor, index: int) -> int:
+    """Return the line of the exchange before one. The client is past it, though it may have looked less often."""
+    return cursor.exchanges[index - 1][0] if index else 0
+
+
+def _compared(asked: bytes | None) -> bytes:
+    """Return a question without the ids by which its client counts."""
+    found = _json(asked or b"")
+    if found is None or not any(key in found for key in _IDS):
+        return asked or b""
+    return json.dumps({key: value for key, value in found.items() if key not in _IDS}, sort_keys=True).encode()
+
+
+def _with_ids_of(asked: bytes, answer: bytes) -> bytes:
+    """Return an answer with the ids of the question that it is now given to."""
+    question, found = _json(asked), _json(answer)
+    if question is None or found is None:
+        return answer
+    ids = {key: question[key] for key in _IDS if key in question and key in found}
+    return json.dumps({**found, **ids}).encode() if ids else answer
+
+
+def _json(content: bytes) -> Plain | None:
+    if not content.startswith(b"{"):
+        return None
+    try:
+        found = json.loads(content)
+    except ValueError:
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _shown(content: bytes) -> str:
+    text = content.decode("utf-8", "backslashreplace").replace("\0", "")
+    return repr(text[:_SHOWN])

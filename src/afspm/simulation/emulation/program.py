@@ -1,0 +1,205 @@
+"""`MakerProgram`: what a maker's program does around the instrument. Scans and curves are begun, end and are saved."""
+
+from __future__ import annotations
+
+import logging
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+
+from afspm.basics.clock import Clock
+from afspm.basics.errors import AfspmError
+from afspm.simulation.activities import ScanActivity, SpectrumActivity
+from afspm.simulation.emulation.pending_writes import PendingWrites
+from afspm.simulation.faults import Faults
+from afspm.simulation.instrument import Instrument, InstrumentBusy
+
+NamedFile = tuple[str, bytes]
+"""The name of a file and its content."""
+
+
+class MakerProgram(ABC):
+    """The program, without its protocol. For one thread at a time.
+
+    Args:
+        folder: that files are saved to.
+        start_s: how long the ramp to the first line takes, experiment time.
+        file_s: how long after the end a file begins to appear; its other half appears as much later.
+
+    Attributes:
+        rig: the instrument.
+        repeats: whether another scan begins when one has ended.
+        saves_partial: whether a scan is saved that was broken off.
+    """
+
+    def __init__(
+        self,
+        rig: Instrument,
+        faults: Faults,
+        clock: Clock,
+        folder: Path,
+        log: logging.Logger,
+        *,
+        start_s: float,
+        file_s: float,
+    ) -> None:
+        self.rig = rig
+        self.faults = faults
+        self.clock = clock
+        self.folder = folder
+        self.repeats = self.saves_partial = False
+        self._log = log
+        self._start_s, self._file_s = start_s, file_s
+        self._disk = PendingWrites()
+        self._starts_at_s = math.inf
+        self._scan: ScanActivity | None = None
+        self._curve: SpectrumActivity | None = None
+        self._engages = False
+
+    # -- what a maker's program adds
+
+    @abstractmethod
+    def prepare_scan(self) -> None:
+        """Put the panel's values into `rig.setup`, right before a scan. Raises AfspmError: they can't be scanned."""
+
+    @abstractmethod
+    def prepare_curve(self) -> None:
+        """The same before a curve."""
+
+    @abstractmethod
+    def scan_files(self, scan: ScanActivity, now_s: float) -> Sequence[NamedFile]:
+        """Return the files of a scan that has ended; none: it is not saved."""
+
+    @abstractmethod
+    def curve_files(self, curve: SpectrumActivity, now_s: float) -> Sequence[NamedFile]:
+        """Return the files of a curve that has ended; none: it is not saved."""
+
+    # -- what goes on
+
+    @property
+    def now_s(self) -> float:
+        """Experiment time."""
+        return self.clock.now_s()
+
+    @property
+    def scanning(self) -> bool:
+        """True from the command to scan to the end of the scan."""
+        return self._scan is not None or math.isfinite(self._starts_at_s)
+
+    @property
+    def measuring_curve(self) -> bool:
+        """True from the command to take a curve to its end."""
+        return self._curve is not None
+
+    @property
+    def engages(self) -> bool:
+        """True while the tip is about to go to the sample."""
+        return self._engages
+
+    @property
+    def engaged(self) -> bool:
+        """True while the tip is at the sample or on its way there."""
+        return self.rig.engaged or self._engages
+
+    def advance(self, now_s: float) -> float | None:
+        """Advance to now; return when something else happens, besides what the rig knows of itself."""
+        if self._engages and not self.rig.busy(now_s):
+            self._engages = False
+            self.rig.engage(now_s)
+        if now_s >= self._starts_at_s and not self.rig.busy(now_s):
+            self._starts_at_s = math.inf
+            self._begin_scan(now_s)
+        if self._scan is not None:
+            self._watch_scan(self._scan, now_s)
+        if self._curve is not None and not self._curve.running(now_s):
+            ended, self._curve = self._curve, None
+            self._save(self.curve_files(ended, now_s), now_s)
+        due_s = self._disk.advance(now_s, there=True)
+        return min((at_s for at_s in (due_s, self._starts_at_s) if at_s is not None and at_s > now_s), default=None)
+
+    def start_scan(self, now_s: float) -> None:
+        """Begin a scan. Raises InstrumentBusy."""
+        self._refuse_busy()
+        if not self.faults.strikes("scan-refused", now_s):
+            self._starts_at_s = now_s + self._start_s
+
+    def stop_scan(self, now_s: float) -> None:
+        """Break the scan off."""
+        self._starts_at_s = math.inf
+        ended, self._scan = self._scan, None
+        if ended is not None:
+            self.rig.stop_scan(now_s)
+            if self.saves_partial:
+                self._save(self.scan_files(ended, now_s), now_s)
+
+    def start_curve(self, kind: str, now_s: float) -> None:
+        """Take a curve where the tip is. Raises InstrumentBusy, InvalidValue."""
+        self._refuse_busy()
+        if not self.faults.strikes("spectrum-refused", now_s):
+            self.prepare_curve()
+            self._curve = self.rig.start_spectrum(kind, now_s)
+
+    def stop_curve(self) -> None:
+        """Break the curve off."""
+        if self._curve is not None:
+            self._curve = None
+            self.rig.stop_spectrum(self.now_s)
+
+    def engage(self) -> None:
+        """Bring the tip to the sample, once it has finished going away. Raises InstrumentBusy."""
+        if self.scanning or self.measuring_curve:
+            raise InstrumentBusy("a measurement is running")
+        self._engages = True
+
+    def stop_engaging(self) -> None:
+        """Leave the tip where it is on its way to the sample: away from it."""
+        if self._engages or self.rig.doing(self.now_s) == "approach":
+            self._engages = False
+            self.rig.stop("approach", self.now_s)
+            self.rig.engaged = False
+
+    def withdraw(self, now_s: float) -> None:
+        """End what goes on, and take the tip away from the sample."""
+        self.stop_scan(now_s)
+        self._engages, self._curve = False, None
+        self.rig.withdraw(now_s)
+
+    def abandon(self) -> None:
+        """Forget what goes on, as an error that nobody foresaw ended it."""
+        self._starts_at_s, self._scan, self._curve, self._engages = math.inf, None, None, False
+
+    # -- inside
+
+    def _refuse_busy(self) -> None:
+        doing = "scan" if self.scanning else self.rig.doing(self.now_s)
+        if doing or self._engages:
+            raise InstrumentBusy(f"the instrument is busy with a {doing or 'approach'}")
+
+    def _begin_scan(self, now_s: float) -> None:
+        """Begin the scan; with values that no scan can be taken with, it ends as if stopped at the panel."""
+        try:
+            self.prepare_scan()
+            self._scan = self.rig.start_scan(now_s)
+        except (AfspmError, ArithmeticError, ValueError) as error:
+            self._log.warning("the scan was interrupted: %s", error)
+
+    def _watch_scan(self, scan: ScanActivity, now_s: float) -> None:
+        if not scan.running(now_s):
+            self._scan = None
+            self._save(self.scan_files(scan, now_s), now_s)
+            if self.repeats:
+                self._starts_at_s = now_s + self._start_s
+        elif self.faults.strikes("stopped", now_s):
+            self.stop_scan(now_s)
+        elif self.faults.strikes("withdrawn", now_s):
+            self.withdraw(now_s)
+
+    def _save(self, files: Sequence[NamedFile], now_s: float) -> None:
+        if not files or self.faults.strikes("no-file", now_s):
+            return
+        late, half = (self.faults.strikes(kind, now_s) for kind in ("late-file", "half-file"))
+        at_s = now_s + self._file_s + (late.duration_s if late else 0.0)
+        rest_at_s = at_s + self._file_s + (half.duration_s if half else 0.0)
+        for name, content in files:
+            self._disk.save(self.folder / name, content, at_s, rest_at_s)

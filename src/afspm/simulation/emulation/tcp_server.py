@@ -1,0 +1,170 @@
+"""The connections of clients: requests in, replies out, one after the other on each, and all that goes wrong there."""
+
+from __future__ import annotations
+
+import contextlib
+import selectors
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from afspm.basics.plain_data import Plain
+
+READ_AT_ONCE = 1 << 16
+
+
+@dataclass(eq=False)
+class ClientConnection:
+    """One client.
+
+    Attributes:
+        received: what has not been answered yet; sending: what has not been sent yet.
+        waits_for: what the reply to the current request is waiting for; nothing else is answered meanwhile.
+        closing: nothing more is answered; it ends once all has been sent.
+        memory: what the controller remembers of the client.
+    """
+
+    socket: socket.socket
+    received: bytearray = field(default_factory=bytearray)
+    sending: bytearray = field(default_factory=bytearray)
+    waits_for: object = None
+    closing: bool = False
+    memory: Plain = field(default_factory=dict)
+
+
+class TcpServer:
+    """Ports and connections, without a thread: everything happens in `poll`.
+
+    Args:
+        ports: to listen on; 0: any free one.
+        stream_port: whoever connects there only reads; 0: any free one, None: there is none.
+        one_each: a port serves one client at a time; another waits until that has gone.
+        wakes: something with a `fileno` that ends `poll`.
+        on_bytes: called with a connection that has more in `received`.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        ports: list[int],
+        *,
+        stream_port: int | None = None,
+        one_each: bool,
+        wakes: Any,
+        on_bytes: Callable[[ClientConnection], None],
+    ) -> None:
+        self._one_each = one_each
+        self._stream: socket.socket | None = None
+        self._on_bytes = on_bytes
+        self._selector = selectors.DefaultSelector()
+        self._listeners: list[socket.socket] = []
+        self._of: dict[ClientConnection, socket.socket] = {}
+        self._selector.register(wakes, selectors.EVENT_READ, None)
+        try:
+            self._listeners = [self._listener(host, port) for port in ports]
+            if stream_port is not None:
+                self._stream = self._listener(host, stream_port)
+        except OSError:
+            self.close()
+            raise
+
+    @property
+    def ports(self) -> list[int]:
+        """Ports that listen for requests."""
+        return [int(listener.getsockname()[1]) for listener in self._listeners]
+
+    @property
+    def stream_port(self) -> int:
+        """Port of the stream; 0 without one."""
+        return 0 if self._stream is None else int(self._stream.getsockname()[1])
+
+    @property
+    def connections(self) -> list[ClientConnection]:
+        """Connections of clients that send requests."""
+        return [connection for connection, listener in self._of.items() if listener is not self._stream]
+
+    @property
+    def readers(self) -> list[ClientConnection]:
+        """Connections of clients that read the stream."""
+        return [connection for connection, listener in self._of.items() if listener is self._stream]
+
+    def poll(self, timeout_s: float) -> None:
+        """Wait for clients up to so many real seconds, and deal with what has come."""
+        for key, events in self._selector.select(timeout_s):
+            if isinstance(key.data, ClientConnection):
+                if events & selectors.EVENT_READ:
+                    self._read(key.data)
+                if events & selectors.EVENT_WRITE and key.data in self._of:
+                    self.send(key.data)
+            elif key.data is not None:
+                self._accept(key.data)
+
+    def send(self, connection: ClientConnection, content: bytes = b"") -> None:
+        """Send what the client takes now, and the rest later."""
+        connection.sending += content
+        try:
+            while connection.sending:
+                sent = connection.socket.send(connection.sending)
+                del connection.sending[:sent]
+        except BlockingIOError:
+            pass
+        except OSError:
+            self.cut(connection)
+            return
+        if connection.closing and not connection.sending:
+            self.cut(connection)
+            return
+        events = selectors.EVENT_READ | (selectors.EVENT_WRITE if connection.sending else 0)
+        self._selector.modify(connection.socket, events, connection)
+
+    def cut(self, connection: ClientConnection) -> None:
+        """End a connection."""
+        listener = self._of.pop(connection, None)
+        if listener is None:
+            return
+        connection.closing = True
+        self._selector.unregister(connection.socket)
+        connection.socket.close()
+        if self._one_each and listener is not self._stream:
+            self._selector.register(listener, selectors.EVENT_READ, listener)
+
+    def close(self) -> None:
+        for connection in self._of:
+            connection.socket.close()
+        for listener in (*self._listeners, *filter(None, [self._stream])):
+            listener.close()
+        self._of.clear()
+        self._listeners.clear()
+        self._selector.close()
+
+    def _listener(self, host: str, port: int) -> socket.socket:
+        listener = socket.create_server((host, port))
+        listener.settimeout(0)
+        self._selector.register(listener, selectors.EVENT_READ, listener)
+        return listener
+
+    def _accept(self, listener: socket.socket) -> None:
+        with contextlib.suppress(BlockingIOError):
+            client, _ = listener.accept()
+            client.settimeout(0)
+            client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            connection = ClientConnection(client)
+            self._of[connection] = listener
+            self._selector.register(client, selectors.EVENT_READ, connection)
+            if self._one_each and listener is not self._stream:
+                self._selector.unregister(listener)
+
+    def _read(self, connection: ClientConnection) -> None:
+        try:
+            received = connection.socket.recv(READ_AT_ONCE)
+        except BlockingIOError:
+            return
+        except OSError:
+            received = b""
+        if not received:
+            self.cut(connection)
+            return
+        if self._of[connection] is not self._stream:
+            connection.received += received
+            self._on_bytes(connection)

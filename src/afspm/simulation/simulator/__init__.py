@@ -1,0 +1,350 @@
+"""A simulated microscope: the physics of `afspm.simulation` behind a controller with all the base actions.
+
+It runs on the experiment clock, so that a night passes in a minute, and keeps its state over a kill: it is the same
+instrument afterwards, with the same tip, and what it was measuring has gone on meanwhile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Final, TypeVar
+
+from afspm.basics.errors import AfspmError, ConfigError, ErrorCollector, Refused
+from afspm.basics.plain_data import PlainMapping
+from afspm.basics.units import Duration, PollPeriod
+from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.simulation import World
+from afspm.simulation.faults import INSTRUMENT_FAULTS, Fault, Faults
+from afspm.simulation.feedback import FeedbackSettings
+from afspm.simulation.instrument import Instrument
+from afspm.simulation.settings import build
+from afspm.simulation.simulator.controller import PanelEvent, SimulatedController
+from afspm.simulation.truth import Truth
+from afspm.simulation.world import read_settings
+from afspm.storage.formats import read
+from afspm.translator.driver import Action, ControllerLost, Driver, action
+from afspm.translator.parameters import FEEDBACK_ON, Value
+from afspm.transport.process.background import in_background
+
+if TYPE_CHECKING:
+    from afspm.transport.process.context import ProcessContext
+
+T = TypeVar("T")
+
+Table = dict[str, object]
+"""Settings as the experiment file has them."""
+Rows = dict[str, Table]
+
+FAULT_KINDS: Final[Mapping[str, str]] = {
+    **INSTRUMENT_FAULTS,
+    "late-reply": "an answer is delayed by the duration (real time)",
+    "no-reply": "a request is carried out but not answered",
+    "error": "the controller refuses a request",
+    "restart": "the controller can't be reached for the duration",
+    "hang": "the process hangs for the duration (real time)",
+    "crash": "the process ends at once",
+}
+_FAULT = "x-fault"
+_FAULT_PARAMETERS = ("x-fault-kind", "x-fault-count", "x-fault-duration")
+_AT_FIRST: Table = {
+    names.SCAN_TOP_LEFT_X: "-0.5 um",
+    names.SCAN_TOP_LEFT_Y: "-0.5 um",
+    names.SCAN_SIZE_X: "1 um",
+    names.SCAN_SIZE_Y: "1 um",
+    names.SCAN_ANGLE: 0.0,
+    names.SCAN_RESOLUTION_X: 128,
+    names.SCAN_RESOLUTION_Y: 128,
+    names.SCAN_SPEED: "2 um/s",
+    names.SCAN_DIRECTION: names.UP,
+    names.DRIFT_RATE_X: 0.0,
+    names.DRIFT_RATE_Y: 0.0,
+    names.MOVE_SPEED: "5 um/s",
+    names.PROBE_POS_X: 0.0,
+    names.PROBE_POS_Y: 0.0,
+    names.SAMPLE_SLOPE_X: 0.0,
+    names.SAMPLE_SLOPE_Y: 0.0,
+    names.TIP_BIAS_VOLTAGE: "100 mV",
+    names.SPEC_KIND: "IV",
+    names.PULSE_VOLTAGE: "4 V",
+    names.PULSE_DURATION: "100 ms",
+    names.CRASH_SPEED: "50 nm/s",
+    names.CRASH_DEPTH: "5 nm",
+    names.ENGAGED: True,
+    "x-fault-kind": "late-reply",
+    "x-fault-count": 1,
+    "x-fault-duration": 1.0,
+}
+
+
+def _told(
+    name: str,
+    do: Callable[[SimulatedController, float], None],
+    *,
+    state: ScopeState | None = None,
+    refuses: bool = True,
+) -> Callable[[Simulator], None]:
+    """Return the action that has the controller do something now, unless a simulated fault refuses."""
+
+    @action(name, state=state)
+    def act(self: Simulator) -> None:
+        do(self._reached(refuses=refuses), self.clock.now_s())
+
+    return act
+
+
+class Simulator(Driver):
+    """The simulated microscope.
+
+    Args:
+        seed: the seed of every random number.
+        surface: a kind, or a table of `kind` and its settings.
+        tip, tip_changes, drift, feedback, scanner, noise, signals, iv, force: a table of its own settings.
+        initial: values of parameters at the start, by their generic names.
+        approach_s: how long engaging and retracting take.
+        faults: faults and their times, each a table of `kind`, `at_s`, `count`, `duration_s` (below).
+        fault_action: whether the action "x-fault" makes faults on demand.
+        panel: what a person does at the controller's panel, each a table of `at_s` with `set` or `action`.
+        parameters: rows added to the table of parameters, or changed in it.
+        actions: generic actions added: `{name = {set = {<parameter> = <value>}}}`.
+        poll_period_s: how often its state is read, in real seconds, while nothing is due.
+        result_timeout_s: how long after a scan or spectrum its file may take to appear.
+        live_lines_s: how often lines of a running scan are published, 0: not at all; by default twice a real second.
+    """
+
+    parameters_file = Path(__file__).with_name("parameters.toml")
+    maker: ClassVar[str] = "afspm"
+    software: ClassVar[str] = "afspm, simulated microscope"
+    max_pixels: ClassVar[int] = 2048 * 2048
+    simulated: ClassVar[bool] = True
+    live_real_s: ClassVar[float | None] = 0.5
+    memory_is_all: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        *,
+        seed: int = 1,
+        surface: str | Table = "steps",
+        tip: Table | None = None,
+        tip_changes: Table | None = None,
+        drift: Table | None = None,
+        feedback: Table | None = None,
+        scanner: Table | None = None,
+        noise: Table | None = None,
+        signals: Table | None = None,
+        iv: Table | None = None,
+        force: Table | None = None,
+        initial: Table | None = None,
+        approach_s: Duration = 1.0,
+        faults: list[Table] | None = None,
+        fault_action: bool = False,
+        panel: list[Table] | None = None,
+        parameters: Rows | None = None,
+        actions: Rows | None = None,
+        poll_period_s: PollPeriod = 0.25,
+        result_timeout_s: Duration = 10.0,
+        live_lines_s: Duration | None = None,
+    ) -> None:
+        world: Table = {
+            "surface": surface,
+            "tip": tip,
+            "tip_changes": tip_changes,
+            "drift": drift,
+            "feedback": feedback,
+            "scanner": scanner,
+            "noise": noise,
+            "signals": signals,
+            "iv": iv,
+            "force": force,
+        }
+        self._world_settings = {name: settings for name, settings in world.items() if settings is not None}
+        self._seed = seed
+        errors = ErrorCollector()
+        with errors:
+            World.from_settings(self._world_settings, seed, 0.0)
+        self._faults_settings = _made(Fault, faults or [], "faults", errors)
+        with errors:
+            Faults(self._faults_settings, FAULT_KINDS, 0.0)
+        self._panel = _made(PanelEvent, panel or [], "panel", errors)
+        self._fault_action, self._approach_s = fault_action, approach_s
+        self.initial: Mapping[str, Value] = {}
+        self.scan_speed_m_s: float | None = None
+        self.faults: Faults | None = None
+        self.demanded: Fault | None = None
+        self._controller: SimulatedController | None = None
+        loop = _loop_of(self._world_settings)
+        with errors:
+            super().__init__(
+                parameters=self.rows({**self._world_settings, "parameters": parameters}),
+                actions=actions,
+                poll_period_s=poll_period_s,
+                result_timeout_s=result_timeout_s,
+                live_lines_s=live_lines_s,
+            )
+            if not fault_action:
+                self.table = self.table.without(_FAULT_PARAMETERS)
+            if loop is not None:  # else it can't be said what a setpoint is
+                self._check_values(loop, initial or {}, errors)
+        errors.raise_all()
+
+    def _check_values(self, loop: FeedbackSettings, initial: PlainMapping, errors: ErrorCollector) -> None:
+        """Values of parameters that are set by themselves: at the start, and by a person at the panel."""
+        in_force = {
+            FEEDBACK_ON: loop.on,
+            names.ZCTRL_PGAIN: loop.proportional_gain,
+            names.ZCTRL_IGAIN: loop.integral_gain,
+            names.ZCTRL_SETPOINT: loop.setpoint,
+        }
+        at_first = {name: value for name, value in {**_AT_FIRST, **in_force}.items() if name in self.table}
+        with errors:
+            self._initial = self.table.written({**at_first, **initial}, where="initial")
+            self.initial = {name: self._initial[name] for name in initial}
+            speed = self._initial.get(names.SCAN_SPEED)
+            self.scan_speed_m_s = speed if isinstance(speed, float) else None
+        for i, event in enumerate(self._panel):
+            with errors:
+                self.table.written(event.set or {}, where=f"panel[{i}].set")
+            if event.action and event.action not in self.own_actions():
+                errors.add(ConfigError(f"there is no action {event.action!r}", where=f"panel[{i}].action"))
+
+    @classmethod
+    def technique(cls, settings: PlainMapping) -> str:
+        loop = _loop_of(settings)
+        return "" if loop is None else "STM" if loop.mode == "current" else "AFM"
+
+    @classmethod
+    def rows(cls, settings: PlainMapping) -> Rows:
+        loop = _loop_of(settings)
+        return _merged({} if loop is None else _rows_for(loop.mode), settings.get("parameters") or {})
+
+    def connect(self) -> None:
+        """Switch the instrument on, or find it as it was."""
+        if self._controller is None:
+            self._controller = self._switch_on()
+        self._reached(refuses=False)
+
+    def _switch_on(self) -> SimulatedController:
+        import_module("scipy.io")  # which saves files: the first is not to be later than others
+        kept = self.memory
+        if "start_s" not in kept:
+            values = {name: self.table[name].to_vendor(value) for name, value in self._initial.items()}
+            kept.update(start_s=self.clock.now_s(), values=values, results=[], panel=0)
+            kept["faults"] = {}
+        start_s = kept["start_s"]
+        self.faults = Faults(self._faults_settings, FAULT_KINDS, start_s, kept["faults"])
+        truth = Truth(self.run_dir / "truth.jsonl", kept)
+        instrument = Instrument(self._world_settings, self._seed, start_s, run=in_background, note=truth.note)
+        instrument.setup.approach_s = self._approach_s
+        instrument.drawing.wake, instrument.drawing.log = self.wake, self.log
+        if "instrument" not in kept:
+            instrument.note(start_s, "start", {"settings": self._world_settings, "seed": self._seed})
+        folder = (self.run_dir / "scans").resolve()
+        return SimulatedController(
+            instrument, self.table, kept, folder, faults=self.faults, log=self.log, panel=self._panel
+        )
+
+    def _reached(self, *, refuses: bool) -> SimulatedController:
+        """Return the controller, unless a fault is in the way."""
+        now_s, faults, controller = self.clock.now_s(), self.faults, self._controller
+        if controller is None or faults is None or faults.lasts("restart", now_s):
+            raise ControllerLost("the simulated controller can't be reached")
+        if refuses and faults.strikes("error", now_s):
+            raise Refused(ControlResponse.FAILURE, "the controller refused (a simulated fault)")
+        return controller
+
+    def status(self) -> ScopeStatus:
+        return ScopeStatus(self._reached(refuses=False).state(self.clock.now_s()))
+
+    def next_change_s(self) -> float | None:
+        return None if self._controller is None else self._controller.next_change_s()
+
+    def get(self, vendor: str) -> Value:
+        if vendor == names.CONTROLLER:
+            return f"simulated microscope of afspm {version('afspm')}"
+        self._reached(refuses=False)
+        if vendor not in self.memory["values"]:
+            raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, f"the simulated controller has no {vendor!r}")
+        value: Value = self.memory["values"][vendor]
+        return value
+
+    def set(self, values: Mapping[str, Value]) -> None:
+        """Set values; the frame and the probe are moved at the move speed."""
+        for vendor in values:
+            self.get(vendor)
+        controller = self._reached(refuses=not set(values) <= set(_FAULT_PARAMETERS))
+        controller.set(dict(values), self.clock.now_s())
+
+    def results(self) -> Sequence[str]:
+        return self._reached(refuses=False).results()
+
+    def load(self, result: str) -> Sequence[Scan | Spectrum]:
+        return list(read(result))
+
+    def lines(self, start: int) -> Sequence[ScanLines]:
+        return self._reached(refuses=False).lines(start, self.clock.now_s())
+
+    start_scan = _told(names.START_SCAN, SimulatedController.start_scan)
+    stop_scan = _told(names.STOP_SCAN, SimulatedController.stop)
+    start_spec = _told(names.START_SPEC, SimulatedController.start_spectrum)
+    stop_spec = _told(names.STOP_SPEC, SimulatedController.stop)
+    pulse = _told(names.PULSE, SimulatedController.pulse, state=ScopeState.BUSY_PARAM)
+    crash = _told(names.CRASH, SimulatedController.crash, state=ScopeState.MOVING)
+    engage = _told(names.ENGAGE, SimulatedController.engage, state=ScopeState.COARSE_MOTOR)
+    retract = _told(names.RETRACT, SimulatedController.retract, state=ScopeState.COARSE_MOTOR, refuses=False)
+
+    @action(_FAULT, while_busy=True)
+    def fault(self) -> None:
+        """Make the fault that the parameters "x-fault-…" describe."""
+        kind, count, duration_s = (self.memory["values"][name] for name in _FAULT_PARAMETERS)
+        self.demanded = Fault(str(kind), 0.0, int(count), float(duration_s))
+
+    def own_actions(self) -> dict[str, Action]:
+        found = super().own_actions()
+        return found if self._fault_action else {name: a for name, a in found.items() if name != _FAULT}
+
+    def run_process(self, context: ProcessContext) -> int:
+        """Be the translator, with the faults that are not the controller's."""
+        from afspm.simulation.simulator.faulty import FaultyTranslator
+        from afspm.translator.translator import run_translator
+
+        return run_translator(self, context, FaultyTranslator)
+
+
+_SETPOINTS: Final[Rows] = {
+    "amplitude": {"unit": "V", "range": ["1 mV", "10 V"]},
+    "current": {"unit": "A", "range": ["1 pA", "100 nA"]},
+    "frequency-shift": {"unit": "Hz", "range": ["-100 kHz", "-1 mHz"]},
+}
+
+
+def _rows_for(mode: str) -> Rows:
+    """Return the rows that depend on the operating mode: what its setpoint is."""
+    return {names.ZCTRL_SETPOINT: _SETPOINTS[mode], names.SPEC_KIND: {"choices": ["IV", "force"]}}
+
+
+def _merged(*tables: Mapping[str, Mapping[str, object]]) -> Rows:
+    merged: Rows = {}
+    for table in tables:
+        for name, row in table.items():
+            # what is no table is for the table of parameters to refuse
+            merged[name] = {**merged.get(name, {}), **row} if isinstance(row, Mapping) else row
+    return merged
+
+
+def _loop_of(settings: Mapping[str, object]) -> FeedbackSettings | None:
+    """The feedback at the start, whatever is wrong with the rest of the world; None: it is itself."""
+    of_it = {name: settings[name] for name in ("surface", "feedback") if settings.get(name) is not None}
+    try:
+        return read_settings(of_it)[1].feedback
+    except AfspmError:
+        return None
+
+
+def _made(kind: type[T], tables: Sequence[Mapping[str, object]], where: str, errors: ErrorCollector) -> list[T]:
+    made = []
+    for i, table in enumerate(tables):
+        with errors:
+            made.append(build(kind, table, f"{where}[{i}]"))
+    return made

@@ -1,0 +1,361 @@
+"""The simulated controller: values in force, a panel, and the files of what the simulated instrument measures.
+
+All that lasts is kept as "this, with these values, since then": a process that is restarted finds a measurement still
+running or finished, as with a controller that has a life of its own.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from afspm.basics.errors import AfspmError, FileError, InvalidValue, Refused
+from afspm.model import ControlResponse, ScanLines, ScopeState, Spectrum, names
+from afspm.simulation.activities import ScanActivity, SpectrumActivity
+from afspm.simulation.faults import Faults
+from afspm.simulation.instrument import Instrument, InstrumentBusy
+from afspm.storage.atomic import write_atomic
+from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
+from afspm.translator.parameters import ParameterTable, Value
+from afspm.translator.setting_groups import feedback, frame
+from afspm.translator.state import Kept
+
+LISTED_RESULTS = 16
+ADJUSTED: Final = (names.ZCTRL_SETPOINT, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN, names.TIP_BIAS_VOLTAGE)
+"""What holds from the next line on, when it is set during a scan."""
+
+_STATES: Final = {
+    "": ScopeState.FREE,
+    "scan": ScopeState.SCANNING,
+    "spectrum": ScopeState.SPEC,
+    "move": ScopeState.MOVING,
+    "crash": ScopeState.MOVING,
+    "pulse": ScopeState.BUSY_PARAM,
+    "approach": ScopeState.COARSE_MOTOR,
+}
+NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class PanelEvent:
+    """An action of a person at the controller's own panel, without a request to the translator.
+
+    Attributes:
+        at_s: experiment seconds after the start.
+        set: values as in the experiment file.
+        action: one of the instrument's own actions.
+    """
+
+    at_s: float
+    set: dict[str, object] | None = None
+    action: str = ""
+
+
+class SimulatedController:
+    """The controller.
+
+    Args:
+        kept: everything that lasts, JSON-able. It is brought up to date by every call.
+        folder: for the files that it saves.
+        panel: actions of a person, in any order.
+    """
+
+    def __init__(
+        self,
+        instrument: Instrument,
+        table: ParameterTable,
+        kept: Kept,
+        folder: Path,
+        *,
+        faults: Faults,
+        log: logging.Logger,
+        panel: list[PanelEvent],
+    ) -> None:
+        self._instrument = instrument
+        self._table = table
+        self._kept = kept
+        self._faults = faults
+        self._files = SavedFiles(folder, kept, faults)
+        self._log = log
+        self._panel = sorted(panel, key=lambda event: event.at_s)
+        self._put_in_force()
+        if "instrument" in kept:
+            instrument.restore(kept["instrument"])
+        else:
+            self._keep()
+        self._actions: dict[str, Callable[[float], None]] = {
+            names.START_SCAN: self.start_scan,
+            names.STOP_SCAN: self.stop,
+            names.START_SPEC: self.start_spectrum,
+            names.STOP_SPEC: self.stop,
+            names.PULSE: self.pulse,
+            names.CRASH: self.crash,
+            names.RETRACT: self.retract,
+            names.ENGAGE: self.engage,
+        }
+
+    # --- what is going on ---
+
+    def state(self, now_s: float) -> ScopeState:
+        """Return the state of the instrument, after everything has happened that was to happen until now."""
+        self._advance(now_s)
+        if self._instrument.doing(now_s) == "scan":
+            if self._faults.strikes("stopped", now_s):
+                self.stop(now_s)
+            elif self._faults.strikes("withdrawn", now_s):
+                self.retract(now_s)
+        return _STATES[self._instrument.doing(now_s)]
+
+    def next_change_s(self) -> float | None:
+        """When the next thing happens by itself; None if nothing will, or the drawing of a scan wakes the driver."""
+        times = (self._panel_s(), self._files.whole_s(), self._instrument.ends_s)
+        return min((at_s for at_s in times if at_s is not None), default=None)
+
+    def results(self) -> list[str]:
+        """Return the files of the last scans and spectra, oldest first."""
+        return list(self._kept["results"])
+
+    def lines(self, start: int, now_s: float) -> list[ScanLines]:
+        """The lines of the running scan beyond the first `start`, as far as they are complete."""
+        scan = self._instrument.scan
+        if scan is None or scan.drawing or self._instrument.doing(now_s) != "scan":
+            return []
+        rows = np.sort(scan.course.order[start : scan.lines_done(now_s)])
+        if not rows.size:
+            return []
+        return [
+            ScanLines(scan.region, scan.shape, channel, unit, int(rows[0]), values[rows])
+            for channel, (unit, values) in scan.channels().items()
+        ]
+
+    def _advance(self, now_s: float) -> None:
+        while (at_s := self.next_change_s()) is not None and at_s <= now_s:
+            if at_s == self._files.whole_s():
+                self._files.complete()
+            elif at_s == self._panel_s():
+                self._someone_at_the_panel(at_s)
+            else:
+                self._end(at_s)
+
+    def _end(self, end_s: float) -> None:
+        ended = self._instrument.ended(end_s)
+        try:
+            if isinstance(ended, ScanActivity) and ended.stopped_s is None:
+                self._save_scan(ended)
+            elif isinstance(ended, SpectrumActivity):
+                self._save_spectrum(ended)
+        except AfspmError as error:
+            # as with a controller that fails: it is free again, and there is no file
+            self._log.error("the simulated measurement failed: %s; it has no file", error)
+        self._keep()
+
+    def _keep(self) -> None:
+        self._kept["instrument"] = self._instrument.state()
+
+    # --- values ---
+
+    def set(self, values: dict[str, Value], now_s: float) -> None:
+        """Change values, by their generic names, in the table's units; a new frame or position is moved to."""
+        before = self._si()
+        self._kept["values"].update(values)
+        after = self._si()
+        self._put_in_force()
+        rate_m_s = (float(after[names.DRIFT_RATE_X]), float(after[names.DRIFT_RATE_Y]))
+        if rate_m_s != (float(before[names.DRIFT_RATE_X]), float(before[names.DRIFT_RATE_Y])):
+            self._instrument.follow(rate_m_s, now_s)
+        if any(before.get(name) != after.get(name) for name in ADJUSTED):  # a driver may lack some
+            self._instrument.adjust(now_s)
+        way_m = _distance(before, after, names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y)
+        if way_m > 0.0 or _distance(before, after, names.PROBE_POS_X, names.PROBE_POS_Y) > 0.0:
+            self.stop(now_s)  # as far as that is allowed, it ends what is being measured
+            place_m = (float(after[names.PROBE_POS_X]), float(after[names.PROBE_POS_Y]))
+            with _refusing():
+                self._instrument.move_probe(place_m, now_s, way_m=way_m)
+        self._keep()
+
+    def _put_in_force(self) -> None:
+        values, setup = self._si(), self._instrument.setup
+        setup.region, setup.shape = frame(values)
+        setup.line_s = 2.0 * setup.region.size_m[0] / float(values[names.SCAN_SPEED])
+        setup.upwards = values[names.SCAN_DIRECTION] == names.UP
+        setup.feedback = feedback(values)
+        setup.bias_v = float(values[names.TIP_BIAS_VOLTAGE])
+        setup.slope = (float(values[names.SAMPLE_SLOPE_X]), float(values[names.SAMPLE_SLOPE_Y]))
+        setup.move_speed_m_s = float(values[names.MOVE_SPEED])
+        self._instrument.engaged = bool(values[names.ENGAGED])
+
+    def _si(self, values: Kept | None = None) -> dict[str, Value]:
+        found: dict[str, Value] = self._kept["values"] if values is None else values
+        return {name: self._table[name].from_vendor(value) for name, value in found.items() if name in self._table}
+
+    # --- actions ---
+
+    def start_scan(self, now_s: float) -> None:
+        """Scan the frame: every line there and back at the scan speed."""
+        self._prepare(now_s)
+        if not self._faults.strikes("scan-refused", now_s):
+            with _refusing():
+                self._instrument.start_scan(now_s)
+            self._measures()
+
+    def start_spectrum(self, now_s: float) -> None:
+        """Take a curve of the kind that is set, where the probe is."""
+        self._prepare(now_s)
+        if not self._faults.strikes("spectrum-refused", now_s):
+            with _refusing():
+                self._instrument.start_spectrum(str(self._kept["values"][names.SPEC_KIND]), now_s)
+            self._measures()
+
+    def stop(self, now_s: float) -> None:
+        """Break the measurement off; it has no result."""
+        self._instrument.stop_scan(now_s)
+        self._instrument.stop_spectrum(now_s)
+        self._keep()
+
+    def pulse(self, now_s: float) -> None:
+        """A bias pulse where the probe is."""
+        self._prepare(now_s)
+        values = self._si()
+        with _refusing():
+            self._instrument.pulse(float(values[names.PULSE_VOLTAGE]), float(values[names.PULSE_DURATION]), now_s)
+        self._keep()
+
+    def crash(self, now_s: float) -> None:
+        """Drive the tip into the sample where the probe is, and out again."""
+        self._prepare(now_s)
+        values = self._si()
+        with _refusing():
+            self._instrument.crash(float(values[names.CRASH_DEPTH]), float(values[names.CRASH_SPEED]), now_s)
+        self._keep()
+
+    def retract(self, now_s: float) -> None:
+        """End the activity, and take the tip away from the sample."""
+        self._kept["values"][names.ENGAGED] = False
+        self._instrument.withdraw(now_s)
+        self._keep()
+
+    def engage(self, now_s: float) -> None:
+        """Bring the tip to the sample."""
+        self.stop(now_s)
+        with _refusing():
+            self._instrument.engage(now_s)
+        self._kept["values"][names.ENGAGED] = True
+        self._keep()
+
+    def _prepare(self, now_s: float) -> None:
+        """Raises Refused if the tip can't be used now."""
+        self._advance(now_s)
+        doing = self._instrument.doing(now_s)
+        if doing:
+            raise Refused(ControlResponse.NOT_FREE, f"the instrument is busy: {doing}")
+        if not self._instrument.engaged:
+            raise Refused(ControlResponse.ACTION_ERROR, f"the tip is retracted: {names.ENGAGE} it first")
+
+    def _measures(self) -> None:
+        self._kept["taken"] = dict(self._kept["values"])
+        self._keep()
+
+    # --- what comes of it ---
+
+    def _save_scan(self, scan: ScanActivity) -> None:
+        content = encode_scan(scan.region, scan.channels(), self._facts(scan.end_s))
+        self._saved("scan", f"scan-{scan.number:04d}.nc", content, scan.end_s, {"scan": dict(scan.truth)})
+
+    def _save_spectrum(self, curve: SpectrumActivity) -> None:
+        spectrum = Spectrum(curve.position_m, curve.kind, curve.names, curve.units, curve.values)
+        content = encode_spectrum(spectrum, self._facts(curve.end_s))
+        name = f"spectrum-{curve.number:04d}-{curve.kind}.nc"
+        self._saved("spectrum", name, content, curve.end_s, {"position_m": curve.position_m, "kind": curve.kind})
+
+    def _saved(self, event: str, name: str, content: bytes, end_s: float, facts: Kept) -> None:
+        self._files.save(name, content, end_s)
+        self._instrument.note(end_s, event, {"file": name, **facts})
+
+    def _facts(self, end_s: float) -> FileFacts:
+        rows, facts = self._table, dict[str, str | float]()
+        for name, value in self._si(self._kept["taken"]).items():
+            key = f"{name} [{rows[name].si_unit}]" if rows[name].si_unit else name
+            facts[key] = value if isinstance(value, str) else float(value)
+        return FileFacts(int(end_s * NS_PER_S), facts)
+
+    # --- the panel ---
+
+    def _panel_s(self) -> float | None:
+        left = self._panel[self._kept["panel"] :]
+        return self._kept["start_s"] + left[0].at_s if left else None
+
+    def _someone_at_the_panel(self, at_s: float) -> None:
+        event = self._panel[self._kept["panel"]]
+        self._kept["panel"] += 1
+        try:
+            if event.set:
+                values = self._table.written(event.set, where="panel")
+                self.set({name: self._table[name].to_vendor(value) for name, value in values.items()}, at_s)
+            if event.action:
+                self._actions[event.action](at_s)
+        except Refused as refused:
+            self._log.warning("a scripted action at the panel was refused: %s", refused)
+
+
+@contextmanager
+def _refusing() -> Iterator[None]:
+    """Turn what the instrument refuses into the refusal of a request."""
+    try:
+        yield
+    except InstrumentBusy as busy:
+        raise Refused(ControlResponse.NOT_FREE, str(busy)) from busy
+    except InvalidValue as invalid:
+        raise Refused(ControlResponse.ACTION_ERROR, str(invalid)) from invalid
+
+
+def _distance(before: dict[str, Value], after: dict[str, Value], *axes: str) -> float:
+    return math.hypot(*(float(after[axis]) - float(before[axis]) for axis in axes))
+
+
+class SavedFiles:
+    """The files that the simulated controller saves, some of them late, or half at first."""
+
+    def __init__(self, folder: Path, kept: Kept, faults: Faults) -> None:
+        self._folder = folder
+        self._kept = kept
+        self._faults = faults
+
+    def save(self, name: str, content: bytes, end_s: float) -> None:
+        """Save a file that was finished at an experiment time."""
+        path, faults = self._folder / name, self._faults
+        if faults.strikes("no-file", end_s):
+            return
+        half = faults.strikes("half-file", end_s)
+        late = half or faults.strikes("late-file", end_s)
+        if late is None:
+            write_atomic(path, [content])
+        else:
+            write_atomic(_hidden(path), [content])
+            self._kept["late"] = [str(path), end_s + late.duration_s]
+        if half is not None:
+            path.write_bytes(content[: len(content) // 2])
+        self._kept["results"] = [*self._kept["results"], str(path)][-LISTED_RESULTS:]
+
+    def whole_s(self) -> float | None:
+        """Return when a file appears that is late, or half; None: none is."""
+        late = self._kept.get("late")
+        return None if late is None else float(late[1])
+
+    def complete(self) -> None:
+        """Put the whole file where it belongs."""
+        path = Path(self._kept.pop("late")[0])
+        try:
+            _hidden(path).replace(path)
+        except OSError as error:
+            raise FileError(f"can't be completed: {error}", where=str(path)) from error
+
+
+def _hidden(path: Path) -> Path:
+    return path.with_name(f".{path.name}.whole")

@@ -1,0 +1,45 @@
+"""Gwyddion Simple Field (.gsf): one image, as Gwyddion and others exchange it.
+
+Format: "Gwyddion Simple Field 1.0", lines `name = value`, one to four NUL bytes up to a multiple of four, then float32,
+little-endian, from the top left (Gwyddion user guide, "Gwyddion Simple Field").
+"""
+
+from __future__ import annotations
+
+from datetime import tzinfo
+from pathlib import Path
+
+import numpy as np
+
+from afspm.basics.errors import FileError
+from afspm.model import Region, Scan
+from afspm.storage.formats.content import FileContent
+
+_MAGIC = b"Gwyddion Simple Field 1.0\n"
+
+
+def read_field(path: Path, zone: tzinfo | None) -> FileContent:
+    """The image. Its region is that of the field turned upright: the format's y points down, so where it says YOffset
+    the field ends at -YOffset. Raises FileError and ValueError: broken."""
+    data = path.read_bytes()
+    end = data.find(b"\0")
+    if not data.startswith(_MAGIC) or end < 0:
+        raise FileError("is not a Gwyddion Simple Field")
+    lines = data[len(_MAGIC) : end].decode("utf-8").splitlines()
+    header = {key.strip(): value.strip() for key, _, value in (line.partition("=") for line in lines)}
+    nx, ny = int(header["XRes"]), int(header["YRes"])
+    start = end + 4 - end % 4
+    if nx < 2 or ny < 2 or len(data) != start + 4 * nx * ny:
+        raise FileError(f"has {len(data) - start} bytes of values, which do not fit {nx} x {ny} pixels")
+    if header.get("XYUnits", "") not in ("m", ""):
+        raise FileError(f"has its sizes in {header['XYUnits']} instead of m")
+    if "XReal" not in header or "YReal" not in header:
+        raise FileError("lacks the size of the scan")
+    width, height = float(header["XReal"]), float(header["YReal"])
+    left, top = float(header.get("XOffset", "0")), -float(header.get("YOffset", "0"))
+    # XReal is that of whole pixels; a region ends at the middles of the outermost.
+    size_m = (width * (nx - 1) / nx, height * (ny - 1) / ny)
+    region = Region((left + width / 2, top - height / 2), size_m)
+    values = np.frombuffer(data, "<f4", nx * ny, start).reshape(ny, nx)[::-1].astype(np.float64)
+    scan = Scan(region, header.get("Title", ""), header.get("ZUnits", ""), values, filename=str(path))
+    return FileContent("Gwyddion", scans=(scan,), header=header)

@@ -1,0 +1,104 @@
+"""Opens HDF5 files, and reads arrays of them without trusting their sizes."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.errors import FileError
+
+if TYPE_CHECKING:
+    import h5py
+
+MAGIC = b"\x89HDF\r\n\x1a\n"
+_HEAP = b"GCOL\x01\0\0\0"
+_OBJECT = 16  # bytes of its head
+_VALUES_PER_BYTE = 16  # if it is well compressed; a damaged header may promise any size
+
+
+def is_hdf5(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
+def opened(path: Path) -> h5py.File:
+    """The file; to be closed. Raises FileError: it is none, or has a part in another file."""
+    import h5py
+
+    if not is_hdf5(path):
+        raise FileError("is not an HDF5 file", where=str(path))
+    _check_heaps(path.read_bytes(), path)
+    file = h5py.File(path, "r")
+    try:
+        _check_links(file, path)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def _check_links(file: h5py.File, path: Path) -> None:
+    # values in other files: the library would read any file of this computer, and a scan that comes from elsewhere,
+    # drawn or exported, would show its content
+    import h5py
+
+    def is_elsewhere(name: bytes, info: h5py.h5l.LinkInfo) -> bytes | None:
+        return name if info.type == h5py.h5l.TYPE_EXTERNAL else None
+
+    def has_values_elsewhere(name: str, node: h5py.Dataset | h5py.Group) -> str | None:
+        return name if isinstance(node, h5py.Dataset) and (node.external or node.is_virtual) else None
+
+    root = file["/"].id
+    found = root.links.visit(is_elsewhere, info=True) or file.visititems(has_values_elsewhere)
+    if found is not None:
+        name = found.decode("utf-8", "replace") if isinstance(found, bytes) else found
+        raise FileError(f"is refused: /{name} is in another file", where=str(path))
+
+
+def _check_heaps(data: bytes, path: Path) -> None:
+    """Heaps of texts whose sizes do not add up are refused here: the library would go round in them for ever.
+
+    A heap: "GCOL", the version (1), its size; objects of number, count of references, size and data up to a multiple
+    of 8; number 0 is the free rest, its size that with its head (HDF5 file format specification, III.E).
+    """
+    at = data.find(_HEAP)
+    while at >= 0:
+        (size,) = struct.unpack_from("<Q", data.ljust(at + 16, b"\0"), at + 8)
+        if at + size > len(data) or not _adds_up(data, at + 16, at + size):
+            raise FileError("is damaged: the sizes in a heap of strings do not add up", where=str(path))
+        at = data.find(_HEAP, at + 16)
+
+
+def _adds_up(data: bytes, place: int, end: int) -> bool:
+    while place + _OBJECT <= end:
+        number, length = struct.unpack_from("<H6xQ", data, place)
+        if number == 0:
+            return bool(place + length == end)
+        place += _OBJECT + (length + 7) // 8 * 8
+    return place <= end
+
+
+def array(dataset: h5py.Dataset) -> NDArray[np.float64]:
+    """All values of a dataset of numbers. Raises FileError: it promises more than the file can hold."""
+    most = _VALUES_PER_BYTE * dataset.file.id.get_filesize()
+    if dataset.size is None or dataset.size > most:
+        raise FileError(f"announces {dataset.size} values in {dataset.name} and holds fewer")
+    return np.asarray(dataset[()], dtype=np.float64)
+
+
+def texts(attributes: h5py.AttributeManager) -> dict[str, str]:
+    """The attributes that are texts."""
+    return {key: text(value) for key, value in attributes.items() if isinstance(value, bytes | str)}
+
+
+def text(value: object) -> str:
+    """An attribute, or a dataset of characters, as text."""
+    if isinstance(value, np.ndarray):
+        value = value.tobytes()
+    if isinstance(value, bytes):
+        return value.split(b"\0", 1)[0].decode("utf-8", "replace").strip()
+    return str(value).strip()

@@ -1,0 +1,112 @@
+"""Igor binary waves of version 5 (WaveMetrics, Technical Note 003, "Igor Binary Format")."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+
+from afspm.basics.errors import FileError
+
+_DATA = 384  # where values begin: after a header of 64 bytes and one of 320
+_LABEL = 32
+_KINDS = {2: "f4", 4: "f8", 8: "i1", 16: "i2", 32: "i4", 72: "u1", 80: "u2", 96: "u4"}
+
+
+@dataclass(frozen=True, eq=False)
+class Wave:
+    """A wave.
+
+    Attributes:
+        name: of it.
+        values: with up to four dimensions.
+        unit: of the values.
+        steps, dimension_units: of each of four dimensions.
+        labels: for each of four dimensions the names of its elements; empty where there are none.
+        note: its text.
+    """
+
+    name: str
+    values: np.ndarray
+    unit: str
+    steps: tuple[float, ...]
+    dimension_units: tuple[str, ...]
+    labels: tuple[list[str], ...]
+    note: str
+
+
+def read_wave(data: bytes) -> Wave:
+    """The wave in the bytes of a file.
+
+    Raises:
+        FileError: of another version, not whole, or its checksum is wrong.
+    """
+    if len(data) < _DATA:
+        raise FileError(f"is incomplete: {len(data)} bytes are too few for an Igor wave")
+    order = "<" if data[0] else ">"
+    (version,) = struct.unpack_from(f"{order}h", data)
+    if version != 5:
+        raise FileError(f"is an Igor wave of version {version}, not 5", hint="save it again in Igor, as version 5")
+    if int(np.frombuffer(data, f"{order}i2", _DATA // 2).sum(dtype=np.int64)) & 0xFFFF:
+        raise FileError("its header is damaged: the checksum is wrong")
+    formula, note = struct.unpack_from(f"{order}2i", data, 8)
+    unit, *units = struct.unpack_from(f"{order}5i", data, 16)
+    sizes = [formula, note, unit, *units, *struct.unpack_from(f"{order}4i", data, 36)]
+    values, after = _values(data, order)
+    parts = []
+    for size in sizes:
+        if size < 0 or after + size > len(data):
+            raise FileError("is incomplete: its strings are cut off")
+        parts.append(data[after : after + size])
+        after += size
+    labels = tuple(_labels(part, max(n, 1)) for part, n in zip(parts[7:], (*values.shape, 1, 1, 1, 1)[:4], strict=True))
+    return Wave(
+        name=_text(data[92:124]),
+        values=values,
+        unit=_text(data[212:216]) or _text(parts[2]),
+        steps=struct.unpack_from(f"{order}4d", data, 148),
+        dimension_units=tuple(_text(data[216 + 4 * k : 220 + 4 * k]) or _text(parts[3 + k]) for k in range(4)),
+        labels=labels,
+        note=decoded(parts[1]),
+    )
+
+
+def decoded(text: bytes) -> str:
+    """Igor 7 and later write UTF-8, older ones what the system had (a degree sign of Windows, which is Latin-1)."""
+    try:
+        return text.decode("utf-8")
+    except UnicodeDecodeError:
+        return text.decode("latin-1")
+
+
+def _values(data: bytes, order: str) -> tuple[np.ndarray, int]:
+    """The values in their shape, and where what follows them begins."""
+    (count,) = struct.unpack_from(f"{order}i", data, 76)
+    (kind,) = struct.unpack_from(f"{order}h", data, 80)
+    if kind not in _KINDS:
+        raise FileError(f"an Igor wave of type {kind}, which is not real numbers")
+    lengths = struct.unpack_from(f"{order}4i", data, 132)
+    used = [n for n in lengths if n]
+    # lengths after the first 0 are not used
+    if not used or min(used) < 0 or list(lengths[: len(used)]) != used or math.prod(used) != count:
+        raise FileError(f"an Igor wave of {count} values can't have the shape {used}")
+    kind_of = np.dtype(f"{order}{_KINDS[kind]}")
+    end = _DATA + count * kind_of.itemsize
+    if end > len(data):
+        raise FileError(f"is incomplete: values of {end - _DATA} bytes, of which {len(data) - _DATA} are there")
+    return np.frombuffer(data, kind_of, count, _DATA).reshape(used, order="F"), end
+
+
+def _labels(text: bytes, count: int) -> list[str]:
+    """The first label is that of the dimension itself. What follows a NUL is left from a longer text."""
+    if not text:
+        return []
+    if len(text) != _LABEL * (count + 1):
+        raise FileError(f"{len(text)} bytes of labels for a dimension of {count}")
+    return [_text(text[k * _LABEL : (k + 1) * _LABEL]) for k in range(1, count + 1)]
+
+
+def _text(raw: bytes) -> str:
+    return decoded(raw.split(b"\0", 1)[0])

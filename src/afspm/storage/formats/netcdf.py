@@ -1,0 +1,110 @@
+"""NetCDF, classic format: arrays with named dimensions, units and attributes in one file, through scipy.
+
+xarray, MATLAB, Gwyddion's users' scripts, `ncdump` … read it. What is written are float64.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.errors import FileError
+from afspm.basics.plain_data import Plain, PlainMapping
+
+Attributes = Mapping[str, str | float]
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One array: the names of its dimensions, float64 values, attributes such as its units."""
+
+    dimensions: tuple[str, ...]
+    values: NDArray[np.float64]
+    attributes: Attributes = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class File:
+    """The arrays of numbers in a file, those of characters as texts, and the attributes of the whole."""
+
+    variables: Mapping[str, Variable]
+    texts: Mapping[str, str]
+    attributes: Attributes
+
+
+def encoded(variables: Mapping[str, Variable], attributes: Attributes) -> bytes:
+    """Return the bytes of a file."""
+    made = io.BytesIO()
+    file = _netcdf_file(made, "w")
+    file._attributes.update(_as_bytes(attributes))  # as attributes of the object, some names would be its own
+    for name, variable in variables.items():
+        for axis, size in zip(variable.dimensions, variable.values.shape, strict=True):
+            if axis not in file.dimensions:
+                file.createDimension(axis, size)
+        written = file.createVariable(name, ">f8", variable.dimensions)
+        written[:] = variable.values
+        written._attributes.update(_as_bytes(variable.attributes))
+    file.flush()
+    return made.getvalue()
+
+
+def read(path: Path) -> File:
+    """Return the variables and the global attributes of a file.
+
+    Raises:
+        FileError: missing, not whole, something else, or scipy is missing.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise FileError(f"can't be read: {error}", where=str(path)) from error
+    if content[:4] not in (b"CDF\x01", b"CDF\x02"):
+        raise FileError("is not a NetCDF file of the classic format", where=str(path))
+    try:
+        file = _netcdf_file(
+            io.BytesIO(content), "r"
+        )  # a file on disk would set aside whatever a damaged header asks for
+        return _file(file)
+    except FileError:
+        raise
+    except Exception as error:  # scipy stumbles in any way over a broken file
+        raise FileError(f"is incomplete: {type(error).__name__}: {error}", where=str(path)) from error
+
+
+def _file(file: Any) -> File:
+    variables: dict[str, Variable] = {}
+    texts: dict[str, str] = {}
+    for name, found in file.variables.items():
+        if found.data.dtype.kind == "S":
+            texts[name] = _text(found.data.tobytes())
+        else:
+            variables[name] = Variable(found.dimensions, found.data.astype(np.float64), _told(found._attributes))
+    return File(variables, texts, _told(file._attributes))
+
+
+def _netcdf_file(content: io.BytesIO, mode: Literal["r", "w"]) -> Any:
+    from scipy.io import netcdf_file
+
+    return netcdf_file(content, mode, mmap=False, version=2)
+
+
+def _as_bytes(attributes: Attributes) -> Plain:
+    return {name: value.encode() if isinstance(value, str) else np.float64(value) for name, value in attributes.items()}
+
+
+def _told(attributes: PlainMapping) -> dict[str, str | float]:
+    """Return text as it is, of numbers the first."""
+    return {
+        name: _text(value) if isinstance(value, bytes) else float(np.ravel(value)[0])
+        for name, value in attributes.items()
+    }
+
+
+def _text(raw: bytes) -> str:
+    return raw.split(b"\0", 1)[0].decode("utf-8", "replace")

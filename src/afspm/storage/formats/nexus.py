@@ -1,0 +1,138 @@
+"""HDF5 files that follow NeXus' NXspm as the record writes them (`record.nexus`), read back without loss.
+
+The spectra of a grid in one file (`record.export.nexus`), too: of several at one point it has the mean.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from datetime import tzinfo
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.errors import FileError
+from afspm.basics.plain_data import Plain
+from afspm.model import Frame, Region, Scan, Spectrum
+from afspm.model.spectrum_grid import PointGrid
+from afspm.storage.formats import hdf5
+from afspm.storage.formats.content import FileContent, OtherFormat
+
+if TYPE_CHECKING:
+    import h5py
+
+DEFINITION = "NXspm"
+BIAS_SPECTRUM = "NXsts"
+"""The definition that a spectrum over the bias of a tunnelling microscope follows."""
+ABOUT = "afspm"
+"""The group with what NeXus has no name for."""
+GRID = "grid"
+"""The content of a file with the spectra of a grid."""
+VENDOR = "vendor"
+"""The group with what the controller's own file said."""
+
+
+def read_hdf5(path: Path, zone: tzinfo | None) -> FileContent:
+    """Return what a file of the record holds.
+
+    Raises:
+        OtherFormat: the record did not write it.
+        FileError: it is broken.
+    """
+    with hdf5.opened(path) as file:
+        if not _is_ours(file):
+            raise OtherFormat("afspm did not write it")
+        about = about_of(file)
+        if about["content"] == GRID:
+            return FileContent("", spectra=tuple(_grid(file, about)), header=about)
+        scans = tuple(_scans(file, about)) if about["content"] == "scan" else ()
+        spectra = (_spectrum(file, about),) if about["content"] == "spectrum" else ()
+        return FileContent(
+            str(about.get("controller", "")), scans, spectra, about | vendor_header(file), about.get("began_ns"),
+            about["time_ns"],
+        )  # fmt: skip
+
+
+def about_of(file: h5py.File) -> Plain:
+    """Return what the record noted beside the values: holder of control, problems … Raises FileError: it is damaged."""
+    try:
+        about: Plain = json.loads(hdf5.text(file["entry"][ABOUT]["about"][()]))
+    except (KeyError, ValueError) as error:
+        raise FileError(f"is damaged: {error}") from error
+    return about
+
+
+def vendor_header(file: h5py.File) -> dict[str, object]:
+    """The header of the controller's own file, as that said it; empty if it was not there to be read."""
+    group = file["entry"].get(VENDOR)
+    if group is None or "header" not in group:
+        return {}
+    header: dict[str, object] = json.loads(hdf5.text(group["header"][()]))
+    return header
+
+
+def _is_ours(file: h5py.File) -> bool:
+    entry = file.get("entry")
+    return entry is not None and ABOUT in entry
+
+
+def _scans(file: h5py.File, about: Plain) -> list[Scan]:
+    region = Region(tuple(about["center_m"]), tuple(about["size_m"]), about["angle_rad"], Frame(about["frame"]))
+    data = file["entry"]["data"]
+    return [
+        Scan(
+            region,
+            channel["name"],
+            channel["unit"],
+            hdf5.array(data[channel["field"]]),
+            channel["time_ns"],
+            about["filename"],
+        )
+        for channel in about["channels"]
+    ]
+
+
+def _spectrum(file: h5py.File, about: Plain) -> Spectrum:
+    data, variables = file["entry"]["data"], about["variables"]
+    columns = [hdf5.array(data[variable["field"]]) for variable in variables]
+    place = about["position_m"]
+    return Spectrum(
+        None if place is None else (place[0], place[1]),
+        about["kind"],
+        tuple(variable["name"] for variable in variables),
+        tuple(variable["unit"] for variable in variables),
+        np.column_stack(columns) if columns else np.empty((0, 0)),
+        about["measured_ns"],
+        about["filename"],
+        Frame(about["frame"]),
+    )
+
+
+def _grid(file: h5py.File, about: Plain) -> Iterator[Spectrum]:
+    """Yield the spectra that were measured, row by row."""
+    entry, swept, columns = file["entry"], about["swept"], about["columns"]
+    data = [[hdf5.array(entry[way][one["field"]]) for way in one["ways"]] for one in columns]
+    forward = entry[columns[0]["ways"][0]]
+    points = PointGrid(hdf5.array(forward["x"]), hdf5.array(forward["y"]), tuple(about["center_m"]), about["angle_rad"])
+    sweep = _there_and_back([hdf5.array(forward[swept["field"]])] * max(len(one["ways"]) for one in columns))
+    times = np.asarray(entry[ABOUT]["time_ns"][()]).astype("datetime64[ns]")
+    for row, column in np.ndindex(times.shape):
+        curves = [_there_and_back([way[row, column] for way in ways]) for ways in data]
+        if np.isnan(curves).all():
+            continue
+        yield Spectrum(
+            points.position_m(row, column),
+            about["kind"],
+            (swept["name"], *(one["name"] for one in columns)),
+            (swept["unit"], *(one["unit"] for one in columns)),
+            np.column_stack([sweep, *curves]),
+            None if np.isnat(times[row, column]) else int(times[row, column].astype(np.int64)),
+            frame=Frame(about["frame"]),
+        )
+
+
+def _there_and_back(ways: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    return np.concatenate([ways[0], *(way[::-1] for way in ways[1:])])

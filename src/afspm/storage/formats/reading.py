@@ -1,0 +1,89 @@
+"""`read`: any file that a controller wrote.
+
+A reader is declared by the suffix of its files ("sxm"). Where several controllers write files of one suffix, each
+further reader adds a name of its own ("nc.gxsm"): the readers of a suffix are tried in the order of their names until
+one does not raise `OtherFormat`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from datetime import tzinfo
+from pathlib import Path
+
+from afspm.basics import entry_points
+from afspm.basics.errors import FileError
+from afspm.storage.formats.content import FileContent, OtherFormat
+
+Reader = Callable[[Path, tzinfo | None], FileContent]
+
+
+def suffixes() -> tuple[str, ...]:
+    """Return the suffixes of files that can be read, with their dots."""
+    return tuple(dict.fromkeys(f".{name.partition('.')[0]}" for name in entry_points.names(entry_points.READERS)))
+
+
+def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
+    """The scans and spectra of a file.
+
+    The suffix of the file chooses the reader: of a maker's format, of Gwyddion's simple fields (.gsf), or of afspm's
+    own files: of the record, and of a grid of spectra that was exported (.h5). `afspm doctor` lists the suffixes. Of
+    channels of one name, the second is "name #2".
+
+    Args:
+        zone: of the clock of the controller, which most write without saying which it was; None: that of this computer.
+
+    Raises:
+        FileError: missing, not whole, not what its suffix says, without a reader, or its library is missing.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileError("no such file", where=str(path))
+    readers = _readers(path.suffix.lower())
+    if not readers:
+        raise FileError(
+            f"afspm has no reader for {path.suffix or 'a file without a suffix'}",
+            where=str(path),
+            hint=f"read: {' '.join(suffixes())}",
+        )
+    try:
+        return _told_apart(_first_that_reads(readers, path, zone))
+    except FileError as error:
+        if error.where:
+            raise
+        raise FileError(error.what, where=str(path), hint=error.hint) from error
+    except Exception as error:  # a reader may stumble in any way over a broken file
+        why = f"{type(error).__name__}: {error}"
+        raise FileError(f"is not readable as {path.suffix}: {why}", where=str(path)) from error
+
+
+def _readers(suffix: str) -> list[str]:
+    return [name for name in entry_points.names(entry_points.READERS) if f".{name.partition('.')[0]}" == suffix]
+
+
+def _first_that_reads(readers: Sequence[str], path: Path, zone: tzinfo | None) -> FileContent:
+    for name in readers[:-1]:
+        with suppress(OtherFormat):
+            return _read(name, path, zone)
+    return _read(readers[-1], path, zone)
+
+
+def _read(name: str, path: Path, zone: tzinfo | None) -> FileContent:
+    reader: Reader = entry_points.load(entry_points.READERS, name)
+    return reader(path, zone)
+
+
+def _told_apart(content: FileContent) -> FileContent:
+    """With a name of its own for each channel: users may give two signals of a controller the same."""
+    taken: set[str] = set()
+    scans = []
+    for scan in content.scans:
+        name, number = scan.channel, 1
+        while name in taken:
+            number += 1
+            name = f"{scan.channel} #{number}"
+        taken.add(name)
+        scans.append(scan if name == scan.channel else replace(scan, channel=name))
+    return replace(content, scans=tuple(scans))

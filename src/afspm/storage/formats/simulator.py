@@ -1,0 +1,99 @@
+"""The files of the simulated microscope: NetCDF with a variable for each channel of a scan, or of a spectrum."""
+
+from __future__ import annotations
+
+from datetime import tzinfo
+from pathlib import Path
+
+import numpy as np
+
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.errors import FileError
+from afspm.model import Region, Scan, Spectrum, names
+from afspm.storage.formats import hdf5, netcdf
+from afspm.storage.formats.content import FileContent, OtherFormat
+from afspm.storage.formats.netcdf import File
+
+CONTROLLER = "afspm simulator"
+CONVENTIONS = "afspm simulator 1"
+_AXES = ("x", "y")
+
+
+def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
+    """Return the scan or spectrum of a file.
+
+    Raises:
+        OtherFormat: another program wrote it.
+        FileError: something of it is missing.
+    """
+    if hdf5.is_hdf5(path):
+        raise OtherFormat("is NetCDF-4, which the simulated microscope does not write")
+    file = netcdf.read(path)
+    if file.attributes.get("Conventions") != CONVENTIONS:
+        raise OtherFormat("the simulated microscope did not write it")
+    header: dict[str, object] = dict(file.attributes)
+    try:
+        end_ns = int(str(file.attributes["time_ns"]))
+        if header.get("content") == "spectrum":
+            return FileContent(CONTROLLER, spectra=(_spectrum(file, end_ns, path),), header=header, end_ns=end_ns)
+        scans = _scans(file, end_ns, path)
+    except KeyError as error:
+        raise FileError(f"lacks {error}", where=str(path)) from error
+    if not scans:
+        raise FileError("holds no channel", where=str(path))
+    direction = header.get(names.SCAN_DIRECTION)
+    return FileContent(
+        CONTROLLER,
+        scans,
+        header=header,
+        start_ns=_start_ns(header, scans[0], end_ns),
+        end_ns=end_ns,
+        upwards=None if direction is None else direction == names.UP,
+    )
+
+
+def _start_ns(header: dict[str, object], scan: Scan, end_ns: int) -> int | None:
+    """Every line is scanned there and back."""
+    speed_m_s = header.get(f"{names.SCAN_SPEED} [m/s]")
+    if not isinstance(speed_m_s, float) or not speed_m_s > 0.0:
+        return None
+    return end_ns - round(scan.shape[0] * 2.0 * scan.region.size_m[0] / speed_m_s * NS_PER_S)
+
+
+def _scans(file: File, end_ns: int, path: Path) -> tuple[Scan, ...]:
+    def number(name: str) -> float:
+        return float(file.attributes[f"region_{name}"])
+
+    region = Region(
+        (number("center_x_m"), number("center_y_m")),
+        (number("size_x_m"), number("size_y_m")),
+        number("angle_rad"),
+    )
+    return tuple(
+        Scan(
+            region,
+            str(variable.attributes["long_name"]),
+            str(variable.attributes["units"]),
+            variable.values,
+            end_ns,
+            str(path),
+        )
+        for name, variable in file.variables.items()
+        if name not in _AXES
+    )
+
+
+def _spectrum(file: File, end_ns: int, path: Path) -> Spectrum:
+    position = None
+    if "position_x_m" in file.attributes:
+        position = (float(file.attributes["position_x_m"]), float(file.attributes["position_y_m"]))
+    variables = list(file.variables.values())
+    return Spectrum(
+        position,
+        str(file.attributes["kind"]),
+        tuple(str(variable.attributes["long_name"]) for variable in variables),
+        tuple(str(variable.attributes["units"]) for variable in variables),
+        np.stack([variable.values for variable in variables], axis=1),
+        end_ns,
+        str(path),
+    )

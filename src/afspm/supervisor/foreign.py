@@ -1,0 +1,101 @@
+"""`python -m afspm.supervisor.foreign [--] command …` runs a component of another language.
+
+The command gets the launch line on its standard input, which stays open for as long as our parent holds ours open, and
+is ended when that is closed or the parent dies: terminated, then killed. Its exit code is ours.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+from afspm.basics.exit_codes import ExitCode
+from afspm.transport.process.parent import end_within, leave_interrupts_to_parent, take_standard_input
+
+ASK_S = 0.6  # to end by itself once its standard input is closed
+TERMINATE_S = 0.4  # to end after it was told to; then it is killed
+_CHUNK = 1 << 16
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command and return its exit code (128 + n for the signal n, as shells do)."""
+    command = arguments[1:] if arguments[:1] == ["--"] else arguments
+    if not command:
+        sys.stderr.write("ERROR foreign: no command given\n")
+        return ExitCode.CONFIG
+    leave_interrupts_to_parent()
+    # a terminal's or a supervisor's wish to end us must not leave the command behind, however early it comes
+    wished = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: wished.set())
+    try:
+        # in our process group, so that a supervisor who kills us, or finds us killed, sweeps the command away too
+        child = subprocess.Popen(command, stdin=subprocess.PIPE)
+    except (OSError, ValueError) as error:
+        sys.stderr.write(f"ERROR {command[0]} can't be started: {error} (is it installed and executable?)\n")
+        return ExitCode.CONFIG
+    program = _ForeignProgram(child, take_standard_input())
+    signal.signal(signal.SIGTERM, lambda *_: program.end_soon())
+    if wished.is_set():
+        program.end_soon()
+    threading.Thread(target=program.pass_on, name="stdin", daemon=True).start()
+    code = child.wait()
+    program.sweep()
+    # it did not end by itself: that it was stopped is what counts. On Windows no code tells the one from the other
+    if program.stopped and (code < 0 or sys.platform == "win32"):
+        return ExitCode.ORPHAN
+    return 128 - code if code < 0 else code
+
+
+class _ForeignProgram:
+    """Passes our standard input on to the child, and ends it.
+
+    Attributes:
+        stopped: the child was terminated or killed, since it did not end with its standard input.
+    """
+
+    def __init__(self, child: subprocess.Popen[bytes], pipe: int) -> None:
+        self._child = child
+        self._pipe = pipe
+        self._parent = os.getppid()
+        self.stopped = False
+
+    def pass_on(self) -> None:
+        """Everything of our standard input, until its end; then the child is to end."""
+        assert self._child.stdin is not None
+        with contextlib.suppress(OSError, ValueError):
+            while chunk := os.read(self._pipe, _CHUNK):
+                with contextlib.suppress(BrokenPipeError):  # it doesn't read: it may run all the same
+                    self._child.stdin.write(chunk)
+                    self._child.stdin.flush()
+        self._end()
+
+    def end_soon(self) -> None:
+        """End the child from a signal handler, which must not wait."""
+        threading.Thread(target=self._end, name="end", daemon=True).start()
+
+    def sweep(self) -> None:
+        """End what the command has started and left behind, if our parent is dead; else that is the parent's to do."""
+        if sys.platform != "win32" and os.getppid() != self._parent and os.getpgrp() == os.getpid():
+            os.killpg(0, signal.SIGKILL)  # us too: nobody is there to be told the exit code
+
+    def _end(self) -> None:
+        assert self._child.stdin is not None
+        with contextlib.suppress(OSError, ValueError):
+            self._child.stdin.close()
+        for seconds, harder in ((ASK_S, self._child.terminate), (TERMINATE_S, self._child.kill)):
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._child.wait(seconds)
+                return
+            self.stopped = True
+            with contextlib.suppress(OSError):
+                harder()
+
+
+if __name__ == "__main__":
+    exit_code = int(main(sys.argv[1:]))
+    end_within(1.0, exit_code)
+    sys.exit(exit_code)

@@ -1,0 +1,231 @@
+"""Supervision of one child: start it, watch it, start it again, give it up, let it end."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from typing import Protocol
+
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.own_fault import OwnFault
+from afspm.supervisor.supervision.liveness import Liveness, LivenessPolicy, ProcessHealth
+from afspm.supervisor.supervision.restart import RestartBudget, RestartPolicy
+
+
+@dataclass(frozen=True)
+class ChildPolicy:
+    """Patience and restarts of one child."""
+
+    liveness: LivenessPolicy = field(default_factory=LivenessPolicy)
+    restart: RestartPolicy = field(default_factory=RestartPolicy)
+    beats: bool = True
+    """Whether it sends heartbeats."""
+    final_codes: Collection[int] = frozenset({ExitCode.DONE, ExitCode.CONFIG, ExitCode.ENDED})
+    """Exit codes after which it is not started again. Who was asked to stop, and not by us, is needed as before."""
+    quiet_codes: Collection[int] = frozenset({ExitCode.CONFIG, ExitCode.ENDED})
+    """Those of them that others tell: who gives it up for its settings, the scheduler that the experiment has ended."""
+
+
+class HeartbeatReport(Protocol):
+    """The content of a heartbeat; None where the process does not say."""
+
+    @property
+    def closing(self) -> bool: ...
+    @property
+    def step_age_s(self) -> float | None: ...
+    @property
+    def longest_step_s(self) -> float | None: ...
+
+
+class ChildPhase(Enum):
+    """Where a child is in its life."""
+
+    IDLE = auto()
+    """Not started yet."""
+    RUNNING = auto()
+    KILLING = auto()
+    """It did not live any more as it should; its end is awaited."""
+    WAITING = auto()
+    """It crashed and is started again when its delay is over."""
+    STOPPING = auto()
+    """We asked it to end."""
+    DONE = auto()
+    """It ended, on purpose or by our wish."""
+    GIVEN_UP = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class StartChild:
+    """Start the process."""
+
+
+@dataclass(frozen=True, slots=True)
+class KillChild:
+    """End the process by force; its exit will be told."""
+
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class GiveUpChild:
+    """It is not started again: say so loudly. The scheduler, who is told of each process, waits for it no more."""
+
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class ChildLog:
+    """Tell people; `level` is a name of the logging module."""
+
+    level: str
+    text: str
+
+
+ChildEffect = StartChild | KillChild | GiveUpChild | ChildLog
+
+_WHY = {
+    ProcessHealth.SLOW_START: "it sent no first heartbeat within {start_s:g} s",
+    ProcessHealth.SILENT: "no heartbeat for {silence_s:g} s: it hangs",
+    ProcessHealth.FROZEN: "a step took longer than its declared longest time: it is frozen",
+    ProcessHealth.NOT_CLOSING: "it announced its end and was still running {closing_s:g} s later",
+}
+
+
+class ChildWatch:
+    """One child, over all its lives. Every method takes the real monotonic time and returns what to do, in order."""
+
+    def __init__(self, policy: ChildPolicy | None = None) -> None:
+        self._policy = policy or ChildPolicy()
+        self._restarts = RestartBudget(self._policy.restart)
+        self._liveness: Liveness | None = None
+        self._began_s = 0.0
+        self._again_s = 0.0
+        self._is_ordered = False  # its end is, and that it is started again at once
+        self._fault: OwnFault | None = None  # by which the life before ended
+        self.phase = ChildPhase.IDLE
+
+    @property
+    def over(self) -> bool:
+        """It runs no more and will not be started again."""
+        return self.phase in (ChildPhase.DONE, ChildPhase.GIVEN_UP)
+
+    def died(self, code: int) -> bool:
+        """Return whether a process that ended with this code had not finished."""
+        return code not in (*self._policy.final_codes, ExitCode.ORPHAN)
+
+    def begin(self, now_s: float) -> list[ChildEffect]:
+        """Start it, the first time or after it was over."""
+        if self.phase not in (ChildPhase.IDLE, ChildPhase.DONE, ChildPhase.GIVEN_UP):
+            return []
+        return self._start(now_s)
+
+    def beat(self, beat: HeartbeatReport, now_s: float) -> list[ChildEffect]:
+        """Take in a heartbeat."""
+        if self._liveness is None:
+            return []
+        if beat.closing:
+            self._liveness.closing(now_s)
+        else:
+            self._liveness.beat(now_s, beat.step_age_s or 0.0, beat.longest_step_s)
+        return self.tick(now_s)
+
+    def waits(self, now_s: float) -> None:
+        """Count the time of its start from now: it is there, and may not begin yet."""
+        if self._liveness is not None:
+            self._liveness.waits(now_s)
+
+    def exited(self, code: int, now_s: float, how: str = "", fault: OwnFault | None = None) -> list[ChildEffect]:
+        """Take in its end, by an exit code or, below zero, a signal; `how` says it for people."""
+        how = how or f"exit code {code}"
+        phase, self._liveness = self.phase, None
+        if phase in (ChildPhase.STOPPING, ChildPhase.DONE):
+            self.phase = ChildPhase.DONE
+            return []
+        ordered, self._is_ordered = self._is_ordered, False
+        if ordered and code not in self._policy.quiet_codes:
+            return self._start(now_s)
+        if (phase is not ChildPhase.KILLING or ordered) and code in self._policy.final_codes:
+            self.phase = ChildPhase.DONE
+            return [ChildLog("DEBUG" if code in self._policy.quiet_codes else "INFO", how)]
+        before, self._fault = self._fault, fault
+        if fault is not None and fault == before:
+            return self._give_up(f"failed twice in the same way without progress ({fault})")
+        return self._failed(now_s, how)
+
+    def start_failed(self, why: str, now_s: float) -> list[ChildEffect]:
+        """Take in that there is no process: the command is missing, the computer has no memory left …"""
+        self._liveness = None
+        if self.phase is ChildPhase.STOPPING:
+            self.phase = ChildPhase.DONE
+            return []
+        return self._failed(now_s, f"could not be started: {why}")
+
+    def restart(self, now_s: float) -> list[ChildEffect]:
+        """Start it anew by order, whatever it does now. That is no failure: it costs no restart."""
+        if self.phase is ChildPhase.STOPPING:
+            return []
+        self._fault = None
+        said = ChildLog("INFO", "is restarted, as ordered")
+        if self.phase in (ChildPhase.RUNNING, ChildPhase.KILLING):
+            is_new = not self._is_ordered
+            self.phase, self._is_ordered = ChildPhase.KILLING, True
+            return [said, KillChild("ordered")] if is_new else []
+        return [said, *self._start(now_s)]
+
+    def stop(self, now_s: float) -> list[ChildEffect]:
+        """Restart it no more: its end is wanted, and the caller has asked it to."""
+        if self.phase in (ChildPhase.RUNNING, ChildPhase.KILLING):
+            self.phase = ChildPhase.STOPPING
+        elif self.phase in (ChildPhase.IDLE, ChildPhase.WAITING):
+            self.phase = ChildPhase.DONE
+        return []
+
+    def tick(self, now_s: float, *, works: bool | None = None) -> list[ChildEffect]:
+        """Take in that time has passed.
+
+        Args:
+            works: whether the process was seen to work lately, though it does not beat; None: that is not known.
+        """
+        if self.phase is ChildPhase.WAITING and now_s >= self._again_s:
+            return self._start(now_s)
+        if self.phase is not ChildPhase.RUNNING or self._liveness is None:
+            return []
+        vital = self._liveness.check(now_s, works=works)
+        if vital not in _WHY:
+            return []
+        self.phase = ChildPhase.KILLING
+        liveness = self._policy.liveness
+        why = _WHY[vital].format(start_s=liveness.start_s, silence_s=liveness.silence_s, closing_s=liveness.closing_s)
+        return [ChildLog("WARNING", f"killed: {why}"), KillChild(why)]
+
+    def deadline_s(self) -> float | None:
+        """Return when `tick` is due at the latest; None: it is not."""
+        if self.phase is ChildPhase.WAITING:
+            return self._again_s
+        if self.phase is ChildPhase.RUNNING and self._liveness is not None:
+            return self._liveness.next_check_s()
+        return None
+
+    def _start(self, now_s: float) -> list[ChildEffect]:
+        self.phase = ChildPhase.RUNNING
+        self._began_s = now_s
+        self._liveness = Liveness(self._policy.liveness, now_s, beats=self._policy.beats)
+        return [StartChild()]
+
+    def _failed(self, now_s: float, what: str) -> list[ChildEffect]:
+        delay_s = self._restarts.failed(now_s, now_s - self._began_s)
+        if delay_s is None:
+            restart = self._policy.restart
+            return self._give_up(
+                f"{what}; it was restarted {restart.budget} times within {restart.window_s:g} s already"
+            )
+        if delay_s <= 0:
+            return [ChildLog("WARNING", f"{what}; restarting"), *self._start(now_s)]
+        self.phase = ChildPhase.WAITING
+        self._again_s = now_s + delay_s
+        return [ChildLog("WARNING", f"{what}; restarting in {delay_s:g} s")]
+
+    def _give_up(self, why: str) -> list[ChildEffect]:
+        self.phase = ChildPhase.GIVEN_UP
+        return [ChildLog("ERROR", f"given up: {why}"), GiveUpChild(why)]

@@ -1,0 +1,83 @@
+"""The end of a run in which nothing that acts is left: all plans are done, or the last was given up. Decisions only."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from afspm.supervisor.supervision.child import ChildPhase
+from afspm.supervisor.supervision.liveness import LivenessPolicy
+from afspm.supervisor.supervision.supervised_child import SupervisedChild
+
+IDLE_AFTER_S = 10.0  # real time; a component that ends the experiment at its last scan, or repairs the tip, comes first
+ASK_AGAIN_S = 5.0
+
+
+@dataclass(slots=True)
+class IdleWatch:
+    """The watch for a run in which nothing that acts is left.
+
+    Attributes:
+        ends: whether the run ends then.
+        since_s: when the last plan was over and everything else at rest, in real monotonic time; None: it is not so.
+        asked_s: when the scheduler was asked last whether the microscope is in use.
+        is_logged, is_postponed: whether that was logged.
+        is_ending: whether the scheduler was asked to end the experiment.
+        starts: how often processes were started by then.
+    """
+
+    ends: bool = False
+    since_s: float | None = None
+    asked_s: float = -math.inf
+    is_logged: bool = False
+    is_postponed: bool = False
+    is_ending: bool = False
+    starts: int = 0
+
+    def look(self, children: Collection[SupervisedChild], now_s: float, liveness: LivenessPolicy) -> bool:
+        """Return whether nothing that acts has been left for a while."""
+        acting = [child for child in children if child.spec.acts]
+        starts_before, self.starts = self.starts, sum(child.starts for child in children)
+        if not acting or not all(child.is_over for child in acting):
+            self.since_s, self.is_logged, self.is_postponed, self.is_ending = None, False, False, False
+            return False
+        if self.is_ending:  # components are at work on what they finish
+            return True
+        if self.starts != starts_before or any(_is_at_work(child, now_s, liveness) for child in children):
+            self.since_s = None
+            return False
+        if self.since_s is None:
+            self.since_s = now_s
+        return now_s >= self.since_s + IDLE_AFTER_S
+
+    def asks(self, now_s: float) -> bool:
+        """Return whether it is time to ask whether the microscope is in use; that counts as asked."""
+        if not self.ends or self.is_ending or now_s < self.asked_s + ASK_AGAIN_S:
+            return False
+        self.asked_s = now_s
+        return True
+
+    def deadline_s(self) -> float | None:
+        """Return when to look again; None: no time by itself."""
+        if self.since_s is None or self.is_ending or (self.is_logged and not self.ends):
+            return None
+        return max(self.since_s + IDLE_AFTER_S, self.asked_s + ASK_AGAIN_S)
+
+
+def describe_idle(children: Collection[SupervisedChild]) -> str:
+    """Return why nothing is left to run: "series is done, grid was given up"."""
+    acting = [child for child in children if child.spec.acts]
+    return ", ".join(f"{child.spec.name} {'was given up' if child.given_up else 'is done'}" for child in acting)
+
+
+def _is_at_work(child: SupervisedChild, now_s: float, liveness: LivenessPolicy) -> bool:
+    """Return whether a process starts, is to be restarted, does not beat, or is a component at work on a step."""
+    if child.is_over or child.spec.acts:
+        return False
+    if child.life is None or child.watch.phase is not ChildPhase.RUNNING:
+        return True
+    if not child.spec.beats:
+        return False
+    is_busy = not child.spec.essential and child.life.is_busy(now_s, liveness)
+    return child.life.beat is None or is_busy or child.life.is_silent(now_s, liveness)

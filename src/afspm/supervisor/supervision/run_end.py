@@ -1,0 +1,160 @@
+"""The end of a run: when processes are asked to end, killed and left. Decisions only."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from enum import Enum, auto
+
+from afspm.model import Role
+from afspm.supervisor.supervision.liveness import LivenessPolicy
+from afspm.supervisor.supervision.supervised_child import SupervisedChild
+
+OWN_PACE_S = 1.5  # after the end of the experiment: everybody has heard it, and may finish a file
+AGAIN_S = 0.25  # somebody is busy with a step that it may take: ask later
+FAREWELL_S = 60.0  # but not for ever
+KILL_AFTER_S = 1.5  # after being asked, or after having finished what may be finished then
+TIP_S = 15.0  # after being asked: a process that retracts the tip, or works on its end, ends by itself before
+LEAVE_AFTER_S = 3.0  # after being killed
+
+
+class EndReason(Enum):
+    """The reason for which a run ended."""
+
+    EXPERIMENT_ENDED = auto()
+    ALL_DONE = auto()
+    STOPPED = auto()
+    LOST = auto()
+    """A process that the experiment can't do without was given up, or all were."""
+    PLANS_DONE = auto()
+    """All components that act are done, and none of them ended the experiment."""
+    PLANS_LOST = auto()
+    """Nothing that acts is left, as a component that does was given up."""
+
+    @property
+    def is_announced(self) -> bool:
+        """Return whether all processes know of the end by the scheduler, and finish by themselves."""
+        return self in (EndReason.EXPERIMENT_ENDED, EndReason.PLANS_DONE)
+
+    @property
+    def is_final(self) -> bool:
+        """Return whether there is nothing to resume."""
+        return self in (EndReason.EXPERIMENT_ENDED, EndReason.ALL_DONE, EndReason.PLANS_DONE)
+
+    @property
+    def exit_code(self) -> int:
+        """Of `afspm run`."""
+        return _EXIT_CODES[self]
+
+
+_EXIT_CODES = {
+    EndReason.EXPERIMENT_ENDED: 0,
+    EndReason.ALL_DONE: 0,
+    EndReason.LOST: 1,
+    EndReason.PLANS_DONE: 3,
+    EndReason.PLANS_LOST: 4,
+    EndReason.STOPPED: 130,
+}
+
+
+class EndStep(Enum):
+    """The next step with processes that still run."""
+
+    ASK = auto()
+    """Close their stdin: they end cleanly."""
+    KILL = auto()
+    LEAVE = auto()
+    """Not even killing ends them (a driver hangs in the system): say so, and go."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunEnd:
+    """A run that is ending: those that still run are asked to end, then killed, then left.
+
+    Attributes:
+        ask_s, kill_s: when, in real monotonic time.
+        latest_s: until when those who are busy may be waited for before they are asked.
+        last: what has been done already.
+        in_haste: somebody wants it to be over now.
+        busy_s: when somebody was last seen to be busy after being asked.
+        began_s: when it began to end.
+    """
+
+    why: EndReason
+    text: str
+    ask_s: float
+    kill_s: float
+    latest_s: float
+    last: EndStep | None = None
+    in_haste: bool = False
+    busy_s: float = -math.inf
+    began_s: float = 0.0
+
+    @classmethod
+    def begin(cls, why: EndReason, text: str, now_s: float) -> RunEnd:
+        """Begin to end. Where the experiment itself ended, all know and close by themselves: not disturbed at first."""
+        if not why.is_announced:
+            return cls(why, text, ask_s=now_s, kill_s=now_s + KILL_AFTER_S, latest_s=now_s, began_s=now_s)
+        ask_s = now_s + OWN_PACE_S
+        return cls(why, text, ask_s, ask_s + KILL_AFTER_S, latest_s=now_s + FAREWELL_S, began_s=now_s)
+
+    def hurried(self, now_s: float) -> RunEnd:
+        """Return the end in haste: those not asked yet are, those that were are killed."""
+        if self.last in (EndStep.KILL, EndStep.LEAVE):
+            return self
+        if self.last is None and self.why is not EndReason.STOPPED:
+            return replace(self, ask_s=now_s, kill_s=now_s + KILL_AFTER_S, latest_s=now_s)
+        return replace(self, kill_s=now_s, last=EndStep.ASK, in_haste=True)
+
+    def deadline_s(self) -> float | None:
+        """Return when `step` has something to do next; None: never again."""
+        match self.last:
+            case None:
+                return self.ask_s
+            case EndStep.ASK:
+                return self.kill_s
+            case EndStep.KILL:
+                return self.kill_s + LEAVE_AFTER_S
+            case EndStep.LEAVE:
+                return None
+
+    def step(self, now_s: float, *, busy: bool = False) -> tuple[RunEnd, EndStep | None]:
+        """Return what the time has come for, if anything, and the ending after it.
+
+        Args:
+            busy: somebody still works on a step, within what it declared: before they are asked, a component (a picture
+                of the night, say), and then a translator, which does not leave before the tip is safe, or any process
+                that is seen to work on its end.
+        """
+        deadline_s = self.deadline_s()
+        seen = replace(self, busy_s=now_s) if busy and self.last is EndStep.ASK else self
+        if deadline_s is None or now_s < deadline_s:
+            return seen, None
+        if self.last is None and busy and now_s < self.latest_s:
+            ask_s = min(now_s + AGAIN_S, self.latest_s)
+            return replace(self, ask_s=ask_s, kill_s=ask_s + KILL_AFTER_S), None
+        if self.last is EndStep.ASK and not self.in_haste:
+            kill_s = min(now_s + AGAIN_S, self.ask_s + TIP_S) if busy else self.busy_s + KILL_AFTER_S
+            if now_s < kill_s:
+                return replace(seen, kill_s=kill_s), None
+        do = {None: EndStep.ASK, EndStep.ASK: EndStep.KILL, EndStep.KILL: EndStep.LEAVE}[self.last]
+        return replace(self, last=do), do
+
+
+def unfinished(
+    ending: RunEnd, children: Mapping[str, SupervisedChild], now_s: float, liveness: LivenessPolicy
+) -> list[str]:
+    """Return which processes have something to finish; a translator may have it after it was asked to end: the tip."""
+    is_asked, has_ended = ending.last is not None, ending.why.is_announced
+    # a scheduler on another computer may be there
+    can_hear = all(child.life for child in children.values() if child.spec.role is Role.SCHEDULER)
+    found = []
+    for name, child in children.items():
+        is_busy = child.life is not None and child.life.is_busy(now_s, liveness)
+        may_finish = has_ended and child.may_still_finish(now_s, liveness, can_hear=can_hear)
+        sees_to_tip = is_busy and child.spec.role is Role.TRANSLATOR
+        is_ending = child.life is not None and child.life.is_ending
+        if (sees_to_tip or is_ending) if is_asked else (is_busy or may_finish):
+            found.append(name)
+    return found

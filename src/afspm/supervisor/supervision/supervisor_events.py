@@ -1,0 +1,204 @@
+"""Events that the supervisor's decisions take in, and the effects that come out."""
+
+from __future__ import annotations
+
+import signal
+from dataclasses import dataclass
+from enum import Enum, auto
+
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.own_fault import OwnFault
+from afspm.supervisor.supervision.child import HeartbeatReport
+
+
+@dataclass(frozen=True, slots=True)
+class RunBegan:
+    """Everything is to be started."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessStarted:
+    """The operating system has made the process."""
+
+    name: str
+    pid: int
+
+
+@dataclass(frozen=True, slots=True)
+class StartFailed:
+    """There is no process."""
+
+    name: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Beaten:
+    """A heartbeat came."""
+
+    name: str
+    report: HeartbeatReport
+
+
+@dataclass(frozen=True, slots=True)
+class ActivitySeen:
+    """The operating system was asked whether a process that does not beat works; None: it can't tell.
+
+    Attributes:
+        processor_s: the processor time that it has used in its life; None: that is not known.
+    """
+
+    name: str
+    works: bool | None
+    processor_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Exited:
+    """A child is gone; a negative code is the number of the signal that ended it, as in `subprocess`."""
+
+    name: str
+    pid: int
+    code: int
+    last_error: str = ""
+    fault: OwnFault | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class EndSignal:
+    """A person, or the system, wants the run to end."""
+
+    number: int
+
+    @property
+    def name(self) -> str:
+        return "Ctrl-C" if self.number == signal.SIGINT else signal.Signals(self.number).name
+
+
+@dataclass(frozen=True, slots=True)
+class RestartOrdered:
+    """A process is to be started anew."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class SchedulerAnswered:
+    """The scheduler of this run has answered: components may ask it."""
+
+
+@dataclass(frozen=True, slots=True)
+class UseReported:
+    """The scheduler answered whether the microscope is in use; `why`: empty if it is not."""
+
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class EndRefused:
+    """The scheduler refused to end the experiment."""
+
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class TimePassed:
+    """The deadline came, or anything else happened."""
+
+
+SupervisorEvent = (
+    RunBegan
+    | ProcessStarted
+    | StartFailed
+    | Beaten
+    | ActivitySeen
+    | Exited
+    | EndSignal
+    | RestartOrdered
+    | SchedulerAnswered
+    | UseReported
+    | EndRefused
+    | TimePassed
+)
+
+
+class ProcessAction(Enum):
+    """An action of the supervisor on a process."""
+
+    START = auto()
+    """`ProcessStarted` or `StartFailed` follows."""
+    KILL = auto()
+    """End it, and all that it has started, now."""
+    CLOSE_INPUT = auto()
+    """Ask it to end by closing its standard input."""
+    ABANDON = auto()
+    """Wait for it no longer: it can't be killed."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessCommand:
+    """Carry out an action on a process."""
+
+    action: ProcessAction
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class ReleaseComponents:
+    """Components that wait for the scheduler may begin."""
+
+
+@dataclass(frozen=True, slots=True)
+class AskUse:
+    """Ask the scheduler whether the microscope is in use; `UseReported` follows if the scheduler can say."""
+
+
+@dataclass(frozen=True, slots=True)
+class EndExperiment:
+    """Have the scheduler end the experiment; `EndRefused` follows if it does not."""
+
+
+@dataclass(frozen=True, slots=True)
+class WriteLog:
+    """Write a line to the log in the name of a process; `level` is a name of the logging module."""
+
+    name: str
+    level: str
+    text: str
+
+
+SupervisorEffect = ProcessCommand | ReleaseComponents | AskUse | EndExperiment | WriteLog
+
+
+_EXIT_REASONS = {
+    ExitCode.DONE: "done",
+    ExitCode.CRASHED: "crashed",
+    ExitCode.OWN_FAULT: "crashed",
+    ExitCode.CONFIG: "its settings can't work",
+    ExitCode.ENDED: "ended with the experiment",
+    ExitCode.ORPHAN: "ended as it was asked to",
+}
+
+
+_WINDOWS_REASONS = {
+    0xC0000005: "access violation",
+    0xC0000017: "out of memory",
+    0xC00000FD: "stack overflow",
+    0xC0000135: "a DLL is missing",
+    0xC000013A: "its console was closed",
+    0xC0000374: "damaged heap",
+    0xC0000409: "aborted",
+}
+"""Of the system's own exit codes, those that are met: what a signal is elsewhere."""
+
+
+def describe_exit(code: int) -> str:
+    """Return why a process ended, as its exit code says."""
+    if code in _WINDOWS_REASONS:
+        return f"killed by Windows: {_WINDOWS_REASONS[code]} (0x{code:08X})"
+    if code < 0:
+        try:
+            return f"killed by {signal.Signals(-code).name}"
+        except ValueError:
+            return f"killed by signal {-code}"
+    return next((words for known, words in _EXIT_REASONS.items() if known == code), f"exit code {code}")

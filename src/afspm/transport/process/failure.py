@@ -1,0 +1,113 @@
+"""An exception in words: what happened, and where in the user's own code."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import traceback
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from afspm.basics.errors import AfspmError, FileError, Refused, RequestError, TransportError
+from afspm.model import ControlResponse
+
+PACKAGE = Path(__file__).parents[2]  # not resolved: as the paths in tracebacks
+_BELOW_START = 2  # of `python -m`: what Python itself does first
+_REFUSED_AGAIN = {
+    ControlResponse.CMD_NOT_SUPPORTED,
+    ControlResponse.PARAM_NOT_SUPPORTED,
+    ControlResponse.PARAM_ERROR,
+    ControlResponse.ACTION_NOT_SUPPORTED,
+}
+"""What is refused for what was asked, by a limit for example, is refused again."""
+
+
+def describe(error: BaseException, name: str = "", package: Path = PACKAGE) -> str:
+    """Return the message of an exception, and below it the lines of code that led to it.
+
+    Our frames above the user's are left out; where we refused on purpose what the user's code asked for, those below it
+    as well. An error from our code alone is shown whole, unless it is one that we foresaw.
+
+    Args:
+        name: of the component, which the reader knows already.
+        package: the folder of the code that is ours.
+    """
+    trace = traceback.TracebackException.from_exception(error)
+    if isinstance(error, AfspmError) and all(_is_passage(frame, package) for frame in trace.stack):
+        return _words(error, name)  # no code of anybody's: how we came to say so helps nobody to put it right
+    is_chained = False
+    link: traceback.TracebackException | None = trace
+    seen: set[int] = set()
+    while link is not None and id(link) not in seen:
+        seen.add(id(link))
+        kept = _kept(link.stack, package, is_foreseen=link is trace and _is_foreseen(error, link.stack, package))
+        link.stack = traceback.StackSummary.from_list(kept)
+        link = link.__cause__ or (None if link.__suppress_context__ else link.__context__)
+        is_chained = is_chained or link is not None
+    what = _words(error, name) if isinstance(error, AfspmError) else "".join(trace.format_exception_only()).strip()
+    where = trace.format() if is_chained else trace.stack.format()
+    return "\n".join([what, *"".join(where).rstrip("\n").splitlines()])
+
+
+def may_pass(error: BaseException) -> bool:
+    """Return whether an error may be a passing one, of the controller or the computer, and not the code's own."""
+    if isinstance(error, Refused):
+        return error.response not in _REFUSED_AGAIN
+    return isinstance(error, (RequestError, FileError, TransportError, OSError, MemoryError))
+
+
+def place_of(error: BaseException, package: Path = PACKAGE) -> str:
+    """Return file and line of the user's code that an exception came from; of ours if there is none."""
+    frames = traceback.extract_tb(error.__traceback__)
+    of_user = [frame for frame in frames if not _is_passage(frame, package)]
+    last = (of_user or frames)[-1]
+    return f"{Path(last.filename).name}:{last.lineno}"
+
+
+def log(logger: logging.Logger, error: BaseException, name: str) -> None:
+    """Log an exception that ends a process."""
+    logger.error("%s", describe(error, name))
+    logger.debug("the full traceback", exc_info=error)
+
+
+def where_now(thread_id: int, package: Path = PACKAGE) -> str:
+    """Return the lines of code that a thread is in just now, from the user's own on."""
+    frame = sys._current_frames().get(thread_id)
+    stack = traceback.extract_stack(frame) if frame is not None else []
+    return "".join(traceback.format_list(_kept(stack[_BELOW_START:], package, is_foreseen=False))).rstrip("\n")
+
+
+def _is_foreseen(error: BaseException, frames: Sequence[traceback.FrameSummary], package: Path) -> bool:
+    """True if we raised it on purpose, for what was asked of us; then its message says all."""
+    last = frames[-1] if frames else None
+    return isinstance(error, AfspmError) or (
+        last is not None and _is_ours(last, package) and (last.line or "").startswith("raise ")
+    )
+
+
+def _words(error: AfspmError, name: str) -> str:
+    said = str(error)
+    return said.removeprefix(f"{name}: ") if name else said
+
+
+def _kept(
+    frames: Iterable[traceback.FrameSummary], package: Path, *, is_foreseen: bool
+) -> list[traceback.FrameSummary]:
+    everything = list(frames)
+    first = next((i for i, frame in enumerate(everything) if not _is_passage(frame, package)), None)
+    if first is None:
+        return everything
+    below = everything[first:]
+    if not is_foreseen:
+        return below
+    last = max(i for i, frame in enumerate(below) if not _is_passage(frame, package))
+    return [frame for frame in below[: last + 1] if not _is_ours(frame, package)]
+
+
+def _is_ours(frame: traceback.FrameSummary, package: Path) -> bool:
+    return frame.filename.startswith("<") or Path(frame.filename).is_relative_to(package)
+
+
+def _is_passage(frame: traceback.FrameSummary, package: Path) -> bool:
+    """True for ours, and for what Python does between two calls of ours."""
+    return _is_ours(frame, package) or Path(frame.filename).name == "contextlib.py"

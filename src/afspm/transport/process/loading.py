@@ -1,0 +1,99 @@
+"""Loads the class that a launch line names, and calls it with the settings."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import inspect
+
+from afspm.basics.errors import AfspmError, ConfigError
+from afspm.basics.launch import Launch
+from afspm.transport.process.context import ExperimentProcess
+
+
+def load(launch: Launch) -> ExperimentProcess:
+    """Return the component, scheduler or translator of a launch line.
+
+    Raises:
+        ConfigError: there is no such class, or it can't be made with these settings. A restart would not help.
+    """
+    class_ = find_class(launch.class_, launch.name)
+    _check_settings(class_, launch)
+    try:
+        plain = getattr(class_, "plain_settings", ())  # tables in which it looks for a `class` by itself
+        made = class_(
+            **{name: value if name in plain else made_of(value, launch.name) for name, value in launch.settings.items()}
+        )
+    except AfspmError as error:
+        where = f"{launch.name}: {error.where}" if error.where else launch.name
+        raise ConfigError(error.what, where=where, hint=error.hint) from error
+    if not isinstance(made, ExperimentProcess):
+        raise ConfigError(
+            f"{launch.class_} can't be run",
+            where=launch.name,
+            hint="derive it from afspm.Component",
+        )
+    return made
+
+
+def made_of(value: object, where: str) -> object:
+    """Return a setting, each table in it with a `class` as the object that this makes."""
+    if isinstance(value, list | tuple):
+        return [made_of(item, where) for item in value]
+    if not isinstance(value, dict):
+        return value
+    inside = {key: made_of(item, where) for key, item in value.items()}
+    path = inside.pop("class", None)
+    if isinstance(path, str):
+        return find_class(path, where)(**inside)
+    return inside if path is None else {"class": path, **inside}
+
+
+def find_class(path: str, where: str) -> type[object]:
+    """Return the class "package.module.Name". Raises ConfigError if there is none."""
+    class_ = find_object(path, where, "class")
+    if not isinstance(class_, type):
+        raise ConfigError(f"{path} is not a class", where=where)
+    return class_
+
+
+def find_object(path: str, where: str, what: str = "function") -> object:
+    """Return the object "package.module.name". Raises ConfigError if there is none.
+
+    Args:
+        what: it should be, for the error.
+    """
+    module_name, _, name = path.rpartition(".")
+    if not module_name:
+        raise ConfigError(f"{path!r} names no {what}", where=where, hint=f'write {what} = "module.name"')
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"the {what} {path} can't be imported: {error}", where=where, hint="is it installed, or on the path?"
+        ) from error
+    found = getattr(module, name, None)
+    if found is None:
+        near = difflib.get_close_matches(name, vars(module), n=1)
+        raise ConfigError(
+            f"the module {module_name} has no {what} {name}",
+            where=where,
+            hint=f"did you mean {near[0]!r}?" if near else "",
+        )
+    return found
+
+
+def _check_settings(class_: type[object], launch: Launch) -> None:
+    """Report a typo as one, and not as a TypeError from within a constructor."""
+    try:
+        signature = inspect.signature(class_)
+        signature.bind(**launch.settings)
+    except ValueError:
+        return  # a class of C code without a signature
+    except TypeError as error:
+        names = [name for name in signature.parameters if name not in ("args", "kwargs")]
+        raise ConfigError(
+            f"{launch.class_} can't be made with these settings: {error}",
+            where=launch.name,
+            hint=f"it takes {', '.join(names) or 'none'}",
+        ) from error

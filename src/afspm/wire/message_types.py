@@ -1,0 +1,76 @@
+"""Messages of the user: Python modules that protoc made or that declare them, or .proto files compiled here."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from types import ModuleType
+
+from afspm import wire
+from afspm.basics.errors import ConfigError
+
+
+def register_all(sources: Iterable[str]) -> None:
+    """Make the messages of modules ("my_lab.messages_pb2") and files ("peaks.proto") known by their names.
+
+    A module may hold `MessageDeclaration`s instead, by which more than the type of its messages is known.
+
+    Raises:
+        ConfigError: there is no such module or file, it has errors, or it holds no messages.
+    """
+    for source in sources:
+        module = _compiled(Path(source)) if source.endswith(".proto") else _imported(source)
+        descriptor = getattr(module, "DESCRIPTOR", None)
+        names = list(getattr(descriptor, "message_types_by_name", ()))
+        declarations = [one for one in vars(module).values() if isinstance(one, wire.MessageDeclaration)]
+        for declaration in declarations:
+            wire.declare(declaration)
+        if not (names or declarations):
+            raise ConfigError(
+                "holds no message types",
+                where=source,
+                hint="name a module that protoc has made, or that holds declarations",
+            )
+        for name in names:
+            wire.register(getattr(module, name))
+
+
+def _imported(name: str) -> ModuleType:
+    try:
+        return importlib.import_module(name)
+    except Exception as error:  # a module may raise anything while it is imported
+        raise ConfigError(
+            f"can't be imported: {error}", where=name, hint="is it on the Python path, or beside the experiment file?"
+        ) from error
+
+
+def _compiled(path: Path) -> ModuleType:
+    """The module that protoc makes of a file. It is used once and not kept: the file is what counts."""
+    if not path.is_file():
+        raise ConfigError("there is no such file", where=str(path))
+    import tempfile  # imported late: few have messages of their own, and all would start later for it
+
+    try:
+        from grpc_tools import protoc
+    except ImportError:
+        raise ConfigError(
+            "needs a compiler for messages",
+            where=str(path),
+            hint='pip install "afspm[messages]", or name a _pb2 module',
+        ) from None
+    well_known = Path(protoc.__file__).parent / "_proto"
+    with tempfile.TemporaryDirectory(prefix="afspm-") as folder:
+        arguments = ["protoc", f"-I{path.parent}", f"-I{well_known}", f"--python_out={folder}", str(path)]
+        if protoc.main(arguments) != 0:
+            raise ConfigError("has errors, told above", where=str(path))
+        name = f"{path.stem.replace('-', '_')}_pb2"
+        spec = importlib.util.spec_from_file_location(name, Path(folder) / f"{name}.py")
+        if spec is None or spec.loader is None:
+            raise ConfigError("protoc made no module of it", where=str(path))
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[name] = module
+        spec.loader.exec_module(module)
+    return module

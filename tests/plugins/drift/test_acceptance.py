@@ -1,0 +1,115 @@
+"""The probability that a match is wrong: what raises it, what is said of it, and how it is fitted."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from benchmarks.drift import fit
+from benchmarks.drift.trials import Outcome
+
+from afspm.plugins.drift.estimators.acceptance import MatchEvidence
+
+GOOD = MatchEvidence(
+    overlap=0.8, sd_px=0.02, gap=300.0, rival=0.05,
+    agreement=1.0, above_repeats=math.inf, surprise=1.0, searched=1.0,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "worse",
+    [
+        {"overlap": 0.3},
+        {"sd_px": 0.5},
+        {"gap": 1.0},
+        {"rival": 0.95},
+        {"agreement": 0.5},
+        {"above_repeats": 2.0},
+        {"surprise": 60.0},
+    ],
+)
+def test_worse_evidence_of_any_kind_makes_a_match_less_likely(worse: dict[str, float]) -> None:
+    assert GOOD.wrong < 0.01
+    assert replace(GOOD, **worse).wrong > GOOD.wrong
+
+
+def test_a_refusal_names_what_speaks_most_against_the_match_and_how_likely_it_is_wrong() -> None:
+    assert GOOD.refusal(0.1) == ""
+    repeated = replace(GOOD, above_repeats=1.5)
+    assert repeated.refusal(0.1).startswith("the surface repeats itself: a site like the others (1.5 standard")
+    assert f"wrong with a probability of {repeated.wrong:.0%}" in repeated.refusal(0.1)
+
+
+def test_the_fit_tells_probabilities_that_are_right() -> None:
+    """Of matches of which only the agreement of their parts says whether they are wrong."""
+    random = np.random.default_rng(2)
+    outcomes, told = [], []
+    for seed in range(3000):
+        found = replace(GOOD, agreement=float(random.uniform(0.0, 1.0)), gap=float(random.uniform(1.0, 300.0)))
+        probability = 1.0 / (1.0 + math.exp(10.0 * (found.agreement - 0.5)))
+        outcomes.append(_outcome(seed, found, wrong=bool(random.random() < probability)))
+        told.append(probability)
+    module: dict[str, Any] = {}
+    exec(fit.fitted(outcomes), module)
+    assert module["WEIGHTS"]["agreement"] == pytest.approx(-10.0, rel=0.1)
+    assert abs(module["WEIGHTS"]["gap"]) < 0.2
+
+
+def test_ellipses_are_as_large_as_errors_are_and_grow_with_the_doubt_that_tells() -> None:
+    random = np.random.default_rng(3)
+    outcomes = []
+    for seed in range(8000):
+        shared, varied = random.uniform(0.0, 1.0, 2)
+        chi2 = 2.0 * math.exp(1.5 * shared) * random.exponential(2.0)
+        doubts = {"varied": varied, "shared": shared, "unclear": 0.0, "leverage": 0.0, "spread": 1.0}
+        outcomes.append(_outcome(seed, GOOD, wrong=False, chi2=chi2, **doubts))
+    spread = fit._spread(outcomes)
+    assert spread["shared"] == pytest.approx(1.5, abs=0.2)
+    assert abs(spread["varied"]) < 0.2
+    assert spread["all"] == pytest.approx(2.0 * math.log(1.0 - fit.COVERED) / math.log(0.05), rel=0.15)
+
+
+def test_no_doubt_makes_an_ellipse_smaller() -> None:
+    random = np.random.default_rng(4)
+    outcomes = []
+    for seed in range(400):
+        shared, varied = random.uniform(0.0, 1.0, 2)
+        chi2 = 2.0 * math.exp(-1.5 * shared) * random.exponential(2.0)
+        doubts = {"varied": varied, "shared": shared, "unclear": 0.0, "leverage": 0.0, "spread": 1.0}
+        outcomes.append(_outcome(seed, GOOD, wrong=False, chi2=chi2, **doubts))
+    spread = fit._spread(outcomes)
+    assert all(spread[name] >= 0.0 for name in fit.DOUBTS)
+
+
+def test_a_fit_that_was_stopped_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: list[int] = []
+    monkeypatch.setattr(fit, "KEPT", tmp_path)
+    monkeypatch.setattr(fit, "trials", lambda half, seeds, names: [_Job(seed, ran) for seed in seeds.get("real", [])])
+    assert len(fit.gathered("fitted", 2, 1)) == 2
+    assert len(fit.gathered("fitted", 3, 1)) == 3
+    assert ran == [fit.SEED, fit.SEED + 1, fit.SEED + 2]
+
+
+@dataclass
+class _Job:
+    seed: int
+    ran: list[int]
+    cell: str = "real"
+    surface: str = "rough"
+
+    def run(self) -> list[Outcome]:
+        self.ran.append(self.seed)
+        return [_outcome(self.seed, GOOD, wrong=False)]
+
+
+def _outcome(seed: int, found: MatchEvidence, *, wrong: bool, chi2: float = 3.0, **doubts: float) -> Outcome:
+    quality = {**asdict(found), "varied": 0.0, "shared": 0.0, "unclear": 0.0, "leverage": 0.0, "spread": 1.0, **doubts}
+    error = (5.0, 0.0) if wrong else (0.01, 0.0)
+    return Outcome(
+        cell="real", surface="rough", estimator="", seed=seed, accepted=True, reason="", error_px=error, chi2=chi2,
+        bound_px=0.01, white_bound_px=0.01, cpu_s=0.1, half="fitted", quality=quality,
+    )  # fmt: skip

@@ -1,0 +1,102 @@
+"""`afspm drift FILE…`: which scans of files are followed, what is told and what is written."""
+
+from __future__ import annotations
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from afspm.basics.errors import InvalidValue
+from afspm.cli.app import app
+from afspm.model import Region, Scan
+from afspm.plugins.drift.record import DriftRecord
+from afspm.plugins.drift.study.scan_series import series
+from afspm.simulation import World
+from afspm.storage.formats import FileContent
+from afspm.translator.own_files import FileFacts, encode_scan
+
+REGION = Region((0.0, 0.0), (1e-6, 1e-6))
+PIXELS = 48
+VELOCITY_M_S = (40e-12, -25e-12)
+
+
+def content(*channels: str, end_s: float | None = 100.0, pixels: int = 8, name: str = "a.nc") -> FileContent:
+    end_ns = None if end_s is None else int(end_s * 1e9)
+    scans = tuple(Scan(REGION, channel, "m", np.zeros((pixels, pixels)), end_ns, name) for channel in channels)
+    return FileContent("test", scans, start_ns=None if end_ns is None else end_ns - 10**11, end_ns=end_ns, upwards=True)
+
+
+def test_scans_of_the_topography_come_in_the_order_of_time_with_what_their_files_say() -> None:
+    found = series([content("Phase", "Height", end_s=1000.0, name="b.nc"), content("Height", "Phase")])
+    assert found.channel == "Height"
+    assert [one.key for one in found.scans] == ["a.nc", "b.nc"]
+    assert (found.scans[0].start_s, found.scans[0].end_s, found.scans[0].upwards) == (0.0, 100.0, True)
+
+
+BROKEN_OFF = "e.nc: it was broken off: 3 of 8 lines are missing"
+
+
+def test_what_cannot_be_followed_is_told_and_the_rest_goes_on() -> None:
+    others = [content("Height", end_s=None, name="c.nc"), content("Height", pixels=1, name="d.nc")]
+    others.append(content("Height", name="e.nc"))
+    others[-1].scans[0].values[5:] = np.nan
+    found = series([content("Height"), *others, content("Height", end_s=900.0, name="b.nc")])
+    assert [one.key for one in found.scans] == ["a.nc", "b.nc"]
+    assert found.left_out == ("c.nc: it does not say when it was taken", "d.nc: 1 x 1 pixels", BROKEN_OFF)
+
+
+def test_a_channel_without_two_scans_is_refused_with_those_there_are() -> None:
+    with pytest.raises(InvalidValue, match=r"'Phase'.*in it: Height, Phase"):
+        series([content("Height"), content("Phase")], "Phase")
+    with pytest.raises(InvalidValue, match="no scan of a topography"):
+        series([])
+
+
+@pytest.fixture
+def run_folder(tmp_path: Path) -> Path:
+    """Six scans of a sample that drifts, as the simulated microscope saves them, and a file that is broken."""
+    settings = {"surface": {"kind": "particles"}, "drift": {"velocity_m_per_s": (*VELOCITY_M_S, 0.0)}}
+    world = World.from_settings(settings, seed=1, start_s=0.0)
+    folder = tmp_path / "run"
+    (folder / "scans").mkdir(parents=True)
+    for k in range(6):
+        scan = world.scan(REGION, (PIXELS, PIXELS), 1.0, 600.0 * k)
+        measured = FileFacts(int(scan.end_s * 1e9), {"scan-speed [m/s]": 2e-6})
+        (folder / "scans" / f"scan-{k}.nc").write_bytes(encode_scan(REGION, scan.channels(), measured))
+    start = {"n": 1, "time_s": 0.0, "event": "start", "settings": settings, "seed": 1}
+    (folder / "truth.jsonl").write_text(json.dumps(start) + "\n", encoding="utf-8")
+    (folder / "scans" / "scan-6.nc").write_bytes(b"CDF\x02 half of a file")
+    return folder
+
+
+@pytest.mark.timeout(60)
+def test_a_run_folder_is_followed_told_and_drawn(run_folder: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    line = ["drift", str(run_folder), "-o", str(output), "-j", "2", "--estimator", "correlation", "--tracker", "paper"]
+    done = CliRunner().invoke(app, line, env={"COLUMNS": "100"})
+    assert done.exit_code == 0, done.output
+    assert "6 scans of Height" in done.output
+    assert "scan-6.nc" in done.output, "what can't be read is named"
+    record = DriftRecord.read(output / "drift.csv")
+    assert record.matched.all()
+    expected = np.array(VELOCITY_M_S) * (record.time_s - record.time_s[0])[:, None]
+    np.testing.assert_allclose(record.drift_m, expected, atol=1e-6 / PIXELS)
+    assert {"drift_estimates.csv", "drift_stack.nc"} <= {path.name for path in output.iterdir()}
+    assert (output / "drift_errors.png").exists() == (find_spec("matplotlib") is not None)
+    estimates = DriftRecord.read(output / "drift_estimates.csv")
+    np.testing.assert_allclose(estimates.drift_m[1:], expected[1:], atol=1e-6 / PIXELS)
+
+
+def test_files_of_which_none_can_be_read_end_with_an_error(tmp_path: Path) -> None:
+    broken = tmp_path / "a.sxm"
+    broken.write_bytes(b"nothing")
+    done = CliRunner().invoke(app, ["drift", "--channel", "Z", str(broken), str(tmp_path / "missing.ibw")])
+    assert done.exit_code != 0
+    assert isinstance(done.exception, InvalidValue)
+    assert "no file was read" in done.exception.what
+    assert "a.sxm" in done.output
+    assert "missing.ibw" in done.output

@@ -1,0 +1,31 @@
+"""The GXSM translator as a real process, an emulated GXSM beside it, and a peer on the translator's sockets."""
+
+from __future__ import annotations
+
+import os
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from vendor_bench import PATIENT, AtPanel, VendorBench
+
+from afspm.plugins.gxsm.emulator import GxsmEmulator
+
+
+class Emulated(AtPanel, GxsmEmulator):
+    """With somebody at its panel."""
+
+
+class Bench(VendorBench[Emulated]):
+    emulated = Emulated
+    translator = "afspm.plugins.gxsm.Gxsm"
+    data_name = "gxsm"
+
+    def __init__(self, folder: Path, stack: ExitStack, speed: float, emulator: dict[str, Any]) -> None:
+        if emulator.get("transport") == "shm" and not sys.platform.startswith("linux"):
+            pytest.skip("Gxsm4's shared memory is there on Linux alone")
+        self.settings = {**PATIENT, "result_timeout_s": 8.0 * speed}
+        block = f"afspm_test_{os.getpid()}_{id(self)}"
+        super().__init__(folder, stack, speed, {"block": block, **emulator})

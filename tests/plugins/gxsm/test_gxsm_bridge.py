@@ -1,0 +1,229 @@
+"""The script in GXSM's console, attacked from outside: by programs that do not know its secret, and by slow ones."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from threading import Event, Thread
+
+import numpy as np
+import pytest
+from raw_clients import SocketClient
+
+from afspm.plugins.gxsm import bridge
+from afspm.plugins.gxsm.bridge_client import BridgeLink
+from afspm.translator.driver import ControllerLost
+
+PROVES_S = 0.3
+
+
+class Gxsm:
+    """The module `gxsm`, as far as the bridge needs it here."""
+
+    wanted = 1.0
+
+    def get(self, ref: str) -> float:
+        return self.wanted if ref == "script-control" else 400.0
+
+    def get_slice(self, *_: int) -> np.ndarray:
+        return np.zeros((1 << 13, 1 << 10))
+
+
+@pytest.fixture
+def serving(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], str]]:
+    """Runs bridges, which end with the test; a client has less time than at a real one."""
+    gxsm = Gxsm()
+    for name, value in {"gxsm": gxsm, "PROVES_S": PROVES_S, "LOOK_S": 0.02}.items():
+        monkeypatch.setattr(bridge, name, value)
+    threads, listeners = [], []
+
+    def serve() -> str:
+        listener = socket.create_server(("127.0.0.1", 0))
+        served = bridge.Bridge(listener, bridge.secret())
+        thread = Thread(target=served.serve)
+        thread.start()
+        threads.append((thread, served))
+        listeners.append(listener)
+        return "{}:{}".format(*listener.getsockname())
+
+    yield serve
+    gxsm.wanted = 0.0
+    for thread, served in threads:
+        thread.join()
+        served.close()
+    for listener in listeners:
+        listener.close()
+
+
+def connected(address: str) -> socket.socket:
+    host, _, port = address.rpartition(":")
+    return socket.create_connection((host, int(port)), 10.0)
+
+
+def link(address: str) -> BridgeLink:
+    host, _, port = address.rpartition(":")
+    return BridgeLink((host, int(port)), 10.0, time.monotonic)
+
+
+@contextmanager
+def listening_in_its_place(answer: Callable[[bytes], bytes]) -> Iterator[tuple[str, bytearray]]:
+    """A program of another user, which listens where the bridge should; all that was sent to it."""
+    received = bytearray()
+
+    def listen(listener: socket.socket) -> None:
+        client, _ = listener.accept()
+        with client, client.makefile("rb") as lines, suppress(OSError):
+            for line in lines:
+                received.extend(line)
+                client.sendall(answer(line))
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = Thread(target=listen, args=(listener,))
+        thread.start()
+        yield "{}:{}".format(*listener.getsockname()), received
+        thread.join()
+
+
+def test_a_listener_in_place_of_the_bridge_learns_nothing_it_can_use(serving: Callable[[], str]) -> None:
+    """Neither the secret, nor a line that the bridge takes for the proof of a client."""
+    address = serving()
+    secret = bridge.secret()
+    reply = json.dumps({"value": ["0" * 64, "1" * 64]}).encode() + b"\n"
+    with (
+        listening_in_its_place(lambda line: reply) as (fake, received),
+        pytest.raises(ControllerLost, match="not know"),
+    ):
+        link(fake).call("get", "RangeX")
+    assert secret not in received
+    assert received.count(b"\n") == 1, "nothing after the challenge"
+    with connected(address) as stranger, stranger.makefile("rb") as replies:
+        stranger.sendall(bytes(received))
+        assert len(json.loads(replies.readline())["value"]) == 2
+        stranger.sendall(bytes(received) + b'["get", "RangeX"]\n')
+        assert replies.readline() == b""
+
+
+def test_a_program_between_client_and_bridge_is_refused(serving: Callable[[], str]) -> None:
+    """It passes on every line, and would then call GXSM itself."""
+    with connected(serving()) as real, real.makefile("rb") as replies:
+
+        def pass_on(line: bytes) -> bytes:
+            real.sendall(line)
+            return replies.readline()
+
+        with listening_in_its_place(pass_on) as (fake, _), pytest.raises(ControllerLost, match="does not know") as lost:
+            link(fake).call("get", "RangeX")
+        assert "a tunnel needs the bridge's port number at both ends" in str(lost.value), "what it may be, too"
+        real.sendall(b'["get", "RangeX"]\n')
+        assert replies.readline() == b""
+
+
+def test_a_proof_holds_for_one_connection_only(serving: Callable[[], str]) -> None:
+    address = serving()
+    nonce = "0" * 64
+    with connected(address) as first, first.makefile("rb") as replies:
+        first.sendall(json.dumps(["challenge", nonce]).encode() + b"\n")
+        theirs, _ = json.loads(replies.readline())["value"]
+        proof = bridge.proof(bridge.secret(), "client", address, nonce, theirs)
+        response = json.dumps(["response", proof]).encode() + b"\n"
+        first.sendall(response)
+        assert json.loads(replies.readline()) == {"value": bridge.WELCOME}
+    with connected(address) as again, again.makefile("rb") as replies:
+        again.sendall(json.dumps(["challenge", nonce]).encode() + b"\n")
+        replies.readline()
+        again.sendall(response)
+        assert replies.readline() == b""
+
+
+def test_a_client_that_dribbles_its_first_line_blocks_nobody_and_is_dropped(serving: Callable[[], str]) -> None:
+    address = serving()
+    pace = Event()
+    with connected(address) as slow:
+        slow.sendall(b"[")
+        client = SocketClient(address)
+        assert client.call("get", "RangeX") == 400.0, "served meanwhile"
+        began_s = time.monotonic()
+        with suppress(ConnectionError):
+            while time.monotonic() < began_s + 20 * PROVES_S:
+                slow.sendall(b" ")
+                pace.wait(PROVES_S / 10)
+        assert time.monotonic() < began_s + 20 * PROVES_S, "dropped, though it goes on sending"
+        assert client.call("get", "RangeX") == 400.0, "which is not asked for proofs again"
+        client.close()
+
+
+def test_a_client_that_takes_no_answer_does_not_block_another(serving: Callable[[], str]) -> None:
+    address = serving()
+    one, other = SocketClient(address), SocketClient(address)
+    one.send(b'["get_slice", 0, 0, 0, 0, 8192]\n')
+    assert other.call("get", "RangeX") == 400.0
+    assert one.reply().shape == (1 << 13, 1 << 10), "all of it is there when it is taken"
+    one.close()
+    other.close()
+
+
+def test_strangers_leave_room_for_clients(serving: Callable[[], str]) -> None:
+    address = serving()
+    strangers = [connected(address) for _ in range(2 * bridge.MOST_STRANGERS)]
+    client = SocketClient(address)
+    assert client.call("get", "RangeX") == 400.0
+    for one in (*strangers, client):
+        one.close()
+
+
+def test_one_client_too_many_is_refused_with_a_reason(serving: Callable[[], str]) -> None:
+    address = serving()
+    clients = [SocketClient(address) for _ in range(bridge.MOST_CLIENTS)]
+    with pytest.raises(ControllerLost, match="the bridge serves 8 clients already"):
+        link(address).call("get", "RangeX")
+    assert [client.call("get", "RangeX") for client in clients] == [400.0] * len(clients)
+    for client in clients:
+        client.close()
+
+
+def test_a_client_that_is_silent_for_long_makes_room(
+    serving: Callable[[], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bridge, "TAKES_S", 0.0)
+    address = serving()
+    clients = [SocketClient(address) for _ in range(bridge.MOST_CLIENTS + 1)]
+    assert clients[-1].call("get", "RangeX") == 400.0
+    assert clients[0].sent_away(b'["get", "RangeX"]\n')
+    for client in clients:
+        client.close()
+
+
+def test_the_readme_describes_the_proofs_of_the_bridge() -> None:
+    readme = (Path(bridge.__file__).parent / "README.md").read_text(encoding="utf-8")
+    for words in ("HMAC-SHA256", '["challenge", nonce]', '["response", proof]', bridge.WELCOME):
+        assert words in readme
+
+
+def test_the_script_needs_nothing_but_the_python_within_gxsm() -> None:
+    """Neither another package, nor a newer Python than systems with Gxsm3 have."""
+    tree = ast.parse(Path(bridge.__file__).read_text(encoding="utf-8"), feature_version=(3, 8))
+    imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    imported |= {one.name for node in ast.walk(tree) if isinstance(node, ast.Import) for one in node.names}
+    assert {str(name) for name in imported} <= sys.stdlib_module_names | {"gxsm"}
+
+
+def test_messages_that_the_readme_explains_are_in_the_code() -> None:
+    folder = Path(bridge.__file__).parent
+    traps = (folder / "README.md").read_text(encoding="utf-8").partition("## Traps")[2].partition("\n## ")[0]
+    code = "\n".join(file.read_text(encoding="utf-8") for file in sorted(folder.glob("*.py")))
+    code += (folder.parents[1] / "translator" / "tcp.py").read_text(encoding="utf-8")
+    strings = [node.value for node in ast.walk(ast.parse(code.replace("from __future__ import annotations", "")))
+               if isinstance(node, ast.Constant) and isinstance(node.value, str)]  # fmt: skip
+    written = "\0".join(strings)
+    quoted = re.findall(r"\*\*`(.*?)`\*\*", traps)
+    assert len(quoted) > 10
+    for message in quoted:
+        for part in re.split(r"…|'400,0 Å'|Xp-|folder \. ", message):
+            assert part.strip() in written, message

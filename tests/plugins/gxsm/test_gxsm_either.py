@@ -1,0 +1,115 @@
+"""What holds for the emulated GXSM and for a real one: set AFSPM_GXSM to its address ("shm", "127.0.0.1:65431").
+
+Its tip is moved, and it scans some nanometres about where it is: use its own simulator (`-h SPM-SIM:SPM`), or withdraw.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gxsm_bench import Bench
+from vendor_bench import Peer, TranslatorProcess, scans, states
+
+from afspm.basics.clock import ExperimentClock
+from afspm.model import ControlRequest, ControlResponse, Region, ScanParameters, ScopeState, names
+
+FREE = ScopeState.FREE
+REAL = "AFSPM_GXSM"
+EMULATED: dict[str, dict[str, Any]] = {
+    "simulator-3": {"card": "simulator", "version": 3},
+    "simulator-4": {"card": "simulator", "transport": "shm"},
+    "sranger": {},
+    "rpspmc": {"card": "RPSPMC", "user_unit": "nm"},
+}
+FRAME = Region((10e-9, -5e-9), (50e-9, 30e-9), math.radians(20.0))
+SHAPE = (24, 32)
+
+
+@pytest.fixture(params=[*EMULATED, "real"])
+def peer(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Peer]:
+    """A translator's, with a small frame in force; what was in force is put back."""
+    with ExitStack() as stack:
+        if request.param != "real":
+            found = Bench(tmp_path, stack, 5.0, EMULATED[request.param]).start()
+        else:
+            address = os.environ.get(REAL)
+            if not address:
+                pytest.skip(f"{REAL} is not set: no real GXSM to ask")
+            clock = ExperimentClock.real()
+            found = TranslatorProcess(Bench.translator, {"address": address}, tmp_path, stack, clock).peer
+        heard = found.until(FREE)
+        before = next(one for one in heard if isinstance(one, ScanParameters))
+        rate = found.get_response("x-pixel-rate")
+        if rate.ok:  # GXSM's own simulator
+            kept = found.get("x-pixel-rate")
+            assert found.set("x-pixel-rate", 4000).ok
+        in_force(found, ScanParameters(FRAME, SHAPE, ""))
+        yield found
+        in_force(found, before)
+        if rate.ok:
+            assert found.set("x-pixel-rate", kept).ok
+
+
+def in_force(peer: Peer, wanted: ScanParameters) -> None:
+    response = peer.ask(ControlRequest.SET_SCAN_PARAMS, wanted)
+    assert response.ok, response.reason
+    peer.until(lambda one: isinstance(one, ScanParameters) and one.shape == wanted.shape)
+    peer.until(FREE)
+
+
+def test_a_scan_of_a_turned_frame_that_is_no_square(peer: Peer) -> None:
+    assert peer.act(names.START_SCAN).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "FREE"]
+    found = scans(heard)
+    assert found
+    for scan in found:
+        assert scan.region == Region.from_top_left(FRAME.top_left_m, FRAME.size_m, FRAME.angle_rad)
+        assert scan.shape == SHAPE
+        assert np.isfinite(scan.values).all()
+    topography = next(scan for scan in found if "Topo" in scan.channel)
+    assert topography.unit == "m"
+    assert 0.0 < np.ptp(topography.values) < 1e-6
+
+
+def test_a_scan_that_is_stopped(peer: Peer) -> None:
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    assert peer.set(names.SCAN_SIZE_X, 60e-9).code == ControlResponse.NOT_FREE
+    assert peer.act(names.STOP_SCAN).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"]
+    assert not scans(heard)
+
+
+def test_parameters_are_as_they_were_set(peer: Peer) -> None:
+    for name, value, unit in (
+        (names.SCAN_TOP_LEFT_X, "-12.5", "nm"),
+        (names.SCAN_SIZE_Y, "25.25", "nm"),
+        (names.SCAN_RESOLUTION_Y, "20", None),
+        (names.SCAN_ANGLE, "-7.5", "deg"),
+    ):
+        response = peer.set(name, value, unit)
+        assert response.ok, (name, response.reason)
+    assert float(peer.get(names.SCAN_SIZE_X)) == pytest.approx(50e-9, rel=1e-6)
+    assert peer.get(names.SCAN_RESOLUTION_X) == "32"
+    before = float(peer.get(names.TIP_BIAS_VOLTAGE))
+    assert peer.set(names.TIP_BIAS_VOLTAGE, before / 2).ok
+    assert float(peer.get(names.TIP_BIAS_VOLTAGE)) == pytest.approx(before / 2)
+    assert peer.set(names.TIP_BIAS_VOLTAGE, before).ok
+
+
+def test_what_can_not_be_is_refused(peer: Peer) -> None:
+    assert peer.set(names.SCAN_SIZE_X, "nan").code == ControlResponse.PARAM_ERROR
+    assert peer.set(names.SCAN_SIZE_X, 1, "V").code == ControlResponse.PARAM_ERROR
+    assert peer.set(names.SCAN_SIZE_X, -1e-9).code == ControlResponse.PARAM_ERROR
+    assert peer.set("x-nonsense", 1).code == ControlResponse.PARAM_NOT_SUPPORTED
+    assert peer.act("x-nonsense").code == ControlResponse.ACTION_NOT_SUPPORTED
+    assert float(peer.get(names.SCAN_SIZE_X)) == pytest.approx(50e-9, rel=1e-6)

@@ -1,0 +1,463 @@
+"""What can go wrong at GXSM: each gives an error with a name, nothing hangs, and it is found again."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from gxsm_bench import Bench
+from vendor_bench import SHAPE, SOON, Peer, ready, scans, states
+
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    ProbePosition,
+    Region,
+    ScanParameters,
+    ScopeState,
+    Spectrum,
+    names,
+)
+from afspm.plugins.gxsm.emulator.program import GxsmProgram
+from afspm.storage.formats import read
+
+Make = Callable[..., Bench]
+FREE = ScopeState.FREE
+UNDEFINED = ScopeState.UNDEFINED
+SHM: dict[str, Any] = {"transport": "shm"}
+BRIDGE: dict[str, Any] = {}
+
+
+def small(made: Bench, **settings: object) -> Peer:
+    """A translator that has found GXSM, with a frame of few pixels in force."""
+    peer = made.start(**settings)
+    ready(peer, Region((0.0, 0.0), (100e-9, 1e-6)), (8, 16))
+    return peer
+
+
+def scanned(peer: Peer) -> list[str]:
+    assert peer.act(names.START_SCAN).ok
+    found = scans(peer.until(FREE))
+    assert found
+    return [Path(scan.filename).name for scan in found]
+
+
+# --- calls ---
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "told"),
+    [
+        ("garbage", BRIDGE, "reports its state as"),
+        ("nan", BRIDGE, "GXSM says nan for"),
+        ("wrong-type", BRIDGE, "GXSM replied '\\x04' to"),
+        ("error", BRIDGE, "SystemError: an emulated error"),
+        ("error", SHM, "GXSM can't pass on the result"),
+        ("wrong-type", SHM, "GXSM replied '\\x04' to"),
+        ("bad-pickle", SHM, "GXSM's reply is not a pickle of a value"),
+        ("evil-pickle", SHM, "GXSM's reply refers to 'posix mkdir', which afspm does not run"),
+        ("code", SHM, "GXSM can't pass on the result"),
+        ("huge", SHM, "GXSM replied 2147483648 bytes"),
+    ],
+)
+def test_a_bad_answer_has_a_name_and_gxsm_is_found_again(
+    bench: Make, kind: str, settings: dict[str, Any], told: str
+) -> None:
+    made = bench(**settings)
+    peer = small(made)
+    made.strike(kind)
+    peer.until(UNDEFINED)
+    peer.until(FREE)
+    made.until_said(told)
+    assert scanned(peer)
+    assert not Path("evil").exists()
+
+
+def test_a_tip_on_its_way_is_still_on_it_when_the_link_comes_back(bench: Make) -> None:
+    """A RedPitaya does not tell that the tip moves."""
+    made = bench(speed=5.0, card="RPSPMC")
+    peer = made.start()
+    ready(peer, Region((0.0, 0.0), (1e-6, 1e-6)))
+    assert peer.set(names.MOVE_SPEED, "20", "nm/s").ok
+    assert peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((400e-9, 0.0))).ok
+    peer.until(ScopeState.MOVING)
+    made.strike("error")
+    heard = peer.until(FREE)
+    assert states(heard) == ["UNDEFINED", "MOVING", "FREE"]
+    assert made.emulator.rig.probe_at(made.clock.now_s()) == pytest.approx((400e-9, 0.0))
+
+
+def test_a_tip_that_its_frame_takes_along_is_on_its_way_too(bench: Make) -> None:
+    """A RedPitaya does not tell that either; and where it goes next, it goes from there."""
+    made = bench(speed=5.0, card="RPSPMC")
+    peer = made.start()
+    ready(peer, Region((0.0, 0.0), (1e-6, 1e-6)))
+    assert peer.set(names.MOVE_SPEED, "50", "nm/s").ok
+    for center_m in ((200e-9, 0.0), (200e-9, -100e-9)):
+        assert peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(Region(center_m, (1e-6, 1e-6)), SHAPE, "")).ok
+        peer.until(ScopeState.MOVING)
+        assert states(peer.until(FREE)) == ["FREE"]
+        assert made.emulator.rig.probe_at(made.clock.now_s()) == pytest.approx(center_m)
+
+
+@pytest.mark.parametrize("settings", [BRIDGE, SHM], ids=["bridge", "shm"])
+def test_a_gxsm_that_hangs_is_lost_and_found(bench: Make, settings: dict[str, Any]) -> None:
+    made = bench(speed=1.0, **settings)
+    peer = small(made, **SOON)
+    made.strike("wedge", duration_s=8.0)
+    peer.until(UNDEFINED)
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.NO_RESPONSE
+    assert "the controller can't be reached" in response.reason
+    peer.until(FREE)
+    made.until_said("no answer to")
+    assert peer.get(names.SCAN_RESOLUTION_X) == "16"
+
+
+@pytest.mark.parametrize("settings", [BRIDGE, SHM], ids=["bridge", "shm"])
+def test_a_gxsm_that_crashes_and_is_started_again_is_found(bench: Make, settings: dict[str, Any]) -> None:
+    made = bench(**settings)
+    address = made.address.partition("@")[0]
+    if settings:
+        process = f"t{os.getpid()}"
+        made = bench(process=process, **settings)
+        address = f"{made.address.partition('@')[0]}@{process}"
+    peer = small(made, address=address)
+    made.strike("wedge", duration_s=1e6)
+    while not made.emulator.unanswered:  # what it was asked, it will never answer
+        pass
+    made.strike("crash")
+    peer.until(UNDEFINED)
+    made.start_controller_again()
+    peer.until(FREE)
+    assert scanned(peer)
+
+
+def test_the_memory_of_a_gxsm_that_has_ended_is_not_believed(bench: Make, left_behind: Path) -> None:
+    made = bench(block=left_behind.name, **SHM)
+    peer = small(made)
+    made.strike("crash")
+    peer.until(UNDEFINED)
+    assert left_behind.exists()
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.NO_RESPONSE
+    made.until_said("no process is called", "has ended")
+
+
+@pytest.fixture
+def left_behind() -> Iterator[Path]:
+    path = Path("/dev/shm", f"afspm_left_{os.getpid()}")
+    yield path
+    path.unlink(missing_ok=True)
+
+
+def test_a_script_that_was_stopped_is_missed_until_it_runs_again(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    made.strike("script-stopped")
+    peer.until(UNDEFINED)
+    assert peer.act(names.START_SCAN).code == ControlResponse.NO_RESPONSE
+    made.until_said("is bridge.py running in GXSM's console?")
+    made.at_panel(lambda emulator: emulator.run_script())
+    peer.until(FREE)
+    assert scanned(peer)
+
+
+def test_script_that_has_ended_is_run_again_from_outside(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    made.strike("script-stopped")
+    peer.until(UNDEFINED)
+    (made.data / "delete-to-run-the-script-again.txt").unlink()
+    peer.until(FREE)
+    assert scanned(peer)
+
+
+def test_a_decimal_comma_is_refused_before_anything_is_set(bench: Make) -> None:
+    made = bench(decimal_comma=True)
+    peer = made.start()
+    peer.until(UNDEFINED)
+    assert peer.set(names.TIP_BIAS_VOLTAGE, 0.25).code == ControlResponse.NO_RESPONSE
+    made.until_said("start GXSM with LC_NUMERIC=C")
+    assert made.emulator.program.entries["dsp-fbs-bias"] == made.emulator.rig.setup.bias_v == 0.1
+
+
+def test_what_gxsm_does_not_take_is_refused_though_it_says_0(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    made.strike("refused")
+    response = peer.set(names.TIP_BIAS_VOLTAGE, 0.3)
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "the controller set 0.1 V instead of 0.3 V; the former values were restored" in response.reason
+    assert peer.set(names.TIP_BIAS_VOLTAGE, 0.3).ok
+
+
+# --- scans ---
+
+
+def test_a_scan_that_did_not_begin_is_told_and_an_old_one_not_taken_for_it(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    assert scanned(peer)
+    made.at_panel(lambda emulator: emulator.woken.post())
+    made.strike("no-start")
+    assert peer.act(names.START_SCAN).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
+    assert not scans(heard)
+    made.until_said("it was stopped or never began")
+
+
+def test_a_scan_without_channels_is_told(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    made.at_panel(lambda emulator: emulator.program.channels.clear())
+    assert peer.act(names.START_SCAN).ok
+    assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
+    made.until_said("a channel is set")
+    assert made.emulator.program.dialogs == ["no channel is set"]
+
+
+def stopped_at_panel(made: Bench, peer: Peer) -> None:
+    """A scan is begun, and somebody stops it after a few lines; nothing comes of it."""
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    until_line(made, peer, 2)
+    made.strike("panel-stop")
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"], made.said()
+    assert not scans(heard)
+
+
+def until_line(made: Bench, peer: Peer, line: int) -> None:
+    """Until so many lines of the running scan are complete."""
+    until_s = made.clock.now_s() + 60.0
+    last = made.emulator.program.scan.activity
+    assert last is not None
+    while last.lines_done(made.clock.now_s()) < line and made.clock.now_s() < until_s:
+        peer.get(names.SPEC_KIND)
+
+
+KINDS: list[dict[str, Any]] = [{"version": 3}, {}, SHM, {"card": "RPSPMC"}, {"card": "simulator"}]
+
+
+@pytest.mark.parametrize("saving", ["afspm", "gxsm"])
+@pytest.mark.parametrize("kind", KINDS, ids=["gxsm3", "gxsm4", "shm", "rpspmc", "simulator"])
+def test_a_scan_stopped_at_the_panel_is_told_as_broken_off(bench: Make, kind: dict[str, Any], saving: str) -> None:
+    """GXSM keeps, and saves, the scan before in the rows that it did not come to, and nothing says so."""
+    made = bench(speed=1.0, **kind)
+    peer = small(made, saving=saving)
+    if kind.get("card") == "simulator":
+        assert peer.set("x-pixel-rate", 1000).ok
+    scanned(peer)
+    stopped_at_panel(made, peer)
+    made.until_said("still holds the previous scan")
+    assert scanned(peer), "the next one is whole, and published"
+
+
+@pytest.mark.parametrize(
+    ("region", "shape"),
+    [
+        (Region((0.0, 0.0), (100e-9, 2e-6)), (8, 16)),
+        (Region((0.0, 0.0), (100e-9, 1e-6)), (6, 16)),
+        (Region((0.0, 0.0), (100e-9, 1e-6)), (8, 12)),
+        (Region((0.0, 0.0), (100e-9, 1e-6)), (8, 24)),
+        (Region((0.0, 0.0), (100e-9, 1e-6)), (12, 16)),
+    ],
+    ids=["frame", "fewer-rows", "fewer-columns", "more-columns", "more-rows"],
+)
+def test_the_rows_of_another_frame_are_known_as_old_too(bench: Make, region: Region, shape: tuple[int, int]) -> None:
+    made = bench(speed=1.0)
+    peer = small(made)
+    scanned(peer)
+    assert peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, shape, "")).ok
+    peer.until(FREE)
+    stopped_at_panel(made, peer)
+
+
+def test_a_scan_stopped_in_its_first_line_is_told_as_broken_off(bench: Make) -> None:
+    made = bench(speed=1.0)
+    peer = small(made)
+    assert peer.set(names.SCAN_SPEED, "10", "um/s").ok
+    scanned(peer)
+    assert peer.set(names.SCAN_SPEED, "50", "nm/s").ok
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.strike("panel-stop")
+    assert states(peer.until(FREE)) == ["INTERRUPTED", "FREE"]
+
+
+def test_a_first_scan_that_is_stopped_is_told_as_broken_off(bench: Make) -> None:
+    """There was none before: its file has zeros."""
+    made = bench(speed=1.0)
+    peer = small(made)
+    stopped_at_panel(made, peer)
+    made.until_said("lacks lines")
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_scan_begun_and_stopped_at_the_panel_is_told_as_broken_off(bench: Make, seen: bool) -> None:
+    """Also if the translator has not seen the scan before."""
+    made = bench(speed=1.0)
+    peer = small(made)
+    scanned(peer)
+    if not seen:
+        made.kill()
+        peer = made.start()
+        peer.until(FREE)
+    made.at_panel(lambda emulator: emulator.program.start_scan())
+    peer.until(ScopeState.SCANNING)
+    until_line(made, peer, 4)
+    made.strike("panel-stop")
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"], made.said()
+    assert not scans(heard)
+
+
+def test_a_scan_stopped_while_the_translator_is_down_is_not_published(bench: Make) -> None:
+    made = bench(speed=1.0)
+    peer = small(made)
+    scanned(peer)
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    until_line(made, peer, 2)
+    made.kill()
+    made.at_panel(lambda emulator: emulator.rig.stop_scan(emulator.clock.now_s()))
+    peer = made.start()
+    heard = peer.until(FREE)
+    assert "INTERRUPTED" in states(heard)
+    assert {Path(scan.filename).name[:7] for scan in scans(heard)} == {"scan001"}, "the one before, once more"
+
+
+def test_slow_lines_of_gxsms_simulator_are_scanned_to_their_end(bench: Make) -> None:
+    made = bench(speed=20.0, card="simulator")
+    peer = small(made)
+    assert peer.set("x-pixel-rate", 50).ok
+    assert scanned(peer)
+    last = made.emulator.program.scan.activity
+    assert last is not None
+    assert last.line_s > 0.2
+
+
+def test_a_scan_is_saved_when_gxsm_is_done_with_it(bench: Make) -> None:
+    made = bench(speed=1.0)
+    peer = small(made)
+    for name in scanned(peer):
+        assert read(made.data / name).end_ns is not None, "saved at once, a file has no end in it"
+
+
+def test_a_folder_chosen_at_the_panel_between_two_scans_is_found(bench: Make, tmp_path: Path) -> None:
+    """Until it scans GXSM tells of the folder before."""
+    made = bench(speed=20.0)
+    peer = small(made)
+    assert scanned(peer)
+    other = tmp_path / "other"
+    other.mkdir()
+    made.at_panel(lambda emulator: setattr(emulator.program.saving, "folder", other))
+    assert scanned(peer)
+    assert len(list(other.glob("*.nc"))) == 4
+
+
+@pytest.mark.parametrize(
+    ("kind", "version", "saving"),
+    [("file-late", 3, "afspm"), ("half-file", 3, "gxsm"), ("file-late", 4, "gxsm"), ("half-file", 4, "afspm")],
+)
+def test_files_that_take_their_time_are_waited_for(bench: Make, kind: str, version: int, saving: str) -> None:
+    made = bench(speed=20.0, version=version)
+    peer = small(made, saving=saving)
+    expected = scanned(peer)
+    made.strike(kind, count=2, duration_s=3.0)
+    assert [name.replace("002", "001") for name in scanned(peer)] == expected
+
+
+@pytest.mark.parametrize("kind", ["file-late", "half-file", "file-missing"])
+def test_a_channel_that_does_not_come_is_named_and_the_others_are_published(bench: Make, kind: str) -> None:
+    made = bench(speed=20.0)
+    peer = small(made, result_timeout_s=20.0)
+    made.strike(kind, duration_s=1e6)
+    found = scanned(peer)  # the last channel is written first
+    assert found == ["scan001-M-Xp-ZSmTopo.nc", "scan001-Xm-ZSmTopo.nc", "scan001-Xp-ImTunnel.nc"]
+    made.until_said("GXSM did not save Xp-Phase.nc")
+    assert len(scanned(peer)) == 4, "it is not given up for ever"
+
+
+def test_a_scan_none_of_whose_files_comes_is_broken_off(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made, result_timeout_s=20.0)
+    made.strike("file-missing", count=4)
+    assert peer.act(names.START_SCAN).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
+    made.until_said("no new file in")
+    assert scanned(peer)
+
+
+def test_a_gxsm_that_names_its_channels_only_once_it_scans(bench: Make) -> None:
+    """Files of before are in its folder, too, and not taken for the new ones."""
+    made = bench(speed=20.0)
+    peer = small(made)
+    assert scanned(peer)
+    made.at_panel(lambda emulator: setattr(emulator.program, "names", _named_late(emulator.program)))
+    assert {name[:7] for name in scanned(peer)} == {"scan002"}
+
+
+def _named_late(program: GxsmProgram) -> Callable[[float], list[Path]]:
+    names, first = program.names, program.scan.activity
+
+    def late(now_s: float) -> list[Path]:
+        return [] if program.scan.activity is first else names(now_s)
+
+    return late
+
+
+def test_a_folder_that_can_not_be_seen_from_here_is_named(bench: Make, tmp_path: Path) -> None:
+    made = bench(speed=20.0)
+    peer = small(made, scan_dir=str(tmp_path / "not there"), result_timeout_s=20.0)
+    assert peer.act(names.START_SCAN).ok
+    assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
+    made.until_said("does not exist on this computer")
+
+
+def test_a_scan_that_ended_while_gxsm_hung_is_not_lost(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made, **SOON)
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.strike("wedge", duration_s=160.0)
+    heard = peer.until(FREE)
+    assert "UNDEFINED" in states(heard)
+    assert scans(heard)
+
+
+# --- spectra ---
+
+
+def test_a_spectrum_that_is_not_saved_is_told(bench: Make) -> None:
+    made = bench(speed=20.0, probe_auto_save=False)
+    peer = small(made, result_timeout_s=20.0)
+    assert peer.act(names.START_SPEC).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SPEC", "INTERRUPTED", "FREE"]
+    made.until_said("switch on Auto Save of probes")
+
+
+@pytest.mark.parametrize("kind", ["file-late", "half-file"])
+def test_a_spectrum_that_takes_its_time_is_waited_for(bench: Make, kind: str) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    made.strike(kind, duration_s=3.0)
+    assert peer.act(names.START_SPEC).ok
+    assert any(isinstance(one, Spectrum) for one in peer.until(FREE))
+
+
+def test_a_spectrum_whose_name_was_there_already_is_the_new_one(bench: Make) -> None:
+    """GXSM overwrites it."""
+    made = bench(speed=20.0)
+    (made.data / "scan001-VP001-VP.vpdata").write_text("of last year")
+    peer = small(made)
+    assert peer.act(names.START_SPEC).ok
+    (spectrum,) = (one for one in peer.until(FREE) if isinstance(one, Spectrum))
+    assert spectrum.filename.endswith("scan001-VP001-VP.vpdata")

@@ -1,0 +1,76 @@
+"""Where the translators of these tests run: hundreds of them, most of whose time would go by importing the same."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import IO, Any, Protocol
+
+from afspm.basics import entry_points
+
+HOST = "afspm.supervisor.host"
+IMPORTED = [HOST, "numpy", *entry_points.modules(entry_points.DRIVERS)]
+
+
+class Host(Protocol):
+    """What of `subprocess.Popen` is used."""
+
+    stdin: IO[bytes]
+    stderr: IO[bytes]
+
+    def kill(self) -> None: ...
+    def wait(self, timeout: float) -> int: ...
+
+
+def host(environment: Mapping[str, str]) -> Host:
+    """A process like `python -m afspm.supervisor.host`; where the system can, forked from one that has imported what
+    all of them need. (How one starts by itself is what the tests of experiments see to.)"""
+    if "forkserver" in multiprocessing.get_all_start_methods():
+        return _Forked(environment)
+    pipes: Any = subprocess.Popen(
+        [sys.executable, "-m", HOST], stdin=subprocess.PIPE, stderr=subprocess.PIPE, env=environment
+    )
+    return pipes  # type: ignore[no-any-return]
+
+
+class _Forked:
+    def __init__(self, environment: Mapping[str, str]) -> None:
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload(IMPORTED)
+        (stdin, to_it), (from_it, stderr) = os.pipe(), os.pipe()
+        self.stdin, self.stderr = os.fdopen(to_it, "wb"), os.fdopen(from_it, "rb")
+        with Connection(stdin) as its_stdin, Connection(stderr) as its_stderr:  # these find their way into it
+            settings = dict(environment), Path.cwd()
+            self._process = context.Process(target=_run, args=(its_stdin, its_stderr, *settings))
+            self._process.start()
+
+    def kill(self) -> None:
+        self._process.kill()
+
+    def wait(self, timeout: float) -> int:
+        self._process.join(timeout)
+        if self._process.exitcode is None:
+            raise subprocess.TimeoutExpired(HOST, timeout)
+        return self._process.exitcode
+
+
+def _run(stdin: Connection, stderr: Connection, environment: Mapping[str, str], folder: Path) -> None:
+    """In the new process."""
+    from afspm.supervisor import host
+
+    for number, pipe in ((0, stdin), (2, stderr)):
+        with pipe:
+            os.dup2(pipe.fileno(), number)
+    os.environ.clear()
+    os.environ.update(environment)
+    os.chdir(folder)
+    tempfile.tempdir = None  # the environment says where
+    code = int(host.main())
+    host.end_within(host.EXIT_GRACE_S, code)
+    sys.exit(code)

@@ -1,0 +1,16 @@
+"""Calls that nobody means well by; `make soak` makes more of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.fuzz import fuzz
+from benchmarks.fuzz.nanonis import NanonisFuzzer
+
+from afspm.plugins.nanonis.emulator import NanonisEmulator
+
+
+def test_nothing_that_a_client_sends_ends_the_emulator_or_is_written_elsewhere(tmp_path: Path) -> None:
+    outcome = fuzz(NanonisFuzzer, NanonisEmulator(port=0), tmp_path, 2000, seed=7)
+    assert outcome.answered > 500
+    assert outcome.refused > 500

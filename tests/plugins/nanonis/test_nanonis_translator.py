@@ -1,0 +1,391 @@
+"""The Nanonis translator against the emulated controller: everything that a peer may ask for, as it sees it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from nanonis_bench import Bench
+from vendor_bench import FLAT, SHAPE, TURNED, left_in_danger, moved, ready, scanned, states
+
+from afspm.basics.exit_codes import ExitCode
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Feedback,
+    ProbePosition,
+    Region,
+    Scan,
+    ScanLines,
+    ScanParameters,
+    ScopeState,
+    Spectrum,
+    names,
+)
+from afspm.storage.formats import read
+
+Make = Callable[..., Bench]
+
+FREE = ScopeState.FREE
+
+
+# --- scans ---
+
+
+def test_a_scan_comes_with_the_frame_that_was_set_exactly(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    scans = scanned(peer)
+    assert {"Z Forward", "Z Backward", "Current Forward", "Current Backward"} <= scans.keys()
+    for scan in scans.values():
+        assert scan.region == TURNED
+        assert scan.shape == SHAPE
+        assert scan.filename == str(made.data / "unnamed001.sxm")
+        assert scan.time_ns is not None
+        assert abs(scan.time_ns / 1e9 - made.clock.now_s()) < 600.0
+
+
+@pytest.mark.parametrize("direction", ["up", "down"])
+@pytest.mark.parametrize("fetch", [False, True])
+def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, direction: str, fetch: bool) -> None:
+    """Against the heights of the simulated sample at each pixel: half a pixel off, or a mirrored axis, would show."""
+    seen = 20.0 if fetch else 100.0  # what is in no file must be seen running
+    made = bench(seen, surface="steps", tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
+    peer = made.start(**({"session_dir": str(made.folder / "not there")} if fetch else {}))
+    region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
+    ready(peer, region, (48, 32))
+    assert peer.set(names.SCAN_DIRECTION, direction).ok
+    scans = scanned(peer)
+    x, y = region.pixels_m((48, 32))
+    truth = made.emulator.rig.world.sample.surface_m(x, y)
+
+    def likeness(values: np.ndarray) -> float:
+        return float(np.corrcoef(values.ravel(), truth.ravel())[0, 1])
+
+    for channel in ("Z Forward", "Z Backward"):
+        values = scans[channel].values
+        assert likeness(values) > 0.98
+        for mirrored in (values[::-1], values[:, ::-1], values[::-1, ::-1]):
+            assert likeness(mirrored) < likeness(values) - 0.1
+    file = scans["Z Forward"].filename
+    assert file.endswith(".nc" if fetch else ".sxm")
+    if not fetch:
+        assert read(file).upwards is (direction == "up")
+
+
+def test_lines_come_while_it_scans(bench: Make) -> None:
+    made = bench(speed=5.0)
+    peer = made.start(live_lines_s=1.0)
+    ready(peer, shape=(40, 32))
+    assert peer.set(names.SCAN_DIRECTION, "down").ok
+    assert peer.act(names.START_SCAN).ok
+    heard = peer.until(FREE)
+    lines = [one for one in heard if isinstance(one, ScanLines) and one.channel == "Z Forward"]
+    whole = next(one for one in heard if isinstance(one, Scan) and one.channel == "Z Forward")
+    assert len(lines) >= 2
+    assert lines[0].first_row + len(lines[0].values) == 40, "the highest first"
+    picture = None
+    for one in lines:
+        picture = one.into(picture)
+    assert picture is not None
+    there = np.isfinite(picture)
+    assert there.any()
+    np.testing.assert_allclose(picture[there], whole.values[there], rtol=1e-6)
+
+
+def test_pixels_that_nanonis_would_round_are_refused(bench: Make) -> None:
+    peer = bench().start()
+    ready(peer)
+    response = peer.set(names.SCAN_RESOLUTION_X, 100)
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "96 or 112, not 100" in response.reason
+    assert peer.get(names.SCAN_RESOLUTION_X) == "32"
+
+
+def test_a_frame_beyond_the_scanner_is_refused_and_the_old_one_stays(bench: Make) -> None:
+    peer = bench(range_m=1e-6).start()
+    ready(peer)
+    far = Region((0.45e-6, 0.0), (300e-9, 100e-9))
+    response = peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(far, SHAPE, ""))
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "the former values were restored" in response.reason
+    assert float(peer.get(names.SCAN_TOP_LEFT_X)) == pytest.approx(TURNED.top_left_m[0], rel=1e-13)
+
+
+def test_a_size_beyond_the_scanner_is_refused_and_the_frame_stays_where_it_is(bench: Make) -> None:
+    made = bench(range_m=2e-6)
+    peer = made.start()
+    ready(peer)
+    before = made.emulator.software.scans.frame
+    response = peer.set(names.SCAN_SIZE_X, 3e-6)
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "the former values were restored" in response.reason
+    assert made.emulator.software.scans.frame == pytest.approx(before, rel=1e-6)
+
+
+def test_what_is_set_is_told_to_the_last_digit_though_nanonis_keeps_a_float32(bench: Make) -> None:
+    peer = bench().start()
+    peer.until(FREE)
+    for name, value in {
+        names.TIP_BIAS_VOLTAGE: 0.123456789,
+        names.SCAN_SPEED: 1.23456789e-6,
+        names.MOVE_SPEED: 2.3456789e-6,
+        names.ZCTRL_PGAIN: 0.123456789,
+        names.ZCTRL_IGAIN: 123.456789,
+        names.ZCTRL_SETPOINT: 0.66666666666,
+        names.SCAN_TOP_LEFT_X: 1.23456789012e-8,
+        names.SCAN_SIZE_Y: 3.33333333333e-7,
+        names.SCAN_ANGLE: -12.3456789012,
+        names.SAMPLE_SLOPE_X: 0.0123456789,
+        "x-drift-rate-x": 1.23456789e-12,
+        names.PULSE_VOLTAGE: 3.21,
+    }.items():
+        response = peer.set(name, value)
+        assert response.ok, (name, response.reason)
+        assert float(peer.get(name)) == pytest.approx(value, rel=1e-13), name
+
+
+def test_the_resolution_alone_leaves_the_frame_as_it_is(bench: Make) -> None:
+    """Nanonis' range is that of whole pixels: with more of them it is another for the same pixel centres."""
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    assert peer.set(names.SCAN_RESOLUTION_X, 64).ok
+    assert float(peer.get(names.SCAN_SIZE_X)) == pytest.approx(TURNED.size_m[0], rel=1e-13)
+    assert made.emulator.software.scans.frame[2] == pytest.approx(TURNED.size_m[0] * 64 / 63, rel=1e-6)
+    assert made.emulator.software.scans.frame[4] == pytest.approx(-30.0), "clockwise"
+
+
+# --- feedback, probe, spectra ---
+
+
+def test_feedback_is_set_switched_off_and_on(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False, proportional_gain=0.25, setpoint=0.5)).ok
+    heard = peer.until(lambda one: isinstance(one, Feedback))
+    assert (heard[-1].on, heard[-1].proportional_gain, heard[-1].setpoint) == (False, 0.25, 0.5)
+    assert made.emulator.rig.setup.feedback.on is False
+    assert made.emulator.rig.setup.feedback.integral_gain == pytest.approx(1500.0), "P alone changes T, and I stays"
+    assert peer.set("x-feedback-on", True).ok
+    assert made.emulator.rig.setup.feedback.on is True
+    response = peer.set(names.ZCTRL_PGAIN, 0)
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "T = P / I" in response.reason
+
+
+def test_feedback_is_switched_on_only_once_the_rest_of_it_is_set(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    software, switched_with = made.emulator.software, []
+    plain = software.z_controller.switch
+
+    def switch(now_s: float, *, on: bool, **settings: float) -> None:
+        switched_with.append((on, software.core.rig.setup.feedback.setpoint))
+        plain(now_s, on=on, **settings)
+
+    assert peer.set(names.ZCTRL_SETPOINT, 0.25).ok
+    monkeypatch.setattr(software.z_controller, "switch", switch)
+    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False, setpoint=0.5)).ok
+    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True, setpoint=0.75)).ok
+    assert switched_with == [(False, 0.25), (True, 0.75)]
+
+
+def test_the_probe_moves_at_its_speed_and_a_scan_does_not_tell_where_it_leads_it(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = made.start()
+    ready(peer)
+    assert peer.set(names.MOVE_SPEED, "100", "nm/s").ok
+    moved(peer, 200e-9, -50e-9)
+    assert float(peer.get(names.PROBE_POS_X)) == 200e-9
+    assert made.emulator.rig.probe_m == (200e-9, -50e-9)
+    assert peer.act(names.START_SCAN).ok
+    assert not any(isinstance(one, ProbePosition) for one in peer.until(FREE))
+
+
+@pytest.mark.parametrize(("kind", "first"), [("IV", "Bias calc"), ("force", "Z rel")])
+@pytest.mark.parametrize("fetch", [False, True])
+def test_a_spectrum_comes_with_where_it_was_taken(bench: Make, kind: str, first: str, fetch: bool) -> None:
+    made = bench(speed=20.0)
+    peer = made.start(**({"session_dir": str(made.folder / "not there")} if fetch else {}))
+    ready(peer)
+    moved(peer, 12.3456789e-9, -50e-9)
+    assert peer.set(names.SPEC_KIND, kind).ok
+    assert peer.act(names.START_SPEC).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SPEC", "FREE"]
+    (spectrum,) = (one for one in heard if isinstance(one, Spectrum))
+    assert spectrum.position_m == (12.3456789e-9, -50e-9)
+    assert spectrum.kind == kind
+    assert spectrum.names[0] == first
+    assert len(spectrum.values) > 100
+    assert spectrum.filename.endswith(".nc" if fetch else ".dat")
+    true = made.emulator.rig.spectrum
+    assert true is not None
+    np.testing.assert_allclose(spectrum.values, true.values, rtol=1e-4, atol=1e-18)
+
+
+def test_a_spectrum_that_is_stopped_gives_none(bench: Make) -> None:
+    made = bench(speed=2.0)
+    peer = made.start()
+    ready(peer)
+    assert peer.act(names.START_SPEC).ok
+    peer.until(ScopeState.SPEC)
+    assert peer.act(names.STOP_SPEC).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"]
+    assert not any(isinstance(one, Spectrum) for one in heard)
+
+
+# --- what a tip needs besides ---
+
+
+def test_pulse_crash_retract_and_engage(bench: Make) -> None:
+    made = bench(speed=5.0)
+    peer = made.start()
+    ready(peer)
+    assert peer.act(names.PULSE).ok
+    assert states(peer.until(FREE)) == ["BUSY_PARAM", "FREE"]
+    assert peer.act(names.CRASH).ok
+    assert states(peer.until(FREE)) == ["MOVING", "FREE"]
+    assert made.emulator.rig.world.truth(made.clock.now_s())["marks"], "a crater"
+    assert peer.act(names.RETRACT).ok
+    assert states(peer.until(FREE)) == ["COARSE_MOTOR", "FREE"]
+    assert not made.emulator.rig.engaged
+    assert peer.act(names.ENGAGE).ok
+    peer.until(FREE)
+    assert made.emulator.rig.engaged
+
+
+def test_retracting_breaks_a_scan_off(bench: Make) -> None:
+    made = bench(speed=10.0)
+    peer = made.start()
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    assert peer.act(names.RETRACT).ok
+    heard = peer.until(FREE)
+    assert states(heard)[:2] == ["SCANNING", "INTERRUPTED"]
+    assert not any(isinstance(one, Scan) for one in heard)
+    assert not made.emulator.rig.engaged
+
+
+def test_retracting_ends_an_auto_approach_which_would_bring_the_tip_back(bench: Make) -> None:
+    made = bench(speed=1.0)
+    peer = made.start(actions={"x-approach": {"command": "AutoApproach.OnOffSet 1"}})
+    peer.until(FREE)
+    assert peer.act("x-approach").ok
+    peer.until(ScopeState.COARSE_MOTOR)
+    assert peer.act(names.RETRACT).ok
+    peer.until(FREE)
+    assert not made.emulator.rig.engaged
+
+
+@pytest.mark.parametrize("scanning", [False, True])
+def test_a_tip_without_feedback_is_retracted_when_the_run_is_stopped(bench: Make, scanning: bool) -> None:
+    made = bench(speed=5.0)
+    left_in_danger(made, scanning=scanning, retracts=True)
+    assert not made.emulator.rig.engaged
+    assert "the run is stopping with the feedback off: the tip was retracted" in made.said()
+
+
+@pytest.mark.parametrize("kind", ["slow", "dialog", "refused", "cut"])
+def test_it_is_retracted_also_by_a_nanonis_that_is_slow_or_refuses_or_is_not_there_just_then(
+    bench: Make, kind: str
+) -> None:
+    made = bench(speed=5.0)
+    peer = made.start(retracts=True)
+    ready(peer)
+    assert peer.set(names.FEEDBACK_ON, False).ok
+    made.strike(kind, count=2, duration_s=10.0)  # two seconds, real time
+    assert made.let_go() == ExitCode.ORPHAN
+    assert not made.emulator.rig.engaged
+    assert "the run is stopping with the feedback off: the tip was retracted" in made.said()
+
+
+def test_a_tip_without_feedback_stays_where_the_file_says_so(bench: Make) -> None:
+    made = bench(speed=5.0)
+    left_in_danger(made, scanning=False, retracts=False)
+    assert made.emulator.rig.engaged
+
+
+def test_drift_compensation_is_switched_on_by_a_rate_and_off_by_none(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    peer.until(FREE)
+    assert peer.set("x-drift-rate-x", "2", "pm/s").ok
+    on, x, y, *_ = made.emulator.software.core.registers.get("Piezo.DriftComp")
+    assert (on, x, y) == (1, pytest.approx(2e-12), 0.0)
+    assert peer.set("x-drift-rate-x", 0).ok
+    assert made.emulator.software.core.registers.get("Piezo.DriftComp")[0] == 0
+
+
+def test_parameters_and_actions_of_the_experiment_file(bench: Make) -> None:
+    made = bench()
+    peer = made.start(
+        parameters={"x-tip-lift": {"vendor": "ZCtrl.TipLift", "unit": "m"}},
+        actions={"x-home": {"command": "ZCtrl.Home"}, "x-wrong": {"command": "Bias.Set 1 2"}},
+    )
+    peer.until(FREE)
+    assert peer.set("x-tip-lift", "2", "nm").ok
+    assert made.emulator.software.core.registers.get("ZCtrl.TipLift") == (pytest.approx(2e-9),)
+    assert peer.act("x-home").ok
+    response = peer.act("x-wrong")
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "the arguments of Bias.Set are f" in response.reason
+
+
+# --- at the panel ---
+
+
+def test_the_panel_may_have_been_left_scanning_on_and_on_and_not_saving(bench: Make) -> None:
+    made = bench()
+    made.at_panel(
+        lambda emulator: emulator.software.scans.properties.__dict__.update(
+            continuous=True, bouncy=True, autosave="off"
+        )
+    )
+    peer = made.start()
+    ready(peer)
+    assert scanned(peer)["Z Forward"].filename.endswith(".sxm")
+    left_behind = made.emulator.software.scans.properties
+    assert (left_behind.continuous, left_behind.bouncy, left_behind.autosave) == (False, False, "all")
+
+
+def test_it_can_be_told_to_leave_saving_alone(bench: Make) -> None:
+    made = bench(speed=5.0)  # what is not saved must be seen running
+    made.at_panel(lambda emulator: emulator.software.scans.properties.__dict__.update(autosave="off"))
+    peer = made.start(autosave=False)
+    ready(peer)
+    assert scanned(peer)["Z Forward"].filename.endswith(".nc")
+    assert made.emulator.software.scans.properties.autosave == "off"
+
+
+@pytest.mark.parametrize("release", ["2021", "2022", "2023", "2024", "2025"])
+def test_every_release(bench: Make, release: str) -> None:
+    made = bench(release=release)
+    made.at_panel(lambda emulator: emulator.software.scans.properties.__dict__.update(continuous=True))
+    peer = made.start()
+    ready(peer)
+    assert scanned(peer)
+    assert "release " in peer.get("x-controller")
+    assert peer.set("x-drift-rate-y", "1", "pm/s").ok
+    assert made.emulator.software.core.registers.get("Piezo.DriftComp")[2] == pytest.approx(1e-12)
+
+
+def test_a_session_folder_that_has_another_name_over_there(bench: Make) -> None:
+    made = bench(session_path="D:\\Data\\2026")
+    peer = made.start(session_dir=str(made.data))
+    ready(peer)
+    assert scanned(peer)["Z Forward"].filename == str(made.data / "unnamed001.sxm")
+
+
+def test_ports_that_serve_one_client_each(bench: Make) -> None:
+    made = bench(one_each=True, ports=2)
+    peer = made.start()
+    ready(peer)
+    assert scanned(peer)

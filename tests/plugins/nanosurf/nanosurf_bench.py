@@ -1,0 +1,21 @@
+"""The Nanosurf translator as a real process, an emulated Studio beside it, and a peer on the translator's sockets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from vendor_bench import PATIENT, AtPanel, VendorBench
+
+from afspm.plugins.nanosurf.emulator import NanosurfEmulator
+
+
+class Emulated(AtPanel, NanosurfEmulator):
+    """With somebody at its panel."""
+
+
+class Bench(VendorBench[Emulated]):
+    emulated = Emulated
+    translator = "afspm.plugins.nanosurf.Nanosurf"
+    data_name = "gallery"
+    settings: Mapping[str, Any] = {**PATIENT, "poll_period_s": 0.1}

@@ -1,0 +1,81 @@
+"""Random scripts do not end the emulated Studio, nor leave it unfit, nor write outside its folder."""
+
+from __future__ import annotations
+
+import socket
+import struct
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from benchmarks.fuzz import fuzz
+from benchmarks.fuzz.nanosurf import NanosurfFuzzer
+
+from afspm.basics.clock import ExperimentClock
+from afspm.plugins.nanosurf.emulator import NanosurfEmulator
+
+CALLS = 1500
+
+
+def test_random_scripts_are_survived(tmp_path: Path) -> None:
+    outcome = fuzz(NanosurfFuzzer, NanosurfEmulator(port=0), tmp_path, CALLS)
+    assert min(outcome.answered, outcome.refused) > CALLS / 20
+
+
+ENDS = ('{1,{"not enough memory"}}', '{1,{"the script runs too long"}}')
+
+
+@pytest.fixture
+def clients(tmp_path: Path) -> Iterator[list[socket.socket]]:
+    """Two clients of an emulator."""
+    with NanosurfEmulator(port=0).running(tmp_path, ExperimentClock.starting_now(speed=1e4)) as address:
+        host, _, port = address.rpartition(":")
+        with ExitStack() as stack:
+            yield [stack.enter_context(socket.create_connection((host, int(port)), 30.0)) for _ in range(2)]
+
+
+@pytest.mark.parametrize("kept", ["local t = {}", "t = {}", "local t = {} root.kept = t"])
+def test_a_script_that_uses_up_the_memory_fails_and_all_others_run(kept: str, clients: list[socket.socket]) -> None:
+    greedy, other = clients
+    ask(greedy, "return root.session.select('91-01-000', 2)")
+    for more in ('("x"):rep(1e6)', "{}", "function() end"):
+        assert ask(greedy, f"{kept} while true do t[#t + 1] = {more} end") in ENDS
+        assert ask(other, "return root.session.list()[1], 1.5") == '{0,{"91-01-000",1.5}}'
+        assert ask(greedy, "return root.workflow.imaging.line_rate.value") == "{0,{1.0}}"
+
+
+@pytest.mark.parametrize(
+    "script",
+    [
+        "while true do pcall(function() while true do end end) end",
+        "root.workflow.imaging.scanning_started.connect(function() while true do end end) "
+        "root.workflow.imaging.acquire()",
+        "string.format, table.concat = nil, nil",
+    ],
+)
+def test_a_script_that_does_not_end_leaves_the_others_alone(script: str, clients: list[socket.socket]) -> None:
+    client, other = clients
+    ask(client, "return root.session.select('91-01-000', 1)")
+    ask(client, script)
+    assert ask(other, "return root.session.list()[1], 1.5") == '{0,{"91-01-000",1.5}}'
+
+
+def test_a_client_that_reads_no_replies_is_cut_off(clients: list[socket.socket]) -> None:
+    deaf, other = clients
+    script = b'return ("x"):rep(5e6)'
+
+    def flood() -> None:
+        for _ in range(200):
+            deaf.sendall(struct.pack("<I", len(script)) + script)
+            assert ask(other, "return 1") == "{0,{1}}"
+
+    with pytest.raises(ConnectionError):
+        flood()
+
+
+def ask(connection: socket.socket, script: str) -> str:
+    raw = script.encode()
+    connection.sendall(struct.pack("<I", len(raw)) + raw)
+    reader = connection.makefile("rb")
+    return reader.read(struct.unpack("<I", reader.read(4))[0]).decode()

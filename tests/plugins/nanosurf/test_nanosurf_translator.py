@@ -1,0 +1,252 @@
+"""The Nanosurf translator against an emulated Studio: what is asked happens, where it should, and is published."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_clock import FakeClock
+from nanosurf_bench import Bench
+from vendor_bench import FLAT, TURNED, moved, ready, scanned, scans, small, states
+
+from afspm.basics.errors import InvalidValue
+from afspm.basics.exit_codes import ExitCode
+from afspm.model import Region, Scan, ScanLines, ScopeState, Spectrum, names
+from afspm.plugins.nanosurf.emulator import NanosurfEmulator
+from afspm.plugins.nanosurf.emulator.studio import SETPOINT, StudioProgram
+from afspm.simulation.faults import Faults
+from afspm.simulation.instrument import Instrument
+
+Make = Callable[..., Bench]
+Settings = dict[str, Any]
+FREE = ScopeState.FREE
+
+
+@pytest.mark.parametrize("release", [17, 19])
+@pytest.mark.parametrize("direction", ["up", "down"])
+def test_a_scan_shows_the_sample_as_it_lies(bench: Make, release: int, direction: str) -> None:
+    made = bench(release=release, tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
+    peer = made.start(release=release)
+    region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
+    ready(peer, region, (48, 32))
+    assert peer.set(names.SCAN_DIRECTION, direction).ok
+    found = scanned(peer)
+    x, y = region.pixels_m((48, 32))
+    truth = made.emulator.rig.world.sample.surface_m(x, y)
+
+    def likeness(values: np.ndarray) -> float:
+        return float(np.corrcoef(values.ravel(), truth.ravel())[0, 1])
+
+    for channel in ("Height Forward", "Height Backward"):
+        scan = found[channel]
+        assert scan.region == region
+        assert likeness(scan.values) > 0.95
+        for mirrored in (scan.values[::-1], scan.values[:, ::-1], scan.values[::-1, ::-1]):
+            assert likeness(mirrored) < likeness(scan.values) - 0.1
+    assert made.emulator.rig.scan is not None
+    assert made.emulator.rig.scan.upwards is (direction == "up")
+
+
+def test_the_setpoint_of_a_frequency_shift_is_in_hertz(tmp_path: Path) -> None:
+    rig = Instrument({"feedback": {"mode": "frequency-shift", "setpoint": -20.0}}, 3, 1000.0)
+    faults, log = Faults([], NanosurfEmulator.all_faults(), 0.0), logging.getLogger("test")
+    studio = StudioProgram(rig, faults, FakeClock(), tmp_path, log, start_s=0.1, file_s=0.1)
+    assert (studio.setpoint_unit, list(studio.setpoint_units), studio.get(SETPOINT)) == ("Hz", ["Hz"], -20.0)
+    studio.put(SETPOINT, -35.0)
+    assert studio.get(SETPOINT) == -35.0
+    with pytest.raises(InvalidValue, match="has no unit 'V'"):
+        studio.set_setpoint_unit("V")
+
+
+@pytest.mark.parametrize("direction", ["up", "down"])
+def test_lines_come_while_it_scans(bench: Make, direction: str) -> None:
+    made = bench(speed=5.0)
+    peer = made.start(live_lines_s=1.0, image_buffer=4410)
+    ready(peer, shape=(40, 32))
+    assert peer.set(names.SCAN_DIRECTION, direction).ok
+    assert peer.act(names.START_SCAN).ok
+    heard = peer.until(FREE)
+    lines = [one for one in heard if isinstance(one, ScanLines) and one.channel == "Height Forward"]
+    whole = next(one for one in heard if isinstance(one, Scan) and one.channel == "Height Forward")
+    assert len(lines) >= 2
+    for part in lines:
+        rows = whole.values[part.first_row : part.first_row + len(part.values)]
+        np.testing.assert_allclose(part.values, rows, atol=1e-6 * np.ptp(whole.values))
+    assert (lines[0].first_row == 0) is (direction == "up")
+
+
+def test_a_force_curve_is_taken_where_the_tip_was_sent(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    moved(peer, 120e-9, -40e-9)
+    scanned(peer)
+    assert peer.act(names.START_SPEC).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SPEC", "FREE"]
+    (curve,) = [one for one in heard if isinstance(one, Spectrum)]
+    assert curve.position_m == (120e-9, -40e-9)
+    assert curve.kind == "force"
+    taken = made.emulator.rig.spectrum
+    assert taken is not None
+    assert taken.position_m == pytest.approx((120e-9, -40e-9))
+    assert len(curve["Deflection"]) == 2 * len(taken.values)
+
+
+def test_a_force_curve_is_a_single_one_at_the_tip_with_any_grid_on_the_panel(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    for name, value in (("columns", 4), ("rows", 3), ("center_offset_x", 10e-6), ("width", 5e-6)):
+        made.at_panel(lambda emulator, name=name, value=value: emulator.program.put(f"spectroscopy.grid_{name}", value))
+    moved(peer, 120e-9, -40e-9)
+    assert peer.act(names.START_SPEC).ok
+    curves = [one for one in peer.until(FREE) if isinstance(one, Spectrum)]
+    assert [curve.position_m for curve in curves] == [(120e-9, -40e-9)]
+    taken = made.emulator.rig.spectrum
+    assert taken is not None
+    assert taken.position_m == pytest.approx((120e-9, -40e-9))
+
+
+def test_a_force_curve_can_be_stopped(bench: Make) -> None:
+    made = bench(speed=1.0, force={"duration_s": 20.0})
+    peer = small(made)
+    assert peer.act(names.START_SPEC).ok
+    peer.until(ScopeState.SPEC)
+    made.at_panel(lambda emulator: None)
+    assert peer.act(names.STOP_SPEC).ok
+    heard = peer.until(FREE)
+    assert not any(isinstance(one, Spectrum) for one in heard)
+
+
+def test_a_stop_that_overtakes_the_start_of_its_curve_is_told_again(
+    bench: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They go by two connections."""
+    stops: list[StudioProgram] = []
+    stop_curve = StudioProgram.stop_curve
+
+    def stop(program: StudioProgram) -> None:
+        stops.append(program)
+        if len(stops) > 1:
+            stop_curve(program)
+
+    monkeypatch.setattr(StudioProgram, "stop_curve", stop)
+    made = bench(speed=1.0, force={"duration_s": 20.0})
+    peer = small(made)
+    assert peer.act(names.START_SPEC).ok
+    peer.until(ScopeState.SPEC)
+    made.at_panel(lambda emulator: None)
+    assert peer.act(names.STOP_SPEC).ok
+    assert not any(isinstance(one, Spectrum) for one in peer.until(FREE))
+    assert len(stops) > 1
+
+
+def test_the_tip_is_withdrawn_at_any_time_and_brought_back(bench: Make) -> None:
+    made = bench(speed=10.0)
+    peer = made.start()
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    assert peer.act(names.RETRACT).ok
+    peer.until(FREE)
+    assert not made.emulator.rig.engaged
+    assert peer.act(names.ENGAGE).ok
+    assert "COARSE_MOTOR" in states(peer.until(FREE))
+    assert made.emulator.rig.engaged
+
+
+def test_the_tip_is_withdrawn_where_a_second_connection_waits(bench: Make) -> None:
+    made = bench(speed=10.0, one_client=True)
+    peer = made.start(reply_timeout_s=1.0)
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    assert peer.act(names.RETRACT).ok
+    made.until_said("the tip is withdrawn by the first")
+    peer.until(FREE)
+    assert not made.emulator.rig.engaged
+
+
+def test_a_run_that_is_stopped_stops_the_scan(bench: Make) -> None:
+    made = bench(speed=10.0)
+    peer = made.start(retracts=True)
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    assert made.let_go() == ExitCode.ORPHAN
+    assert not made.emulator.program.scanning
+    assert made.emulator.rig.engaged, "the tip stays as it is"
+
+
+def test_settings_reach_the_instrument(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    assert peer.set(names.ZCTRL_SETPOINT, 0.65, "V").ok
+    assert peer.set(names.ZCTRL_IGAIN, 2500).ok
+    assert peer.set(names.SCAN_SPEED, 4e-6, "m/s").ok
+    scanned(peer)
+    setup = made.emulator.rig.setup
+    assert setup.feedback.setpoint == 0.65
+    assert setup.feedback.integral_gain == pytest.approx(1250.0)
+    assert setup.line_s == pytest.approx(2 * setup.region.size_m[0] / 4e-6)
+    assert math.isclose(float(peer.get(names.ZCTRL_IGAIN)), 2500)
+
+
+def test_a_translator_that_is_started_again_finds_the_scan(bench: Make) -> None:
+    made = bench(speed=5.0)
+    peer = made.start()
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.kill()
+    peer = made.start()
+    heard = peer.until(FREE)
+    assert "SCANNING" in states(heard)
+    assert {scan.region for scan in scans(heard)} == {TURNED}
+
+
+@pytest.mark.parametrize(
+    ("emulator", "settings", "told"),
+    [
+        ({"release": 19}, {"release": 18}, "Studio is of release 19, not 18"),
+        ({}, {"session": "91-99-999"}, "Studio has no single measurement session 91-99-999"),
+        ({}, {"parameters": {"zctrl-setpoint": {"unit": "nm"}}}, "Studio has z_control.setpoint in V, not in nm"),
+        ({}, {"parameters": {"x-a": {"vendor": "no.such"}}}, "Studio has no no.such"),
+        ({}, {"parameters": {"x-a": {"vendor": "imaging.overscan_x", "unit": "m"}}}, "no imaging.overscan_x"),
+        ({}, {"gallery_dir": "/nowhere/at/all"}, "does not exist on this computer"),
+    ],
+)
+def test_what_does_not_fit_is_told(
+    bench: Make, emulator: dict[str, int], settings: dict[str, object], told: str
+) -> None:
+    made = bench(**emulator)
+    made.start(**settings)
+    made.until_said(told)
+
+
+def test_values_that_studio_refuses_change_none(bench: Make) -> None:
+    made = bench()
+    peer = made.start(parameters={"scan-speed": {"range": [1e-9, 1.0]}})
+    ready(peer)
+    before = dict(made.emulator.program.values)  # type: ignore[attr-defined]
+    # at this speed, the narrow frame takes more lines in a second than Studio allows
+    refused = peer.set(names.SCAN_SPEED, 0.9, "m/s")
+    assert "Studio refused" in refused.reason
+    assert "not within" in refused.reason
+    assert made.emulator.program.values == before  # type: ignore[attr-defined]
+
+
+def test_no_command_is_called_that_the_release_does_not_have(bench: Make) -> None:
+    made = bench(release=19)
+    asked: list[bytes] = []
+    answer = made.emulator.answer
+    made.emulator.answer = lambda client, request: asked.append(request) or answer(client, request)  # type: ignore[method-assign,func-returns-value]
+    scanned(small(made))
+    assert asked
+    assert not any(b"is_scanning" in script for script in asked)

@@ -1,0 +1,25 @@
+"""Without lupa the emulated Studio is refused before anything starts."""
+
+from __future__ import annotations
+
+from importlib import metadata
+
+import pytest
+
+from afspm.basics.errors import ConfigError
+from afspm.plugins.nanosurf.emulator import NanosurfEmulator
+
+
+def test_what_is_missing_is_told_with_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    version = metadata.version
+
+    def found(name: str) -> str:
+        if name == "lupa":
+            raise metadata.PackageNotFoundError(name)
+        return version(name)
+
+    NanosurfEmulator().check()
+    monkeypatch.setattr(metadata, "version", found)
+    with pytest.raises(ConfigError, match="NanosurfEmulator needs what is not installed: lupa") as refused:
+        NanosurfEmulator().check()
+    assert refused.value.hint == 'pip install "afspm[nanosurf]"'

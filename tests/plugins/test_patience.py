@@ -1,0 +1,15 @@
+"""How long a program that controls a microscope is waited for, however fast the experiment's time passes."""
+
+from __future__ import annotations
+
+import pytest
+
+from afspm.basics.clock import ExperimentClock
+from afspm.plugins.gxsm import Gxsm
+
+
+@pytest.mark.parametrize(("speed", "expected_s"), [(1.0, 5.0), (60.0, 120.0)])
+def test_a_program_has_two_real_seconds_to_save_a_file_at_any_speed(speed: float, expected_s: float) -> None:
+    microscope = Gxsm()
+    microscope.clock = ExperimentClock.starting_now(speed=speed)
+    assert microscope.patience_s(5.0) == pytest.approx(expected_s)

@@ -1,0 +1,394 @@
+"""What the tests of all vendors share: a translator as a real process, an emulated microscope, and a raw peer."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import secrets
+import socket
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from queue import SimpleQueue
+from threading import Condition, Event, Thread
+from typing import IO, Any, ClassVar, Generic, TypeVar
+
+import zmq
+from hosts import host
+
+from afspm import wire
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.launch import Launch, Sockets
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Parameter,
+    ProbePosition,
+    Region,
+    Request,
+    Response,
+    Scan,
+    ScanParameters,
+    ScopeState,
+    ScopeStatus,
+    names,
+)
+from afspm.simulation.emulation.emulator import Emulator
+from afspm.simulation.faults import Fault
+from afspm.supervisor.ports import FreePorts
+
+DEADLINE_S = 30.0
+PATIENT: Mapping[str, Any] = {"reply_timeout_s": 10.0}
+"""As long as a controller on a busy computer may need to answer."""
+
+SOON: Mapping[str, Any] = {"reply_timeout_s": 2.5}
+"""Where its silence is what is tested."""
+
+TURNED = Region((40e-9, -25e-9), (300e-9, 100e-9), math.radians(30))
+"""A frame that is no square, not in the middle and not straight: what is mistaken for something else shows."""
+
+SHAPE = (12, 32)
+FLAT = {"noise": {"white_m": 0.0, "one_over_f_m": 0.0, "line_offset_m": 0.0, "scar_probability": 0.0}}
+"""A microscope without noise."""
+
+
+class Peer:
+    """What a scheduler is to the translator."""
+
+    def __init__(self, serve: str, publish: str) -> None:
+        self._context: zmq.Context[Any] = zmq.Context()
+        self._asked = (f"bench/{secrets.token_hex(4)}/{number}" for number in itertools.count())
+        self._request = self._context.socket(zmq.REQ)
+        self._request.connect(serve)
+        self._packets = self._context.socket(zmq.SUB)
+        for prefix in (b"", b"ScanLines"):  # by the first a plain socket means what version 1 has
+            self._packets.subscribe(prefix)
+        self._packets.connect(publish)
+        for each in (self._request, self._packets):
+            each.setsockopt(zmq.LINGER, 0)
+            each.setsockopt(zmq.RCVTIMEO, int(DEADLINE_S * 1000))
+
+    def ask(self, kind: int, subject: Any) -> Response:
+        request = Request(kind, subject, wire.frames.encode_subject(subject), next(self._asked))
+        self._request.send_multipart(wire.encode_request(request))
+        return wire.decode_response(self._request.recv_multipart())
+
+    def act(self, action: str) -> Response:
+        return self.ask(ControlRequest.ACTION, action)
+
+    def act_once_free(self, action: str) -> Response:
+        """The first answer that is not that it is busy: for what may be over before anybody sees it."""
+        deadline_s = time.monotonic() + DEADLINE_S
+        while (response := self.act(action)).code == ControlResponse.NOT_FREE:
+            assert time.monotonic() < deadline_s, response.reason
+        return response
+
+    def set(self, name: str, value: object, unit: str | None = None) -> Response:
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        return self.ask(ControlRequest.PARAM, Parameter(name, text, unit))
+
+    def get_response(self, name: str) -> Response:
+        return self.ask(ControlRequest.PARAM, Parameter(name))
+
+    def get(self, name: str) -> str:
+        response = self.get_response(name)
+        assert response.ok, response.reason
+        value = wire.frames.decode_parameter(response.payload).value
+        assert value is not None
+        return value
+
+    def next(self) -> Any:
+        """The next thing that is published."""
+        envelope, payload, *_ = self._packets.recv_multipart()
+        return wire.decode(envelope.decode(), payload)
+
+    def until(self, wanted: Callable[[Any], bool] | ScopeState) -> list[Any]:
+        """All that is published up to the first that is wanted."""
+        heard: list[Any] = []
+        deadline_s = time.monotonic() + DEADLINE_S
+        while time.monotonic() < deadline_s:
+            try:
+                heard.append(self.next())
+            except zmq.Again:
+                break
+            newest = heard[-1]
+            if newest == ScopeStatus(wanted) if isinstance(wanted, ScopeState) else wanted(newest):
+                return heard
+        raise AssertionError(f"waited for {wanted}, heard {heard}")
+
+    def close(self) -> None:
+        self._context.destroy(linger=0)
+
+
+class Said:
+    """What a translator says on its standard error, over all its lives."""
+
+    def __init__(self) -> None:
+        self.text = ""
+        self._more = Condition()
+
+    def listen(self, pipe: IO[bytes]) -> None:
+        """Until there is nobody any more to say anything."""
+        with pipe:
+            for line in pipe:
+                with self._more:
+                    self.text += line.decode()
+                    self._more.notify_all()
+
+    def until(self, *wanted: str) -> None:
+        """Wait until it has said one of these."""
+        with self._more:
+            said = self._more.wait_for(lambda: any(words in self.text for words in wanted), DEADLINE_S)
+            assert said, f"it never said {wanted}:\n{self.text}"
+
+
+class TranslatorProcess:
+    """A translator as a process of its own, and the peer that it has; both end with the stack."""
+
+    def __init__(
+        self,
+        class_: str,
+        settings: dict[str, Any],
+        folder: Path,
+        stack: ExitStack,
+        clock: ExperimentClock,
+        said: Said | None = None,
+        *,
+        retracts: bool = False,
+    ) -> None:
+        ports = FreePorts()
+        serve, publish = f"tcp://127.0.0.1:{ports.take()}", f"tcp://127.0.0.1:{ports.take()}"
+        launch = Launch(
+            "translator",
+            class_,
+            settings,
+            Sockets(publish=publish, serve=serve),
+            clock=clock.as_dict(),
+            run_dir=str(folder),
+            state_dir=str(folder / "state"),
+            retracts=retracts,
+        )
+        # where the lock on the controller lies, which one that is killed leaves behind
+        own = {**os.environ, "TMPDIR": str(folder), "TEMP": str(folder)}
+        self._process = host(own)
+        self._listening = Thread(target=(said or Said()).listen, args=(self._process.stderr,))
+        self._listening.start()
+        stack.callback(self._end)
+        self._process.stdin.write(launch.to_json().encode() + b"\n")
+        self._process.stdin.flush()
+        self.peer = Peer(serve, publish)
+        stack.callback(self.peer.close)
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait(DEADLINE_S)
+        self._listening.join(DEADLINE_S)
+
+    def let_go(self) -> int:
+        """End its standard input, as a run that is stopped does; returns the exit code."""
+        self._process.stdin.close()
+        code = self._process.wait(DEADLINE_S)
+        self._listening.join(DEADLINE_S)
+        return code
+
+    def _end(self) -> None:
+        self.kill()
+        self._process.stdin.close()
+
+
+class AtPanel(Emulator):
+    """An emulator with somebody at its panel."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.to_do: SimpleQueue[Callable[[], None]] = SimpleQueue()
+
+    def tick(self, now_s: float) -> float | None:
+        while not self.to_do.empty():
+            self.to_do.get()()
+        return super().tick(now_s)
+
+
+Emulated = TypeVar("Emulated", bound=AtPanel)
+
+
+class VendorBench(Generic[Emulated]):
+    """An emulator and a translator of it. Each vendor's says which they are::
+
+        class Bench(VendorBench[Emulated]):
+            emulated = Emulated
+            translator = "afspm.plugins.mine.Mine"
+            data_name = "mine"
+            settings = PATIENT
+
+    Attributes:
+        emulated: the class of the emulator.
+        translator: the class of the translator, as in an experiment file.
+        data_name: of the folder that the emulator saves in.
+        settings: of the translator, besides the address, where a test gives no others.
+    """
+
+    emulated: type[Emulated]
+    translator: ClassVar[str]
+    data_name: ClassVar[str]
+    settings: Mapping[str, Any]
+
+    def __init__(self, folder: Path, stack: ExitStack, speed: float, emulator: dict[str, Any]) -> None:
+        self.folder, self._stack = folder, stack
+        self.clock = ExperimentClock.starting_now(speed=speed)
+        self.data = folder / self.data_name
+        self._said = Said()
+        stack.callback(lambda: print(self._said.text))  # noqa: T201 (shown of a test that failed)
+        self._emulator_settings: dict[str, Any] = {"port": FreePorts().take(), "surface": "steps", **emulator}
+        self._controller = stack.enter_context(ExitStack())
+        self.start_controller_again()
+
+    def start_controller_again(self) -> None:
+        """Another one where the last was, which knows nothing of it, once that has let go of its address."""
+        self._controller.close()
+        self.emulator = self.emulated(**self._emulator_settings)
+        self.address = self._controller.enter_context(self.emulator.running(self.data, self.clock))
+
+    def at_panel(self, do: Callable[[Emulated], object]) -> None:
+        """Do something in the emulator's own thread; returns when it is done."""
+        done = Event()
+
+        def job() -> None:
+            do(self.emulator)
+            done.set()
+
+        self.emulator.to_do.put(job)
+        self.emulator.woken.post()
+        assert done.wait(DEADLINE_S)
+
+    def strike(self, kind: str, count: int = 1, duration_s: float = 1.0) -> None:
+        """Have something go wrong from now on."""
+        fault = Fault(kind, 0.0, count, duration_s)
+        self.at_panel(lambda emulator: emulator.faults.demand(fault, self.clock.now_s()))
+
+    def start(self, *, retracts: bool = False, **settings: Any) -> Peer:
+        """The translator, as a process of its own."""
+        given = {"address": self.address, **self.settings, **settings}
+        self._process = TranslatorProcess(
+            self.translator, given, self.folder, self._stack, self.clock, self._said, retracts=retracts
+        )
+        return self._process.peer
+
+    def kill(self) -> None:
+        """The translator."""
+        self._process.kill()
+
+    def let_go(self) -> int:
+        """Stop the translator as a run that is stopped does; returns its exit code."""
+        return self._process.let_go()
+
+    def said(self) -> str:
+        """The translator's log: all of it once it is killed, before that as far as it has come."""
+        return self._said.text
+
+    def until_said(self, *wanted: str) -> None:
+        """Wait until the translator's log has one of these in it."""
+        self._said.until(*wanted)
+
+
+OneBench = TypeVar("OneBench", bound=VendorBench[Any])
+
+
+def benches(kind: type[OneBench], folder: Path) -> Iterator[Callable[..., OneBench]]:
+    """The `bench` fixture of a vendor: makes benches that end with the test."""
+    with ExitStack() as stack:
+
+        def make(speed: float = 100.0, **emulator: Any) -> OneBench:
+            return kind(folder, stack, speed, emulator)
+
+        yield make
+
+
+# --- what was heard, and what a test begins with ---
+
+
+def states(heard: Sequence[Any]) -> list[str]:
+    """The states among what was heard, in words."""
+    return [one.state.name for one in heard if isinstance(one, ScopeStatus)]
+
+
+def scans(heard: Sequence[Any]) -> list[Scan]:
+    return [one for one in heard if isinstance(one, Scan)]
+
+
+def ready(peer: Peer, region: Region = TURNED, shape: tuple[int, int] = SHAPE) -> None:
+    """A small frame is in force, and all that comes of it was heard."""
+    peer.until(ScopeState.FREE)
+    response = peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, shape, ""))
+    assert response.ok, response.reason
+    peer.until(lambda one: isinstance(one, ScanParameters) and one.region == region and one.shape == shape)
+    peer.until(ScopeState.FREE)
+
+
+def small(made: VendorBench[Any], **settings: object) -> Peer:
+    """A translator that has found the microscope, with a frame of few pixels in force."""
+    peer = made.start(**settings)
+    peer.until(ScopeState.FREE)
+    assert peer.set(names.SCAN_RESOLUTION_X, 16).ok
+    assert peer.set(names.SCAN_RESOLUTION_Y, 8).ok
+    peer.until(lambda one: getattr(one, "shape", None) == (8, 16))
+    peer.until(ScopeState.FREE)
+    return peer
+
+
+def scanned(peer: Peer) -> dict[str, Scan]:
+    """A scan, by channel."""
+    response = peer.act(names.START_SCAN)
+    assert response.ok, response.reason
+    heard = peer.until(ScopeState.FREE)
+    assert states(heard) == ["SCANNING", "FREE"]
+    found = scans(heard)
+    assert heard[-1 - len(found) : -1] == found, "the scans come before FREE, and nothing in between"
+    return {scan.channel: scan for scan in found}
+
+
+def moved(peer: Peer, x_m: float, y_m: float) -> list[Any]:
+    """The probe is there; returns all that was heard on the way."""
+    response = peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((x_m, y_m)))
+    assert response.ok, response.reason
+    heard = peer.until(ScopeState.FREE)
+    assert states(heard) == ["MOVING", "FREE"]
+    return heard
+
+
+def left_in_danger(made: VendorBench[Any], *, scanning: bool, retracts: bool) -> None:
+    """A run is stopped while the feedback is off, which one of its components has switched off."""
+    peer = made.start(retracts=retracts)
+    ready(peer, shape=(64, 32))
+    assert peer.set(names.FEEDBACK_ON, False).ok
+    if scanning:
+        assert peer.act(names.START_SCAN).ok
+        peer.until(ScopeState.SCANNING)
+    assert made.emulator.rig.engaged
+    assert made.let_go() == ExitCode.ORPHAN
+
+
+@contextmanager
+def answering(*replies: bytes, silent: bool = False) -> Iterator[tuple[str, int]]:
+    """The address of somebody who answers each request with the next of these bytes, and then hangs up (or not)."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        ended = Thread(target=_answer, args=(listener, replies, silent))
+        ended.start()
+        try:
+            yield listener.getsockname()
+        finally:
+            ended.join()
+
+
+def _answer(listener: socket.socket, replies: tuple[bytes, ...], silent: bool) -> None:
+    client, _ = listener.accept()
+    with client, suppress(OSError):
+        for reply in replies:
+            client.recv(1000)
+            client.sendall(reply)
+        client.settimeout(10.0)
+        while silent and client.recv(1000):
+            pass

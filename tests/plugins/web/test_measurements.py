@@ -1,0 +1,142 @@
+"""A measurement is begun once for its key, whatever is refused, lost or killed in between."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from afspm.basics.clock import ExperimentClock
+from afspm.client.measurement import BEGUN_WITHIN_S
+from afspm.client.targets import ScanTarget
+from afspm.model import ControlResponse, Frame, Region, Response, Scan, ScopeState, ScopeStatus
+from afspm.plugins.web.gateway.measurements import Measurement, Measurements
+from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest
+from afspm.plugins.web.person_commands import PersonCommands
+from afspm.plugins.web.watch import Watch
+
+REGION = Region((0.0, 0.0), (1e-6, 1e-6))
+TARGET = ScanTarget.of(REGION, (4, 4), Frame.TIP)
+OK = Response(int(ControlResponse.SUCCESS))
+SILENCE = Response(int(ControlResponse.NO_RESPONSE))
+NOT_IN_CONTROL = Response(int(ControlResponse.NOT_IN_CONTROL), reason="series is in control")
+NOT_FREE = Response(int(ControlResponse.NOT_FREE))
+
+
+class Commands:
+    """A scheduler that answers as it is told, and keeps the ids that it was asked with."""
+
+    def __init__(self, *answers: Response) -> None:
+        self.answers = list(answers)
+        self.ids: list[str] = []
+
+    def prepare_scan(self, region: object, shape: object) -> None:
+        pass
+
+    def act_when_free(self, action: str, next_id: Callable[[], str]) -> Response:
+        while True:
+            self.ids.append(next_id())
+            if (answer := self.answers.pop(0)).code != ControlResponse.NOT_FREE:
+                return answer
+
+
+class Lab:
+    def __init__(self, file: Path) -> None:
+        self.now_s = 100.0
+        self.watch = Watch(ExperimentClock.real())
+        self.kept = Measurements(file, self.watch, lambda: self.now_s)
+
+    def begin(self, commands: Commands, key: str = "tile") -> Measurement:
+        return self.kept.take("gateway:ada", key, TARGET)(cast("PersonCommands", commands))
+
+    def found(self) -> Measurement:
+        found = self.kept.find("gateway:ada", "tile")
+        assert found is not None
+        return found
+
+    def publish(self, *things: Any, since_ns: int = 1000) -> None:
+        for time_ns, thing in enumerate(things, since_ns):
+            self.kept.on_packet(ScopeStatus(thing) if isinstance(thing, ScopeState) else thing, time_ns)
+
+
+def scan(time_ns: int = 77) -> Scan:
+    return Scan(REGION, "Height", "m", np.zeros((4, 4)), time_ns)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "measurements.json"
+
+
+def test_it_is_done_with_the_scan_and_not_begun_again(file: Path) -> None:
+    lab, commands = Lab(file), Commands(OK)
+    assert lab.begin(commands).state == "running"
+    lab.publish(ScopeState.SCANNING, scan(), ScopeState.FREE)
+    assert (lab.found().state, lab.found().result) == ("done", "77")
+    assert lab.begin(commands) == lab.found()
+    assert commands.ids == ["gateway:ada/key/tile/1"]
+
+
+def test_each_attempt_that_was_refused_is_followed_by_one_of_another_id(file: Path) -> None:
+    lab, commands = Lab(file), Commands(NOT_FREE, NOT_IN_CONTROL, OK)
+    with pytest.raises(RefusedRequest) as refused:
+        lab.begin(commands)
+    assert refused.value.model.code is RefusalCode.NOT_IN_CONTROL
+    lab.begin(commands)
+    assert commands.ids == [f"gateway:ada/key/tile/{n}" for n in (1, 2, 3)]
+
+
+def test_what_may_have_begun_is_asked_for_again_by_its_own_id(file: Path) -> None:
+    lab, commands = Lab(file), Commands(SILENCE, OK)
+    with pytest.raises(RefusedRequest) as refused:
+        lab.begin(commands)
+    assert refused.value.model.may_have_been_done
+    lab.begin(commands)
+    assert commands.ids == ["gateway:ada/key/tile/1"] * 2
+
+
+def test_a_scan_that_was_never_answered_counts_when_it_comes(file: Path) -> None:
+    lab = Lab(file)
+    with pytest.raises(RefusedRequest):
+        lab.begin(Commands(SILENCE))
+    lab.publish(ScopeState.SCANNING, scan(), ScopeState.FREE)
+    assert lab.found().state == "done"
+
+
+def test_an_interrupted_one_fails_and_may_be_begun_again(file: Path) -> None:
+    lab, commands = Lab(file), Commands(OK, OK)
+    lab.begin(commands)
+    lab.publish(ScopeState.SCANNING, ScopeState.INTERRUPTED)
+    assert (lab.found().state, lab.found().model().refusal.code) == ("failed", RefusalCode.INTERRUPTED)  # type: ignore[union-attr]
+    assert lab.begin(commands).state == "running"
+    assert commands.ids[-1].endswith("/2")
+
+
+def test_one_that_never_begins_does_not_run_for_ever(file: Path) -> None:
+    lab = Lab(file)
+    lab.begin(Commands(OK))
+    assert lab.found().state == "running"
+    lab.now_s += BEGUN_WITHIN_S + 1.0
+    assert lab.found().model().refusal.code is RefusalCode.NO_RESULT  # type: ignore[union-attr]
+
+
+def test_a_restarted_gateway_goes_on_by_what_is_replayed(file: Path) -> None:
+    Lab(file).begin(Commands(OK))
+    lab = Lab(file)
+    assert lab.found().state == "running"
+    lab.publish(scan(), ScopeState.FREE)  # the cache has kept the last state only
+    assert lab.found().state == "done"
+    assert Lab(file).found().state == "done"
+
+
+def test_a_key_is_of_one_measurement_and_of_one_client(file: Path) -> None:
+    lab = Lab(file)
+    lab.begin(Commands(OK))
+    other = ScanTarget.of(None, None, Frame.TIP)
+    with pytest.raises(RefusedRequest) as refused:
+        lab.kept.take("gateway:ada", "tile", other)(cast("PersonCommands", Commands()))
+    assert refused.value.model.code is RefusalCode.KEY_USED
+    assert lab.kept.find("gateway:max", "tile") is None

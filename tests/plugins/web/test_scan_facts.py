@@ -1,0 +1,111 @@
+"""What stands beside a scan: its number, times, and what was set."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Future
+from typing import Any
+
+import numpy as np
+
+from afspm.basics.clock import ExperimentClock
+from afspm.model import ControlMode, ControlState, Feedback, Region, Scan, ScopeState, ScopeStatus
+from afspm.plugins.web.dashboard.actions import ActionResult
+from afspm.plugins.web.dashboard.conditions import Conditions
+from afspm.plugins.web.dashboard.pictures import SIDE_PX, Thumbnails
+from afspm.plugins.web.dashboard.scan_facts import scan_facts
+from afspm.plugins.web.frames import ChannelFrame
+from afspm.plugins.web.watch import Watch
+from afspm.record.overview import Overview
+
+S = 1_000_000_000
+REGION = Region((1e-6, -5e-7), (1e-6, 5e-7), 0.1)
+VALUES = np.arange(8.0).reshape(2, 4)
+
+
+def states(*changes: tuple[ScopeState, int]) -> list[tuple[str, Any, int]]:
+    return [("ScopeStateMsg", ScopeStatus(state), time_s * S) for state, time_s in changes]
+
+
+def a_scan(begin_s: int, channels: Sequence[str] = ("Height", "Phase")) -> list[tuple[str, Any, int]]:
+    end_s = begin_s + 10
+    scans = [
+        ("Scan2d", Scan(REGION, channel, "m", VALUES, time_ns=end_s * S), end_s * S + i)
+        for i, channel in enumerate(channels)
+    ]
+    return [*states((ScopeState.FREE, begin_s - 1), (ScopeState.SCANNING, begin_s)), *scans,
+            *states((ScopeState.FREE, end_s + 1))]  # fmt: skip
+
+
+def overview_of(packets: Sequence[tuple[str, Any, int]]) -> Overview:
+    overview = Overview()
+    overview.take("ControlState", ControlState(ControlMode.AUTOMATED, "series"), 0)
+    for packet in packets:
+        overview.take(*packet, f"{packet[0]}_{getattr(packet[1], 'channel', '')}")
+    return overview
+
+
+def test_channels_of_one_scan_have_one_number_and_scans_are_counted() -> None:
+    overview = overview_of([*a_scan(10), *a_scan(40), *a_scan(70)])
+    assert [one.number for one in overview.scans] == [1, 1, 2, 2, 3, 3]
+
+
+def test_a_finished_scan_is_told_with_number_time_holder_place_and_what_was_set() -> None:
+    overview = overview_of([*a_scan(10), *a_scan(40)])
+    frame = ChannelFrame(1, "Height", "m", REGION, VALUES, 50 * S, None, 2)
+    facts = dict(scan_facts(frame, overview, {"Bias": "100 mV"}, 60 * S))
+    assert {name: facts[name] for name in ("Scan", "Took", "By", "Size", "Centre", "Angle", "Pixels", "Bias")} == {
+        "Scan": "no. 2", "Took": "10 s", "By": "series", "Size": "1 × 0.5 µm", "Centre": "(1, −0.5) µm",
+        "Angle": "5.73°", "Pixels": "4 × 2", "Bias": "100 mV",
+    }  # fmt: skip
+
+
+def test_a_scan_from_before_the_page_has_the_recorded_setpoint_of_its_beginning() -> None:
+    feedback = [("ZCtrlParameters", Feedback(setpoint=value), time_s * S) for value, time_s in ((0.7, 5), (0.5, 45))]
+    overview = overview_of(sorted([*a_scan(10), *a_scan(40), *a_scan(70), *feedback], key=lambda packet: packet[2]))
+    frames = [ChannelFrame(1, "Height", "m", REGION, VALUES, time_s * S, None, 2) for time_s in (50, 80)]
+    facts = [dict(scan_facts(frame, overview, {}, 90 * S)) for frame in frames]
+    assert [one["Setpoint"] for one in facts] == ["0.7", "0.5"]
+    read = {"Setpoint": "700 mV"}
+    assert dict(scan_facts(frames[0], overview, read, 90 * S))["Setpoint"] == "700 mV"
+
+
+def test_a_growing_scan_is_told_with_when_it_ends() -> None:
+    overview = overview_of([*a_scan(10), *states((ScopeState.SCANNING, 40))])
+    frame = ChannelFrame(1, "Height", "m", REGION, VALUES, None, 40 * S, 1, 0)
+    facts = dict(scan_facts(frame, overview, {}, 44 * S))
+    assert facts["Scan"] == "no. 2"
+    assert facts["Lines"] == "1 of 2"
+    assert facts["Ends"].endswith("(in 7 s)")
+
+
+def test_conditions_are_read_when_a_scan_begins_and_belong_to_it_alone() -> None:
+    asked: list[Future[ActionResult]] = []
+
+    def ask(_: object) -> Future[ActionResult]:
+        asked.append(Future())
+        return asked[-1]
+
+    watch = Watch(ExperimentClock.real())
+    conditions = Conditions(watch, ask)
+    for packet in states(
+        (ScopeState.FREE, 1), (ScopeState.SCANNING, 2), (ScopeState.FREE, 3), (ScopeState.SCANNING, 4)
+    ):
+        watch.take(*packet)
+    assert len(asked) == 1, "one question at a time"
+    bias, speed = ActionResult("100 mV"), ActionResult("no such parameter", ok=False)
+    asked[0].set_result(ActionResult("", each={"tip-bias-voltage": bias, "scan-speed": speed}))
+    assert conditions.at(2 * S) == {"Bias": "100 mV"}
+    assert conditions.at(4 * S) == {}
+
+
+def test_a_thumbnail_is_small_and_of_what_is_not_kept_there_is_none() -> None:
+    values = np.add.outer(np.arange(300.0), np.arange(900.0)) * 1e-12 + 1.0
+    values[100:140, 300:400] += 1e-9
+    frame = ChannelFrame(1, "Height", "m", REGION, values, S, None, 300)
+    thumbnails = Thumbnails(lambda time_ns, channel: frame if (time_ns, channel) == (S, "Height") else None)
+    png = thumbnails.png(S, "Height")
+    assert png is not None
+    assert 100 <= min(int.from_bytes(png[16:20]), int.from_bytes(png[20:24])) <= SIDE_PX
+    assert len(png) > 500, "a particle is on it"
+    assert thumbnails.png(2 * S, "Height") is None

@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+from importlib import metadata
+
+import pytest
+
+from afspm.basics.errors import ConfigError
+from afspm.basics.requirements import require
+
+
+class Needy:
+    requires: object = ()
+
+
+INSTALLED = {"afspm": "0.1.0", "numpy": "2.1", "nicegui": "2.9"}
+OF_AFSPM = [
+    "numpy>=1.26",
+    'nicegui>=3.0; extra == "dashboard"',
+    'itsdangerous>=2.2; extra == "dashboard"',
+    'afspm[dashboard]; extra == "all"',
+    'torch; extra == "all" and python_version < "3"',
+]
+
+
+@pytest.fixture(autouse=True)
+def _packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    def version(name: str) -> str:
+        if name not in INSTALLED:
+            raise metadata.PackageNotFoundError(name)
+        return INSTALLED[name]
+
+    monkeypatch.setattr(metadata, "version", version)
+    monkeypatch.setattr(metadata, "requires", {"afspm": OF_AFSPM}.get)
+
+
+@pytest.mark.parametrize(
+    ("requires", "packages", "command"),
+    [
+        (("torch>=2.4",), "torch", 'pip install "torch>=2.4"'),
+        ("torch", "torch", 'pip install "torch"'),
+        (("numpy>=3",), "numpy>=3 (there is 2.1)", 'pip install "numpy>=3"'),
+        (("afspm[dashboard]",), "nicegui>=3.0 (there is 2.9), itsdangerous", 'pip install "afspm[dashboard]"'),
+        (("afspm[all]",), "nicegui>=3.0 (there is 2.9), itsdangerous", 'pip install "afspm[all]"'),
+        (("numpy", "torch", "jax"), "torch, jax", 'pip install "torch" "jax"'),
+    ],
+)
+def test_what_is_missing_is_named_with_the_command_that_installs_it(
+    requires: object, packages: str, command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Needy, "requires", requires)
+    with pytest.raises(ConfigError) as refused:
+        require(Needy)
+    assert (refused.value.what, refused.value.hint) == (f"Needy needs what is not installed: {packages}", command)
+
+
+@pytest.mark.parametrize("requires", [(), ("numpy>=1.26",), ("afspm",)])
+def test_what_is_installed_is_not_refused(requires: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Needy, "requires", requires)
+    require(Needy)
+    require(None)
+
+
+def test_what_is_no_package_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Needy, "requires", ("two words",))
+    with pytest.raises(ConfigError, match="'two words' is not a requirement"):
+        require(Needy)

@@ -1,0 +1,41 @@
+from __future__ import annotations
+
+import itertools
+import re
+from datetime import UTC
+
+from afspm.record.drawing.timeline import COLUMNS, TimelineRow, stretches, time_ticks, timeline_html
+from afspm.record.timeline import Span
+
+S = 1_000_000_000
+
+
+def test_a_stretch_is_where_its_time_is() -> None:
+    found = stretches([Span("a", 0, 50 * S), Span("b", 50 * S, None)], 0, 100 * S)
+    assert [(one.label, one.begin, one.end) for one in found] == [("a", 0, COLUMNS // 2), ("b", COLUMNS // 2, COLUMNS)]
+
+
+def test_a_night_of_many_changes_takes_no_more_room_than_the_picture_has() -> None:
+    spans = [Span("scanning" if i % 2 else "free", i * S, (i + 1) * S) for i in range(20_000)]
+    found = stretches(spans, 0, 20_000 * S)
+    assert len(found) <= COLUMNS
+    assert all(a.end <= b.begin for a, b in itertools.pairwise(found))
+    assert sum(one.count for one in found) == 20_000
+
+
+def test_of_several_in_one_column_the_longest_is_shown() -> None:
+    spans = [Span("short", 0, S // 1000), Span("long", S // 1000, S // 4), Span("rest", S // 4, None)]
+    assert stretches(spans, 0, 1000 * S)[0].label == "long"
+
+
+def test_a_time_in_the_far_future_makes_no_millions_of_ticks() -> None:
+    assert 3 <= len(time_ticks(0.0, 3600.0)) <= 8
+    assert len(time_ticks(0.0, 1e12)) <= 8
+
+
+def test_times_at_the_ends_of_a_row_stay_within_it() -> None:
+    row = TimelineRow("control", (Span("series", 0, 60 * S),), lambda _: "")
+    drawn = timeline_html([row], 0, 60 * S, UTC)
+    ticks = re.findall(r'<span style="left:([\d.]+)%(;transform:translateX\((-?\d+)%\))?">', drawn)
+    assert [(at, shift) for at, _, shift in ticks][:2] == [("0.00", "0"), ("16.67", "")]
+    assert (ticks[-1][0], ticks[-1][2]) == ("100.00", "-100")

@@ -1,0 +1,573 @@
+"""The scheduler's decisions composed: what comes in, what goes out, in which order."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from logic_lab import NS, Lab, killed, published, replies
+
+from afspm.model import (
+    CLOCK_REQUEST,
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    ControlState,
+    Feedback,
+    Packet,
+    PacketHeader,
+    Parameter,
+    Request,
+    ResponseDetail,
+    ScopeState,
+)
+from afspm.scheduler.control.arbitration import RoleTable, Rules
+from afspm.scheduler.events import (
+    Disconnected,
+    Forward,
+    Greeted,
+    Kill,
+    Log,
+    PacketIn,
+    Publish,
+    Replay,
+    ReplayRequested,
+    Reply,
+    SaveState,
+    Tick,
+    TranslatorCaughtUp,
+    TranslatorDown,
+    TranslatorUp,
+)
+from afspm.scheduler.publishing.envelopes import Envelopes
+from afspm.scheduler.safety.limits import ExperimentLimits, Limit
+from afspm.scheduler.safety.watchdog import WatchdogSettings
+from afspm.scheduler.settings import ControlSettings, RunFacts, SchedulerSettings
+
+TIP = 1
+ACTION, PARAM, SUPPORT = ControlRequest.ACTION, ControlRequest.PARAM, ControlRequest.ACTION_SUPPORT
+OK, NOT_IN_CONTROL, NO_RESPONSE = ControlResponse.SUCCESS, ControlResponse.NOT_IN_CONTROL, ControlResponse.NO_RESPONSE
+
+
+def kinds(effects: list[object]) -> list[str]:
+    return [type(effect).__name__ for effect in effects if not isinstance(effect, Log)]
+
+
+def test_a_change_is_saved_published_and_then_answered(lab: Lab) -> None:
+    effects = lab.ask("experiment", ControlRequest.REQUEST_CTRL, 0)
+    assert kinds(effects) == ["SaveState", "Publish", "Reply"]
+    assert lab.codec.decode(published(effects)[0].payload) == ControlState(ControlMode.AUTOMATED, "experiment", ())
+
+
+def test_what_changes_nothing_is_only_answered(lab: Lab) -> None:
+    lab.flag("classifier", TIP)
+    assert kinds(lab.ask("other", ControlRequest.ADD_EXP_PRBLM, TIP)) == ["Reply"]
+    assert kinds(lab.ask("other", ControlRequest.RELEASE_CTRL)) == ["Reply"]
+
+
+def test_the_holder_s_command_goes_to_the_translator_and_its_answer_back(lab: Lab) -> None:
+    lab.take_control("experiment")
+    effects = lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
+    assert kinds(effects) == ["Forward"]
+    answer = replies(lab.answer(lab.forwarded[-1], payload=b"7"))[0]
+    assert (answer.name, answer.response.code, answer.response.payload) == ("experiment", OK, b"7")
+
+
+def test_others_commands_are_refused_and_their_questions_answered(lab: Lab) -> None:
+    lab.take_control("experiment")
+    assert lab.says("other", ACTION, "start-scan") is NOT_IN_CONTROL
+    assert lab.says("other", PARAM, Parameter("tip-bias-voltage", "1", "V")) is NOT_IN_CONTROL
+    assert kinds(lab.ask("other", PARAM, Parameter("tip-bias-voltage"))) == ["Forward"]
+    lab.answer(lab.forwarded[-1])
+    assert kinds(lab.ask("other", SUPPORT, "x-pulse")) == ["Forward"]
+
+
+def test_requests_of_extensions_are_for_the_holder(lab: Lab) -> None:
+    assert lab.says("experiment", 150) is NOT_IN_CONTROL  # type: ignore[arg-type]
+    lab.take_control("experiment")
+    assert kinds(lab.ask("experiment", 150)) == ["Forward"]  # type: ignore[arg-type]
+
+
+def test_a_request_without_a_meaning_is_not_supported(lab: Lab) -> None:
+    assert lab.says("experiment", ControlRequest.UNDEFINED) is ControlResponse.CMD_NOT_SUPPORTED
+
+
+def test_a_flag_stops_the_scan_before_anything_else_is_sent(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.scope_is(ScopeState.SCANNING)
+    effects = lab.ask("classifier", ControlRequest.ADD_EXP_PRBLM, TIP)
+    assert [f.request.subject for f in effects if isinstance(f, Forward)] == ["stop-scan"]
+    lab.take_control("corrector", TIP)
+    lab.ask("corrector", ACTION, "x-pulse")
+    assert lab.forwarded[-1].request.subject == "stop-scan"
+    lab.answer(lab.forwarded[-1])
+    assert lab.forwarded[-1].request.subject == "x-pulse"
+
+
+def test_a_start_of_which_nobody_knows_is_stopped_as_well(lab: Lab) -> None:
+    """The translator was killed while it began the scan; the instrument scans on."""
+    lab.take_control("experiment")
+    lab.ask("experiment", ACTION, "start-scan", "experiment/a/1")
+    lab.step(TranslatorDown())
+    lab.flag("classifier", TIP)
+    lab.step(TranslatorUp())
+    lab.answer(lab.forwarded[-1])
+    assert lab.forwarded[-1].request.subject == "stop-scan"
+
+
+def test_manual_stops_a_scan_that_nobody_holds_as_well(lab: Lab) -> None:
+    lab.scope_is(ScopeState.SCANNING)
+    lab.mode("person", ControlMode.MANUAL)
+    assert lab.forwarded[-1].request.subject == "stop-scan"
+
+
+def test_the_experiment_file_may_let_the_scan_run_on() -> None:
+    lab = Lab(SchedulerSettings(watchdog=WatchdogSettings(stop_when=frozenset())))
+    lab.translator()
+    lab.take_control("experiment")
+    lab.scope_is(ScopeState.SCANNING)
+    lab.mode("person", ControlMode.MANUAL)
+    assert lab.forwarded == []
+
+
+def test_what_a_former_holder_has_waiting_is_not_sent_any_more(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.ask("experiment", PARAM, Parameter("scan-speed", "1"), "experiment/a/1")
+    lab.ask("experiment", ACTION, "start-scan", "experiment/a/2")
+    effects = lab.ask("classifier", ControlRequest.ADD_EXP_PRBLM, TIP)
+    refused = [r for r in replies(effects) if r.name == "experiment"]
+    assert [(r.response.id, r.response.code) for r in refused] == [("experiment/a/2", NOT_IN_CONTROL)]
+    lab.answer(lab.forwarded[-1])
+    assert all(f.request.subject != "start-scan" for f in lab.forwarded)
+
+
+def test_a_holder_that_is_gone_is_given_up_after_its_grace(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.step(Disconnected(lab.connections["experiment"]))
+    dead_s = lab.now_s + SchedulerSettings().control.grace_s
+    lab.entries()
+    assert lab.core.deadline_s() == dead_s
+    lab.now_s = dead_s - 0.1
+    lab.step(Tick())
+    assert lab.holder == "experiment"
+    lab.later(0.1)
+    effects = lab.step(Tick())
+    assert lab.holder is None
+    assert "Publish" in kinds(effects)
+
+
+def test_a_holder_that_comes_back_in_time_keeps_control(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.step(Disconnected(lab.connections["experiment"]))
+    lab.later(5.0)
+    connection = lab.connect("experiment")
+    lab.step(Greeted(connection, "experiment"))
+    lab.later(100.0)
+    lab.step(Tick())
+    assert lab.holder == "experiment"
+    assert lab.core.deadline_s() is None
+
+
+def test_a_connection_that_says_nothing_does_not_keep_control(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.step(Disconnected(lab.connections["experiment"]))
+    lab.connect("experiment")
+    lab.later(10.0)
+    lab.step(Tick())
+    assert lab.holder is None
+
+
+def test_a_holder_that_will_not_come_back_is_given_up_at_once(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.give_up("other")
+    assert lab.holder == "experiment"
+    lab.give_up("experiment")
+    assert lab.holder is None
+
+
+@pytest.mark.parametrize(
+    ("life", "feedback_on", "last"), [("b", False, "x-retract"), ("b", True, None), ("a", False, None)]
+)
+def test_a_restarted_holder_that_gives_control_back_leaves_no_danger_behind(
+    lab: Lab, life: str, feedback_on: bool, last: str | None
+) -> None:
+    lab.translator()
+    lab.ask("experiment", ControlRequest.REQUEST_CTRL, 0, "experiment/a/1")
+    lab.publish("ZCtrlParameters", Feedback(on=False))
+    lab.step(Disconnected(lab.connections.pop("experiment")))
+    lab.ask("experiment", ControlRequest.REQUEST_CTRL, 0, f"experiment/{life}/2")
+    lab.publish("ZCtrlParameters", Feedback(on=feedback_on))
+    again = killed(lab, SchedulerSettings())
+    released = again.ask("experiment", ControlRequest.RELEASE_CTRL, None, f"experiment/{life}/3")
+    assert replies(released)[0].response.ok
+    assert (again.forwarded[-1].request.subject if again.forwarded else None) == last
+
+
+def test_the_tip_of_a_holder_that_died_in_danger_is_retracted_and_nobody_disturbs_that(lab: Lab) -> None:
+    lab.publish("ZCtrlParameters", Feedback(on=False))
+    lab.take_control("experiment")
+    lab.give_up("experiment")
+    assert lab.forwarded[-1].request.subject == "x-retract"
+    lab.take_control("other")
+    assert lab.says("other", ACTION, "start-scan") is ControlResponse.NOT_FREE
+    lab.answer(lab.forwarded[-1])
+    assert lab.says("other", ACTION, "start-scan") is ControlResponse.NOT_FREE  # the tip is not at the surface
+
+
+def test_a_holder_that_does_nothing_loses_control_with_its_lease() -> None:
+    lab = Lab(SchedulerSettings(control=ControlSettings(lease_s=60.0)))
+    lab.translator()
+    lab.scope_is(ScopeState.FREE)
+    lab.take_control("greedy")
+    deadline_ns = lab.core.deadline_ns()
+    assert deadline_ns == lab.now_ns + 60 * NS
+    lab.later(experiment_s=60.0)
+    lab.step(Tick())
+    assert lab.holder is None
+
+
+def test_a_second_of_the_same_name_is_refused_with_a_reason(lab: Lab) -> None:
+    lab.take_control("experiment")
+    second = lab.newest + 1
+    lab.connect("second")
+    lab.connections["experiment"] = second
+    answer = replies(lab.ask("experiment", ACTION, "x-crash", "experiment/other/1"))[0]
+    assert (answer.connection, answer.response.code) == (second, ControlResponse.FAILURE)
+    assert "experiment" in answer.response.reason
+    assert lab.forwarded == []
+
+
+def test_a_peer_without_ids_that_connects_anew_is_answered_once_its_old_connection_closes(lab: Lab) -> None:
+    lab.take_control("plain")
+    old = lab.connections.pop("plain")
+    assert lab.ask("plain", ControlRequest.REQUEST_CTRL, 0) == []
+    effects = lab.step(Disconnected(old))
+    assert [(reply.connection, reply.response.code) for reply in replies(effects)] == [(lab.newest, OK)]
+    lab.entries()
+    assert lab.core.deadline_s() is None
+
+
+def test_two_without_ids_that_both_go_on_are_two(lab: Lab) -> None:
+    lab.take_control("plain")
+    lab.connections.pop("plain")
+    assert lab.ask("plain", ControlRequest.REQUEST_CTRL, 0) == []
+    lab.entries()
+    deadline_s = lab.core.deadline_s()
+    assert deadline_s is not None
+    lab.later(real_s=deadline_s - lab.now_s)
+    assert replies(lab.step(Tick()))[0].response.code == ControlResponse.FAILURE
+
+
+def test_who_is_authenticated_as_another_is_refused(lab: Lab) -> None:
+    answer = replies(lab.ask("experiment", ControlRequest.REQUEST_CTRL, 0, user="mallory"))[0]
+    assert answer.response.code == ControlResponse.FAILURE
+    assert lab.holder is None
+    assert replies(lab.ask("experiment", ControlRequest.REQUEST_CTRL, 0, user="experiment"))[0].response.code == OK
+
+
+def test_the_nameless_are_told_to_say_who_they_are(lab: Lab) -> None:
+    assert "without a name" in replies(lab.ask("", ControlRequest.REQUEST_CTRL, 0))[0].response.reason
+
+
+def test_a_repeated_request_is_answered_and_not_done_again(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
+    assert lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1") == []
+    lab.answer(lab.forwarded[-1])
+    again = replies(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1"))
+    assert [r.response.code for r in again] == [OK]
+    assert len(lab.forwarded) == 1
+
+
+def test_the_answer_goes_to_the_connection_that_the_client_has_then(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
+    lab.step(Disconnected(lab.connections["experiment"]))
+    new = lab.connect("experiment")
+    lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
+    assert [r.connection for r in replies(lab.answer(lab.forwarded[-1]))] == [new]
+
+
+def test_without_an_id_an_answer_is_not_given_to_a_new_life(lab: Lab) -> None:
+    lab.take_control("old")
+    lab.ask("old", ACTION, "x-pulse")
+    lab.step(Disconnected(lab.connections["old"]))
+    lab.connect("old")
+    lab.ask("old", ControlRequest.REQUEST_CTRL, 0)
+    assert replies(lab.answer(lab.forwarded[-1])) == []
+
+
+def test_a_silent_translator_is_told_of_and_its_late_answer_is_kept_for_a_repetition(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
+    lab.later(5.0)
+    silent = replies(lab.step(Tick()))[0].response
+    assert (silent.code, silent.detail) == (NO_RESPONSE, ResponseDetail.OUTCOME_UNKNOWN)
+    assert replies(lab.answer(lab.forwarded[-1])) == []
+    assert lab.says("experiment", ACTION, "x-pulse", "experiment/a/1") is OK
+    assert len(lab.forwarded) == 1
+
+
+def test_while_the_translator_is_slow_everybody_else_is_served(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.ask("experiment", ACTION, "start-scan", "experiment/a/1")
+    assert lab.flag("classifier", TIP) is OK
+    assert published(lab.scope_is(ScopeState.SCANNING))
+
+
+def test_what_nobody_knows_the_end_of_is_asked_again_of_a_translator_that_knows_ids(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
+    lab.step(TranslatorDown())
+    lab.translator()
+    assert kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")) == ["Forward"]
+
+
+def test_what_was_not_sent_may_be_asked_again(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.step(TranslatorDown())
+    answer = replies(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1"))[0].response
+    assert (answer.code, answer.detail) == (NO_RESPONSE, ResponseDetail.NOT_SENT)
+    lab.translator()
+    assert kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")) == ["Forward"]
+
+
+def test_what_the_translator_could_not_even_begin_is_asked_again(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
+    answer = replies(lab.answer(lab.forwarded[-1], NO_RESPONSE, detail=ResponseDetail.NOT_SENT))[0].response
+    assert (answer.code, answer.detail) == (NO_RESPONSE, ResponseDetail.NOT_SENT)
+    assert kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")) == ["Forward"]
+
+
+def test_what_a_translator_had_no_answer_to_is_for_it_to_say_when_asked_again(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
+    lab.answer(lab.forwarded[-1], NO_RESPONSE, reason="the controller can't be reached")
+    assert kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")) == ["Forward"]
+    lab.answer(lab.forwarded[-1])
+    assert lab.says("experiment", ACTION, "x-pulse", "experiment/a/1") is OK
+
+
+def test_a_limit_refuses_and_is_logged() -> None:
+    limits = ExperimentLimits({"tip-bias-voltage": Limit(high=5.0, source="experiment.toml:7")})
+    lab = Lab(SchedulerSettings(limits=limits))
+    lab.translator()
+    lab.take_control("experiment")
+    effects = lab.ask("experiment", PARAM, Parameter("tip-bias-voltage", "6", "V"))
+    assert replies(effects)[0].response.code == ControlResponse.PARAM_ERROR
+    assert any(isinstance(e, Log) and "experiment.toml:7" in e.text for e in effects)
+    assert lab.forwarded == []
+
+
+def test_packets_pass_renamed_and_late_joiners_get_them_in_order(lab: Lab) -> None:
+    header = PacketHeader("Scan2d", "Height", (2e-6, 2e-6))
+    scan = lab.step(PacketIn(Packet("Scan2d", b"values", lab.now_ns + NS), header))
+    assert published(scan)[0].envelope == "Scan2d_2000.0_Height"
+    assert published(scan)[0].payload == b"values"
+    lab.scope_is(ScopeState.FREE)
+    replay = lab.step(ReplayRequested("late", ("",), -1))[0]
+    assert isinstance(replay, Replay)
+    assert [p.envelope for p in replay.packets] == ["ControlState", "Scan2d_2000.0_Height", "ScopeStateMsg"]
+    newest_ns = replay.packets[-1].time_ns or 0
+    assert lab.step(ReplayRequested("late", ("Scan2d", "Scope"), newest_ns)) == [Replay("late", ())]
+
+
+def test_a_mapping_that_fails_is_told_once_and_costs_only_its_own_packets() -> None:
+    lab = Lab(SchedulerSettings(envelopes=Envelopes(mapping=lambda header: str(1 / len(header.channel or "")))))
+    lab.translator()
+    effects = [e for _ in range(3) for e in lab.scope_is(ScopeState.FREE)]
+    assert kinds(effects) == []
+    assert len(effects) == 1
+
+
+def test_a_control_state_of_the_translator_s_is_dropped(lab: Lab) -> None:
+    assert published(lab.publish("ControlState", ControlState(ControlMode.AUTOMATED, "mallory"))) == []
+
+
+def test_control_is_told_after_what_the_translator_published_before() -> None:
+    lab = Lab()
+    assert published(lab.effects) == []
+    lab.scope_is(ScopeState.FREE)
+    assert [p.envelope for p in published(lab.step(TranslatorCaughtUp()))] == ["ControlState"]
+
+
+def test_without_a_translator_control_is_told_soon_all_the_same() -> None:
+    lab = Lab()
+    lab.later(1.0)
+    assert [p.envelope for p in published(lab.step(Tick()))] == ["ControlState", "JournalEntries"]
+
+
+def restarted(lab: Lab) -> Lab:
+    """A new core with what the former had saved."""
+    saved = [e for e in lab.effects if isinstance(e, SaveState)][-1]
+    return Lab(state=saved.state, codec=lab.codec)
+
+
+def test_killed_and_restarted_it_has_mode_problems_and_holder_back(lab: Lab) -> None:
+    lab.flag("classifier", TIP)
+    lab.take_control("corrector", TIP)
+    after = restarted(lab)
+    assert after.core.control == lab.core.control
+    after.step(TranslatorCaughtUp())
+    assert after.take_control("experiment") is ControlResponse.WRONG_EXP_PROBLEM
+    assert after.clear("corrector", TIP) is OK
+    assert after.holder is None
+
+
+@pytest.mark.parametrize("translator", ["comes", "stays away"])
+def test_after_a_restart_control_changes_once_what_was_published_before_has_come_again(
+    lab: Lab, translator: str
+) -> None:
+    lab.take_control("experiment")
+    saved = lab.core.snapshot()
+    scan_ns = lab.now_ns + 5000  # published, and not written down any more when the scheduler was killed
+    (first,) = published(lab.publish("Scan2d", "a scan", scan_ns))
+    after = Lab(state=saved)
+    after.later(experiment_s=60.0)
+    assert replies(after.ask("experiment", ControlRequest.RELEASE_CTRL)) == []
+    assert after.holder == "experiment"
+    if translator == "comes":
+        (again,) = published(after.publish("Scan2d", "a scan", scan_ns))
+        assert again.time_ns == first.time_ns
+        after.step(TranslatorCaughtUp())
+    else:
+        after.later(1.0)
+        after.step(Tick())
+    assert after.core.deadline_s() == after.now_s
+    assert [reply.response.code for reply in replies(after.step(Tick()))] == [OK]
+    assert after.holder is None
+
+
+def test_a_holder_not_heard_of_after_a_restart_is_given_up() -> None:
+    lab = Lab()
+    lab.take_control("experiment")
+    after = restarted(lab)
+    after.later(29.0)
+    after.step(Tick())
+    assert after.holder == "experiment"
+    after.later(1.0)
+    after.step(Tick())
+    assert after.holder is None
+
+
+def test_a_stop_that_was_due_in_the_kill_is_made_up_for(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.scope_is(ScopeState.SCANNING)
+    lab.flag("classifier", TIP)
+    after = restarted(lab)
+    after.step(TranslatorUp())
+    after.answer(after.forwarded[-1])
+    assert after.forwarded[-1].request.subject == "stop-scan"
+
+
+def test_the_end_is_saved_answered_and_then_told_to_all(lab: Lab) -> None:
+    effects = lab.ask("boss", ControlRequest.END_EXPERIMENT)
+    assert kinds(effects) == ["SaveState", "Reply", "Publish", "Kill"]
+    assert lab.says("experiment", ControlRequest.REQUEST_CTRL, 0) is ControlResponse.FAILURE
+    assert any(isinstance(e, Kill) for e in restarted(lab).effects)
+
+
+def test_only_who_has_the_role_ends_the_experiment() -> None:
+    lab = Lab(SchedulerSettings(rules=Rules(RoleTable(end_experiment=("boss",)))))
+    assert lab.says("other", ControlRequest.END_EXPERIMENT) is ControlResponse.FAILURE
+    assert not any(isinstance(e, Kill) for e in lab.effects)
+
+
+def test_an_operator_commands_in_manual() -> None:
+    lab = Lab(SchedulerSettings(rules=Rules(RoleTable(operate=("console",)))))
+    lab.translator()
+    assert lab.says("console", ACTION, "start-scan") is NOT_IN_CONTROL
+    lab.mode("console", ControlMode.MANUAL)
+    assert kinds(lab.ask("console", ACTION, "start-scan")) == ["SaveState", "Forward"]
+
+
+def test_only_what_the_file_names_is_adjusted_beside_the_holder() -> None:
+    lab = Lab(SchedulerSettings(rules=Rules(RoleTable(operate=("console",)), adjustable=frozenset({"zctrl-setpoint"}))))
+    lab.translator()
+    lab.take_control("experiment")
+    setpoint, bias = Parameter("zctrl-setpoint", "0.5"), Parameter("tip-bias-voltage", "1", "V")
+    assert kinds(lab.ask("console", ControlRequest.PARAM, setpoint)) == ["Forward"]
+    assert lab.says("console", ControlRequest.PARAM, bias) is NOT_IN_CONTROL
+    assert lab.says("other", ControlRequest.PARAM, setpoint) is NOT_IN_CONTROL
+    assert lab.says("console", ACTION, "start-scan") is NOT_IN_CONTROL
+
+
+def test_what_is_set_by_hand_and_stays_in_force_is_said_when_components_go_on() -> None:
+    lab = Lab(SchedulerSettings(rules=Rules(RoleTable(operate=("console",)))))
+    lab.translator()
+    lab.publish("ZCtrlParameters", Feedback(on=True, setpoint=1e-9))
+    lab.mode("console", ControlMode.MANUAL)
+    for value in ("0.2", "0.5"):
+        lab.ask("console", PARAM, Parameter("tip-bias-voltage", value, "V"))
+        lab.answer(lab.forwarded[-1])
+    lab.publish("ZCtrlParameters", Feedback(on=True, setpoint=2e-9))  # changed at the controller's panel
+
+    def said() -> list[str]:
+        lab.mode("console", ControlMode.AUTOMATED)
+        return [one.text for one in lab.effects if isinstance(one, Log) and "by hand" in one.text]
+
+    assert said() == ["set by hand, and still in force: tip-bias-voltage = 0.5 V, setpoint = 2e-09"]
+    lab.mode("console", ControlMode.MANUAL)
+    assert len(said()) == 1  # told once, and nothing was set this time
+
+
+def test_a_feedback_that_is_set_back_by_hand_is_not_worth_a_word() -> None:
+    lab = Lab()
+    lab.translator()
+    for mode, setpoint in [(ControlMode.AUTOMATED, 1.0), (ControlMode.MANUAL, 2.0), (ControlMode.MANUAL, 1.0)]:
+        lab.mode("person", mode)
+        lab.publish("ZCtrlParameters", Feedback(setpoint=setpoint))
+    lab.mode("person", ControlMode.AUTOMATED)
+    assert not [one for one in lab.effects if isinstance(one, Log) and "by hand" in one.text]
+
+
+def test_a_stop_that_fails_is_said_loudly(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.scope_is(ScopeState.SCANNING)
+    lab.flag("classifier", TIP)
+    effects = lab.answer(lab.forwarded[-1], ControlResponse.ACTION_ERROR)
+    assert any(isinstance(e, Log) and e.level == "ERROR" and "stop-scan" in e.text for e in effects)
+
+
+def test_same_events_same_effects() -> None:
+    def story() -> list[object]:
+        lab = Lab()
+        lab.translator()
+        lab.take_control("a")
+        lab.flag("b", TIP)
+        lab.scope_is(ScopeState.FREE)
+        lab.later(20.0)
+        lab.step(Tick())
+        return lab.effects
+
+    assert story() == story()
+
+
+@pytest.mark.parametrize("garbage", [Request(99999), Request(-5), Request(6, None), Request(8, 0), Request(1, None)])
+def test_odd_requests_are_answered(lab: Lab, garbage: Request) -> None:
+    from afspm.scheduler.events import RequestIn
+
+    lab.connect("odd")
+    assert [type(e) for e in lab.step(RequestIn(1, "odd", garbage)) if isinstance(e, Reply | Publish)]
+
+
+def test_whoever_asks_is_told_the_time_of_the_experiment_and_how_it_passes() -> None:
+    lab = Lab(SchedulerSettings(run=RunFacts({"origin_s": 5.0, "start_s": 7.0, "speed": 600.0})))
+    answer = replies(lab.ask("elsewhere", CLOCK_REQUEST, id_="elsewhere/a/1"))[0].response
+    assert (answer.code, answer.id) == (OK, "elsewhere/a/1")
+    clock = {"origin_s": 5.0, "start_s": 7.0, "speed": 600.0, "now_ns": lab.now_ns}
+    assert json.loads(answer.payload) == {**clock, "run": "", "simulated": False, "versions": {}, "in_use": ""}
+
+
+def test_the_answer_with_the_time_says_whether_the_microscope_is_in_use() -> None:
+    lab = Lab()
+
+    def in_use() -> str:
+        found: str = json.loads(replies(lab.ask("elsewhere", CLOCK_REQUEST))[0].response.payload)["in_use"]
+        return found
+
+    lab.ask("series", ControlRequest.REQUEST_CTRL, 0)
+    assert in_use() == "series is in control"
+    lab.mode("person", ControlMode.MANUAL)
+    assert in_use() == "the mode is MANUAL"

@@ -1,0 +1,45 @@
+"""Files to cut and damage: those of real microscopes, where they are, and small ones as the controllers write them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import pytest
+from samples import DATA, WHOLE
+from systems import not_on_wine
+
+import afspm
+from afspm.storage.formats import FileContent, suffixes
+
+_FILES = sorted(path.relative_to(DATA).as_posix() for path in DATA.rglob("*") if path.suffix in suffixes())
+REAL = sorted({re.sub(r"\w+\.h5$|\d+", "", name): name for name in reversed(_FILES)}.values())
+"""One of each series, and one .h5, all of which one program made: the others are built the same."""
+
+
+@cache
+def whole(name: str) -> bytes:
+    """Of one of `WHOLE` or `REAL`."""
+    if name not in WHOLE:
+        return (DATA / name).read_bytes()
+    with TemporaryDirectory() as folder:
+        WHOLE[name](Path(folder) / name)
+        return (Path(folder) / name).read_bytes()
+
+
+def reading(content: bytes, name: str) -> FileContent:
+    """What is in a file of that name. Raises FileError: as `afspm.read`."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / Path(name).name
+        path.write_bytes(content)
+        return afspm.read(path)
+
+
+def to_damage(names: Iterable[str]) -> list[Any]:
+    """Parameters of a test that reads damaged files."""
+    old = not_on_wine("the older HDF5 that runs there ends the process on some damaged files")
+    return [pytest.param(name, marks=old) if name.endswith((".nc", ".h5", ".nhf")) else name for name in names]

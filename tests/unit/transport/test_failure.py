@@ -1,0 +1,132 @@
+"""What a person is told when their code raises: their lines, without ours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from afspm.basics.errors import Refused
+from afspm.client.component import Component
+from afspm.client.dispatch import MessageDispatcher
+from afspm.model import Region, ScanParameters
+from afspm.transport.process.failure import describe
+
+OURS = Path(MessageDispatcher.give.__code__.co_filename).parents[1]
+
+
+def made_up(code: str, **names: object) -> dict[str, Any]:
+    """The names that `code` defines, as if it stood in a file of ours."""
+    exec(compile(code, str(OURS / "client" / "made_up.py"), "exec"), names)
+    return names
+
+
+CALL = """
+def call(function):
+    try:
+        function()
+    except Exception as error:
+        return error
+    raise AssertionError("it did not raise")
+"""
+
+
+def raised(function: Callable[[], object]) -> BaseException:
+    """What it raises when it is called by code of ours."""
+    error = made_up(CALL)["call"](function)
+    assert isinstance(error, BaseException)
+    return error
+
+
+REFUSE = """
+def refuse():
+    raise Refused(9, "too far", where="series")
+"""
+
+
+def refuse() -> None:
+    made_up(REFUSE, Refused=Refused)["refuse"]()
+
+
+def test_first_comes_what_happened_then_the_lines_of_whoever_wrote_the_component() -> None:
+    lines = describe(raised(lambda: {}["sharpness"])).splitlines()
+    assert lines[0] == "KeyError: 'sharpness'"
+    assert all("made_up.py" not in line for line in lines[1:])
+    assert any("test_failure.py" in line for line in lines[1:])
+
+
+def test_what_we_refused_is_told_at_the_line_that_asked_for_it() -> None:
+    text = describe(raised(refuse), "series")
+    assert text.splitlines()[0] == "too far"
+    assert "made_up.py" not in text
+    assert "test_failure.py" in text
+
+
+WITHIN = """
+@contextmanager
+def holding():
+    raise Refused(9, "too far", where="series")
+    yield
+
+def run():
+    with holding():
+        pass
+"""
+
+
+def test_what_a_component_of_ours_was_refused_within_a_context_is_told() -> None:
+    run = made_up(WITHIN, Refused=Refused, contextmanager=contextmanager)["run"]
+    assert describe(raised(run), "series").splitlines()[0].startswith("too far")
+
+
+def test_an_error_of_ours_alone_is_told_whole() -> None:
+    text = describe(raised(lambda: 1 / 0), package=Path(__file__).parents[3])  # as if all of this were ours
+    assert "made_up.py" in text
+    assert "test_failure.py" in text
+
+
+def test_a_refusal_of_what_a_component_of_ours_asked_for_is_told_in_its_words() -> None:
+    error = raised(refuse)
+    error.__cause__ = raised(lambda: {}["of a library that we called"])
+    assert describe(error, "series", package=Path(__file__).parents[3]) == "too far"
+
+
+def test_what_led_to_it_is_told_too() -> None:
+    def careless() -> None:
+        try:
+            {}["first"]
+        except KeyError:
+            undefined()  # type: ignore[name-defined]  # noqa: F821
+
+    text = describe(raised(careless))
+    assert text.startswith("NameError")
+    assert "KeyError: 'first'" in text
+    assert "made_up.py" not in text
+
+
+def test_asking_for_the_scope_too_early_is_told_at_the_line_that_did() -> None:
+    class Early(Component):
+        def __init__(self) -> None:
+            self.region = self.scope.scan_parameters
+
+    text = describe(raised(Early))
+    assert "not there yet in __init__" in text.splitlines()[0]
+    assert "component.py" not in text
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda: Region(([0], 0), ("1 um", "1 um")),
+        lambda: Region(0, 1e-6),
+        lambda: ScanParameters(shape=64),
+        lambda: ScanParameters(shape=(1, 2, 3)),
+        lambda: ScanParameters(shape=(64.0, 64.0)),
+        lambda: ScanParameters(shape=("64", 64)),
+    ],
+)
+def test_values_of_the_wrong_kind_are_told_with_what_would_be_right(wrong: Callable[[], object]) -> None:
+    assert "e.g. " in describe(raised(wrong)).splitlines()[0]
