@@ -295,6 +295,19 @@ def _value(default: Any, hint: Any, metadata: Any) -> str:
     return f"`{default!r}`".replace("'", '"')
 
 
+def example_maker() -> str:
+    """The files of the sample package of a maker, as the tests install them."""
+    package = ROOT / "tests" / "support" / "example_maker"
+    shown = [
+        ("pyproject.toml", "ini"),
+        ("example_maker/parameters.toml", "ini"),
+        ("example_maker/driver.py", "py"),
+        ("example_maker/emulated.toml", "ini"),
+    ]
+    parts = (f"`{name}`:\n\n```{kind}\n{(package / name).read_text(encoding='utf-8')}```\n" for name, kind in shown)
+    return "\n" + "\n".join(parts)
+
+
 PARTS: dict[str, Callable[[], str]] = {
     "state-diagram": state_diagram,
     "transition-table": transition_table,
@@ -309,6 +322,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "cache": lambda: section(CacheSettings),
     "cache-rule": lambda: section(CacheRule),
     "messages": messages,
+    "example-maker": example_maker,
 }
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from afspm.basics import entry_points
 from afspm.translator import Driver
 
-VENDORS = Path(__file__).parents[1] / "vendors"
+VENDORS = Path(__file__).parents[1] / "plugins"
 
 
 @dataclass(frozen=True)

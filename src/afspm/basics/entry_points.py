@@ -25,7 +25,7 @@ from typing import Any
 from afspm.basics.errors import ConfigError
 
 DRIVERS = "afspm.drivers"  # class = "Name" of a translator
-EMULATORS = "afspm.simulation.emulation"  # class = "Name" of an emulated controller; `afspm emulate NAME`
+EMULATORS = "afspm.emulators"  # class = "Name" of an emulated controller; `afspm emulate NAME`
 SCHEDULERS = "afspm.schedulers"  # class = "Name" of a scheduler
 COMPONENTS = "afspm.components"  # class = "Name" of a component
 READERS = "afspm.readers"  # by the suffix of a file, without its dot: (path, zone) -> FileContent

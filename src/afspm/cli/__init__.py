@@ -1,4 +1,4 @@
-"""The command `afspm`."""
+"""The commands. Each module reads arguments, calls one room, and prints; nothing is decided here."""
 
 from __future__ import annotations
 

@@ -1,1 +1,4 @@
-"""Ready-made components, a module each: an experiment file names their classes without a module."""
+"""Ready-made components: scan plans, surveys, tip judge and repair, notes, notifications, the recorder.
+
+Each is an ordinary component: it derives from `afspm.Component`, is named by an entry point, and could be yours.
+"""

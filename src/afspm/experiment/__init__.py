@@ -1,4 +1,13 @@
-"""The experiment file: load it, check it, expand it, draw it, and say what is to be started."""
+"""The experiment file: read, checked, expanded, and made into the launch lines of processes.
+
+**Theory of operation.** TOML files are laid over each other (`document`), references replaced, defaults filled in
+(`resolution`), classes found by entry points (`class_loader`), and everything checked before a process starts.
+
+    comes in      TOML files
+    state         none: an `Experiment` is frozen
+    goes out      launch lines; findings, each with file, line, and what to write instead
+    always holds  all findings are reported at once; an experiment that passes the check starts
+"""
 
 from afspm.experiment.experiment import Experiment, ProcessStart, load, load_expanded
 from afspm.experiment.findings import Finding, Level, SourceLocation

@@ -1,11 +1,12 @@
-"""The physics behind the simulated microscope: pure, seeded, in SI units and experiment time.
+"""The one simulated instrument: world, tip, feedback and noise; its driver; and the rig of all emulated controllers.
 
-    world = World.from_settings({"surface": {"kind": "steps"}}, seed=1, start_s=0.0)
-    scan = world.scan(Region((0.0, 0.0), (1e-6, 1e-6)), (128, 128), line_s=1.0, start_s=0.0)
-    unit, height = scan.channels()["Height"]
+**Theory of operation.** A night on it is a function of its settings and its seed. Nothing here has a clock: the
+instrument is asked what it is at a time.
 
-A feature at `x_sample` is found at `x_tip = world.sample.to_tip(x_sample, t)`; that is
-`x_sample + world.drift_m(t)` where the sample neither turns nor expands.
+    comes in      settings, a seed, commands with their times, faults on demand
+    state         the sample, its drift, the tip with its history, what is being measured
+    goes out      values of pixels and curves; the truth, which is written beside the record
+    always holds  the same seed and commands give the same values; what is simulated is marked so wherever it is shown
 """
 
 from __future__ import annotations

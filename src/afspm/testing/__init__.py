@@ -1,1 +1,4 @@
-"""For those who write translators and components: conformance tests, a fake clock, an in-memory network, faults."""
+"""For those who write drivers, components and clients: conformance suites, commissioning, skeletons.
+
+No process of a run imports this room.
+"""

@@ -1,6 +1,17 @@
-"""The translator: the process between the scheduler and one microscope, the same for all, around a vendor's `Driver`.
+"""The Microscope Translator: the process between the scheduler and one microscope, around a maker's `Driver`.
 
-To add a microscope: write a `Driver` and its table of parameters (docs/how-to/write-a-driver.md).
+**Theory of operation.** One loop waits for requests and for the next look at the controller.
+
+    comes in      requests of the scheduler; what the driver reads from the controller
+    state         what the microscope was last seen to do; answers to recent requests; finished scans not yet published
+                  (all on disk)
+    goes out      commands to the controller; states, settings, scans and spectra as packets
+    always holds  a request is checked as a whole before anything is set; none is executed twice; one scheduler is
+                  obeyed (`fencing`); a result is published once, over a kill too (`outbox`); when nobody is left to
+                  command, nothing measures on and the tip is safe (`safe_exit`)
+
+A driver (`driver`) reads and sets what its table of parameters names (`parameters`), starts and stops measurements, and
+returns their results. It may fail at any time with `ControllerLost`; connecting again is not its business.
 """
 
 from __future__ import annotations

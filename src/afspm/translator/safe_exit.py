@@ -17,7 +17,7 @@ from afspm.translator.temporary_settings import TemporarySettings
 _LOOK_S = 0.1
 _TIP_S = 8.0
 """Real time in which the tip is tried to be retracted when the run is stopped: a controller may be lost just then, or
-refuse. A little less than `runtime.parent` leaves."""
+refuse. A little less than `transport.process.parent` leaves."""
 
 
 class FeedbackWatch:

@@ -92,7 +92,7 @@ def test_the_published_names_are_ours(write: Write) -> None:
             rescanner="afspm.components.drift.rescanner.DriftRescanner",
         ),
     )
-    assert names["scheduler"].class_.endswith("scheduler.drift.scheduler.DriftCompensatedScheduler")
+    assert names["scheduler"].class_.endswith("drift.scheduler.scheduler.DriftCompensatedScheduler")
     assert names["rescanner"].class_.endswith("rescanner.Rescanner")
 
 

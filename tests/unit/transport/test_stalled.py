@@ -73,7 +73,8 @@ def test_what_waits_for_one_that_stands_still_is_dropped_and_others_miss_nothing
     kept = sys.getrefcount(payload)
     for _ in range(SCANS):
         publisher.publisher.socket.send_multipart([b"Scan2d", payload, b""], copy=False)
-    received = lambda: sum(isinstance(i, PacketReceived) for i in got)  # noqa: E731
+    scans = lambda i: isinstance(i, PacketReceived) and len(i.packet.payload) == len(payload)  # noqa: E731
+    received = lambda: sum(map(scans, got))  # noqa: E731
     until(lambda: received() == SCANS, (publisher, happened), (healthy, got))
     waiting = sys.getrefcount(payload) - kept
     assert waiting > SCANS // 2 or DISCONNECTED in happened

@@ -1,5 +1,5 @@
 #pragma rtGlobals=1
-// What afspm needs beside Asylum's own functions. See the README of afspm's microscopes/asylum.
+// What afspm needs beside Asylum's own functions. See the README of afspm's plugins/asylum.
 // Functions of Asylum's that not every release has are called so that this file compiles without them.
 
 // The bits of ARGetStatus (nan: this release has none), then a value for each name of a list "ScanSize;XOffset;".

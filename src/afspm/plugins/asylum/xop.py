@@ -40,7 +40,7 @@ _MEANINGS: Final = {
 }
 _HINTS: Final = {
     100: "a procedure window was edited: compile the procedures",
-    101: "is afspm.ipf included in Igor's procedures (see the README of microscopes/asylum)?",
+    101: "is afspm.ipf included in Igor's procedures (see the README of plugins/asylum)?",
 }
 
 Parameter = bool | int | float | str

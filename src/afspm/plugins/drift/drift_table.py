@@ -22,7 +22,7 @@ COLUMNS = ("datetime", "filename", "offset_x", "offset_y", "rate_x", "rate_y", "
 class DriftTable(Component):
     """Writes `drift_correction.csv`: for each scan the offset between tip and sample coordinates, and its rate.
 
-    The offset is x_sample - x_tip. The columns from `scan` to `failures` are those of `plugins.drift.record`, which reads
+    The offset is x_sample - x_tip. The columns from `scan` to `failures` are those of `drift.record`, which reads
     the table. `outcome` says how the position of a scan is known: registered, coarse, or by dead reckoning (refused,
     failed, new), with the variances that it then has. Whatever is killed, there is one header and no row is there
     twice.

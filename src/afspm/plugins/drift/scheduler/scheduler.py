@@ -86,7 +86,7 @@ class DriftCompensatedScheduler(Scheduler):
 
 
 class DriftWireCodec(WireCodec):
-    """See `scheduler.drift.messages.DriftCodec`."""
+    """The wire as `DriftCodec` asks for it."""
 
     def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
         of = "ProbePosition" if message in ("Spec1d", "ProbePosition") else "ScanParameters2d"

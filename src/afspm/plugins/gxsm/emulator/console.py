@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-SCRIPT: Final = Path(__file__).parents[2] / "microscopes" / "gxsm" / "bridge.py"
+SCRIPT: Final = Path(__file__).parents[1] / "bridge.py"
 """What is run if nothing else is said: the file that a user runs, not a module of ours."""
 _LISTENS: Final = re.compile(r"listening at (\S+):(\d+)")
 
