@@ -284,8 +284,8 @@ def check_names_of_people(resolved: ResolvedExperiment) -> None:
                 what = f"[control.roles] {role}: {member!r} has no password: anyone who types the name has the role"
                 hint = f"`afspm dashboard --make-password` makes a line of people for [{component_of(member)}]"
                 resolved.document.warning(what, *path, hint=hint)
-    if any_role and (security.plain or security.insecure):
-        hint = "leave [security] plain away, or make keys with `afspm keys` and set [security] keys"
+    if any_role and security.insecure:
+        hint = "leave [security] insecure away, or make keys with `afspm keys` and set [security] keys"
         what = "[control.roles] without keys: any program that takes the name has the role"
         resolved.document.warning(what, "control", "roles", hint=hint)
     for name in resolved.saying(OPENS_PLAIN):

@@ -24,7 +24,6 @@ from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
 from afspm.transport.translator_link import LinkReply, LinkUp
-from afspm.wire.protocol import LONGEST_ID
 
 if TYPE_CHECKING:
     from afspm.basics.clock import Clock
@@ -177,7 +176,7 @@ class SchedulerShell:
             self._request(asked)
             return
         ended = ResponseDetail.EXPERIMENT_ENDED
-        self._answer(asked, Response(ControlResponse.FAILURE, b"", HAS_ENDED, _id_of(asked), ended))
+        self._answer(asked, Response(ControlResponse.FAILURE, b"", HAS_ENDED, wire.id_of(asked.frames), ended))
 
     def stop(self) -> None:
         """See to what must be known to whoever resumes the run, unless the experiment is over."""
@@ -218,7 +217,7 @@ class SchedulerShell:
             request = wire.decode_request(asked.frames)
         except WireError as error:
             self._warnings.warning(f"refused a request of {name or 'a nameless peer'}: {error}")
-            response = Response(error.response, reason=str(error), id=_id_of(asked))
+            response = Response(error.response, reason=str(error), id=wire.id_of(asked.frames))
             self._answer(asked, response)
             self._take(events.Unreadable(name, response))
             return
@@ -315,13 +314,6 @@ class SchedulerShell:
             elif isinstance(effect, events.Kill):
                 over = True
         self._write_ahead.write(state, entries)
-
-
-def _id_of(asked: PeerAsked) -> str:
-    """The id of a malformed request, if that much of it is well-formed: its sender then knows what was refused."""
-    if len(asked.frames) == 3 and len(asked.frames[2]) <= LONGEST_ID:
-        return asked.frames[2].decode("utf-8", "replace")
-    return ""
 
 
 def _response(reply: LinkReply) -> Response:

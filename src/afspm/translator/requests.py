@@ -84,7 +84,7 @@ class RequestHandler:
             return False
         last, self._last_refusal = self._last_refusal, why
         level = logging.DEBUG if last == why else logging.WARNING
-        self._reply(Response(ControlResponse.FAILURE, reason=why), level)
+        self._reply(Response(ControlResponse.FAILURE, reason=why, id=wire.id_of(arrived.frames)), level)
         return True
 
     def answer(self, frames: Sequence[bytes]) -> None:
@@ -92,7 +92,8 @@ class RequestHandler:
         try:
             request = wire.decode_request(frames)
         except WireError as error:
-            self._reply(Response(error.response, reason=str(error)), logging.DEBUG)  # a stranger can send millions
+            refusal = Response(error.response, reason=str(error), id=wire.id_of(frames))
+            self._reply(refusal, logging.DEBUG)  # a stranger can send millions
             return
         known = self._outcomes.outcome(request)
         if known is not None:

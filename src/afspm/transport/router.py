@@ -204,7 +204,7 @@ class Router:
         if self._keys is not None and not self._has_refused:
             self._has_refused = True
             self._log.warning(
-                f"refused a connection to {self.address}: its key is missing or unknown; [security] plain = true "
+                f"refused a connection to {self.address}: its key is missing or unknown; [security] insecure = true "
                 "admits programs without keys"
             )
 

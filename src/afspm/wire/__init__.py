@@ -24,6 +24,7 @@ from afspm.wire.frames import (
     encode_response,
     encode_subject,
     encode_time,
+    id_of,
 )
 from afspm.wire.mapping import decode_orders, encode_orders
 from afspm.wire.messages import (
@@ -78,6 +79,7 @@ __all__ = [
     "encode_time",
     "followed_messages",
     "header",
+    "id_of",
     "known_messages",
     "message_of",
     "message_type",

@@ -133,6 +133,11 @@ def decode_request(frames: Sequence[Buffer]) -> Request:
         raise WireError(f"{request_name(kind)}: {error}", response=response) from error
 
 
+def id_of(frames: Sequence[Buffer]) -> str:
+    """Return the id of a request that may be malformed, so that its sender knows what is refused; "" if it has none."""
+    return str(frames[2], "utf-8", "replace") if len(frames) == 3 and len(frames[2]) <= LONGEST_ID else ""
+
+
 def _request_id(frame: Buffer) -> str:
     if len(frame) > LONGEST_ID:
         raise WireError(f"a request id of {len(frame)} bytes", hint=f"at most {LONGEST_ID}")

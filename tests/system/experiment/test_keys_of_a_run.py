@@ -64,9 +64,9 @@ def test_a_component_without_the_role_can_not_take_the_name_of_one_that_has_it(r
     assert not (one.folder / "state" / "guest.keys").exists()
 
 
-@pytest.mark.parametrize("plain", [False, True])
-def test_a_program_without_keys_joins_where_the_file_says_so(run: Run, plain: bool) -> None:
-    one = run(scans=1000, more="[security]\nplain = true\n" if plain else "")
+@pytest.mark.parametrize("open_to_all", [False, True])
+def test_a_program_without_keys_joins_where_the_file_says_so(run: Run, open_to_all: bool) -> None:
+    one = run(scans=1000, more="[security]\ninsecure = true\n" if open_to_all else "")
     one.wait_for("scan 1 of 1000")
     control = guest_of(one.folder, "bare").sockets.control
     assert control is not None
@@ -75,9 +75,9 @@ def test_a_program_without_keys_joins_where_the_file_says_so(run: Run, plain: bo
         socket.setsockopt(zmq.ROUTING_ID, b"bare")
         socket.connect(control)
         socket.send_multipart(wire.encode_request(Request(ControlRequest.END_EXPERIMENT)))
-        if plain:
+        if open_to_all:
             assert wire.decode_response(socket.recv_multipart()).ok
             assert one.end() == 0, one.output
         else:
-            one.wait_for(" scheduler ", r"\[security\] plain = true")
+            one.wait_for(" scheduler ", r"\[security\] insecure = true")
             assert socket.poll(0) == 0

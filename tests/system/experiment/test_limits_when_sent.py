@@ -31,7 +31,7 @@ heartbeats = false
 region = { x = ["-3 um", "3 um"], y = ["-3 um", "3 um"] }
 
 [security]
-plain = true
+insecure = true
 """
 BURST = '''
 """Widens the frame, moves it, and scans, without waiting for answers. Each of the first two fits by itself."""

@@ -53,7 +53,7 @@ def test_a_guard_that_is_terminated_takes_its_command_along(start: Any) -> None:
 
 TERMINATED_AT_ONCE = """
 import os, signal, subprocess, sys
-from afspm.transport.process import foreign
+from afspm.supervisor import foreign
 
 class Popen(subprocess.Popen):
     def __init__(self, *args, **settings):

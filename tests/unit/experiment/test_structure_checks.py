@@ -311,7 +311,7 @@ def test_all_insecure_must_be_said_aloud(write: Write) -> None:
 
 def test_roles_without_keys_are_a_warning(write: Write) -> None:
     roles = CORRECTOR + '[control.roles]\nend_experiment = ["repair"]\n'
-    for more, told in (("", False), ("[security]\nplain = true\n", True)):
+    for more, told in (("", False), ("[security]\ninsecure = true\n", True)):
         experiment = write(roles + more)
         assert not errors(experiment)
         assert any("without keys" in f.what for f in experiment.check()) is told

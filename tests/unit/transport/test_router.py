@@ -279,4 +279,4 @@ def test_one_without_a_key_is_not_heard_and_that_is_told_once(
     while "its key is missing" not in caplog.text:
         assert time.monotonic() < deadline_s
         run.listening.router.receive()
-    assert caplog.text.count("plain = true") == 1
+    assert caplog.text.count("insecure = true") == 1

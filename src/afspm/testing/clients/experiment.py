@@ -73,7 +73,7 @@ class Security(Enum):
     EVERYWHERE = f'[security]\nkeys = "{KEYS}"\n'
     REQUESTS = ""
     """As every run on one computer is by default: with keys that are made for it. Packets are plain."""
-    NONE = "[security]\nplain = true\n"
+    NONE = "[security]\ninsecure = true\n"
 
 
 _NOTHING = logging.CRITICAL + 1

@@ -141,7 +141,7 @@ MOVED_S = 60.0
 _STOPS = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
 
 
-_ANSWERS = "a scheduler that answers (of a running experiment: one with `[security] plain = true`)"
+_ANSWERS = "a scheduler that answers (of a running experiment: one with `[security] insecure = true`)"
 
 
 class CheckClient:
