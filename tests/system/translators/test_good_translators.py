@@ -46,7 +46,7 @@ component = true
 class = "DriftCompensatedScheduler"
 """
 SCHEDULER = """
-security = {{ plain = true }}
+security = {{ insecure = true }}
 router_url = "{router}"
 publish_url = "{publish}"
 
@@ -211,7 +211,8 @@ def test_ctrl_c_in_the_middle_of_a_scan_puts_everything_back(file: Path) -> None
     assert written["passed"] is False
     kept = Memory(folder / "state" / "microscope.json")["microscope"]
     assert kept["values"]["scan-size-x"] == pytest.approx(1000.0)
-    assert kept["doing"] is None
+    instrument = kept["instrument"]["instrument"]
+    assert [instrument[what] for what in ("scan", "spectrum", "move", "occupied")] == [None] * 4
 
 
 def test_a_translator_that_does_not_find_its_controller_is_said_to_with_what_it_said_itself(
