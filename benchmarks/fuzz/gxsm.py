@@ -24,7 +24,7 @@ from afspm.plugins.gxsm.emulator import GxsmEmulator
 from afspm.plugins.gxsm.emulator.signalled import CONTENT, LENGTH, SIZE, STATUS
 from afspm.plugins.gxsm.errors import GxsmError
 from afspm.plugins.gxsm.link import Address, Link, open_link
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 from benchmarks.fuzz.frame import Fuzzer, Unfit
 
 _PATIENCE_S: Final = 60.0

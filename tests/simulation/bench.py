@@ -11,7 +11,8 @@ import numpy as np
 from afspm.model import Scan, ScopeState, ScopeStatus, Spectrum, names
 from afspm.simulation import simulator
 from afspm.translator import setting_groups
-from afspm.translator.driver import Driver, action
+from afspm.translator.driver import Driver
+from afspm.translator.driver_base import action
 from afspm.translator.parameters import Value
 
 CHANNELS = ("Height", "Phase")

@@ -16,7 +16,8 @@ returns their results. It may fail at any time with `ControllerLost`; connecting
 
 from __future__ import annotations
 
-from afspm.translator.driver import ControllerLost, Driver, action
+from afspm.translator.driver import Driver
+from afspm.translator.driver_base import ControllerLost, action
 from afspm.translator.parameters import ParameterSpec, ParameterTable, Value
 
 __all__ = ["ControllerLost", "Driver", "ParameterSpec", "ParameterTable", "Value", "action"]

@@ -14,7 +14,7 @@ from afspm.basics import units
 from afspm.basics.errors import AfspmError, ConfigError, Refused
 from afspm.basics.plain_data import PlainMapping
 from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, request_name
-from afspm.translator.driver import LOST, Action, Driver
+from afspm.translator.driver_base import LOST, Action, DriverBase
 from afspm.translator.parameters import Value
 from afspm.translator.sequence import SequenceStep, StatusSequence
 from afspm.translator.setters import apply, wanted_values
@@ -50,7 +50,7 @@ class Commands:
 
     def __init__(
         self,
-        driver: Driver,
+        driver: DriverBase,
         sequence: StatusSequence,
         temporary: TemporarySettings,
         about_to_act: Callable[[Request], None],

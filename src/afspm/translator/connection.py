@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from afspm.basics.clock import Clock
 from afspm.basics.errors import AfspmError, ConfigError
-from afspm.translator.driver import LOST, ControllerLost, Driver
+from afspm.translator.driver_base import LOST, ControllerLost, DriverBase
 from afspm.translator.emulated_controller import EmulatedController
 
 RETRY_S = 1.0
@@ -33,7 +33,7 @@ class Connection:
 
     def __init__(
         self,
-        driver: Driver,
+        driver: DriverBase,
         controller: EmulatedController | None,
         clock: Clock,
         log: logging.Logger,

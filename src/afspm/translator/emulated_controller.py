@@ -15,11 +15,11 @@ from typing import IO, TYPE_CHECKING
 
 from afspm.basics.errors import ConfigError
 from afspm.basics.file_lock import lock
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 
 if TYPE_CHECKING:
     from afspm.basics.launch import Launch
-    from afspm.translator.driver import Driver
+    from afspm.translator.driver_base import DriverBase
 
 _LOCKED_BYTES = 1
 """Windows lets nobody read what is locked: the text begins behind it."""
@@ -78,7 +78,7 @@ class EmulatedController:
         self._name, self._file, self._run = name, file, run
         self._reached: Listening | None = None
 
-    def reach(self, microscope: Driver) -> None:
+    def reach(self, microscope: DriverBase) -> None:
         """Connect to this run's emulator, or to nobody.
 
         Raises:
@@ -129,7 +129,7 @@ def notice_file(state_dir: str, name: str) -> Path:
     return Path(state_dir) / f"{name}.controller"
 
 
-def wired_to(launch: Launch, microscope: Driver) -> EmulatedController | None:
+def wired_to(launch: Launch, microscope: DriverBase) -> EmulatedController | None:
     """The emulator that a translator may talk to; None: the controller in its settings, or none at all.
 
     Raises:

@@ -14,7 +14,7 @@ from afspm.basics.errors import AfspmError
 from afspm.model import ScopeState, ScopeStatus, names
 from afspm.storage.disk import is_full
 from afspm.translator import setting_groups
-from afspm.translator.driver import LOST, MEASURING, Driver
+from afspm.translator.driver_base import LOST, MEASURING, DriverBase
 from afspm.translator.outbox import Outbox, Outgoing
 from afspm.translator.parameters import Value
 from afspm.translator.polling import AdaptivePolling
@@ -34,7 +34,7 @@ class Observer:
 
     def __init__(
         self,
-        driver: Driver,
+        driver: DriverBase,
         port: ServerPort,
         state: TranslatorState,
         temporary: TemporarySettings,
@@ -214,7 +214,7 @@ class Observer:
         return None, extent
 
 
-def _live_lines_s(microscope: Driver) -> float | None:
+def _live_lines_s(microscope: DriverBase) -> float | None:
     """Return how often, in experiment seconds, lines of a running scan are published; None: never."""
     if microscope.live_lines_s is not None:
         return microscope.live_lines_s or None
@@ -229,7 +229,7 @@ class LiveLines:
         microscope: its `live_lines_s` says how often it is asked for lines.
     """
 
-    def __init__(self, microscope: Driver) -> None:
+    def __init__(self, microscope: DriverBase) -> None:
         self._microscope = microscope
         self._every_s = _live_lines_s(microscope)
         self._began_ns = 0

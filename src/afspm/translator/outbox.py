@@ -13,7 +13,7 @@ from typing import NamedTuple
 from afspm.basics.errors import AfspmError
 from afspm.basics.plain_data import Plain
 from afspm.model import Scan, Spectrum
-from afspm.translator.driver import Driver
+from afspm.translator.driver_base import DriverBase
 from afspm.wire import encode
 
 KEPT_FOR_REPLAY = 8
@@ -39,7 +39,7 @@ class Outbox:
 
     def __init__(
         self,
-        microscope: Driver,
+        microscope: DriverBase,
         kept: Plain,
         stamp: Callable[[int], list[int]],
         log: logging.Logger,

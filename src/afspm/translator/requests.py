@@ -26,7 +26,7 @@ from afspm.model.idempotency_cache import TOO_OLD, Floors
 from afspm.model.sessions import number_of, run_of
 from afspm.translator.commands import Commands
 from afspm.translator.connection import Connection
-from afspm.translator.driver import LOST, Driver
+from afspm.translator.driver_base import LOST, DriverBase
 from afspm.translator.observer import Observer
 from afspm.translator.safe_exit import FeedbackWatch
 from afspm.translator.state import TranslatorState
@@ -49,7 +49,7 @@ class RequestHandler:
 
     def __init__(
         self,
-        driver: Driver,
+        driver: DriverBase,
         connection: Connection,
         observer: Observer,
         state: TranslatorState,

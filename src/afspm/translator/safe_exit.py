@@ -10,7 +10,7 @@ from afspm.basics.clock import Clock
 from afspm.model import ControlRequest, Request, Response, ScopeState, names
 from afspm.model.microscope_status import feedback_of
 from afspm.translator.connection import RETRY_S, Connection
-from afspm.translator.driver import LOST
+from afspm.translator.driver_base import LOST
 from afspm.translator.state import Kept, TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
 

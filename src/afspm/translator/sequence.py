@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from afspm.model import ScopeState, ScopeStatus
-from afspm.translator.driver import MEASURING
+from afspm.translator.driver_base import MEASURING
 
 
 @dataclass(frozen=True)

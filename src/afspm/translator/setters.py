@@ -19,14 +19,14 @@ from afspm.model import (
     ScanParameters,
 )
 from afspm.model.positions import scan_values
-from afspm.translator.driver import LOST, Driver
+from afspm.translator.driver_base import LOST, DriverBase
 from afspm.translator.parameters import ParameterSpec, Value, refuse_value
 from afspm.translator.setting_groups import FEEDBACK, FRAME, POSITION, check_together
 
 _UNBOUNDED: Final = (-math.inf, math.inf)
 
 
-def wanted_values(request: Request, driver: Driver) -> dict[str, Value] | None:
+def wanted_values(request: Request, driver: DriverBase) -> dict[str, Value] | None:
     """Return the values in SI that a request sets, each checked by itself; None if it only asks.
 
     A value that can't be set, and is in force, is no change: peers send back a whole message in which they have changed
@@ -52,7 +52,7 @@ def wanted_values(request: Request, driver: Driver) -> dict[str, Value] | None:
     return values if asked else None
 
 
-def apply(driver: Driver, values: Mapping[str, Value], about_to_act: Callable[[], None] = lambda: None) -> None:
+def apply(driver: DriverBase, values: Mapping[str, Value], about_to_act: Callable[[], None] = lambda: None) -> None:
     """Set the values, or change nothing.
 
     Args:

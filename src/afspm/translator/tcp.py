@@ -8,7 +8,7 @@ from contextlib import suppress
 from typing import Final, TypeVar
 
 from afspm.basics.errors import ConfigError
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 from afspm.translator.trace import TCP, TRACE, TracedAnswer
 
 _AT_ONCE: Final = 1 << 20

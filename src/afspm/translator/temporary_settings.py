@@ -10,7 +10,7 @@ import logging
 from collections.abc import Mapping
 
 from afspm.model import ScopeState, ScopeStatus
-from afspm.translator.driver import LOST, Driver
+from afspm.translator.driver_base import LOST, DriverBase
 from afspm.translator.parameters import Value
 from afspm.translator.setters import apply
 from afspm.translator.setting_groups import MOVES
@@ -22,7 +22,7 @@ _KEY = "temporary"
 class TemporarySettings:
     """The values that are in force for a while, if any are."""
 
-    def __init__(self, driver: Driver, state: TranslatorState, log: logging.Logger) -> None:
+    def __init__(self, driver: DriverBase, state: TranslatorState, log: logging.Logger) -> None:
         self._driver = driver
         self._state = state
         self._kept = state.kept

@@ -24,7 +24,7 @@ from afspm.model.fencing import SchedulerFence
 from afspm.storage.memory import Memory
 from afspm.translator.connection import Connection
 from afspm.translator.controller_lock import ControllerTaken, commanding
-from afspm.translator.driver import Driver
+from afspm.translator.driver_base import DriverBase
 from afspm.translator.emulated_controller import EmulatedController, wired_to
 from afspm.translator.observer import Observer
 from afspm.translator.requests import RequestHandler
@@ -57,7 +57,7 @@ class Translator:
 
     def __init__(
         self,
-        driver: Driver,
+        driver: DriverBase,
         port: ServerPort,
         memory: Memory,
         run_dir: Path,
@@ -165,7 +165,7 @@ class Translator:
         self.look()
 
 
-def run_translator(driver: Driver, context: ProcessContext, make: Callable[..., Translator] = Translator) -> int:
+def run_translator(driver: DriverBase, context: ProcessContext, make: Callable[..., Translator] = Translator) -> int:
     """Run a translator as the host does. While another run commands the controller, say which, and end."""
     with contextlib.ExitStack() as stack:
         controller = wired_to(context.launch, driver)
@@ -181,7 +181,7 @@ def run_translator(driver: Driver, context: ProcessContext, make: Callable[..., 
         return _run_alone(driver, context, partial(make, controller=controller))
 
 
-def _begin_trace(driver: Driver, context: ProcessContext) -> None:
+def _begin_trace(driver: DriverBase, context: ProcessContext) -> None:
     """Keep what is said to the controller; a process that is started again keeps it in a file of its own."""
     folder = Path(context.launch.run_dir or ".")
     file = next(one for i in itertools.count() if not (one := folder / (f"{i}-{FILE}" if i else FILE)).exists())
@@ -189,7 +189,7 @@ def _begin_trace(driver: Driver, context: ProcessContext) -> None:
     TRACE.begin(file, TraceHeader(type(driver).__name__, version("afspm"), began), context.clock)
 
 
-def _run_alone(driver: Driver, context: ProcessContext, make: Callable[..., Translator]) -> int:
+def _run_alone(driver: DriverBase, context: ProcessContext, make: Callable[..., Translator]) -> int:
     """Open the sockets and the memory, and run the translator."""
     from afspm.transport.zmq_server import open_server_port
 

@@ -10,7 +10,7 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from afspm.basics.errors import ConfigError
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 from afspm.translator.trace import TRACE, ZEROMQ, TracedAnswer
 
 T = TypeVar("T")

@@ -19,7 +19,7 @@ from raw_clients import SocketClient
 
 from afspm.plugins.gxsm import bridge
 from afspm.plugins.gxsm.bridge_client import BridgeLink
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 
 PROVES_S = 0.3
 

@@ -29,7 +29,7 @@ from afspm.plugins.gxsm.bridge_client import BridgeLink
 from afspm.plugins.gxsm.errors import BadReply, GxsmError
 from afspm.plugins.gxsm.hardware import Doing, Hardware, decoded, recognised
 from afspm.plugins.gxsm.link import Address, open_link
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 
 VALUES: list[Any] = [
     1.5, -3, 10**30, -math.inf, "12.5 Å    ", "", (), (1, 2, "x"), [1, [2]], {"a": 1}, None, True,

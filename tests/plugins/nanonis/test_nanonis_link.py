@@ -16,7 +16,7 @@ from vendor_bench import answering
 from afspm.plugins.nanonis.emulator import wire
 from afspm.plugins.nanonis.link import Link
 from afspm.plugins.nanonis.protocol import NanonisError
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 
 GOOD = wire.reply("Bias.Get", wire.body("Bias.Get", [0.5], 0))
 

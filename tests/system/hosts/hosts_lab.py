@@ -107,7 +107,7 @@ from pathlib import Path
 from afspm import Component, Region
 from afspm.simulation.simulator import Simulator
 from afspm.model import names
-from afspm.translator.driver import action
+from afspm.translator.driver_base import action
 from afspm.basics.units import Length
 
 

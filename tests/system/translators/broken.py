@@ -16,7 +16,7 @@ from afspm.basics.errors import FileError, Refused
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
 from afspm.simulation.simulator import Simulator
 from afspm.translator import commands, parameters, sequence, setting_groups
-from afspm.translator.driver import Action, action
+from afspm.translator.driver_base import Action, action
 from afspm.translator.observer import Observer
 from afspm.translator.parameters import Value
 from afspm.translator.translator import run_translator

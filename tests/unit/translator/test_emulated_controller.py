@@ -13,7 +13,7 @@ import pytest
 
 from afspm.basics.errors import ConfigError
 from afspm.basics.launch import Launch
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 from afspm.translator.emulated_controller import AddressNotice, EmulatedController, notice_file, wired_to
 
 RUN = "0123456789abcdef"

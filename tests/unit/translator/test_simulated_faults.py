@@ -11,7 +11,7 @@ import pytest
 from afspm.basics.errors import Refused
 from afspm.model import ScopeState
 from afspm.simulation.simulator import Simulator
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 
 FREE, SCANNING, COARSE = ScopeState.FREE, ScopeState.SCANNING, ScopeState.COARSE_MOTOR
 

@@ -9,7 +9,7 @@ import pytest
 import zmq
 
 from afspm.basics.errors import ConfigError
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 from afspm.translator.zmq_connection import ZmqConnection
 
 HINTS = ("an address", "does it listen?", "does it answer?")

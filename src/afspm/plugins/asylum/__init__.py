@@ -17,7 +17,8 @@ from afspm.plugins.asylum.result_files import AsylumFiles
 from afspm.plugins.asylum.session import Session
 from afspm.plugins.asylum.settings import NAMES, FeedbackSwitch, FrameSettings, TipPlace
 from afspm.plugins.asylum.xop import XopError
-from afspm.translator.driver import ControllerLost, Driver, action
+from afspm.translator.driver import Driver
+from afspm.translator.driver_base import ControllerLost, action
 from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.translator.result_files import SCAN
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame

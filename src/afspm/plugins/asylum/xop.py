@@ -13,7 +13,7 @@ from typing import Final
 
 from afspm.basics.errors import AfspmError, InvalidValue
 from afspm.basics.plain_data import PlainMapping
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 
 LONGEST_REQUEST: Final = 1024
 """Bytes: what is longer makes the XOP drop the connection without a word."""

@@ -37,7 +37,8 @@ from afspm.plugins.gxsm.settings import (
     send,
     user_unit_m,
 )
-from afspm.translator.driver import ControllerLost, Driver, Introduction, action
+from afspm.translator.driver import Driver
+from afspm.translator.driver_base import ControllerLost, Introduction, action
 from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from afspm.plugins.gxsm.bridge import NONCE, SECRET, WELCOME, proof
 from afspm.plugins.gxsm.errors import BadReply, GxsmError
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 from afspm.translator.tcp import Receiver, TcpConnection
 
 _LONGEST: Final = 1 << 29

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from afspm.basics.errors import AfspmError
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 
 
 class GxsmError(AfspmError):

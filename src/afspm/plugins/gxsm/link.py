@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from afspm.basics.errors import ConfigError
 from afspm.plugins.gxsm.errors import BadReply, GxsmError
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 from afspm.translator.tcp import host_and_port
 
 BLOCK = "gxsm4_py_shm_data_block"

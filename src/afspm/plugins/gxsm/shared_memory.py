@@ -23,7 +23,7 @@ from afspm.basics.errors import ConfigError
 from afspm.plugins.gxsm import bridge_client, pickles
 from afspm.plugins.gxsm.errors import BadReply, GxsmError
 from afspm.plugins.gxsm.processes import GxsmProcess, NoProcess, find
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 from afspm.translator.trace import TCP, TRACE
 
 _FOLDER: Final = Path("/dev/shm")

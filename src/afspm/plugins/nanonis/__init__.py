@@ -15,7 +15,8 @@ from afspm.plugins.nanonis import settings as own
 from afspm.plugins.nanonis.activity import NanonisActivity
 from afspm.plugins.nanonis.result_files import NanonisFiles
 from afspm.plugins.nanonis.session import MODULES, Session
-from afspm.translator.driver import ControllerLost, Driver, action
+from afspm.translator.driver import Driver
+from afspm.translator.driver_base import ControllerLost, action
 from afspm.translator.parameters import Value
 from afspm.translator.result_files import SCAN, Entry, as_region
 from afspm.translator.setting_groups import FRAME, KeptSettings, frame

@@ -15,7 +15,7 @@ from afspm.plugins.nanonis.result_files import NanonisFiles
 from afspm.plugins.nanonis.session import APPROACH, MODULES, CurveEnded, Heard, ScanEnded, Session
 from afspm.plugins.nanonis.settings import Probe, ScanFrame
 from afspm.translator.activity import Activity
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 from afspm.translator.result_files import SCAN, as_list
 from afspm.translator.setting_groups import frame
 from afspm.translator.state import Kept

@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from afspm.basics.errors import AfspmError, InvalidValue
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 
 HEADER_BYTES: Final = 40
 NEWEST: Final = 1 << 31

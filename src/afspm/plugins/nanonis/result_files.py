@@ -9,7 +9,7 @@ from typing import Final
 
 from afspm.basics.errors import AfspmError, FileError
 from afspm.plugins.nanonis import fetched
-from afspm.translator.driver import LOST
+from afspm.translator.driver_base import LOST
 from afspm.translator.result_files import (
     SCAN,
     Content,

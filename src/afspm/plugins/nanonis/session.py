@@ -13,7 +13,8 @@ import numpy as np
 from afspm.basics.errors import AfspmError
 from afspm.plugins.nanonis.link import Link
 from afspm.plugins.nanonis.protocol import BadReply, NanonisError
-from afspm.translator.driver import ControllerLost, Driver
+from afspm.translator.driver import Driver
+from afspm.translator.driver_base import ControllerLost
 
 MODULES: Final = {"IV": "BiasSpectr", "force": "ZSpectr"}
 APPROACH: Final = "AutoApproach"

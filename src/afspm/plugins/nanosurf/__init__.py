@@ -15,7 +15,8 @@ from afspm.plugins.nanosurf.activity import FORCE, NanosurfFiles, StudioActivity
 from afspm.plugins.nanosurf.link import Link, StudioError
 from afspm.plugins.nanosurf.session import Session
 from afspm.plugins.nanosurf.settings import DIRECTION, UNITS, FrameSettings, Slopes, TipPlace, direction
-from afspm.translator.driver import ControllerLost, Driver, action
+from afspm.translator.driver import Driver
+from afspm.translator.driver_base import ControllerLost, action
 from afspm.translator.parameters import Value
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
 

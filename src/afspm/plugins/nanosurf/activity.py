@@ -16,7 +16,7 @@ from afspm.plugins.nanosurf.link import StudioError
 from afspm.plugins.nanosurf.session import Session
 from afspm.plugins.nanosurf.settings import TipPlace
 from afspm.translator.activity import Activity
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 from afspm.translator.folder_files import FolderFiles
 from afspm.translator.long_call import LongCall
 from afspm.translator.result_files import SCAN, FilePrecision, as_list

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from afspm.basics.errors import AfspmError
 from afspm.plugins.nanosurf.lua_values import BadLua, parse
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 from afspm.translator.tcp import Receiver, TcpConnection, host_and_port
 
 _LENGTH: Final = struct.Struct("<I")

@@ -13,7 +13,7 @@ from afspm.plugins.nanosurf import commands
 from afspm.plugins.nanosurf.commands import WORKFLOW
 from afspm.plugins.nanosurf.link import Link, StudioError
 from afspm.plugins.nanosurf.lua_values import written
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 from afspm.translator.long_call import LongCall
 from afspm.translator.parameters import Value
 

@@ -15,7 +15,8 @@ from afspm.plugins.park.link import Link, SmartScanError
 from afspm.plugins.park.result_files import SETTLE_S, ParkFiles
 from afspm.plugins.park.session import FALSE, TRUE, Session
 from afspm.plugins.park.settings import MICROMETRE, FrameSettings, Gains, TipPlace
-from afspm.translator.driver import ControllerLost, Driver, action
+from afspm.translator.driver import Driver
+from afspm.translator.driver_base import ControllerLost, action
 from afspm.translator.long_call import LongCall
 from afspm.translator.parameters import Value
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.plain_data import Plain
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 from afspm.translator.zmq_connection import ZmqConnection
 
 RUN_SCRIPT, SCRIPT_RUNS, IS_CONNECTED, SCAN_STATUS, GEOMETRY = (

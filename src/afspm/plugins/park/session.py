@@ -18,7 +18,7 @@ from afspm.plugins.park.link import (
     SmartScanError,
     numbers,
 )
-from afspm.translator.driver import ControllerLost
+from afspm.translator.driver_base import ControllerLost
 from afspm.translator.long_call import LongCall
 from afspm.translator.parameters import Value
 

@@ -25,7 +25,8 @@ from afspm.simulation.simulator.controller import PanelEvent, SimulatedControlle
 from afspm.simulation.truth import Truth
 from afspm.simulation.world import read_settings
 from afspm.storage.formats import read
-from afspm.translator.driver import Action, ControllerLost, Driver, action
+from afspm.translator.driver import Driver
+from afspm.translator.driver_base import Action, ControllerLost, action
 from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.transport.process.background import in_background
 

@@ -1,0 +1,417 @@
+"""`DriverBase`: what the translator asks of a driver. `Driver` adds the process around it."""
+
+from __future__ import annotations
+
+import logging
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, ClassVar, Protocol, TypeVar
+
+from afspm.basics.clock import Clock
+from afspm.basics.errors import AfspmError, ConfigError, InvalidValue, Refused
+from afspm.basics.plain_data import Plain, PlainMapping
+from afspm.basics.units import Duration, PollPeriod
+from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.translator.parameters import ParameterTable, Value
+from afspm.translator.polling import EAGER_S
+from afspm.translator.setting_groups import SettingsGroup
+
+MEASURING = frozenset({ScopeState.SCANNING, ScopeState.SPEC})
+
+
+class ControllerLost(AfspmError):
+    """The controller can't be reached: the translator says so to who asks, and connects again."""
+
+    code = "controller-lost"
+
+
+LOST = (ControllerLost, ConnectionError, TimeoutError)
+"""What says that the controller is gone, and not that it refuses."""
+
+
+@dataclass(frozen=True)
+class Action:
+    """One generic action of a microscope.
+
+    Attributes:
+        name: the generic name, e.g. "start-scan".
+        do: begins it and returns at once; what it leads to is seen by `Driver.status`.
+        state: what the microscope is in from the moment that it is accepted, until `status` says otherwise.
+        while_busy: it may be asked for while the microscope is not free.
+        interrupts: the states that it breaks off.
+    """
+
+    name: str
+    do: Callable[[], None]
+    state: ScopeState | None = None
+    while_busy: bool = False
+    interrupts: frozenset[ScopeState] = frozenset()
+
+    @property
+    def only_stops(self) -> bool:
+        """It is nothing to do unless what it interrupts is running."""
+        return self.name in (names.STOP_SCAN, names.STOP_SPEC)
+
+
+def _nothing() -> None:
+    raise NotImplementedError
+
+
+def _nothing_to_prove() -> None:
+    """A real controller is the one at its address."""
+
+
+_KNOWN = {
+    action.name: action
+    for action in (
+        Action(names.START_SCAN, _nothing, ScopeState.SCANNING),
+        Action(names.START_SPEC, _nothing, ScopeState.SPEC),
+        Action(names.STOP_SCAN, _nothing, None, while_busy=True, interrupts=frozenset({ScopeState.SCANNING})),
+        Action(names.STOP_SPEC, _nothing, None, while_busy=True, interrupts=frozenset({ScopeState.SPEC})),
+        # the way out must always be open
+        Action(names.RETRACT, _nothing, None, while_busy=True, interrupts=MEASURING),
+    )
+}
+
+Method = TypeVar("Method", bound=Callable[[Any], None])
+
+
+def action(name: str, *, state: ScopeState | None = None, while_busy: bool | None = None) -> Callable[[Method], Method]:
+    """Marks a method of a `Driver` as the generic action `name`.
+
+    Args:
+        state: what the microscope is in from the moment that it is accepted; known for the base actions.
+        while_busy: it may be asked for while the microscope is not free; known for the base actions.
+    """
+    known = _KNOWN.get(name, Action(name, _nothing))
+    mark = replace(
+        known,
+        state=known.state if state is None else state,
+        while_busy=known.while_busy if while_busy is None else while_busy,
+    )
+
+    def marked(method: Method) -> Method:
+        method._afspm_action = mark  # type: ignore[attr-defined]
+        return method
+
+    return marked
+
+
+class Introduction(Protocol):
+    """The first lines of a connection, which a trace does not hold since they prove a secret.
+
+    Attributes:
+        is_over: True once both sides have proven that they know the secret.
+    """
+
+    is_over: bool
+
+    def reply_to(self, line: bytes) -> str:
+        """Return the controller's answer to a line; empty: hang up."""
+
+
+class DriverBase(ABC):
+    """A microscope behind its controller. Write the abstract methods and an `@action` for each action::
+
+        class Mine(Driver):
+            def __init__(self, *, address: str = "127.0.0.1:1234"): super().__init__(); self.controller_at = address
+            def connect(self): self.link = Link(self.controller_at); self.prove()
+            def status(self): return ScopeStatus(ScopeState.SCANNING if self.link.busy() else ScopeState.FREE)
+            def get(self, vendor): return self.link.read(vendor)
+            def set(self, values): self.link.write(values)
+            def results(self): return sorted(self.folder.glob("*.dat"))
+            def load(self, result): return read_dat(result)
+
+            @action(names.START_SCAN)
+            def start_scan(self): self.link.send("scan")
+
+    and beside it `parameters.toml`, the table of parameters by their generic names. All methods are called from one
+    thread and return soon: whatever takes long is begun and then seen by `status`. What they raise becomes the
+    response, its text the reason.
+
+    Args:
+        parameters: rows added to the table or changed in it by the experiment file.
+        actions: generic actions added by the experiment file: `{name = {set = {<parameter> = <value>}}}` sets
+            parameters, `{name = {command = "<text>"}}` sends a text to the controller (`command`), both does both; with
+            `for = "50 ms"` the microscope is busy so long, and what was set is put back then.
+        poll_period_s: the controller is looked at this often, in real seconds, when nothing is about to happen; its
+            state more often when a measurement is about to end, as learned from those before.
+        result_timeout_s: how long after a scan or spectrum its file may take to appear, in experiment seconds (see
+            `patience_s`).
+        live_lines_s: how often the lines of a running scan are published, in experiment seconds; 0: not at all; None:
+            as often as `live_real_s` says.
+        trace: keep all that is said to and by the controller, in `controller.trace.jsonl` of the run's folder.
+
+    Attributes:
+        clock, log: of the experiment; given before `connect`.
+        run_dir: the folder of this run.
+        wake: call it, from any thread, to have the controller looked at now rather than at the next poll.
+        for_a_while: sets parameters by their generic names, in SI, and has them put back after so many experiment
+            seconds: for actions that are made of settings. The microscope is busy meanwhile.
+        adjustable: parameters that may be set during a scan, whatever their row says: [control] adjustable.
+        controller_at: where the controller is: to be set by the constructor, and read by `connect`, since an experiment
+            with an emulator puts the emulator's address there. One run at a time commands it. Empty: there is none that
+            others can reach.
+        prove: to be called by `connect` once a connection stands, before anything is asked: it raises ControllerLost if
+            an emulated controller is not that of this run.
+        groups: the parameters that the controller has in another form than the table can say.
+        lacking: actions that this controller turned out not to have, and why; set it when connecting.
+        memory: a dict of JSON values, kept on disk: saved with every request and result, there after a restart.
+    """
+
+    parameters_file: ClassVar[Path]
+    translated: ClassVar[Collection[str]] = ()
+    """The parameters that `read` and `write` of the class translate, rather than `get` and `set` by a row."""
+    eager_poll_s: ClassVar[float] = EAGER_S
+    """Real seconds between two looks when a scan may end at any moment."""
+    max_pixels: ClassVar[int] = 4096 * 4096
+    live_real_s: ClassVar[float | None] = None
+    """Real seconds between the lines of a running scan where `live_lines_s` is not given; None: none are published."""
+    maker: ClassVar[str] = ""
+    """The company or project that makes the controller, for the files of a run."""
+    software: ClassVar[str] = ""
+    """The controller's program, for the files of a run."""
+    simulated: ClassVar[bool] = False
+    """No tip can break: the experiment's clock may go at another speed than the real one."""
+    memory_is_all: ClassVar[bool] = False
+    """The microscope has no state outside of `memory` (a simulated one): nothing was done that is not in there."""
+
+    program_s: ClassVar[float] = 0.0
+    """Real seconds that the controller's program may need for whatever it does beside measuring, such as to save a
+    file, however fast the experiment's time passes."""
+
+    clock: Clock
+    log: logging.Logger
+    run_dir: Path
+    wake: Callable[[], None]
+    for_a_while: Callable[[Mapping[str, Value], float], None]
+    controller_at: str = ""
+    lacking: Mapping[str, str] = MappingProxyType({})
+    groups: Sequence[SettingsGroup] = ()
+    memory: Plain
+
+    def __init__(
+        self,
+        *,
+        parameters: Mapping[str, Mapping[str, object]] | None = None,
+        actions: Mapping[str, Mapping[str, object]] | None = None,
+        poll_period_s: PollPeriod = 0.1,
+        result_timeout_s: Duration = 10.0,
+        live_lines_s: Duration | None = None,
+        trace: bool = False,
+    ) -> None:
+        if live_lines_s is not None and type(self).lines is DriverBase.lines:
+            raise ConfigError(f"{type(self).__name__} does not publish lines of a running scan", where="live_lines_s")
+        self.table = self.parameter_table(parameters or {})
+        self.added_actions = dict(actions or {})
+        self.poll_period_s = poll_period_s
+        self.result_timeout_s = result_timeout_s
+        self.live_lines_s = live_lines_s
+        self.trace = trace
+        self.adjustable: frozenset[str] = frozenset()
+        self.prove: Callable[[], None] = _nothing_to_prove
+        self._told: dict[str, Value] = {}
+
+    def patience_s(self, of_s: float) -> float:
+        """Return how long to wait, in experiment seconds, for what takes the controller `of_s` at most.
+
+        It is longer where so much passes while a program runs at all (an emulated controller at sixty times the speed).
+        """
+        return max(of_s, self.program_s / self.clock.real_s(1.0))
+
+    @classmethod
+    def rows(cls, settings: PlainMapping) -> Mapping[str, Mapping[str, object]]:
+        """Return the rows that these settings add to the table, or change in it."""
+        return settings.get("parameters") or {}
+
+    @classmethod
+    def parameter_table(cls, changed: Mapping[str, Mapping[str, object]]) -> ParameterTable:
+        """The parameters of this kind of microscope, with the rows that the experiment file adds or changes.
+
+        Raises:
+            ConfigError: a row says what it can't.
+        """
+        table = ParameterTable.from_toml(cls.parameters_file)
+        return table.extended(changed, where="the experiment file", translated=cls.translated)
+
+    @classmethod
+    def introductions(cls) -> Callable[[str], Introduction] | None:
+        """Return what makes the introduction of a connection to an address, for the replay of a trace; None: no secret.
+
+        Raises:
+            OSError, ValueError: the secret can't be read.
+        """
+        return None
+
+    @classmethod
+    def technique(cls, settings: Mapping[str, object]) -> str:
+        """Return STM or AFM, where the microscope is always the same with these settings; else an empty text."""
+        return ""
+
+    @classmethod
+    def excused(cls, controller: str) -> Mapping[str, str]:
+        """Return the checks of the translators' suite that a controller can't pass through no fault of ours, and why.
+
+        Args:
+            controller: its name and version, as `x-controller` tells.
+        """
+        return {}
+
+    @abstractmethod
+    def connect(self) -> None:
+        """Reach the controller. Called at the start, and again after a `ControllerLost`."""
+
+    def close(self) -> None:  # noqa: B027 (many have nothing to close)
+        """Let go of the controller. The tip stays as it is."""
+
+    @abstractmethod
+    def status(self) -> ScopeStatus:
+        """Return the state of the controller now."""
+
+    @abstractmethod
+    def get(self, vendor: str) -> Value:
+        """The value of a parameter, by the vendor's name, in the vendor's unit."""
+
+    @abstractmethod
+    def set(self, values: Mapping[str, Value]) -> None:
+        """Set parameters together, by the vendor's names, in the vendor's units. All or none, if it can be."""
+
+    @abstractmethod
+    def results(self) -> Sequence[str]:
+        """The finished scans and spectra that there are, oldest first: as a rule the names of the controller's files.
+
+        The translator remembers which it has published, also over a restart.
+        """
+
+    @abstractmethod
+    def load(self, result: str) -> Sequence[Scan | Spectrum]:
+        """Read one of `results`: every channel of a scan, or a spectrum, with the parameters it was taken with.
+
+        Raises:
+            FileError: it is not (yet) whole; asked for again until `result_timeout_s` is over.
+        """
+
+    def followed(self) -> bool | None:
+        """Return whether a measurement was whole whose end `status` never reported, since another one followed at once.
+
+        To be written where a panel can repeat scans. Called after `results`, which have to list it by then.
+
+        Returns:
+            once for each of them: True if it was whole, False if it was broken off; None: there was none.
+        """
+        return None
+
+    def lines(self, start: int) -> Sequence[ScanLines]:
+        """Return the complete lines of a running scan beyond the first `start`, in the order in which they are scanned.
+
+        To be written where the controller can tell (`live_lines_s`).
+
+        Returns:
+            for each channel the same lines, rows and columns ascending; nothing while there are no new ones.
+        """
+        return ()
+
+    def command(self, text: str) -> None:
+        """Send a command that the experiment file added to the controller as it is."""
+        raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, f"{type(self).__name__} does not take commands as text")
+
+    def next_change_s(self) -> float | None:
+        """The experiment time at which something is known to change by itself; None if nothing is known."""
+        return None
+
+    def read(self, wanted: Collection[str]) -> dict[str, Value]:
+        """Return the values of parameters by their generic names, in SI; others may be among them.
+
+        To be written only where neither the table nor `groups` can say how the controller has it.
+        """
+        found: dict[str, Value] = {}
+        for group in self.groups:
+            if not set(group.names).isdisjoint(wanted):
+                found |= group.read()
+        return found | self.read_rows([name for name in wanted if name not in found])
+
+    def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
+        """Return the values of parameters that the table alone says how to get."""
+        return {name: self.table[name].from_vendor(self.get(self.table[name].vendor)) for name in wanted}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        """Set parameters by their generic names, in SI: each group at once, in their order, and then the rest."""
+        left = dict(values)
+        for group in self.groups:
+            asked = {name: left.pop(name) for name in group.names if name in left}
+            if asked:
+                group.write(asked)
+        if left:
+            self.write_rows(left)
+
+    def write_rows(self, values: Mapping[str, Value]) -> None:
+        """Set parameters that the table alone says how to set."""
+        self.set({self.table[name].vendor: self.table[name].to_vendor(value) for name, value in values.items()})
+
+    def wait_for(self, condition: Callable[[], bool], at_most_s: float) -> bool:
+        """Ask the controller until something holds, which it does with a delay. Return False after so long, real time.
+
+        Each question takes as long as the controller takes to answer it.
+        """
+        until_s = self.clock.monotonic_s() + at_most_s
+        while not (holds := condition()) and self.clock.monotonic_s() < until_s:
+            pass
+        return holds
+
+    def pulse_bias(self) -> None:
+        """Do a bias pulse of `x-pulse-voltage` for `x-pulse-duration` by setting the bias, which is put back."""
+        wanted = self.in_force([names.PULSE_VOLTAGE, names.PULSE_DURATION])
+        self.for_a_while({names.TIP_BIAS_VOLTAGE: wanted[names.PULSE_VOLTAGE]}, float(wanted[names.PULSE_DURATION]))
+
+    def same(self, name: str, a: Value, b: Value, among: Mapping[str, Value]) -> bool:
+        """Return True if two values of a parameter are one to the controller's precision.
+
+        To be written only where a `resolution` in the table can't say it.
+
+        Args:
+            among: the values that `a` was read with.
+        """
+        return self.table[name].same(a, b)
+
+    def in_force(self, wanted: Collection[str]) -> dict[str, Value]:
+        """Return what `read` gives; what was set is told as it was set, as long as the controller has the same.
+
+        Raises:
+            InvalidValue: the controller says what is no number: it can be told to nobody.
+        """
+        found, told = self.read(wanted), self._told
+        for name in wanted:
+            value = found[name]
+            if isinstance(value, float) and not math.isfinite(value):
+                raise InvalidValue(f"the controller says that {name} is {value}")
+        return {
+            name: told[name] if name in told and self.same(name, found[name], told[name], found) else found[name]
+            for name in wanted
+        }
+
+    def put_in_force(self, values: Mapping[str, Value]) -> None:
+        """`write` these, and remember them.
+
+        Feedback is switched on after all else is written, and off before: it is not to act on what was there before.
+        """
+        rest = {name: value for name, value in values.items() if name != names.FEEDBACK_ON}
+        parts = [rest] if rest else []
+        if names.FEEDBACK_ON in values:
+            on = values[names.FEEDBACK_ON]
+            parts.insert(len(parts) if on else 0, {names.FEEDBACK_ON: on})
+        for part in parts:
+            self.write(part)
+        self._told.update(values)
+
+    def own_actions(self) -> dict[str, Action]:
+        """The methods marked with `@action`, by name."""
+        found = {}
+        for attribute in dir(type(self)):
+            mark = getattr(getattr(type(self), attribute), "_afspm_action", None)
+            if isinstance(mark, Action):
+                found[mark.name] = replace(mark, do=getattr(self, attribute))
+        return found
