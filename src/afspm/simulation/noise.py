@@ -108,6 +108,3 @@ def flattened(values: Array, how: str) -> Array:
         return level
     x: Array = np.linspace(-1.0, 1.0, values.shape[1])
     return np.asarray(level - np.outer(level @ x / (x @ x), x))
-
-
-FLATTENINGS = ("none", "offset", "line")

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from afspm.basics.errors import InvalidValue
 from afspm.model import Frame, Region
 from afspm.simulation.fields import Array
-from afspm.simulation.noise import FLATTENINGS
 from afspm.simulation.settings import check, one_of
 
 MOST_PIXELS = 1 << 24
 DIRECTIONS = ("up", "down")
+FLATTENINGS = ("none", "offset", "line")
 
 
 @dataclass(frozen=True)
