@@ -169,4 +169,4 @@ class Component:
         """Called by the host; see `afspm.transport.process.context.ExperimentProcess`."""
         from afspm.client.loop import ComponentLoop
 
-        return ComponentLoop(self, context).run()
+        return ComponentLoop(self, Component, context).run()

@@ -11,7 +11,7 @@ from afspm.basics.errors import WireError
 from afspm.model import ControlState, Packet
 
 if TYPE_CHECKING:
-    from afspm.client.component import Component
+    from afspm.client.hosted import HostedComponent
 
 
 class MessageDispatcher:
@@ -22,7 +22,7 @@ class MessageDispatcher:
     """
 
     def __init__(
-        self, component: Component, base: type[Component], prefixes: tuple[str, ...] | None, log: logging.Logger
+        self, component: HostedComponent, base: type, prefixes: tuple[str, ...] | None, log: logging.Logger
     ) -> None:
         self._component = component
         self._base = base

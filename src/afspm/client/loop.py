@@ -14,9 +14,9 @@ from afspm.basics.errors import ConfigError, ExperimentEnded, MeasurementFailed,
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.own_fault import OwnFault
 from afspm.client.backlog import PacketBacklog
-from afspm.client.component import Component
 from afspm.client.dispatch import MessageDispatcher, overrides
 from afspm.client.experiment_link import ExperimentLink
+from afspm.client.hosted import HostedComponent
 from afspm.client.keyed_results import kept_in
 from afspm.client.scope import Scope
 from afspm.model import Frame, Packet, Problem
@@ -32,19 +32,23 @@ AT_ONCE = 16  # packets handled before the port is looked at again: a KILL must 
 
 
 class ComponentLoop:
-    """Runs one component until the experiment ends, it is stopped, or its `run` returns."""
+    """Runs one component until the experiment ends, it is stopped, or its `run` returns.
 
-    def __init__(self, component: Component, context: ProcessContext) -> None:
+    Args:
+        base: the class whose empty handlers the component overrides.
+    """
+
+    def __init__(self, component: HostedComponent, base: type, context: ProcessContext) -> None:
         self._component = component
         self._context = context
         self._activity = context.activity
         self._activity.longest_step_s = component.longest_step_s
-        self._is_script = overrides(component, Component, "run")
+        self._is_script = overrides(component, base, "run")
         self._backlog = PacketBacklog()
         self._has_begun = False
         self._has_reacted = False  # a handler that had control has returned
         launch = context.launch
-        self._dispatcher = MessageDispatcher(component, Component, launch.envelopes, context.log)
+        self._dispatcher = MessageDispatcher(component, base, launch.envelopes, context.log)
         self._ticker = None if self._is_script else _ticker(component, context.clock)
         self._link = ExperimentLink.of_launch(
             launch, context.open_port(), context.session, activity=self._activity, log=context.log
@@ -209,7 +213,7 @@ class _Ticker:
         self._next += (missed + 1) * self._period
 
 
-def _ticker(component: Component, clock: Clock) -> _Ticker | None:
+def _ticker(component: HostedComponent, clock: Clock) -> _Ticker | None:
     if component.period_s is None:
         return None
     if not component.period_s > 0.0:

@@ -281,7 +281,7 @@ def test_a_script_without_handlers_keeps_nothing_in_memory() -> None:
     lab = Lab()
     from afspm.client.loop import ComponentLoop
 
-    loop = ComponentLoop(Script(), context_of(lab))
+    loop = ComponentLoop(Script(), Component, context_of(lab))
     loop.run()
     assert len(loop._backlog) == 0
 
