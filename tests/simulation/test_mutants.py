@@ -335,7 +335,6 @@ MUTANTS = [
     nobody_is_dead,
     an_impostor_is_let_in,
     ids_are_forgotten,
-    sent_actions_are_not_saved,
     nothing_expires,
     any_answer_will_do,
     a_former_holder_commands_on,
@@ -375,3 +374,16 @@ def test_limits_decided_at_arrival_are_found_in_sample_coordinates(monkeypatch: 
     limits_are_decided_at_arrival(monkeypatch)
     with pytest.raises(InvariantViolated):
         _drift_nights()
+
+
+def test_actions_that_are_not_saved_are_found_in_sample_coordinates(monkeypatch: Patch) -> None:
+    """Where the sample moves an action is sent to another place when it is repeated, so no translator knows it again."""
+
+    def nights() -> None:
+        for seed in range(12, 15):
+            DriftNight(_bad_night(seed)).run()
+
+    nights()
+    sent_actions_are_not_saved(monkeypatch)
+    with pytest.raises(InvariantViolated):
+        nights()
