@@ -377,7 +377,7 @@ def test_limits_decided_at_arrival_are_found_in_sample_coordinates(monkeypatch: 
 
 
 def test_actions_that_are_not_saved_are_found_in_sample_coordinates(monkeypatch: Patch) -> None:
-    """Where the sample moves an action is sent to another place when it is repeated, so no translator knows it again."""
+    """Where the sample moves, a repeated action is sent to another place: no translator knows that it is the same."""
 
     def nights() -> None:
         for seed in range(12, 15):
