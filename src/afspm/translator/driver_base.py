@@ -20,6 +20,8 @@ from afspm.translator.parameters import ParameterTable, Value
 from afspm.translator.polling import EAGER_S
 from afspm.translator.setting_groups import SettingsGroup
 
+T = TypeVar("T")
+
 MEASURING = frozenset({ScopeState.SCANNING, ScopeState.SPEC})
 
 
@@ -27,6 +29,13 @@ class ControllerLost(AfspmError):
     """The controller can't be reached: the translator says so to who asks, and connects again."""
 
     code = "controller-lost"
+
+
+def connected(link: T | None, program: str, address: str = "") -> T:
+    """Return what stands for the connection to a maker's program. Raises ControllerLost: there is none (None)."""
+    if link is None:
+        raise ControllerLost(f"{program} is not connected", where=address)
+    return link
 
 
 LOST = (ControllerLost, ConnectionError, TimeoutError)

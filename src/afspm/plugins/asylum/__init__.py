@@ -18,7 +18,7 @@ from afspm.plugins.asylum.session import Session
 from afspm.plugins.asylum.settings import NAMES, FeedbackSwitch, FrameSettings, TipPlace
 from afspm.plugins.asylum.xop import XopError
 from afspm.translator.driver import Driver
-from afspm.translator.driver_base import ControllerLost, action
+from afspm.translator.driver_base import action, connected
 from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.translator.result_files import SCAN
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
@@ -127,9 +127,7 @@ class Asylum(Driver):
             self._session = None
 
     def _igor(self) -> Session:
-        if self._session is None:
-            raise ControllerLost("Igor is not connected", where=self.controller_at)
-        return self._session
+        return connected(self._session, "Igor", self.controller_at)
 
     def _frame_in_force(self) -> Region:
         return frame(self.in_force(FRAME))[0]

@@ -38,7 +38,7 @@ from afspm.plugins.gxsm.settings import (
     user_unit_m,
 )
 from afspm.translator.driver import Driver
-from afspm.translator.driver_base import ControllerLost, Introduction, action
+from afspm.translator.driver_base import ControllerLost, Introduction, action, connected
 from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
 
@@ -188,9 +188,7 @@ class Gxsm(Driver):
 
     @property
     def _ask(self) -> Asking:
-        if self._asking is None:
-            raise ControllerLost("GXSM is not connected")
-        return self._asking
+        return connected(self._asking, "GXSM")
 
     def status(self) -> ScopeStatus:
         return self._activity.status()

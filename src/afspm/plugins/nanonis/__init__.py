@@ -16,7 +16,7 @@ from afspm.plugins.nanonis.activity import NanonisActivity
 from afspm.plugins.nanonis.result_files import NanonisFiles
 from afspm.plugins.nanonis.session import MODULES, Session
 from afspm.translator.driver import Driver
-from afspm.translator.driver_base import ControllerLost, action
+from afspm.translator.driver_base import action, connected
 from afspm.translator.parameters import Value
 from afspm.translator.result_files import SCAN, Entry, as_region
 from afspm.translator.setting_groups import FRAME, KeptSettings, frame
@@ -109,9 +109,7 @@ class Nanonis(Driver):
 
     @property
     def _there(self) -> Session:
-        if self._session is None:
-            raise ControllerLost("Nanonis is not connected")
-        return self._session
+        return connected(self._session, "Nanonis")
 
     def _ask(self, name: str, *arguments: object) -> tuple[object, ...]:
         return self._there.ask(name, *arguments)

@@ -16,7 +16,7 @@ from afspm.plugins.nanosurf.link import Link, StudioError
 from afspm.plugins.nanosurf.session import Session
 from afspm.plugins.nanosurf.settings import DIRECTION, UNITS, FrameSettings, Slopes, TipPlace, direction
 from afspm.translator.driver import Driver
-from afspm.translator.driver_base import ControllerLost, action
+from afspm.translator.driver_base import action, connected
 from afspm.translator.parameters import Value
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
 
@@ -171,15 +171,11 @@ class Nanosurf(Driver):
         return Link(self.controller_at, self._reply_timeout_s, self.clock.monotonic_s)
 
     def _studio(self) -> Session:
-        if self._session is None:
-            raise ControllerLost("Studio is not connected", where=self.controller_at)
-        return self._session
+        return connected(self._session, "Studio", self.controller_at)
 
     @property
     def _doing(self) -> StudioActivity:
-        if self._activity is None:
-            raise ControllerLost("Studio is not connected", where=self.controller_at)
-        return self._activity
+        return connected(self._activity, "Studio", self.controller_at)
 
     def _frame_in_force(self) -> Region:
         return frame(self.in_force(FRAME))[0]

@@ -16,7 +16,7 @@ from afspm.plugins.park.result_files import SETTLE_S, ParkFiles
 from afspm.plugins.park.session import FALSE, TRUE, Session
 from afspm.plugins.park.settings import MICROMETRE, FrameSettings, Gains, TipPlace
 from afspm.translator.driver import Driver
-from afspm.translator.driver_base import ControllerLost, action
+from afspm.translator.driver_base import action, connected
 from afspm.translator.long_call import LongCall
 from afspm.translator.parameters import Value
 from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
@@ -174,15 +174,11 @@ class Park(Driver):
         return Link(self.controller_at, self._reply_timeout_s, self.clock.monotonic_s)
 
     def _smartscan(self) -> Session:
-        if self._session is None:
-            raise ControllerLost("SmartScan is not connected", where=self.controller_at)
-        return self._session
+        return connected(self._session, "SmartScan", self.controller_at)
 
     @property
     def _doing(self) -> SmartScanActivity:
-        if self._activity is None:
-            raise ControllerLost("SmartScan is not connected", where=self.controller_at)
-        return self._activity
+        return connected(self._activity, "SmartScan", self.controller_at)
 
     def _begun(self, call: LongCall) -> None:
         self._doing.watch(call)
