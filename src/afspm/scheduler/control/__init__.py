@@ -1,5 +1,1 @@
-"""Decisions without sockets, threads or clocks: an event and a time go in, effects come out.
-
-`scheduling.SchedulerCore` is the whole of the scheduler's deciding, `supervision.ChildWatch` that of the supervisor
-about one child. `arbitration.TABLE` is the transition table of control, as data.
-"""
+"""Decisions about control: the arbitration table, leases and grace periods, problems, begin and end of an experiment."""

@@ -1,0 +1,1 @@
+"""Decisions about packets: envelopes, times, the cache for late joiners, the event log."""

@@ -1,0 +1,1 @@
+"""Decisions for the tip: limits at the moment of sending, and the watchdog when a holder dies."""

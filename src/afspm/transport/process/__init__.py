@@ -1,1 +1,1 @@
-"""Shared by all processes of an experiment: host, bond to the parent, loading of classes, failures, log, memory."""
+"""The context of a process of an experiment: bond to the parent, loading of classes, signals, failures, log."""
