@@ -1,1 +1,1 @@
-"""Decisions about control: the arbitration table, leases and grace periods, problems, begin and end of an experiment."""
+"""Decisions about control: the arbitration table, leases and grace periods, begin and end of an experiment."""
