@@ -8,7 +8,7 @@ from afspm.model import Parameter
 
 
 class TableCodec:
-    """See `logic.events.Codec`; payloads are the numbers, in ASCII, of the objects that they stand for."""
+    """See `scheduler.events.Codec`; payloads are the numbers, in ASCII, of the objects that they stand for."""
 
     def __init__(self) -> None:
         self._objects: dict[bytes, Any] = {}

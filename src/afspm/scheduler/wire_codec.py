@@ -8,7 +8,7 @@ from afspm.model import Parameter
 
 
 class WireCodec:
-    """See `logic.events.Codec`."""
+    """The wire as `scheduler.events.Codec` asks for it."""
 
     def decode_parameter(self, payload: bytes) -> Parameter | None:
         try:

@@ -1,6 +1,6 @@
 """The supervisor: one poller on heartbeats, exits, output, signals and the next deadline.
 
-`logic.supervision.SupervisorCore` decides what to do about it; here it is done.
+`supervision.SupervisorCore` decides what to do about it; here it is done.
 """
 
 from __future__ import annotations

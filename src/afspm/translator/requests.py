@@ -174,7 +174,7 @@ def _only_asks(request: Request) -> bool:
 
 
 class RequestOutcomes:
-    """The outcomes of the last requests that had an id. See `logic.idempotency_cache` for older ids.
+    """The outcomes of the last requests that had an id. See `model.idempotency_cache` for older ids.
 
     Args:
         kept: the translator's memory; whoever owns it saves it, with every request. So an entry is a text, which is

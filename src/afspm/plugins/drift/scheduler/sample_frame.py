@@ -1,6 +1,6 @@
 """`SampleFrame`: coordinates in which the sample stands still, though it drifts under the tip.
 
-Theory of operation. The frame is a part of the scheduler's state behind `logic.coordinate_frame`, and decides in three
+Theory of operation. The frame is a part of the scheduler's state behind `scheduler.coordinate_frame`, and decides in three
 places:
 
 | what | module |
@@ -60,7 +60,7 @@ from afspm.scheduler.events import (
 
 @dataclass(frozen=True)
 class SampleFrame:
-    """See `logic.coordinate_frame.CoordinateFrame`; made by `SampleFrame.initial`."""
+    """See `scheduler.coordinate_frame.CoordinateFrame`; made by `SampleFrame.initial`."""
 
     env: DriftEnvironment
     state: DriftState
