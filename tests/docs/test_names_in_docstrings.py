@@ -72,6 +72,9 @@ def _is_there(name: str, identifiers: set[str], words: set[str]) -> bool:
         return rest.partition(".")[0] in PUBLIC or _resolves(rest)
     if rest and (SOURCE / first).is_dir():  # a room
         return _resolves(name)
+    if "." in rest and name.rpartition(".")[2][:1].isupper():  # a class, by its module
+        module = name.rpartition(".")[0]
+        return any(f".{one}".endswith(f".{module}") for one in MODULES) and name.rpartition(".")[2] in words
     return (first in identifiers if rest else True) and all(part in words for part in name.split(".") if part)
 
 

@@ -1,4 +1,4 @@
-"""[limits]: what of the microscope may be set, how far, how fast, where and by whom. Into the limits of `logic`.
+"""[limits]: what of the microscope may be set, how far, how fast, where and by whom: see `scheduler.safety.limits`.
 
 [limits]
 region = { x = ["-5 um", "5 um"], y = ["-5 um", "5 um"] }

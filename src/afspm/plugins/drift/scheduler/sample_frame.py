@@ -1,7 +1,7 @@
 """`SampleFrame`: coordinates in which the sample stands still, though it drifts under the tip.
 
-Theory of operation. The frame is a part of the scheduler's state behind `scheduler.coordinate_frame`, and decides in three
-places:
+Theory of operation. The frame is a part of the scheduler's state behind `scheduler.coordinate_frame`. It decides in
+three places:
 
 | what | module |
 | --- | --- |
