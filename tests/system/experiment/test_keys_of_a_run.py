@@ -35,7 +35,10 @@ class Thief(Component):
             network.connect(socket, self.launch.sockets.control)
             request = Request(ControlRequest.END_EXPERIMENT, id=claimed + "/thief/1")
             socket.send_multipart([b"", *wire.encode_request(request)])
-            said = wire.decode_response(socket.recv_multipart()[1:]).reason if socket.poll(20_000) else "nothing"
+            frames = [b""]
+            while frames == [b""] and socket.poll(20_000):  # an empty message only looks whether a client is there
+                frames = socket.recv_multipart()
+            said = wire.decode_response(frames[1:]).reason if frames != [b""] else "nothing"
             self.log.info("was told: %s", said)
             network.close()
 """
