@@ -7,7 +7,7 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 SETUP := .venv/.made
 
-.PHONY: demo demo-drift test test-all test-apart mutants test-samples coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
+.PHONY: demo demo-drift dev test test-all test-apart mutants test-samples coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
 .PHONY: test-nexus test-tiled check bench bench-drift soak chaos simulate power-cut docs clean
 .DEFAULT_GOAL := demo
 
@@ -119,10 +119,15 @@ test-nexus: $(TEST)
 test-tiled: test-nexus
 	@$(PYTHON) tools/serve_with_tiled.py
 
-## style, types, and who may import whom
+## everything for those who change afspm: the environment, and the hooks that check each commit
+dev: $(SETUP)
+	@$(BIN)/pre-commit install
+
+## style, spelling, types, and which package imports which
 check: $(SETUP)
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
+	@$(BIN)/codespell
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
 
