@@ -1,7 +1,7 @@
 """Words that make a sentence hard to read are in no docstring, comment, message, page or name of a test.
 
-They stand for a noun that is missing ("whoever hosts it", "those that came") or make data speak ("told", "said"). A line
-that needs one ends with `# word: told` (in a page: `<!-- word: told -->`).
+They stand for a missing noun ("whoever hosts it", "those that came") or make data speak ("told", "said"). A line that
+needs one ends with `# word: told` (in a page: `<!-- word: told -->`).
 """
 
 from __future__ import annotations
@@ -113,7 +113,8 @@ def test_names_of_tests_are_free_of_the_words() -> None:
 
 
 def test_words_are_found_in_each_kind_of_text() -> None:
-    source = 'def f(x: int) -> str:\n    """Return what is told."""\n    # nobody\n    return f"{x} was said"  # word: said\n'
+    docstring, comment, message = '"""Return what is told."""', "# nobody", 'return f"{x} was said"  # word: said'
+    source = f"def f(x: int) -> str:\n    {docstring}\n    {comment}\n    {message}\n"
     assert [word for _, line in _sentences(source) for word in FOUND.findall(line)] == [
         "what is",
         "told",
