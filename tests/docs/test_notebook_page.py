@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from afspm_process import AFSPM
-from test_snippets import FILE_NAME, ROOT, snippets
+from tests.docs.test_snippets import FILE_NAME, ROOT, snippets
 
 import afspm
 from afspm.model import ScopeState

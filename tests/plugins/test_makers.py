@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from vendor_bench import TURNED, VendorBench, benches, ready, scanned, scans, small, states
+from tests.plugins.vendor_bench import TURNED, VendorBench, benches, ready, scanned, scans, small, states
 
 from afspm.model import ControlResponse, ScopeState, names
 

@@ -16,7 +16,7 @@ from threading import Condition, Event, Thread
 from typing import IO, Any, ClassVar, Generic, TypeVar
 
 import zmq
-from hosts import host
+from tests.plugins.hosts import host
 
 from afspm import wire
 from afspm.basics.clock import ExperimentClock

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ui_lab import SCREENSHOTS, Night, Opened
+from tests.ui.ui_lab import SCREENSHOTS, Night, Opened
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # `benchmarks` has a stage to publish on, which serves here too
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ui_lab import Night
+from tests.ui.ui_lab import Night
 
 from afspm.model import ControlMode
 from afspm.plugins.web.passwords import hashed

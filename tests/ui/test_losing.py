@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from afspm_process import AFSPM
-from ui_lab import EXPERIMENT, Night, Opened
+from tests.ui.ui_lab import EXPERIMENT, Night, Opened
 
 from afspm.model import ProcessCondition
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ui_lab import Night, Opened
+from tests.ui.ui_lab import Night, Opened
 
 import afspm
 from afspm.model import ControlMode

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from ui_lab import Night, Opened
+from tests.ui.ui_lab import Night, Opened
 
 import afspm
 from afspm.model import ControlMode, ControlRequest, ControlResponse, ProcessCondition, ScopeState, names

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ui_lab import Night, Opened
+from tests.ui.ui_lab import Night, Opened
 
 import afspm
 from afspm.model import Region, Scan

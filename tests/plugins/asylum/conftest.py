@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from asylum_bench import Bench
-from vendor_bench import benches
+from tests.plugins.asylum.asylum_bench import Bench
+from tests.plugins.vendor_bench import benches
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from asylum_bench import Emulated
+from tests.plugins.asylum.asylum_bench import Emulated
 
 from afspm.plugins.asylum.emulator.wire import CallFailed, IgorFunction, wave
 

@@ -7,8 +7,8 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from asylum_bench import Bench, Emulated
-from vendor_bench import SOON, Peer, scans, small, states
+from tests.plugins.asylum.asylum_bench import Bench, Emulated
+from tests.plugins.vendor_bench import SOON, Peer, scans, small, states
 
 from afspm.model import ControlRequest, ControlResponse, ProbePosition, Scan, ScopeState, Spectrum, names
 from afspm.simulation.faults import Fault

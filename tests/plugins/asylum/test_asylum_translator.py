@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from asylum_bench import Bench, Emulated
 from igor2 import binarywave
-from vendor_bench import FLAT, SHAPE, TURNED, Peer, left_in_danger, moved, ready, scanned, states
+from tests.plugins.asylum.asylum_bench import Bench, Emulated
+from tests.plugins.vendor_bench import FLAT, SHAPE, TURNED, Peer, left_in_danger, moved, ready, scanned, states
 
 from afspm.model import (
     ControlRequest,

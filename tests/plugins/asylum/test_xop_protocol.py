@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
-from igor_test_functions import WithTestFunctions
+from tests.plugins.asylum.igor_test_functions import WithTestFunctions
 
 from afspm.basics.clock import ExperimentClock
 from afspm.plugins.asylum import xop

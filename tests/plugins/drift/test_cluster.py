@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from test_study_command import SMALL, told
-from test_workers import by_index, doubled, doubled_by_the_next
+from tests.plugins.drift.test_study_command import SMALL, told
+from tests.plugins.drift.test_workers import by_index, doubled, doubled_by_the_next
 
 from afspm.basics.errors import ConfigError
 from afspm.plugins.drift.study.workers import TaskOutcome, on_cluster

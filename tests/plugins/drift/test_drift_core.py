@@ -7,7 +7,7 @@ from dataclasses import FrozenInstanceError
 
 import numpy as np
 import pytest
-from drift_lab import HERE, NS, SHAPE, Lab, forecast, registered
+from tests.plugins.drift.drift_lab import HERE, NS, SHAPE, Lab, forecast, registered
 
 from afspm import wire
 from afspm.model import (

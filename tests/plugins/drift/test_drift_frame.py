@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from drift_lab import HERE, NS, SHAPE, START_S, Lab, forecast
+from tests.plugins.drift.drift_lab import HERE, NS, SHAPE, START_S, Lab, forecast
 
 from afspm import wire
 from afspm.model import (

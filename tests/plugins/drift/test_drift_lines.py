@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from drift_lab import Lab, forecast
+from tests.plugins.drift.drift_lab import Lab, forecast
 
 from afspm.model import ControlRequest, Region, ScanLines, ScanParameters
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-from drift_parts import Brightest
+from tests.plugins.drift.drift_parts import Brightest
 
 from afspm.basics.errors import ConfigError, FileError
 from afspm.model import Frame, Region, Scan
@@ -283,7 +283,7 @@ def test_worker_ends_with_a_killed_scheduler_even_while_it_registers(tmp_path: P
         from afspm.plugins.drift.scheduler.messages import StartWorker
         from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings
         from afspm.plugins.drift.scheduler.worker_process import DriftWorkerProcess
-        from test_drift_worker import Heard, job
+        from tests.plugins.drift.test_drift_worker import Heard, job
         from afspm.plugins.drift.scheduler.messages import Registered
 
         worker = DriftWorkerProcess(

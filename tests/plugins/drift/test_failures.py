@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
-from trackers_lab import INTERVAL_S, World, follow, scan_at, steady
+from tests.plugins.drift.trackers_lab import INTERVAL_S, World, follow, scan_at, steady
 
 from afspm.model import Region, RegistrationOutcome
 from afspm.plugins.drift.estimators import PairFailure, estimator, unguarded

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from registering import PIXEL_M, Waves, scanned
+from tests.plugins.drift.registering import PIXEL_M, Waves, scanned
 
 from afspm.basics.errors import ConfigError
 from afspm.model import Region

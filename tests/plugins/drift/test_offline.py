@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_record import record
+from tests.plugins.drift.test_record import record
 
 from afspm.model import Region
 from afspm.plugins.drift.offline import against_first, spread_pairs

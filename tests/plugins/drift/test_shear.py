@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from trackers_lab import FRAME_S, SIZE_M, scan_at
+from tests.plugins.drift.trackers_lab import FRAME_S, SIZE_M, scan_at
 
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 from afspm.plugins.drift.shear import (

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from trackers_lab import FRAME_S, INTERVAL_S, SIZE_M, World, follow, scan_at, steady
+from tests.plugins.drift.trackers_lab import FRAME_S, INTERVAL_S, SIZE_M, World, follow, scan_at, steady
 
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from trackers_lab import INTERVAL_S, SIZE_M, World, follow, scan_at, steady
+from tests.plugins.drift.trackers_lab import INTERVAL_S, SIZE_M, World, follow, scan_at, steady
 
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.plugins.drift.mapping import Mapping

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from registering import PIXEL_M, Waves
-from trackers_lab import World, follow
+from tests.plugins.drift.registering import PIXEL_M, Waves
+from tests.plugins.drift.trackers_lab import World, follow
 
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.model import Frame, Region

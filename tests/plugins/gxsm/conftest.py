@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from gxsm_bench import Bench
-from vendor_bench import benches
+from tests.plugins.gxsm.gxsm_bench import Bench
+from tests.plugins.vendor_bench import benches
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from vendor_bench import PATIENT, AtPanel, VendorBench
+from tests.plugins.vendor_bench import PATIENT, AtPanel, VendorBench
 
 from afspm.plugins.gxsm.emulator import GxsmEmulator
 

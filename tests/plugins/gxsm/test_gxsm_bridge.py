@@ -15,7 +15,7 @@ from threading import Event, Thread
 
 import numpy as np
 import pytest
-from raw_clients import SocketClient
+from tests.plugins.gxsm.raw_clients import SocketClient
 
 from afspm.plugins.gxsm import bridge
 from afspm.plugins.gxsm.bridge_client import BridgeLink

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gxsm_bench import Bench
-from vendor_bench import Peer, TranslatorProcess, scans, states
+from tests.plugins.gxsm.gxsm_bench import Bench
+from tests.plugins.vendor_bench import Peer, TranslatorProcess, scans, states
 
 from afspm.basics.clock import ExperimentClock
 from afspm.model import ControlRequest, ControlResponse, Region, ScanParameters, ScopeState, names

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from gxsm_bench import Bench
-from vendor_bench import SHAPE, SOON, Peer, ready, scans, states
+from tests.plugins.gxsm.gxsm_bench import Bench
+from tests.plugins.vendor_bench import SHAPE, SOON, Peer, ready, scans, states
 
 from afspm.model import (
     ControlRequest,

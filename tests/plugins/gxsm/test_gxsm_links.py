@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from vendor_bench import answering
+from tests.plugins.vendor_bench import answering
 
 from afspm.basics.errors import ConfigError
 from afspm.plugins.gxsm import bridge, pickles

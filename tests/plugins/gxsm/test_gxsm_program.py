@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gxsm_bench import Bench
-from raw_clients import MemoryClient, SocketClient, client
-from vendor_bench import DEADLINE_S
+from tests.plugins.gxsm.gxsm_bench import Bench
+from tests.plugins.gxsm.raw_clients import MemoryClient, SocketClient, client
+from tests.plugins.vendor_bench import DEADLINE_S
 
 from afspm.plugins.gxsm.emulator.block import FAULT_KINDS, SharedMemoryBlock
 from afspm.plugins.gxsm.emulator.file_writer import GxsmFileWriter

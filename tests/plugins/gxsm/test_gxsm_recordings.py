@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 from fake_clock import FakeClock
-from gxsm_bench import Bench
-from raw_clients import client
+from tests.plugins.gxsm.gxsm_bench import Bench
+from tests.plugins.gxsm.raw_clients import client
 
 from afspm.model import Scan, ScopeState, names
 from afspm.plugins.gxsm import Gxsm

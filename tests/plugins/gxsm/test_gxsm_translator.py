@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gxsm_bench import Bench
-from vendor_bench import FLAT, SHAPE, TURNED, moved, ready, scanned, scans, states
+from tests.plugins.gxsm.gxsm_bench import Bench
+from tests.plugins.vendor_bench import FLAT, SHAPE, TURNED, moved, ready, scanned, scans, states
 
 from afspm.model import (
     ControlRequest,

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from nanonis_bench import Bench
-from vendor_bench import benches
+from tests.plugins.nanonis.nanonis_bench import Bench
+from tests.plugins.vendor_bench import benches
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from threading import Event
 from typing import Any
 
-from vendor_bench import PATIENT, AtPanel, VendorBench
+from tests.plugins.vendor_bench import PATIENT, AtPanel, VendorBench
 
 from afspm.plugins.nanonis.emulator import NanonisEmulator, PendingReply
 

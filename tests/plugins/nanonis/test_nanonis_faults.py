@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nanonis_bench import Bench
-from vendor_bench import SOON, scans, small, states
+from tests.plugins.nanonis.nanonis_bench import Bench
+from tests.plugins.vendor_bench import SOON, scans, small, states
 
 from afspm.model import ControlRequest, ControlResponse, ProbePosition, Scan, ScopeState, Spectrum, names
 from afspm.supervisor.ports import FreePorts

@@ -11,7 +11,7 @@ from threading import Thread
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from vendor_bench import answering
+from tests.plugins.vendor_bench import answering
 
 from afspm.plugins.nanonis.emulator import wire
 from afspm.plugins.nanonis.link import Link

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from nanonis_bench import Bench
-from vendor_bench import FLAT, SHAPE, TURNED, left_in_danger, moved, ready, scanned, states
+from tests.plugins.nanonis.nanonis_bench import Bench
+from tests.plugins.vendor_bench import FLAT, SHAPE, TURNED, left_in_danger, moved, ready, scanned, states
 
 from afspm.basics.exit_codes import ExitCode
 from afspm.model import (

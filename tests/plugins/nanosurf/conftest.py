@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from nanosurf_bench import Bench
-from vendor_bench import benches
+from tests.plugins.nanosurf.nanosurf_bench import Bench
+from tests.plugins.vendor_bench import benches
 
 pytest.importorskip("lupa", reason="the emulated Studio runs scripts in lupa's Lua: pip install afspm[nanosurf]")
 

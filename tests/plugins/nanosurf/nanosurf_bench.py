@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from vendor_bench import PATIENT, AtPanel, VendorBench
+from tests.plugins.vendor_bench import PATIENT, AtPanel, VendorBench
 
 from afspm.plugins.nanosurf.emulator import NanosurfEmulator
 

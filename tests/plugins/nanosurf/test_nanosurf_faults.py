@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from nanosurf_bench import Bench
-from vendor_bench import SOON, Peer, ready, scanned, scans, small, states
+from tests.plugins.nanosurf.nanosurf_bench import Bench
+from tests.plugins.vendor_bench import SOON, Peer, ready, scanned, scans, small, states
 
 from afspm.model import ScopeState, names
 

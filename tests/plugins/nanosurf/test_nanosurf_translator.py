@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_clock import FakeClock
-from nanosurf_bench import Bench
-from vendor_bench import FLAT, TURNED, moved, ready, scanned, scans, small, states
+from tests.plugins.nanosurf.nanosurf_bench import Bench
+from tests.plugins.vendor_bench import FLAT, TURNED, moved, ready, scanned, scans, small, states
 
 from afspm.basics.errors import InvalidValue
 from afspm.basics.exit_codes import ExitCode

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from nanosurf_bench import Emulated
+from tests.plugins.nanosurf.nanosurf_bench import Emulated
 
 import afspm
 from afspm.basics.clock import ExperimentClock

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from park_bench import Bench
-from vendor_bench import benches
+from tests.plugins.park.park_bench import Bench
+from tests.plugins.vendor_bench import benches
 
 pytest.importorskip("quickjs", reason="the emulated SmartScan runs scripts in JavaScript: pip install afspm[park]")
 

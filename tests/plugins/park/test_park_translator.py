@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from park_bench import Bench
-from vendor_bench import FLAT, SOON, left_in_danger, moved, ready, scanned, scans, small, states
+from tests.plugins.park.park_bench import Bench
+from tests.plugins.vendor_bench import FLAT, SOON, left_in_danger, moved, ready, scanned, scans, small, states
 
 from afspm.model import ControlResponse, Region, ScopeState, Spectrum, names
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from park_bench import Emulated
+from tests.plugins.park.park_bench import Emulated
 
 from afspm.basics.clock import ExperimentClock
 

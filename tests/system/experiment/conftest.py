@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from experiment_lab import EXPERIMENT, SPEED, WITNESS, AfspmRun, Run
+from tests.system.experiment.experiment_lab import EXPERIMENT, SPEED, WITNESS, AfspmRun, Run
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from experiment_lab import AfspmRun
+from tests.system.experiment.experiment_lab import AfspmRun
 
 from afspm.storage.formats import read
 

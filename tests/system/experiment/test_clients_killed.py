@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from afspm_process import DEADLINE_S
-from experiment_lab import Run
+from tests.system.experiment.experiment_lab import Run
 
 import afspm
 from afspm.model import ScopeState

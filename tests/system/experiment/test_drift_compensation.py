@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drift_rig import Rig, Surveyed, surveyed, table, worker_of
 from systems import KILLED_FROM_OUTSIDE, PATIENCE, kill
+from tests.system.experiment.drift_rig import Rig, Surveyed, surveyed, table, worker_of
 
 from afspm.model import Region
 

@@ -7,8 +7,8 @@ import time
 from pathlib import Path
 
 import pytest
-from experiment_lab import AfspmRun, Run, require_each_once, require_each_row_once
 from systems import can_interrupt, interrupt
+from tests.system.experiment.experiment_lab import AfspmRun, Run, require_each_once, require_each_row_once
 
 from afspm.client.connect import connect
 from afspm.model import ScopeState

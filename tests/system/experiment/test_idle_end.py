@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
-from experiment_lab import AfspmRun, Run
+from tests.system.experiment.experiment_lab import AfspmRun, Run
 
 import afspm
 from afspm.model import ControlMode

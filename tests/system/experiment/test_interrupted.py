@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from afspm_process import DEADLINE_S
-from experiment_lab import AfspmRun
+from tests.system.experiment.experiment_lab import AfspmRun
 
 import afspm
 from afspm.model import ScopeState

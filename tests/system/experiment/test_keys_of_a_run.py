@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import zmq
-from experiment_lab import Run, require_each_once
+from tests.system.experiment.experiment_lab import Run, require_each_once
 
 import afspm
 from afspm import wire

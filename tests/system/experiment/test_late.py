@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from experiment_lab import Run
+from tests.system.experiment.experiment_lab import Run
 
 import afspm
 from afspm.model import ControlRequest

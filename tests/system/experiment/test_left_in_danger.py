@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from experiment_lab import AfspmRun, require_each_once
 from systems import can_interrupt, interrupt, wait_until_gone
+from tests.system.experiment.experiment_lab import AfspmRun, require_each_once
 
 from afspm.storage.memory import Memory
 

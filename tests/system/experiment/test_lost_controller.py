@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from experiment_lab import WITNESS, AfspmRun
 from makers import MAKERS
+from tests.system.experiment.experiment_lab import WITNESS, AfspmRun
 
 FILES = Path(__file__).parents[3] / "experiments" / "every_microscope"
 TIMED = sorted(name for name, maker in MAKERS.items() if maker.takes("reply_timeout_s"))

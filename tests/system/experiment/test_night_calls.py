@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from afspm_process import AFSPM, DEADLINE_S
-from experiment_lab import Run
+from tests.system.experiment.experiment_lab import Run
 
 SECRET = "T0PSECRET"
 MORE = """

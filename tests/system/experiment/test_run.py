@@ -8,8 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from experiment_lab import Run, require_each_once, require_recorded_once
 from systems import can_interrupt, interrupt, wait_until_gone
+from tests.system.experiment.experiment_lab import Run, require_each_once, require_recorded_once
 
 import afspm
 from afspm.basics.errors import ExperimentEnded

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from experiment_lab import AfspmRun, Run
+from tests.system.experiment.experiment_lab import AfspmRun, Run
 
 import afspm
 from afspm.supervisor.ports import FreePorts

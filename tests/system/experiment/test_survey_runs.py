@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from experiment_lab import AfspmRun, Run
+from tests.system.experiment.experiment_lab import AfspmRun, Run
 
 import afspm
 from afspm.basics.errors import ExperimentEnded

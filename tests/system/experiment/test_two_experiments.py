@@ -8,7 +8,7 @@ import socket
 from pathlib import Path
 
 import pytest
-from experiment_lab import AfspmRun, Run
+from tests.system.experiment.experiment_lab import AfspmRun, Run
 
 import afspm
 from afspm.basics.errors import ConfigError

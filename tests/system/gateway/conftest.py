@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from gateway_lab import GatewayRun
+from tests.system.gateway.gateway_lab import GatewayRun
 
 Started = Callable[..., GatewayRun]
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from urllib.request import urlopen
 
 import pytest
-from gateway_lab import SERIES, GatewayRun
+from tests.system.gateway.gateway_lab import SERIES, GatewayRun
 
 from afspm.plugins.web.passwords import hashed
 

@@ -20,7 +20,7 @@ import numpy as np
 import psutil
 import pytest
 from afspm_process import DEADLINE_S
-from gateway_lab import EXPERIMENT, REGION, SERIES, Client, Event, GatewayRun
+from tests.system.gateway.gateway_lab import EXPERIMENT, REGION, SERIES, Client, Event, GatewayRun
 
 import afspm
 from afspm.plugins.web.gateway.stream import MOST_STREAMS

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from gateway_lab import GatewayRun
+from tests.system.gateway.gateway_lab import GatewayRun
 
 import afspm
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from gateway_lab import SERIES, GatewayRun
+from tests.system.gateway.gateway_lab import SERIES, GatewayRun
 
 Started = Callable[..., GatewayRun]
 SAMPLE = Path(__file__).parents[3] / "experiments" / "gateway"

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 if sys.platform == "linux":
-    from hosts_lab import HostsLab
+    from tests.system.hosts.hosts_lab import HostsLab
 
 
 def _lacking() -> str:

@@ -21,8 +21,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from faulty_network import FaultyNetwork
-from namespaced_host import Host, interrupt
+from tests.system.hosts.faulty_network import FaultyNetwork
+from tests.system.hosts.namespaced_host import Host, interrupt
 
 import afspm
 from afspm.transport.keys import generate

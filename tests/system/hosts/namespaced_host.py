@@ -12,8 +12,8 @@ import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from faulty_network import FaultyNetwork
-from host_init import DEVICE
+from tests.system.hosts.faulty_network import FaultyNetwork
+from tests.system.hosts.host_init import DEVICE
 
 _INIT = Path(__file__).with_name("host_init.py")
 _NAMESPACES = ("--net", "--mount", "--uts", "--ipc", "--pid", "--fork", "--mount-proc")

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
-from hosts_lab import AFSPM, TILERS, HostsLab
-from namespaced_host import interrupt
+from tests.system.hosts.hosts_lab import AFSPM, TILERS, HostsLab
+from tests.system.hosts.namespaced_host import interrupt
 
 from afspm.transport.keys import generate
 

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable
 
 import pytest
-from hosts_lab import HOSTS, TILERS, HostsLab
+from tests.system.hosts.hosts_lab import HOSTS, TILERS, HostsLab
 
 Lab = Callable[..., HostsLab]
 Directions = tuple[tuple[str, str], ...]

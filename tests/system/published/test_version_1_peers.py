@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
-from version_1 import END, PARAM, RELEASE, REQUEST, Client, Router, Server, Subscriber
+from tests.system.published.version_1 import END, PARAM, RELEASE, REQUEST, Client, Router, Server, Subscriber
 
 from afspm import wire
 from afspm.basics.clock import ExperimentClock

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from power_cut import power_cuts
+from tests.system.record.power_cut import power_cuts
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="finds processes in /proc")
 

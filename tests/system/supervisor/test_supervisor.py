@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from supervisor_lab import DEADLINE_S, QUICK, RunTasks, peer
 from systems import KILLED_FROM_OUTSIDE, WINE, freeze, kill, not_on_wine
+from tests.system.supervisor.supervisor_lab import DEADLINE_S, QUICK, RunTasks, peer
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.exit_codes import ExitCode

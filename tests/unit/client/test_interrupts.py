@@ -6,7 +6,7 @@ import signal
 from collections.abc import Iterator
 
 import pytest
-from client_lab import REGION, SCAN_S, Lab
+from tests.unit.client.client_lab import REGION, SCAN_S, Lab
 
 from afspm.client.scope import Scope
 from afspm.model import ControlMode, Request, Response, ScopeState

@@ -7,9 +7,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
-from client_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, LabPort
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.unit.client.client_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, LabPort
 
 from afspm.basics.errors import InvalidValue, NoResponse, Refused
 from afspm.client.experiment_link import ExperimentLink

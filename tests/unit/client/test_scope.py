@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from client_lab import OTHER_REGION, REGION, SCAN_S, SOURCE, Lab, LabPort
+from tests.unit.client.client_lab import OTHER_REGION, REGION, SCAN_S, SOURCE, Lab, LabPort
 
 from afspm import model, wire
 from afspm.basics.errors import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from client_lab import Lab, run
+from tests.unit.client.client_lab import Lab, run
 
 from afspm import wire
 from afspm.basics.exit_codes import ExitCode

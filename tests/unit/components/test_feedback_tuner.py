@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from client_lab import Lab, run
+from tests.unit.client.client_lab import Lab, run
 
 from afspm.basics.exit_codes import ExitCode
 from afspm.components.feedback_tuner import FeedbackTuner

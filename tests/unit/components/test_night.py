@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from client_lab import REGION, Lab, context_of, run
+from tests.unit.client.client_lab import REGION, Lab, context_of, run
 
 from afspm import wire
 from afspm.basics.exit_codes import ExitCode

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from client_lab import SCAN_S, Kill9, Lab, LabPort, context_of, run
+from tests.unit.client.client_lab import SCAN_S, Kill9, Lab, LabPort, context_of, run
 
 from afspm import wire
 from afspm.basics.errors import ConfigError

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from client_lab import Kill9, LabPort, context_of, run
-from survey_lab import PARTICLES, ParticleLab
+from tests.unit.client.client_lab import Kill9, LabPort, context_of, run
+from tests.unit.components.survey_lab import PARTICLES, ParticleLab
 
 from afspm.basics.errors import ConfigError
 from afspm.basics.exit_codes import ExitCode

@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from client_lab import Lab, run
-from tip_scans_lab import channels
+from tests.unit.client.client_lab import Lab, run
+from tests.unit.components.tip_scans_lab import channels
 
 from afspm import wire
 from afspm.basics.exit_codes import ExitCode

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from client_lab import REGION, Kill9, Lab, LabPort, context_of, run
-from tip_scans_lab import HOME, channels
+from tests.unit.client.client_lab import REGION, Kill9, Lab, LabPort, context_of, run
+from tests.unit.components.tip_scans_lab import HOME, channels
 
 from afspm import wire
 from afspm.basics.errors import ConfigError

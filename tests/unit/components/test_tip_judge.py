@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tip_scans_lab import ELSEWHERE, HOME, PIXELS, channels
+from tests.unit.components.tip_scans_lab import ELSEWHERE, HOME, PIXELS, channels
 
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.components.tip_judge import Opinion, TipJudge, TipTolerance, Verdict, VerdictCounter

@@ -9,7 +9,7 @@ from datetime import date
 from pathlib import Path
 
 import pytest
-from record_lab import ABOUT, Night
+from tests.unit.record.record_lab import ABOUT, Night
 from typer.testing import CliRunner
 
 from afspm.basics.errors import FileError, InvalidValue

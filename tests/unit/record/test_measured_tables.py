@@ -7,7 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from record_lab import Given, Night
+from tests.unit.record.record_lab import Given, Night
 
 import afspm
 from afspm.basics.errors import InvalidValue

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from record_lab import ABOUT, REGION, START_NS, Night, same
+from tests.unit.record.record_lab import ABOUT, REGION, START_NS, Night, same
 
 import afspm
 from afspm import wire

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import pytest
-from logic_lab import Lab
+from tests.unit.scheduler.logic_lab import Lab
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from logic_lab import Lab
+from tests.unit.scheduler.logic_lab import Lab
 
 from afspm.model import ControlResponse, Problem, ScopeState
 from afspm.scheduler.events import Tick

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from logic_lab import Lab, published
+from tests.unit.scheduler.logic_lab import Lab, published
 
 from afspm.model import (
     CLOCK_REQUEST,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from core_parts import Held
+from tests.unit.scheduler.core_parts import Held
 
 from afspm.model import ControlResponse, Request, Response, ResponseDetail
 from afspm.model.idempotency_cache import IdempotencyCache, RequestStatus

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from logic_lab import Lab, killed, published
+from tests.unit.scheduler.logic_lab import Lab, killed, published
 
 from afspm.model import ControlRequest, ProcessCondition, ProcessState
 from afspm.scheduler.control.supervisor_registry import SILENT_S

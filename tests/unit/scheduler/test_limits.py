@@ -6,7 +6,7 @@ import json
 import math
 
 import pytest
-from core_parts import Held
+from tests.unit.scheduler.core_parts import Held
 
 from afspm import wire
 from afspm.model import (

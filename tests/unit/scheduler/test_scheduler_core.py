@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from logic_lab import NS, Lab, killed, published, replies
+from tests.unit.scheduler.logic_lab import NS, Lab, killed, published, replies
 
 from afspm.model import (
     CLOCK_REQUEST,

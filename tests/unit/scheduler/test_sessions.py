@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from core_parts import Held
+from tests.unit.scheduler.core_parts import Held
 
 from afspm.model.sessions import Hearing, SessionTable, token_of
 

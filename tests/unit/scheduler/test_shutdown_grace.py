@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from logic_lab import Lab
+from tests.unit.scheduler.logic_lab import Lab
 
 from afspm.model import ControlRequest, ProcessCondition, ProcessState
 from afspm.scheduler.control.lifecycle import LONGEST_GRACE_S, SHUTDOWN_GRACE_S

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from logic_lab import Lab, in_control, killed, kinds, replies, resumed
+from tests.unit.scheduler.logic_lab import Lab, in_control, killed, kinds, replies, resumed
 
 from afspm.model import (
     ControlMode,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from core_parts import Dog
-from logic_lab import Lab, killed
+from tests.unit.scheduler.core_parts import Dog
+from tests.unit.scheduler.logic_lab import Lab, killed
 
 from afspm.model import LEASE_REQUEST, ControlEvent, ControlRequest, ControlResponse, ScopeState
 from afspm.scheduler.control.arbitration import Cause

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 import pytest
-from logic_lab import NS, Lab, in_control, killed, kinds, replies
+from tests.unit.scheduler.logic_lab import NS, Lab, in_control, killed, kinds, replies
 
 from afspm.model import (
     ControlMode,

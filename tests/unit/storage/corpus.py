@@ -10,8 +10,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from samples import DATA, WHOLE
 from systems import not_on_wine
+from tests.unit.storage.samples import DATA, WHOLE
 
 import afspm
 from afspm.storage.formats import FileContent, suffixes

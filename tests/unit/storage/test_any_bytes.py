@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from corpus import REAL, reading, to_damage, whole
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from samples import DATA, WHOLE
+from tests.unit.storage.corpus import REAL, reading, to_damage, whole
+from tests.unit.storage.samples import DATA, WHOLE
 
 import afspm
 from afspm.basics.errors import FileError

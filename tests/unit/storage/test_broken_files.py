@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from corpus import reading, to_damage, whole
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from samples import DATA, WHOLE
+from tests.unit.storage.corpus import reading, to_damage, whole
+from tests.unit.storage.samples import DATA, WHOLE
 
 from afspm.basics.errors import FileError
 from afspm.model import Region, Scan

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import samples
-from samples import END_NS, HEIGHT_M, OTHER, REGION, WHOLE, gxsm3, gxsm4, sxm
+from tests.unit.storage import samples
+from tests.unit.storage.samples import END_NS, HEIGHT_M, OTHER, REGION, WHOLE, gxsm3, gxsm4, sxm
 
 import afspm
 from afspm.basics.errors import FileError

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from samples import DATA
+from tests.unit.storage.samples import DATA
 
 import afspm
 from afspm.model import Scan

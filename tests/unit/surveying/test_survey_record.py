@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from surfaces import scanned
+from tests.unit.surveying.surfaces import scanned
 
 from afspm.components.surveying import Outcome, SurveyRecord, Target, Visit
 from afspm.components.surveying.figure import draw_survey

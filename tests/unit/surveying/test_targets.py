@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from surfaces import SIDE_M, Ground, scanned, strewn
+from tests.unit.surveying.surfaces import SIDE_M, Ground, scanned, strewn
 
 from afspm.components.surveying import find_particles, lowest_beside, nearest
 from afspm.components.surveying.targets import Target, flattened
