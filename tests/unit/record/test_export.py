@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import csv
+import hashlib
+import json
 import re
 import struct
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,8 @@ from afspm.model import ScopeState, Spectrum
 from afspm.record.export import chosen, export
 from afspm.record.run import Run
 from afspm.record.store import RecordStore
+
+ORCID = "https://orcid.org/0000-0002-1825-0097"
 
 
 @pytest.fixture
@@ -310,3 +315,45 @@ def test_what_was_not_seen_is_told_and_left_out(night: Night, store: RecordStore
     told: list[str] = []
     assert list(export(afspm.open_run(tmp_path), "gwy", tmp_path / "out", tell=told.append)) == []
     assert told == ["scan 1 was interrupted before anything of it was seen"]
+
+
+def test_lab_notebook_archive_is_read_by_ro_crate(run: Run, tmp_path: Path) -> None:
+    from rocrate.rocrate import ROCrate  # a reader by others
+
+    (tmp_path / "run.json").write_text(
+        json.dumps({"run": "1f", "metadata": {"sample": "gold", "person": "Ada L", "orcid": ORCID, "vendor": "V"}})
+    )
+    (path,) = export(run, "eln", tmp_path / "out")
+    assert path.name == f"{tmp_path.name}.SIMULATED.eln"
+    with zipfile.ZipFile(path) as container:
+        assert {Path(name).parts[0] for name in container.namelist()} == {path.stem}
+        container.extractall(tmp_path / "extracted")
+    crate = ROCrate(tmp_path / "extracted" / path.stem)
+    night = crate.dereference(f"./{tmp_path.name}/")
+    assert night["name"].endswith("(SIMULATED)")
+    assert "SIMULATED" in night["description"]
+    assert night["author"].id == ORCID
+    assert (night["author"]["givenName"], night["author"]["familyName"]) == ("Ada", "L")
+    files = {part.id.split("/", 1)[1]: part for part in night["hasPart"]}
+    assert {row.file for row in run.scans if row.file} <= files.keys()
+    for name, entity in files.items():
+        content = (tmp_path / "extracted" / path.stem / tmp_path.name / name).read_bytes()
+        assert entity["sha256"] == hashlib.sha256(content).hexdigest()
+        assert entity["contentSize"] == str(len(content))
+    again = afspm.open_run(tmp_path / "extracted" / path.stem / tmp_path.name)
+    assert [row.file for row in again.scans] == [row.file for row in run.scans]
+    assert (again.scan(0)["Height"].values == run.scan(0)["Height"].values).all()
+
+
+def test_lab_notebook_archive_of_chosen_scans_has_only_their_files(run: Run, tmp_path: Path) -> None:
+    (path,) = export(run, "eln", tmp_path / "out", "2")
+    with zipfile.ZipFile(path) as container:
+        scans = [name for name in container.namelist() if name.endswith(".h5")]
+    assert [Path(name).name for name in scans] == [Path(run.scans[1].file).name]
+
+
+def test_lab_notebook_archive_that_cannot_be_written_leaves_nothing(run: Run, tmp_path: Path) -> None:
+    (tmp_path / run.scans[0].file).unlink()
+    with pytest.raises(FileError, match="can't be written"):
+        list(export(run, "eln", tmp_path / "out"))
+    assert list((tmp_path / "out").iterdir()) == []

@@ -3,7 +3,8 @@
 An exporter is a module that a package declares by its format. `write(run, row)` yields the ends of the names and the
 contents of the files of a scan or spectrum. Two more functions where the format has such files: `tables(run, scans,
 spectra)` yields names and contents of files about all that was measured, and `grid_file(stack, metadata)` returns the
-spectra of a grid as one file.
+spectra of a grid as one file. A format that keeps everything in one file has `archive(run, scans, spectra, folder)`
+instead of `write`: it writes that file, which may be larger than memory, and yields its path.
 """
 
 from __future__ import annotations
@@ -54,6 +55,9 @@ def export(
     wanted = [row for row in wanted if row.file]
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        if hasattr(module, "archive"):
+            yield from module.archive(run, wanted, spectra, folder)
+            return
         for name, content in module.tables(run, wanted, spectra) if hasattr(module, "tables") else ():
             yield _written(folder / name, content)
         yield from _one_by_one(module.write, run, [*wanted, *spectra], folder, tell)
