@@ -19,6 +19,7 @@ from afspm.cli import (
     experiment_file,
     new,
     notify,
+    probes,
     recorded,
     run,
     runs,
@@ -88,6 +89,7 @@ app.command("restart", rich_help_panel=MEANWHILE)(steer.restart)
 app.command("problems", rich_help_panel=MEANWHILE)(steer.problems)
 app.command("note", rich_help_panel=MEANWHILE)(steer.note)
 app.command("runs", rich_help_panel=AFTERWARDS)(runs.runs)
+app.command("probes", rich_help_panel=AFTERWARDS)(probes.probes)
 app.command("report", rich_help_panel=AFTERWARDS)(recorded.report)
 app.command("export", rich_help_panel=AFTERWARDS)(recorded.export)
 app.command("replay", rich_help_panel=AFTERWARDS)(recorded.replay)

@@ -86,6 +86,8 @@ class MetadataSection(Section):
     """The model, such as "Cypher S"."""
     vendor: str | None = None
     """Of the microscope; if it is not given, that of the controller."""
+    probe: str | None = None
+    """The probe or tip that is mounted, such as "PPP-NCHR 12/7": `afspm probes` lists the history of each."""
 
 
 class NotifySection(Section):

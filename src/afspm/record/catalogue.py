@@ -6,6 +6,7 @@ import json
 import os
 import re
 import sqlite3
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -13,20 +14,27 @@ from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import FileError, InvalidValue
 from afspm.basics.formatting import counted
 from afspm.basics.plain_data import Plain
+from afspm.model import ControlRequest, ControlResponse, JournalEntry
+from afspm.model.names import BASE_ACTIONS
+from afspm.record.bad_scans import BAD
 from afspm.record.journal import not_a_table
 from afspm.record.run import Run, open_run
 from afspm.record.run_json import RUN_FILE
 from afspm.record.run_lock import describe_state
+from afspm.record.tables import ScanRow
 from afspm.wire.messages import CONTROL_STATE, DRIFT_RESCAN, JOURNAL
 
 INDEX_FILE: Final = "runs.sqlite"
-_FORMAT: Final = 2
+_FORMAT: Final = 3
 _WATCHED: Final = (RUN_FILE, "journal.sqlite", "journal.sqlite-wal")
 """Files of a run by which it is seen that something has changed."""
+_SEARCHED: Final = ("sample", "person", "project", "technique", "probe")
 _WORD: Final = re.compile(r"(?:(\w+):)?(.+)", re.DOTALL)
 
 
@@ -43,6 +51,9 @@ class RunSummary:
         scans: the whole ones; spectra: their number.
         problems: the names of those that were flagged.
         notes: the texts of all notes.
+        scanned_m: the path of the probe in scans, trace and retrace, in metres.
+        treatments: how often each action that is not a measurement was executed, by its name.
+        judged: scans with a last verdict, and those of them with a good tip.
         damage: why its record can't be read; empty: it can.
     """
 
@@ -57,6 +68,9 @@ class RunSummary:
     spectra: int = 0
     problems: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    scanned_m: float = 0.0
+    treatments: Mapping[str, int] = field(default_factory=dict)
+    judged: tuple[int, int] = (0, 0)
     damage: str = ""
 
     @property
@@ -69,7 +83,7 @@ class RunSummary:
         """Return the fields that are looked through, by name."""
         lists = {"problem": self.problems, "note": self.notes}
         texts = {"folder": self.folder, "name": self.name, "state": self.state, "microscope": self.microscope}
-        texts |= {name: self.metadata.get(name, "") for name in ("sample", "person", "project", "technique")}
+        texts |= {name: self.metadata.get(name, "") for name in _SEARCHED}
         return texts | {name: "\n".join(all_) for name, all_ in lists.items()}
 
     @property
@@ -199,7 +213,7 @@ def _stamp(folder: Path) -> str:
 
 def _from_json(text: str) -> RunSummary:
     about: Plain = json.loads(text)
-    lists = {name: tuple(about[name]) for name in ("problems", "notes")}
+    lists = {name: tuple(about[name]) for name in ("problems", "notes", "judged")}
     return RunSummary(**{one.name: about[one.name] for one in fields(RunSummary)} | lists)
 
 
@@ -226,4 +240,29 @@ def _read(run: Run) -> RunSummary:
         spectra=len(run.spectra),
         problems=tuple(sorted({span.label for span in overview.problem_spans})),
         notes=tuple(note.text for note in run.notes),
+        scanned_m=sum(_scanned_m(run, scan) for scan in run.scans),
+        treatments=dict(Counter(entry.what for entry in run.journal if _is_treatment(entry))),
+        judged=_judged(run.verdicts()),
     )
+
+
+def _scanned_m(run: Run, scan: ScanRow) -> float:
+    """Return the path of the probe along the lines of a scan, trace and retrace; lines of which none was seen are 0."""
+    if scan.region is None or scan.shape is None:
+        return 0.0
+    rows = scan.shape[0]
+    if scan.interrupted:
+        with suppress(FileError):  # damaged: counted as whole, the most that it can be
+            first = next(iter(run.scan(scan).values()))
+            rows = int(np.isfinite(first.values).any(axis=1).sum())
+    return 2.0 * rows * scan.region.size_m[0]
+
+
+def _is_treatment(entry: JournalEntry) -> bool:
+    is_done = entry.request == ControlRequest.ACTION and entry.response == ControlResponse.SUCCESS
+    return is_done and entry.what not in BASE_ACTIONS
+
+
+def _judged(verdicts: Sequence[tuple[int, float]]) -> tuple[int, int]:
+    last = dict(verdicts)
+    return len(last), sum(score != BAD for score in last.values())
