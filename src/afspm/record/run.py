@@ -45,6 +45,7 @@ from afspm.record.run_json import EXPERIMENT_FILE, METADATA, REPLAY_OF, latest_r
 from afspm.record.tables import ControlRow, NoteRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
 
 if TYPE_CHECKING:
+    from afspm.record.film import Film
     from afspm.record.overview import DriftPoint, Overview
     from afspm.storage.formats.content import FileContent
 
@@ -113,6 +114,26 @@ class Run:
         header: dict[str, Any] = dict(self._content(row.file, f"number {row.number}").header)
         notes = [f"{note.text} ({note.who})" for note in self.notes_on(row)]
         return header | ({"notes": notes} if notes else {}) | ({"key": row.key} if row.key else {})
+
+    def film(self, scans: Sequence[ScanRow] | None = None, channel: str | None = None) -> Film:
+        """Return scans of one place as a film that stands still: `run.film().save("night.gif")`.
+
+        Args:
+            scans: rows of `scans`; None: all of the place that was scanned most often.
+            channel: None: the first.
+
+        Raises:
+            InvalidValue: fewer than two scans, not of one place, or a scan without the channel.
+            FileError: a file is missing or damaged.
+        """
+        from afspm.record.film import film_of, places
+
+        if scans is None:
+            groups = places(self, list(self.scans))
+            if not groups:
+                raise InvalidValue("a film needs two scans of one place, and there are none")
+            scans = groups[0]
+        return film_of(self, scans, channel)
 
     def scan_at(self, time_ns: int, channel: str = "") -> ScanRow | None:
         """Return the scan that was finished at a time; None if there is none.

@@ -82,7 +82,7 @@ def _value(kind: str, data: bytes, at: int) -> tuple[Any, int]:
 
 def test_gwyddion_gets_every_channel_with_place_and_units(run: Run, tmp_path: Path) -> None:
     files = list(export(run, "gwy", tmp_path / "out", "1"))
-    assert [file.name for file in files] == [Path(run.scans[0].file).stem + ".gwy"]
+    assert [file.name for file in files] == ["0001.gwy"]
     content = parsed(files[0].read_bytes())
     for number, (channel, scan) in enumerate(run.scan(0).items()):
         kind, field = content[f"/{number}/data"]
@@ -115,7 +115,7 @@ def test_what_was_not_measured_is_masked_for_gwyddion(run: Run, tmp_path: Path) 
 
 
 def test_gwyddion_gets_the_curves_of_a_spectrum(run: Run, tmp_path: Path) -> None:
-    file = next(file for file in export(run, "gwy", tmp_path / "out") if Path(run.spectra[0].file).stem in file.name)
+    file = next(file for file in export(run, "gwy", tmp_path / "out") if file.name.startswith("spectrum-0001"))
     model = parsed(file.read_bytes())["/0/graph/graph/1"][1]
     ((kind, curve),) = model["curves"]
     assert (kind, model["y_unit"][1]["unitstr"], curve["description"]) == ("GwyGraphCurveModel", "A", "Current")
@@ -247,8 +247,7 @@ def test_netcdf_is_read_by_xarray(run: Run, tmp_path: Path) -> None:
 def test_pictures_are_there_for_every_channel(run: Run, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     names = [file.name for file in export(run, "png", tmp_path / "out")]
-    stems = [Path(row.file).stem for row in run.scans]
-    assert names[:2] == [f"{stems[0]}_Height.png", f"{stems[0]}_Height_Retrace.png"]
+    assert names[:2] == ["0001_Height.png", "0001_Height_Retrace.png"]
     assert len(names) == 2 + 2 + 1 + 1
     assert all((tmp_path / "out" / name).read_bytes().startswith(b"\x89PNG") for name in names)
 
@@ -261,7 +260,7 @@ def test_tables_have_their_columns_even_if_they_are_empty(run: Run, tmp_path: Pa
     assert rows[0]["time"].startswith("2026-03-14T20:00:00.")
     assert [row["interrupted"] for row in rows] == ["False", "False", "True"]
     assert files["drift.csv"].read_text(encoding="utf-8").startswith("time,x_m,y_m,rate_x_m_s")
-    curve = files[Path(run.spectra[0].file).stem + ".csv"].read_text(encoding="utf-8").splitlines()
+    curve = files["spectrum-0001.csv"].read_text(encoding="utf-8").splitlines()
     assert curve[0] == "Bias [V],Current [A],dI/dV [S]"
     assert float(curve[1].split(",")[1]) == run.spectrum(0)["Current"][0]
 

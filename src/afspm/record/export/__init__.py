@@ -74,11 +74,17 @@ def _one_by_one(
     for row in rows:
         try:
             for end, content in write(run, row):
-                yield _written(folder / f"{Path(row.file).stem}{end}", content)
+                yield _written(folder / f"{_stem(row)}{end}", content)
         except FileError as error:
             if tell is None:
                 raise
             tell(str(error))
+
+
+def _stem(row: ScanRow | SpectrumRow) -> str:
+    kind = "spectrum-" if isinstance(row, SpectrumRow) else ""
+    key = re.sub(r"[^\w.-]+", "-", row.key).strip("-.")
+    return f"{kind}{row.number:04}" + (f"-{key}" if key else "")
 
 
 def _written(path: Path, content: bytes) -> Path:

@@ -1,0 +1,38 @@
+"""Films (.gif, .mp4): one for each place that was scanned at least twice, of the first channel."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from afspm.basics.errors import InvalidValue
+from afspm.record.film import film_of, places
+from afspm.record.run import Run
+from afspm.record.tables import ScanRow, SpectrumRow
+
+
+class FilmExporter:
+    """Writes films with one suffix. See `afspm.record.export`."""
+
+    def __init__(self, suffix: str) -> None:
+        self._suffix = suffix
+
+    def archive(self, run: Run, scans: Sequence[ScanRow], _: Sequence[SpectrumRow], folder: Path) -> Iterator[Path]:
+        """Write the films and yield each path.
+
+        Raises:
+            InvalidValue: no place was scanned twice.
+            FileError: a file can't be read or written.
+        """
+        groups = places(run, scans)
+        if not groups:
+            raise InvalidValue("a film needs two scans of one place, and there are none", where=str(run.folder))
+        for number, rows in enumerate(groups, 1):
+            film = film_of(run, rows)
+            channel = re.sub(r"[^\w.-]+", "_", film.channel).strip("_") or "channel"
+            yield film.save(folder / f"film-{number:02}-{channel}{self._suffix}")
+
+
+GIF = FilmExporter(".gif")
+MP4 = FilmExporter(".mp4")
