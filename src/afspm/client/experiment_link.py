@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from afspm import wire
 from afspm.basics.clock import Clock
-from afspm.basics.errors import ConfigError, ExperimentEnded, NoResponse, WireError
+from afspm.basics.errors import ConfigError, ExperimentEnded, Interrupted, NoResponse, WireError
 from afspm.basics.launch import Launch
-from afspm.client.interrupts import Interrupts
 from afspm.client.published_state import PublishedState
-from afspm.client.request_tracker import RequestTracker
 from afspm.model import (
+    CLOCK_REQUEST,
     HAS_ENDED,
     OTHER_RUN_RESPONSE,
+    RELAY_REQUEST,
     ControlRequest,
     Packet,
+    RelayedMessage,
     Request,
     Response,
     ResponseDetail,
     request_name,
 )
+from afspm.model.sessions import run_of
 from afspm.transport.port import (
     CaughtUp,
     ControlConnected,
@@ -34,6 +38,7 @@ from afspm.transport.port import (
     Port,
     ReplyReceived,
 )
+from afspm.transport.process import signals
 from afspm.transport.process.context import ProcessActivity
 from afspm.transport.process.parent import StopRequested
 
@@ -43,7 +48,119 @@ asks again instead makes the connection anew, as if the scheduler were gone."""
 CAUGHT_UP_WITHIN_S = 2.0
 """Before a warning that nothing is heard of what the scheduler publishes."""
 UNHEARD = "the scheduler is there, but nothing is heard of what it publishes"
+Send = Callable[[Sequence[bytes]], None]
 Listener = Callable[[Packet, bool], None]
+
+
+class Interrupts:
+    """The interrupts (Ctrl-C, the stop button of a notebook) that arrive during calls over one port.
+
+    A program that handles or ignores SIGINT itself, as components do, is left alone.
+    """
+
+    def __init__(self, port: Port) -> None:
+        self._port = port
+        self._is_deferred = False
+        self._has_come = False
+
+    @contextmanager
+    def heeded(self) -> Iterator[None]:
+        """Raise KeyboardInterrupt in this block only where `heed` is called, and at its end."""
+        if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+            yield  # also within another such block
+            return
+        self._has_come = False
+        with signals.caught(self._come, self._port.wakeup_fileno(), signals.CTRL_C):
+            yield
+            self.heed()
+
+    @contextmanager
+    def deferred(self) -> Iterator[None]:
+        """Finish what is in this block, which is to be short; further interrupts during it are dropped."""
+        self._is_deferred = True
+        try:
+            yield
+        finally:
+            self._is_deferred = self._has_come = False
+
+    def heed(self) -> None:
+        """Raise KeyboardInterrupt if an interrupt has come."""
+        if self._has_come and not self._is_deferred:
+            self._has_come = False
+            raise Interrupted
+
+    def interrupt(self) -> None:
+        """Have the call under way, or the next, raise KeyboardInterrupt as by Ctrl-C. From any thread."""
+        self._has_come = True
+        self._port.wake_up()
+
+    def _come(self, _number: int) -> None:
+        self._has_come = True
+
+
+class RequestTracker:
+    """Gives requests their ids, and takes the answers. One request at a time is waited for.
+
+    Args:
+        session: differs between two lives of a component of the same name.
+
+    Attributes:
+        connections: how often the scheduler was connected.
+        answer: to the request that is waited for; None: not yet there.
+    """
+
+    def __init__(self, send: Send, name: str, session: str) -> None:
+        self._send = send
+        self._name = name
+        self._session = session
+        self._requests = 0
+        self._asked = ""
+        self._told: tuple[str, float] | None = None  # the id of what was told and not answered yet, and when
+        self._untold: dict[str, RelayedMessage] = {}
+        self.connections = 0
+        self.connected = False
+        self.answer: Response | None = None
+
+    def next_id(self) -> str:
+        """Return an id for a request, not used before in any life of this component."""
+        self._requests += 1
+        return f"{self._name}/{self._session}/{self._requests}"
+
+    def expect(self, request_id: str) -> None:
+        """Take the answer to this request from now on; empty: to none."""
+        self._asked, self.answer = request_id, None
+
+    def send_only(self, kind: int, subject: object = None) -> str:
+        """Send a request whose answer is not waited for, and return its id."""
+        request = Request(kind, subject, id=self.next_id())
+        self._send(wire.encode_request(request))
+        return request.id
+
+    def tell(self, thing: object, now_s: float, timeout_s: float) -> None:
+        """Have the scheduler publish `thing`. Until that is answered, only the newest of each kind waits."""
+        told = RelayedMessage(*wire.encode(thing))
+        self._untold[told.message] = told
+        if self._told is None or self._told[1] < now_s - timeout_s:
+            self._tell_next(now_s)
+
+    def on_connected(self) -> None:
+        self.connections += 1
+        self.connected = True
+        self._told = None  # its answer may be lost with the connection
+        if run_of(self._name, f"{self._name}/{self._session}/0"):
+            self.send_only(CLOCK_REQUEST)  # shows by its id which run is ours
+
+    def on_reply(self, response: Response, now_s: float) -> None:
+        if self._told is not None and response.id == self._told[0]:
+            self._told = None
+            self._tell_next(now_s)
+        elif self._asked and response.id == self._asked:  # else it is late: it was given up on
+            self.answer = response
+
+    def _tell_next(self, now_s: float) -> None:
+        if self._untold:
+            told = self._untold.pop(next(iter(self._untold)))
+            self._told = (self.send_only(RELAY_REQUEST, told), now_s)
 
 
 class ExperimentLink:

@@ -14,9 +14,8 @@ from afspm.basics.errors import ConfigError, ExperimentEnded, MeasurementFailed,
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.own_fault import OwnFault
 from afspm.client.backlog import PacketBacklog
-from afspm.client.dispatch import MessageDispatcher, overrides
+from afspm.client.dispatch import HostedComponent, MessageDispatcher, overrides
 from afspm.client.experiment_link import ExperimentLink
-from afspm.client.hosted import HostedComponent
 from afspm.client.keyed_results import kept_in
 from afspm.client.scope import Scope
 from afspm.model import Frame, Packet, Problem

@@ -99,7 +99,7 @@ class Network:
         self._sockets: list[zmq.Socket[bytes]] = []
         self._authenticator = None
         if keys is not None and (keys.everywhere or keys.guards):
-            from afspm.transport.authenticator import Authenticator
+            from afspm.transport.keys import Authenticator
 
             self._authenticator = Authenticator(self._context, keys)
 

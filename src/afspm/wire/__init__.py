@@ -15,6 +15,11 @@ from __future__ import annotations
 
 from afspm.wire.codec import decode, encode, header
 from afspm.wire.frames import (
+    BEAT,
+    CLOSE,
+    CLOSING,
+    KILL,
+    PROTOCOL_VERSION,
     decode_packet,
     decode_parameter,
     decode_request,
@@ -40,13 +45,6 @@ from afspm.wire.messages import (
     messages_of_the_experiment,
     messages_without_values,
     register,
-)
-from afspm.wire.protocol import (
-    BEAT,
-    CLOSE,
-    CLOSING,
-    KILL,
-    PROTOCOL_VERSION,
 )
 from afspm.wire.split import Buffer
 from afspm.wire.values import encode_place, place_in, relocated

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from typing import Final
 
 from google.protobuf.duration_pb2 import Duration
 from google.protobuf.message import DecodeError
@@ -30,8 +31,19 @@ from afspm.wire.codec import encode
 from afspm.wire.generated import control_pb2, scan_pb2, spectroscopy_pb2
 from afspm.wire.mapping import FEEDBACK, PARAMETER, RELAYED, known, time_ns, timestamp
 from afspm.wire.messages import parse
-from afspm.wire.protocol import LONGEST_ENVELOPE, LONGEST_ID
 from afspm.wire.split import Buffer
+
+PROTOCOL_VERSION: Final = 2
+
+KILL: Final = b"KILL"
+"""The packet of one frame by which all subscribers learn that the experiment has ended."""
+CLOSE: Final = bytes([100])
+"""The request of one frame that ends the translator, which subscribes to no publisher, with the experiment."""
+BEAT: Final = b"\x00"
+CLOSING: Final = b"\x01"
+LONGEST_ID: Final = 200
+LONGEST_ENVELOPE: Final = 1000
+"""Bytes."""
 
 
 def encode_time(time_ns: int) -> bytes:

@@ -14,7 +14,7 @@ from zmq.utils import z85
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError, TransportError
 from afspm.transport import keys
-from afspm.transport.authenticator import Authenticator
+from afspm.transport.keys import Authenticator
 from afspm.transport.network import Network, is_local
 from afspm.transport.port import CaughtUp, ControlConnected, PacketReceived, RequestReceived
 from afspm.transport.zmq_port import ZmqPort
