@@ -50,7 +50,10 @@ def test_what_is_missing_is_named_with_the_command_that_installs_it(
     monkeypatch.setattr(Needy, "requires", requires)
     with pytest.raises(ConfigError) as refused:
         require(Needy)
-    assert (refused.value.what, refused.value.hint) == (f"Needy needs what is not installed: {packages}", command)
+    assert (refused.value.what, refused.value.hint) == (
+        f"Needy needs packages that are not installed: {packages}",
+        command,
+    )
 
 
 @pytest.mark.parametrize("requires", [(), ("numpy>=1.26",), ("afspm",)])
