@@ -64,7 +64,7 @@ class Launch:
     request_retries: int = 3
     log_level: str = "INFO"
     keys: PlainMapping | None = None
-    """The CURVE key pair of the process, and the key owner at each address (`transport.keys.from_launch`); None: plain."""
+    """CURVE key pair of the process, and the key owner of each address (`transport.keys.from_launch`); None: plain."""
     messages: tuple[str, ...] = ()
     """Python modules, or .proto files, with the user's message types."""
     run: str = ""
