@@ -85,9 +85,8 @@ def _nearest(places: Floats) -> tuple[float, float]:
     one, rank = np.nonzero((distances > 0.0) & (distances < 1.3 * spacing_m))
     between = distinct[others[one, rank]] - distinct[one]
     angles = np.arctan2(between[:, 1], between[:, 0])
-    return spacing_m, float(
-        np.angle(np.exp(4j * angles).mean()) / 4.0
-    )  # four times the angle: a grid turned by a quarter is the same
+    # four times the angle: a grid turned by a quarter is the same grid
+    return spacing_m, float(np.angle(np.exp(4j * angles).mean()) / 4.0)
 
 
 def _axis(along_m: Floats, spacing_m: float) -> tuple[Floats, NDArray[np.int64]]:

@@ -1,4 +1,4 @@
-"""Model objects and messages to and from bytes, by the name of the message."""
+"""Conversion of model objects and messages to and from bytes, by the name of the message."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def encode(thing: object) -> tuple[str, bytes]:
     """Return a model object, or any message, as (name of the message, bytes).
 
     Raises:
-        InvalidValue: it is neither.
+        InvalidValue: `thing` is neither.
     """
     if isinstance(thing, Message):
         return _serialised(thing)
@@ -37,12 +37,12 @@ def encode(thing: object) -> tuple[str, bytes]:
 
 
 def decode(name: str, payload: Buffer) -> Any:
-    """Return the message `name` as a model object, where there is one for it, else as the generated message itself.
+    """Return the message `name` as a model object if it has one, else as the generated message.
 
     A scan's values are a view of `payload`.
 
     Raises:
-        WireError: the bytes are no such message, or say what can't be.
+        WireError: the bytes are no such message, or hold invalid values.
     """
     decoder = _DECODERS.get(name)
     try:
@@ -52,7 +52,7 @@ def decode(name: str, payload: Buffer) -> Any:
 
 
 def header(name: str, payload: Buffer) -> model.PacketHeader:
-    """Return the facts that the envelope of a message may depend on; its values are not touched.
+    """Return the facts on which the envelope of a message may depend, without reading its values.
 
     Raises:
         WireError: the bytes are no such message.
@@ -213,7 +213,7 @@ def _encode_mapped(mapping: MessageMapping[object], thing: object) -> tuple[str,
 
 def _published_parameters(payload: Buffer) -> model.ScanParameters:
     parameters = convert.scan_parameters_from_wire(parse(scan_pb2.ScanParameters2d, payload))
-    if isinstance(parameters.region, model.RegionChange):  # published is what is in force: no angle means none
+    if isinstance(parameters.region, model.RegionChange):  # published parameters are in force: no angle means unrotated
         whole = convert.whole_region(parameters.region)
         parameters = model.ScanParameters(whole or parameters.region, parameters.shape, parameters.unit)
     if isinstance(parameters.shape, model.ShapeChange):

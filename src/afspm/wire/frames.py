@@ -1,4 +1,4 @@
-"""Packets, requests and responses as the frames that travel."""
+"""Packets, requests and responses as frames of a ZeroMQ message, and the signals of one frame."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ BEAT: Final = b"\x00"
 CLOSING: Final = b"\x01"
 LONGEST_ID: Final = 200
 LONGEST_ENVELOPE: Final = 1000
-"""Bytes."""
+"""In bytes."""
 
 
 def encode_time(time_ns: int) -> bytes:
-    """The third frame of a packet: a serialised google.protobuf.Timestamp."""
+    """Return the third frame of a packet: a serialised google.protobuf.Timestamp."""
     return timestamp(time_ns).SerializeToString()
 
 
@@ -55,7 +55,7 @@ def decode_time(frame: Buffer) -> int:
     """Return the time in the third frame of a packet, ns since the Unix epoch.
 
     Raises:
-        WireError: it is none.
+        WireError: the bytes are no Timestamp, or a time out of range.
     """
     try:
         return time_ns(Timestamp.FromString(bytes(frame)))
@@ -64,7 +64,7 @@ def decode_time(frame: Buffer) -> int:
 
 
 def encode_packet(packet: Packet) -> list[Buffer]:
-    """[envelope, message] and, where it is known, [timestamp]."""
+    """Return the frames [envelope, message] and, for a packet with a time, [timestamp]."""
     frames: list[Buffer] = [packet.envelope.encode(), packet.payload]
     if packet.time_ns is not None:
         frames.append(encode_time(packet.time_ns))
@@ -72,10 +72,10 @@ def encode_packet(packet: Packet) -> list[Buffer]:
 
 
 def decode_packet(frames: Sequence[Buffer]) -> Packet:
-    """Return a packet of two or three frames; its message is not decoded.
+    """Return a packet of two or three frames, with its message still in bytes.
 
     Raises:
-        WireError: it is none.
+        WireError: the frames are no packet.
     """
     if not 2 <= len(frames) <= 3:
         raise WireError(f"a packet of {len(frames)} frames instead of two or three")
@@ -90,7 +90,7 @@ def decode_packet(frames: Sequence[Buffer]) -> Packet:
 
 
 def encode_request(request: Request) -> list[bytes]:
-    """[number, object, id]; frames at the end that are empty are left out."""
+    """Return the frames [number, object, id], without empty frames at the end."""
     frames = [bytes([request.kind]), request.payload or encode_subject(request.subject), request.id.encode()]
     while len(frames) > 1 and not frames[-1]:
         frames.pop()
@@ -98,9 +98,9 @@ def encode_request(request: Request) -> list[bytes]:
 
 
 def encode_subject(subject: object) -> bytes:
-    """Return a request's subject in bytes.
+    """Return the subject of a request in bytes.
 
-    One byte for a whole number, a Duration for seconds, an ActionMsg for text, else the model object's.
+    One byte for a whole number, a Duration for seconds, an ActionMsg for text, else the bytes of the model object.
     """
     if subject is None:
         return b""
@@ -125,8 +125,8 @@ def decode_request(frames: Sequence[Buffer]) -> Request:
     """Return a request of one to three frames.
 
     Raises:
-        WireError: it is none, with the `response` to answer: REP_CMD_NOT_SUPPORTED for a number that is unknown,
-            REP_PARAM_ERROR for a value that makes no sense, else REP_FAILURE.
+        WireError: the frames are no request; with the `response` to send: REP_CMD_NOT_SUPPORTED for an unknown number,
+            REP_PARAM_ERROR for an invalid value, else REP_FAILURE.
     """
     if not 1 <= len(frames) <= 3:
         raise WireError(f"a request of {len(frames)} frames instead of one to three")
@@ -146,7 +146,7 @@ def decode_request(frames: Sequence[Buffer]) -> Request:
 
 
 def id_of(frames: Sequence[Buffer]) -> str:
-    """Return the id of a request that may be malformed, so that its sender knows what is refused; "" if it has none."""
+    """Return the id of a request, perhaps a malformed one, for a refusal; empty if there is none."""
     return str(frames[2], "utf-8", "replace") if len(frames) == 3 and len(frames[2]) <= LONGEST_ID else ""
 
 
@@ -160,7 +160,7 @@ def _request_id(frame: Buffer) -> str:
 
 
 def encode_response(response: Response) -> list[bytes]:
-    """[number] and, where there is any of it, [object, reason, id, detail]."""
+    """Return the frames [number, object, reason, id, detail], without empty frames at the end."""
     detail = bytes([response.detail]) if response.detail else b""
     frames = [bytes([response.code]), response.payload, response.reason.encode(), response.id.encode(), detail]
     while len(frames) > 1 and not frames[-1]:
@@ -172,7 +172,7 @@ def decode_response(frames: Sequence[Buffer]) -> Response:
     """Return a response of one to five frames; frames that a newer peer appends are ignored.
 
     Raises:
-        WireError: it is none.
+        WireError: the frames are no response.
     """
     count = len(frames)
     if not count or len(frames[0]) != 1:
@@ -185,10 +185,10 @@ def decode_response(frames: Sequence[Buffer]) -> Response:
 
 
 def decode_parameter(payload: Buffer) -> Parameter:
-    """Return the object of a successful REQ_PARAM: the value in force.
+    """Return the parameter in the answer to REQ_PARAM, with the value in force.
 
     Raises:
-        WireError: it is none.
+        WireError: the bytes are no parameter.
     """
     try:
         return PARAMETER.decode(payload)
@@ -197,7 +197,7 @@ def decode_parameter(payload: Buffer) -> Parameter:
 
 
 def _action(payload: bytes) -> str:
-    # there are few actions, and they are asked for again and again
+    # cached: an experiment repeats the same few actions
     return _known_action(payload) if len(payload) <= LONGEST_ID else _new_action(payload)
 
 

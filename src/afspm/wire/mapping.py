@@ -1,4 +1,4 @@
-"""Model objects to and from messages, field by field: a table for each, of those that need no more than that."""
+"""Conversion of model objects to and from messages field by field, by one table for each class."""
 
 from __future__ import annotations
 
@@ -32,7 +32,11 @@ def timestamp(time_ns: int) -> Timestamp:
 
 
 def time_ns(stamp: Timestamp) -> int:
-    """Raises InvalidValue: 64 bits, the years 1678 to 2261, don't hold it; no record could keep it."""
+    """Return a timestamp in ns since the Unix epoch.
+
+    Raises:
+        InvalidValue: the time does not fit 64 bits (the years 1678 to 2261), so that no record could keep it.
+    """
     found = int(stamp.seconds) * NS_PER_S + stamp.nanos
     if not -_TIMES <= found < _TIMES:
         raise InvalidValue(f"a time {stamp.seconds} s from 1970")
@@ -40,24 +44,24 @@ def time_ns(stamp: Timestamp) -> int:
 
 
 def known(kind: type[E], number: int) -> E:
-    """Return the member with this number; UNDEFINED (0) for one that only a newer peer knows."""
+    """Return the member with this number; UNDEFINED (0) for a number that only a newer peer knows."""
     return kind(number) if number in kind._value2member_map_ else kind(0)
 
 
 def shortest(number: float) -> float:
-    """Return the decimal number that a float32 means: 0.1, not 0.10000000149011612, which is above a limit of 0.1."""
+    """Return the shortest decimal number for a float32: 0.1, not 0.10000000149011612, which exceeds a limit of 0.1."""
     for digits in range(6, 9):
         decimal = float(f"{number:.{digits}g}")
         if _FLOAT32.unpack(_FLOAT32.pack(decimal)) == (number,):
             return decimal
-    return float(f"{number:.9g}")  # which tells any two of them apart
+    return float(f"{number:.9g}")  # nine digits distinguish any two float32
 
 
 class FieldMapping(NamedTuple):
-    """One field of a message, and how its value is converted each way.
+    """One field of a message, and the conversion of its value in both directions.
 
     Attributes:
-        sparse: it is not sent where it is empty or zero.
+        sparse: an empty or zero value is not sent.
     """
 
     name: str
@@ -67,10 +71,12 @@ class FieldMapping(NamedTuple):
 
 
 class MessageMapping(Generic[T]):
-    """A model class and its message. An attribute that is None is absent; one whose default is None may be absent.
+    """A model class and its message.
+
+    None is sent as an absent field. An absent field is read as None if that is the attribute's default.
 
     Args:
-        same: attributes that are fields of the same name and type.
+        same: attributes with a field of the same name and type.
         other: all other attributes.
     """
 
@@ -94,7 +100,11 @@ class MessageMapping(Generic[T]):
         return self._message(**values)
 
     def from_wire(self, message: Message) -> T:
-        """Raises InvalidValue: a value makes no sense."""
+        """Return the model object of a message.
+
+        Raises:
+            InvalidValue: a value is invalid.
+        """
         return self.kind(
             **{
                 attribute: None
@@ -105,7 +115,12 @@ class MessageMapping(Generic[T]):
         )
 
     def decode(self, payload: Buffer) -> T:
-        """Raises WireError: the bytes are no such message; InvalidValue: a value makes no sense."""
+        """Return the model object of a serialised message.
+
+        Raises:
+            WireError: the bytes are no such message.
+            InvalidValue: a value is invalid.
+        """
         return self.from_wire(parse(self._message, payload))
 
 
@@ -226,10 +241,14 @@ MAPPINGS: tuple[MessageMapping[Any], ...] = (
 
 
 def encode_orders(restart: Iterable[str]) -> bytes:
-    """Return the object of the answer to RELAY_REQUEST."""
+    """Return the object in the answer to RELAY_REQUEST."""
     return journal_pb2.Orders(restart=restart).SerializeToString()
 
 
 def decode_orders(payload: Buffer) -> tuple[str, ...]:
-    """Return the processes that are to be started anew. Raises WireError: the bytes are no orders."""
+    """Return the names of the processes to restart.
+
+    Raises:
+        WireError: the bytes are no orders.
+    """
     return tuple(parse(journal_pb2.Orders, payload).restart)
