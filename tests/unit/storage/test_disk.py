@@ -140,7 +140,7 @@ def test_sync_that_the_disk_refuses_is_raised_to_the_next_that_waits_and_logged_
         syncer.soon(file.fileno())
         syncer.now(DEADLINE_S)
     assert [(record.levelname, record.message) for record in caplog.records] == [
-        ("CRITICAL", "what was written in the last moment may not outlive a power cut: [Errno 5] Input/output error"),
+        ("CRITICAL", "the data written in the last moment may be lost in a power cut: [Errno 5] Input/output error"),
         ("INFO", "the disk syncs again"),
     ]
 
