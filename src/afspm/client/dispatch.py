@@ -1,4 +1,4 @@
-"""Brings packets to the handlers of a component."""
+"""Delivery of packets to the handlers of a component."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class HostedComponent(Protocol):
-    """A component as its loop sees it; see `Component` for what each member means."""
+    """The interface of a component for its loop; see `Component` for each member."""
 
     longest_step_s: ClassVar[float]
     period_s: float | None
@@ -42,10 +42,11 @@ class HostedComponent(Protocol):
 
 
 class MessageDispatcher:
-    """Brings packets to the handlers of `component`, of which `base` has the empty ones.
+    """Calls the handlers of `component` for packets; handlers inherited from `base` are empty.
 
     Args:
-        prefixes: of the envelopes that the component subscribed to; None: all. (More may arrive: what `Scope` needs.)
+        prefixes: prefixes of the envelopes that the component subscribed to; None: all. More packets arrive: `Scope`
+            needs them.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class MessageDispatcher:
         self._wanted: dict[str, bool] = {}
 
     def wants(self, packet: Packet) -> bool:
-        """Return whether there is a handler for a packet; only those need to be kept."""
+        """Return whether the component has a handler for a packet; only such packets need to be kept."""
         try:
             message = wire.message_of(packet.envelope)
         except WireError:
@@ -75,7 +76,7 @@ class MessageDispatcher:
         return any(map(self._wants_message, wire.known_messages()))
 
     def give(self, packet: Packet) -> None:
-        """Call the handlers of a packet. One that can't be read is logged and dropped."""
+        """Call the handlers of a packet; an unreadable packet is logged and dropped."""
         try:
             message = wire.message_of(packet.envelope)
             thing = wire.decode(message, packet.payload)
@@ -108,10 +109,9 @@ class MessageDispatcher:
         return self._component.on_message if self._has("on_message") else None
 
     def _has(self, name: str) -> bool:
-        """Return whether the component's class has a handler of its own."""
         return hasattr(type(self._component), name) and overrides(self._component, self._base, name)
 
 
 def overrides(thing: object, base: type, name: str) -> bool:
-    """Return whether the class of `thing` has another `name` than `base`."""
+    """Return whether the class of `thing` overrides the attribute `name` of `base`."""
     return getattr(type(thing), name, None) is not getattr(base, name, None)

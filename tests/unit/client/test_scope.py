@@ -297,7 +297,7 @@ def test_a_notebook_shows_how_it_is(lab: Lab, scope: Scope) -> None:
         assert repr(scope) == f"<Scope {name!r}: FREE, AUTOMATED, {name} is in control>"
     lab.flag(Problem.TIP_SHAPE_CHANGED)
     assert scope.control_state.problems
-    assert "nobody is in control, tip-shape-changed is flagged" in repr(scope)
+    assert "no component is in control, tip-shape-changed is flagged" in repr(scope)
     assert "'tip-shape-changed': 1" in repr(scope.problems)
 
 
@@ -472,7 +472,7 @@ def test_nothing_is_measured_before_what_a_scheduler_of_ours_publishes_is_heard(
 
 def test_a_measurement_that_nothing_is_heard_for_ends_when_its_time_is_over(lab: Lab, scope: Scope) -> None:
     lab._inbox.remove(CaughtUp(SOURCE))
-    with pytest.raises(NoResponse, match="nothing is heard of what it publishes"):
+    with pytest.raises(NoResponse, match="its packets do not arrive"):
         scope.scan(REGION, timeout_s=10.0)
     assert lab.begun_scans == 0
 
