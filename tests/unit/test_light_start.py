@@ -23,6 +23,6 @@ import pytest
         "afspm.cli.status",
     ],
 )
-def test_numpy_is_loaded_by_those_who_reckon_with_values(module: str) -> None:
+def test_numpy_is_loaded_only_by_processes_that_use_values(module: str) -> None:
     script = f"import sys, {module}; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0

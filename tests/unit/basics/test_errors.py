@@ -41,7 +41,7 @@ def test_a_notebook_shows_the_error_and_the_lines_of_the_cell_alone(name: str) -
     assert not any("geometry.py" in line for line in rest)
 
 
-def test_what_is_not_there_is_missed_as_python_does_and_told_in_a_sentence() -> None:
+def test_missing_item_is_a_key_error_with_a_readable_message() -> None:
     scans = ScanSet([Scan(Region((0, 0), (1, 1)), "Height", "m", np.zeros((2, 2)))])
     assert scans.get("Z") is None
     assert "Z" not in scans

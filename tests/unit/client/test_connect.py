@@ -66,9 +66,7 @@ def test_an_old_run_that_is_damaged_does_not_hide_the_newest(
     assert find_run(file).name == "night-2"
 
 
-def test_a_run_is_found_by_a_file_that_begins_as_editors_of_windows_let_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_run_is_found_by_a_file_with_a_byte_order_mark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     run_folder(tmp_path / "runs", "night-1")
     file = tmp_path / "other.toml"
@@ -76,9 +74,7 @@ def test_a_run_is_found_by_a_file_that_begins_as_editors_of_windows_let_it(
     assert find_run(file).name == "night-1"
 
 
-def test_who_is_interrupted_while_joining_leaves_no_connection_behind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupt_while_joining_leaves_no_connection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     port = Port()
     monkeypatch.setattr(connect, "open_port", lambda launch, clock: port)
     with pytest.raises(KeyboardInterrupt):
@@ -86,9 +82,7 @@ def test_who_is_interrupted_while_joining_leaves_no_connection_behind(
     assert port.is_closed
 
 
-def test_who_can_not_read_what_it_kept_leaves_no_connection_behind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unreadable_results_leave_no_connection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     port, folder = Port(ControlConnected(), CaughtUp(PUBLISHER)), run_folder(tmp_path, "night")
     monkeypatch.setattr(connect, "open_port", lambda launch, clock: port)
     (folder / "state" / "notebook.scope.json").write_text("nonsense", encoding="utf-8")

@@ -90,7 +90,7 @@ def test_pieces_of_files_are_refused_or_make_sense(pieces: list[bytes], suffix: 
 @pytest.mark.parametrize("name", to_damage([*WHOLE, *REAL]))
 @settings(max_examples=10, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
-def test_a_number_that_can_not_be_is_refused_or_makes_sense(name: str, data: st.DataObject) -> None:
+def test_impossible_number_is_refused_or_makes_sense(name: str, data: st.DataObject) -> None:
     """Of text: one of the numbers in it, of the same length where places are counted."""
     content = whole(name)
     numbers = list(re.finditer(rb"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?", content[:HEAD]))
@@ -119,7 +119,7 @@ def mended(content: bytes, name: str) -> bytes:
 @pytest.mark.parametrize("name", BINARY)
 @settings(max_examples=10, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
-def test_a_size_that_can_not_be_is_refused_or_makes_sense(name: str, data: st.DataObject) -> None:
+def test_impossible_size_is_refused_or_makes_sense(name: str, data: st.DataObject) -> None:
     content = bytearray(whole(name))
     most = min(len(content), 4096) - 8
     for _ in range(data.draw(st.integers(1, 2))):

@@ -85,7 +85,7 @@ def test_damaged_bytes_are_refused_or_read_and_nothing_else(name: str, data: st.
 
 
 @pytest.mark.parametrize("size", [0, 2**63])
-def test_a_heap_of_texts_in_which_the_library_would_go_round_for_ever_is_refused(size: int) -> None:
+def test_string_heap_that_would_make_the_library_loop_is_refused(size: int) -> None:
     damaged = bytearray(whole("nsid.h5"))
     second = damaged.index(b"GCOL") + 16 + 16 + 8  # its first text is no longer than 8 bytes
     damaged[second + 8 : second + 16] = size.to_bytes(8, "little")

@@ -95,7 +95,7 @@ def test_a_curve_goes_there_and_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(curve["Deflection"][len(z) :], back, atol=1e-9 * np.ptp(back))
 
 
-def test_the_makers_image() -> None:
+def test_image_of_the_maker_is_read() -> None:
     content = afspm.read(example("Calculate_Roughness/sapphire.nid"))
     assert content.controller == "Nanosurf 3.8.3.5"
     assert [scan.channel for scan in content.scans][:2] == ["Z-Axis forward", "Amplitude forward"]
@@ -107,7 +107,7 @@ def test_the_makers_image() -> None:
     assert content.upwards is True
 
 
-def test_the_makers_image_that_is_turned_and_off_the_middle() -> None:
+def test_rotated_image_of_the_maker_is_read() -> None:
     region = afspm.read(example("Plane_Removal/grid.nid")).scans[0].region
     assert region.center_m == (1.2982e-06, -1.65728e-07)
     assert np.degrees(region.angle_rad) == pytest.approx(45.0)
@@ -135,7 +135,7 @@ def test_a_file_that_ends_early_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore")  # of the maker's reader, about pandas
-def test_heights_of_a_real_studio_are_those_that_nsfopen_reads() -> None:
+def test_heights_of_a_real_studio_agree_with_nsfopen() -> None:
     """Of format 1; its channels have a range about zero, as those of the emulator."""
     nanosurf = importlib.util.find_spec("nanosurf")
     folder = Path(nanosurf.origin if nanosurf is not None and nanosurf.origin else "/").parent

@@ -54,7 +54,7 @@ def test_a_channel_is_read_as_it_was_scanned(written: dict[str, Path]) -> None:
     assert content.start_ns == 1.7e18
 
 
-def test_directions_and_units_are_told_apart(written: dict[str, Path]) -> None:
+def test_directions_and_units_are_distinguished(written: dict[str, Path]) -> None:
     (back,), (phase,) = (afspm.read(written[name]).scans for name in ("Z Height_Backward", "Phase_Forward"))
     assert (back.channel, phase.channel, phase.unit) == ("Z Height Backward", "Phase Forward", "deg")
     np.testing.assert_allclose(phase.values, HEIGHTS * 1e9, rtol=1e-6)

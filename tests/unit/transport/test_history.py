@@ -17,7 +17,7 @@ from afspm.transport.publisher import Publisher
 CLOCK = ExperimentClock.real()
 
 
-def test_what_is_of_this_moment_only_is_not_sent_to_who_comes_later() -> None:
+def test_packet_about_the_moment_is_not_sent_to_late_joiners() -> None:
     published = PublishedHistory(CLOCK, most_packets=3)
     scan = published.stamp("Scan2d", b"scan")
     lines = [published.stamp("ScanLines", b"line", keep=False) for _ in range(10)]

@@ -31,7 +31,7 @@ def unreachable() -> Iterator[int]:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse where what waits is full")
-def test_an_attempt_to_connect_is_given_up_and_begun_again(
+def test_attempt_to_connect_is_ended_and_begun_again(
     unreachable: int, open_: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert network._CONNECT_MS <= 3_000  # a partition is to heal within ten seconds

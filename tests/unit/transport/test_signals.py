@@ -22,7 +22,7 @@ def writer() -> Iterator[int]:
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
-def test_each_is_told_and_ends_nothing_by_itself(name: str, writer: int) -> None:
+def test_caught_signal_is_passed_on_and_ends_nothing(name: str, writer: int) -> None:
     number = getattr(signal, name, None)
     if number is None or (sys.platform == "win32" and name == "SIGTERM"):
         pytest.skip("no such signal here")

@@ -54,7 +54,7 @@ def publisher(monkeypatch: pytest.MonkeyPatch, open_: Any) -> Any:
 
 
 @WITHOUT_MAXRT
-def test_what_waits_for_one_that_stands_still_is_dropped_and_others_miss_nothing(
+def test_packets_for_a_stalled_subscriber_are_dropped_and_others_miss_nothing(
     publisher: Any, plain: Any, open_: Any, until: Any
 ) -> None:
     stalled = plain(zmq.SUB)
@@ -83,7 +83,7 @@ def test_what_waits_for_one_that_stands_still_is_dropped_and_others_miss_nothing
 
 
 @WITHOUT_MAXRT
-def test_one_that_goes_on_after_standing_still_gets_everything_once(
+def test_stalled_subscriber_that_continues_gets_everything_once(
     publisher: Any, open_: Any, until: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = Network.socket

@@ -42,13 +42,13 @@ def parsed(name: str, payload: bytes) -> Any:
 
 
 @each("messages")
-def test_a_peers_bytes_say_what_they_should(entry: Any) -> None:
+def test_bytes_of_a_peer_are_decoded_as_specified(entry: Any) -> None:
     expected = json_format.ParseDict(entry["fields"], message_type(entry["type"])(), ignore_unknown_fields=False)
     assert parsed(entry["type"], bytes.fromhex(entry["hex"])) == expected
 
 
 @each("messages")
-def test_our_messages_are_the_reference_bytes(entry: Any) -> None:
+def test_encoded_messages_equal_the_reference_bytes(entry: Any) -> None:
     message = json_format.ParseDict(entry["fields"], message_type(entry["type"])())
     assert message.SerializeToString(deterministic=True).hex() == entry["hex"]
 
@@ -162,7 +162,7 @@ def test_signals_and_heartbeats() -> None:
     assert [wire.BEAT.hex(), wire.CLOSING.hex()] == [beat["frames"][0] for beat in GOLDEN["heartbeats"]]
 
 
-def test_our_enumerations_have_the_numbers_of_the_contract() -> None:
+def test_enumerations_have_the_numbers_of_the_contract() -> None:
     from afspm.wire.generated import control_pb2
 
     for ours, theirs, prefix in (
