@@ -1,4 +1,4 @@
-"""The host, as a process: how it begins, what it says, how it ends."""
+"""The host, as a process: its start, its log, its end."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def listener() -> Iterator[HeartbeatListener]:
 
 
 def beats_until(listener: HeartbeatListener, enough: Callable[[Heartbeat], bool]) -> list[Heartbeat]:
-    """The beats up to one that is enough."""
+    """Return the heartbeats up to one that is enough."""
     beats: list[Heartbeat] = []
     end_s = CLOCK.monotonic_s() + 20.0
     while CLOCK.monotonic_s() < end_s:
@@ -155,7 +155,7 @@ def test_busy_component_sends_age_and_limit_of_its_step(host: Host, listener: He
 
 
 def test_slow_constructor_does_not_count_as_frozen(host: Host, listener: HeartbeatListener) -> None:
-    """The class is not known yet: it can't say how long it takes to import it."""
+    """The limit of the class is unknown before the class is imported."""
     address = listener.listen("slow")[0]
     host(part("SlowToMake", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
     beats_until(listener, lambda beat: (beat.step_age_s or 0.0) > 0.1 and beat.longest_step_s == 300.0)

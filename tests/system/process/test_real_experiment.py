@@ -24,7 +24,7 @@ pytestmark = pytest.mark.timeout(90)
 
 
 class Experiment:
-    """Scheduler and simulator, each in a process, and the launch lines of whoever joins."""
+    """Scheduler and simulator, each in a process, and the launch lines of processes that join."""
 
     def __init__(self, host: Callable[[Launch], Any], folder: Path) -> None:
         self.folder = folder

@@ -49,7 +49,7 @@ def test_nanoseconds_never_go_back() -> None:
 
 
 def told(clock: ExperimentClock) -> dict[str, object]:
-    """As another process is told of it."""
+    """Return the fields that another process gets."""
     plain: dict[str, object] = json.loads(json.dumps(clock.as_dict()))
     return plain
 

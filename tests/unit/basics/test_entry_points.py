@@ -1,4 +1,4 @@
-"""A laboratory's own package joins by being installed."""
+"""A laboratory's own package joins by its installation alone."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ class InterruptedPort:
 
 
 def shown(name: str) -> list[str]:
-    """What IPython shows of the error of a cell; IPython keeps the lines of cells so that they can be quoted."""
+    """Return the lines that IPython shows for the error of a cell, whose lines it keeps to quote them."""
     linecache.cache[name] = (len(CELL), None, CELL.splitlines(keepends=True), name)
     with pytest.raises(AfspmError) as caught:
         exec(compile(CELL, name, "exec"), {"Region": Region})

@@ -1,4 +1,4 @@
-"""Durations, lengths and times in words: the same wherever they are told."""
+"""Durations, lengths and times as text."""
 
 from __future__ import annotations
 

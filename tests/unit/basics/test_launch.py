@@ -1,4 +1,4 @@
-"""The line that a process is started with."""
+"""The launch line of a process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Somebody else, at the panel or by another program, moves the frame: what is measured then is not taken for ours."""
+"""Another person or program moves the frame: its scan is not taken for the requested one."""
 
 from __future__ import annotations
 

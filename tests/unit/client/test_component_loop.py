@@ -1,4 +1,4 @@
-"""The component's loop: which handler gets what, in which order, and how it ends."""
+"""The component's loop: handlers, their order, and the end."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Sharpness(Component):
 
 
 class Diary(Component):
-    """Writes everything down."""
+    """A component that writes every call down."""
 
     def __init__(self) -> None:
         self.lines: list[Any] = []
@@ -346,7 +346,7 @@ def test_attribute_used_too_early_is_refused_with_a_reason() -> None:
 
 
 class Counts(Component):
-    """Counts scans, and fails at those of one channel."""
+    """A component that counts scans, and fails on those of one channel."""
 
     def on_scan(self, scan: Scan) -> None:
         self.memory.setdefault("seen", []).append(scan.channel)
@@ -523,7 +523,7 @@ class Fails(Component):
 
 
 def fault_of(component: Component, folder: Path, lab: Lab | None = None) -> OwnFault | None:
-    """What its supervisor is told of its end."""
+    """Return the fault that the component reports to its supervisor."""
     assert run(component, lab or Lab(), folder) == ExitCode.OWN_FAULT
     return take_fault(folder, "experiment")
 
@@ -555,7 +555,7 @@ def test_error_that_may_pass_is_not_a_fault(tmp_path: Path, error: Exception) ->
 
 
 class Reacts(Component):
-    """Fails over each scan of one channel, having done what it was told to before."""
+    """A component that fails on scans of one channel, after an action of its test."""
 
     def __init__(self, *does: str) -> None:
         self.does = does

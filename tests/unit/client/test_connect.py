@@ -1,4 +1,4 @@
-"""Joining a run: which one is meant, and what is left behind where it fails."""
+"""Joining a run: the choice of the run, and the clean-up after a failure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PUBLISHER = "tcp://127.0.0.1:1"
 
 
 class Port:
-    """Brings the same each time, or is interrupted."""
+    """A port that brings the same events each time, or is interrupted."""
 
     def __init__(self, *brings: Incoming) -> None:
         self.clock: Clock = ExperimentClock.real()
@@ -94,7 +94,7 @@ def test_unreadable_results_leave_no_connection(tmp_path: Path, monkeypatch: pyt
 def test_module_that_a_run_folder_names_is_imported_only_if_the_caller_names_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The folder may come from somebody else, and the module with it."""
+    """The folder, and the module with it, may come from another person."""
     folder = run_folder(tmp_path, "night")
     (tmp_path / "beside_the_run.py").write_text("raise SystemExit('it was run')\n", encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)

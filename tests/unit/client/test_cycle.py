@@ -1,4 +1,4 @@
-"""One scan, followed through what is published."""
+"""One scan, followed through the published packets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ctrl-C while a script or notebook measures: what was begun is stopped, or it is said that it goes on."""
+"""Ctrl-C during a measurement of a script or notebook: the measurement is stopped, or reported as running."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from afspm.model import ControlMode, Request, Response, ScopeState
 
 @pytest.fixture(autouse=True)
 def as_in_a_script() -> Iterator[None]:
-    """Ctrl-C does what it does in a plain Python, also under a runner that ignores it."""
+    """Set the default handler of Ctrl-C, also under a runner that ignores it."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -1,4 +1,4 @@
-"""With a key, a scan is there exactly once, whenever the component is killed."""
+"""A keyed scan is taken exactly once, for a kill of the component at any time."""
 
 from __future__ import annotations
 
@@ -216,7 +216,7 @@ def test_refused_key_is_requested_again_with_another_id(tmp_path: Path) -> None:
 
 
 def retracted(lab: Lab) -> Callable[[], None]:
-    """The tip is retracted: no scan begins, and ids are remembered with that answer. Returns what engages it again."""
+    """Retract the tip: scans are refused, and the refusals cached. Return the function that engages it again."""
     execute, is_retracted = lab._execute, [True]
 
     def carry_out(request: Request) -> Response:

@@ -1,4 +1,4 @@
-"""What is kept on disk, and what waits in memory."""
+"""The memory on disk, and the backlog of packets."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_memory_file_of_another_kind_is_refused(tmp_path: Path, content: str) ->
 
 
 def test_unwritable_folder_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A drive that is away for a while must not end a component, which would be given up by the time it is back."""
+    """An unmounted drive must not end a component, which would be given up before the drive is back."""
     (tmp_path / "file").write_text("")
     memory = Memory(None)
     memory._path = tmp_path / "file" / "x.json"

@@ -1,4 +1,4 @@
-"""Scope, over a scheduler that decides by the real table and a microscope in memory."""
+"""Scope, with a scheduler that decides by the real table and a microscope in memory."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def test_accepted_scan_that_never_begins_is_requested_again(lab: Lab, scope: Sco
 
 
 def test_scan_of_the_requested_shape_counts_without_values(lab: Lab, scope: Scope) -> None:
-    """Of a translator that tells what was taken and leaves the values in its files."""
+    """Some translators publish a scan's parameters and leave the values in the controller's files."""
 
     def publish(region: Region, shape: tuple[int, int] = (8, 8)) -> None:
         lab.publish(Scan(region, "Height", "m", np.empty((0, 0)), lab.clock.now_ns(), "a.dat", shape))
@@ -459,7 +459,7 @@ def test_the_answer_to_an_earlier_request_is_not_taken_for_this_ones(lab: Lab, s
 
 
 def test_nothing_is_measured_before_the_schedulers_packets_arrive(lab: Lab, scope: Scope) -> None:
-    """It may tell that we have measured already."""
+    """The cache may show that the measurement is already done."""
     lab._inbox.remove(CaughtUp(SOURCE))
     lab.at(100.0, lambda: lab._inbox.append(CaughtUp(SOURCE)))
     scope.scan(REGION)
@@ -542,7 +542,7 @@ def test_an_error_in_the_block_still_gives_control_back(lab: Lab, scope: Scope) 
 
 
 def test_an_old_control_state_is_not_taken_for_a_loss(lab: Lab, scope: Scope) -> None:
-    """Control was granted; a state from before that arrives only now."""
+    """Control was granted; a state from before the grant arrives later."""
 
     def grant_quietly(request: model.Request) -> Response | str:
         if request.kind != ControlRequest.REQUEST_CTRL:
@@ -746,7 +746,7 @@ def test_sleeping_passes_the_time_of_the_experiment(lab: Lab, scope: Scope) -> N
 
 
 def test_request_waits_for_control_lost_during_silence(lab: Lab, scope: Scope) -> None:
-    """Then the answer is never coming: nobody asks for somebody who is not in control."""
+    """Then the answer never comes: the scheduler forwards requests only for the holder of control."""
     lab.intercept = lambda request: (
         Response(ControlResponse.NO_RESPONSE)
         if request.subject == "start-scan" and lab.clock.passed_s < 300.0

@@ -1,4 +1,4 @@
-"""What hangs together is done in one tenure of control, or begun again."""
+"""Requests that belong together are sent in one tenure of control, or from the beginning again."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TIP = Problem.TIP_SHAPE_CHANGED
 
 
 def taken_over_before(lab: Lab, subject: str) -> None:
-    """A person sets MANUAL just before this action is heard of, and hands back later."""
+    """Have a person set MANUAL just before this action arrives, and hand back later."""
 
     def person(request: model.Request) -> Response | str:
         if request.subject == subject:

@@ -1,4 +1,4 @@
-"""A scan is freed from the drift during its own acquisition, against the simulator's truth."""
+"""Drift during a scan's own acquisition is removed, judged by the simulator's truth."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ QUIET = {
 
 
 def scanned(surface: str, velocity_px: tuple[float, float], region: Region, direction: str = "up") -> Scan:
-    """In a world that drifts by so many pixels a frame."""
+    """Return a scan in a world that drifts by some pixels per frame."""
     velocity = [v * PIXEL_M / DURATION_S for v in velocity_px]
     settings = {"surface": SURFACES[surface], **QUIET, "drift": {"velocity_m_per_s": [*velocity, 0.0]}}
     world = World.from_settings(settings, seed=3, start_s=0.0)

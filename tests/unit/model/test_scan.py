@@ -1,4 +1,4 @@
-"""Scans and spectra as people hold them."""
+"""Scans and spectra in the hands of a user."""
 
 from __future__ import annotations
 

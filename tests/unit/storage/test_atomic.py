@@ -1,4 +1,4 @@
-"""A file that is saved often outlives a kill as it is, and a power cut as it was a moment before."""
+"""A file that is saved often survives a kill unchanged, and a power cut in the state of a moment before."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CUT = [b"", b"\0" * 40, b'{"control": {"mo']
 
 
 def saved(path: Path, *contents: bytes) -> None:
-    """Saved one after the other, each made sure of."""
+    """Save contents one after the other, each synced."""
     for content in contents:
         kept = CheckpointFile(path)
         kept.save(content)
@@ -122,7 +122,7 @@ def test_previous_generation_is_synced_in_the_background(tmp_path: Path) -> None
 
 
 class Reader:
-    """Has a file open, as only Windows minds, for some tries."""
+    """A reader that keeps a file open for some tries, which only Windows minds."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, tries: int) -> None:
         self.left = tries

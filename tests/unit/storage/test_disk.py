@@ -1,4 +1,4 @@
-"""Work for a disk: in order, waited for, but not for long."""
+"""Work for a disk: in order, and with short waits only."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DEADLINE_S = 10.0
 
 
 class Hanging:
-    """Work that is not done before it is let go."""
+    """Work that lasts until it is released."""
 
     def __init__(self) -> None:
         self.done: list[str] = []
@@ -75,7 +75,7 @@ def test_single_read_has_a_time_limit() -> None:
 
 @pytest.fixture
 def synced(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[int]:
-    """The files of the test that were synced, by number. What earlier tests have left running may sync others."""
+    """Return the inodes of the test's synced files; threads of earlier tests may sync others."""
     found: list[int] = []
 
     def note(descriptor: int) -> None:

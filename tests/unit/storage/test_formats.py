@@ -1,4 +1,4 @@
-"""Every format: values, geometry and times come out as the controller meant them."""
+"""Every format: values, geometry and times are read as the controller meant them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of Nanosurf's programs: the maker's examples, where they are installed, and what the emulator writes."""
+"""Files of Nanosurf's programs: the maker's examples, if installed, and the emulator's files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ START_S = 1.7e9
 
 
 def scanned(folder: Path, *, upwards: bool = True) -> tuple[Path, Instrument]:
-    """A file of the emulator, and the instrument that it was scanned with."""
+    """Return a file of the emulator, and the simulated instrument."""
     rig = Instrument({"surface": "steps"}, 3, START_S)
     rig.setup.region, rig.setup.shape = Region((40e-9, -25e-9), (300e-9, 100e-9), np.deg2rad(30)), (6, 10)
     rig.setup.upwards = upwards
@@ -56,7 +56,7 @@ def test_an_image_comes_back_as_it_was_scanned(tmp_path: Path, *, upwards: bool)
 
 @pytest.mark.filterwarnings("ignore")  # of the maker's reader, about pandas
 def test_nsfopen_reads_the_same_heights_and_curves(tmp_path: Path) -> None:
-    """It takes the range of each channel for one about zero, as it is in a file of a real Studio."""
+    """NSFopen assumes a range about zero for each channel, as in a file of a real Studio."""
     reading = pytest.importorskip("NSFopen.read")
     path, rig = scanned(tmp_path)
     assert rig.scan is not None

@@ -51,7 +51,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def logging(folder: Path) -> Iterator[Logging]:
-    """Opens the log, another life each time."""
+    """Open the log, each time as another life."""
     made: list[PacketLog] = []
 
     def make(**settings: int) -> PacketLog:
@@ -65,7 +65,7 @@ def logging(folder: Path) -> Iterator[Logging]:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Segments of a few packets, and no more than four of them."""
+    """Limit the log to four segments of a few packets."""
     monkeypatch.setattr(packet_log, "SEGMENT_BYTES", SMALL_SEGMENT)
     monkeypatch.setattr(packet_log, "CAPACITY_BYTES", 4 * SMALL_SEGMENT)
 
@@ -259,7 +259,7 @@ def test_a_full_disk_is_not_filled_with_files_nor_with_halves(logging: Logging, 
     real = segment._file
 
     class Full:
-        """Has room for a few bytes more."""
+        """A disk with room for a few bytes."""
 
         def write(self, data: memoryview) -> int:
             real.write(data[:3])

@@ -1,4 +1,4 @@
-"""Park's TIFF files: what the emulator writes, judged by Gwyddion where it is installed, and what is refused."""
+"""Park's TIFF files: the emulator's files, judged by Gwyddion if installed, and refusals."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Drawn:
 
 @pytest.fixture
 def written(tmp_path: Path) -> dict[str, Path]:
-    """The files of a scan, by channel and direction."""
+    """Return the files of a scan, by channel and direction."""
     scan = ScanActivity(1, REGION, (12, 20), 0.0, 0.5, True, Feedback(setpoint=0.7), 0.2)
     scan.draw(Drawn())
     for name, content in files.images(scan, 1.7e9, "NCM"):
@@ -100,7 +100,7 @@ def test_curves_that_are_not_whole_are_refused(tmp_path: Path) -> None:
 
 
 def test_the_makers_own_reader_reads_the_same(written: dict[str, Path], tmp_path: Path) -> None:
-    """It wants a picture in colours and in several strips, which every Park file has."""
+    """The reader needs a coloured picture in several strips, which every Park file has."""
     tiff = pytest.importorskip(
         "pspylib.tiff", reason="pspylib, Park's own reader, is not installed (pip install pspylib)"
     )

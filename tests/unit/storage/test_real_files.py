@@ -1,4 +1,4 @@
-"""Files of real microscopes: what is known of them comes out."""
+"""Files of real microscopes: their known facts are read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a person is told when their code raises: their lines, without ours."""
+"""The text of an error in a user's code: the user's lines, without those of afspm."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OURS = Path(MessageDispatcher.give.__code__.co_filename).parents[1]
 
 
 def made_up(code: str, **names: object) -> dict[str, Any]:
-    """The names that `code` defines, as if it stood in a file of ours."""
+    """Return the names that `code` defines, as if it were a file of afspm."""
     exec(compile(code, str(OURS / "client" / "made_up.py"), "exec"), names)
     return names
 
@@ -35,7 +35,7 @@ def call(function):
 
 
 def raised(function: Callable[[], object]) -> BaseException:
-    """What it raises when it is called by code of ours."""
+    """Return the error that a function raises when afspm's code calls it."""
     error = made_up(CALL)["call"](function)
     assert isinstance(error, BaseException)
     return error

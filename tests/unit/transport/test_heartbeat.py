@@ -1,4 +1,4 @@
-"""Heartbeats: they come while a process is busy, and say so."""
+"""Heartbeats of idle and busy processes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_heartbeats_arrive_under_the_name_of_their_process(open_: Any) -> None:
 
 @pytest.mark.parametrize("needs_token", [True, False])
 def test_only_the_process_itself_can_send_its_heartbeats(open_: Any, needs_token: bool) -> None:
-    """A process that knows its token is known by it: from the beginning, or from its first beat on."""
+    """A token identifies the process, from the beginning or from its first heartbeat on."""
     listener = open_(HeartbeatListener())
     address = listener.listen("Component", token="secret", needs_token=needs_token)[0]
     sender = open_(HeartbeatSender(address, 0.02, lambda: 0.0, lambda: 30.0, "secret"))

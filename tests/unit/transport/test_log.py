@@ -1,4 +1,4 @@
-"""What a process writes to standard error."""
+"""Lines of a process on standard error."""
 
 from __future__ import annotations
 

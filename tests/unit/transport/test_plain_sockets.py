@@ -1,4 +1,4 @@
-"""Programs of other makes, as plain sockets with the golden bytes, in every place that they can take."""
+"""Programs of other makes in every role, as plain sockets with the golden bytes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long is waited, and for what."""
+"""Timeouts and sources of the poller."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who only looks on lets others have the processor first."""
+"""Processes that only observe have a lower priority."""
 
 from __future__ import annotations
 

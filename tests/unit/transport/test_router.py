@@ -24,7 +24,7 @@ CLOCK = ExperimentClock.real()
 
 
 class Listening:
-    """A router and everything that it has told."""
+    """A router and all its events."""
 
     def __init__(self, open_: Any, own: Keys | None = None) -> None:
         self.network = open_(Network(own))
@@ -33,7 +33,7 @@ class Listening:
         self.told: list[Any] = []
 
     def until(self, count: int, kind: type = PeerAsked, *ports: ZmqPort) -> list[Any]:
-        """What was told of a kind, once it is so much; `ports` of ours are waited for meanwhile."""
+        """Return the events of a kind once there are `count`, while polling `ports`."""
         deadline_s = time.monotonic() + 5.0
         while len(found := [event for event in self.told if isinstance(event, kind)]) < count:
             assert time.monotonic() < deadline_s, self.told
@@ -155,7 +155,7 @@ def test_probe_disturbs_no_component(open_: Any, until: Any, caplog: pytest.LogC
 
 
 class Run:
-    """A router with keys that were made for a run, and clients of it."""
+    """A router with keys made for a run, and its clients."""
 
     def __init__(self, open_: Any) -> None:
         self._open = open_
@@ -181,7 +181,7 @@ class Run:
 
 
 def answered(port: ZmqPort) -> list[bytes]:
-    """The payloads of what the port is answered within a moment."""
+    """Return the payloads of the answers within a moment."""
     found: list[Any] = []
     deadline_s = time.monotonic() + 0.5
     while not found and time.monotonic() < deadline_s:

@@ -1,4 +1,4 @@
-"""What is let in: this computer, or the owners of keys."""
+"""Accepted peers: this computer, or the owners of keys."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ends a program is told to the supervisor instead, the closing of the terminal too."""
+"""Signals that end a program are passed on, also SIGHUP of a closed terminal."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from afspm.transport.process import signals
 
 @pytest.fixture
 def writer() -> Iterator[int]:
-    """What wakes a poller up."""
+    """Yield the descriptor that wakes a poller up."""
     ours, theirs = socket.socketpair()
     theirs.setblocking(False)
     with ours, theirs:

@@ -1,4 +1,4 @@
-"""A subscriber that takes nothing any more: what waits for it is dropped, and once it goes on it gets everything."""
+"""A stalled subscriber: its waiting packets are dropped, and it gets them when it continues."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SOON_S = 6.0  # earlier than anything else disconnects it
 
 @pytest.fixture
 def publisher(monkeypatch: pytest.MonkeyPatch, open_: Any) -> Any:
-    """One that waits for a peer for half a second and remembers its last packet alone."""
+    """Return a publisher that waits for a peer for half a second and keeps only its last packet."""
     monkeypatch.setattr(network, "_STALLED_MS", 500)
     published = PublishedHistory(CLOCK, most_packets=2 * SCANS, most_bytes=2 * SCANS * len(SCAN))
 

@@ -1,4 +1,4 @@
-"""What other threads post is taken in turns that end."""
+"""Items from other threads are taken in bounded turns."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_constant_posting_does_not_block_the_taker(wake_up: WakeUp[int]) -> None
     most = 10_000
 
     class Refilled(deque[int]):
-        """Whenever one is taken another is there, as from a thread that does nothing but post."""
+        """A queue that is never empty, as with a thread that posts all the time."""
 
         taken = 0
 

@@ -1,4 +1,4 @@
-"""Arrays without lists, envelopes, users' own messages, and bytes that are none."""
+"""Arrays as views, envelopes, users' own messages, and bytes without a message."""
 
 from __future__ import annotations
 

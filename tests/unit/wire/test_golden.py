@@ -57,7 +57,7 @@ def test_encoded_messages_equal_the_reference_bytes(entry: Any) -> None:
     "entry", [e for e in GOLDEN["messages"] if e["type"] in AS_MODEL], ids=lambda entry: entry["name"]
 )
 def test_model_objects_survive_a_round_trip(entry: Any) -> None:
-    """What we make of a peer's message and send on says the same in SI units, with the same presence."""
+    """A peer's message, decoded and sent on, has the same content in SI units and the same fields."""
     received = wire.decode(entry["type"], bytes.fromhex(entry["hex"]))
     name, sent = wire.encode(received)
     assert name == entry["type"]
@@ -67,7 +67,7 @@ def test_model_objects_survive_a_round_trip(entry: Any) -> None:
 
 
 def _presence(message: Any) -> Any:
-    """Which fields are there, all the way down."""
+    # the present fields at every level
     return {
         field.name: _presence(value) if field.message_type and not field.is_repeated else None
         for field, value in message.ListFields()

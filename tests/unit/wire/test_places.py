@@ -1,4 +1,4 @@
-"""A message in other coordinates: the place changes, and nothing else."""
+"""A message in other coordinates: only its place changes."""
 
 from __future__ import annotations
 
