@@ -70,6 +70,7 @@ def find(name: str, *groups: str) -> EntryPoint | None:
     Raises:
         ConfigError: two packages declare the name.
     """
+    # by value: two packages may declare the same object
     found = {point.value: point for point in _points(groups) if point.name == name}
     if len(found) > 1:
         packages = sorted({_package(point) for point in found.values()})

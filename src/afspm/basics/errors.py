@@ -9,6 +9,7 @@ from typing import ClassVar, Final
 
 _PACKAGE: Final = str(Path(__file__).parents[1])
 _LIBRARIES: Final = "site-packages"
+# IPython's names of the files that cells pretend to be
 _CELLS: Final = ("<ipython-input", "ipykernel_")
 
 

@@ -66,13 +66,13 @@ def position_text(xy_m: tuple[float, float]) -> str:
     return f"({numbers}) {unit}"
 
 
-def typeset(told: str) -> str:
+def typeset(text: str) -> str:
     """Return the text of lengths, areas and positions with typographic signs, for pages.
 
     >>> typeset("2 x 1 µm at (1.2, -0.5) µm")
     '2 × 1 µm at (1.2, −0.5) µm'
     """
-    return told.replace(" x ", " × ").replace("-", "−")
+    return text.replace(" x ", " × ").replace("-", "−")
 
 
 def time_of_day(time_ns: int, zone: tzinfo | None = None, *, seconds: bool = True) -> str:
@@ -115,7 +115,7 @@ def scale(largest: float, unit: str) -> tuple[float, str]:
     """Return (factor, unit with prefix) that suit numbers up to `largest`: shown = value * factor."""
     if unit not in PREFIXABLE or not math.isfinite(largest) or largest == 0.0:
         return 1.0, unit
-    # what rounds up to a thousand belongs to the next prefix
+    # 0.9996 µm is shown as "1 µm", not as "1000 nm"
     size = abs(largest) * 1.0005
     power, prefix = next(((p, name) for p, name in _PREFIXES if size >= p), _PREFIXES[-1])
     return 1.0 / power, prefix + unit

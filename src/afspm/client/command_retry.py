@@ -40,8 +40,8 @@ _ASKED_FOR: dict[int, str] = {
     RELAY_REQUEST: "the note",
 }
 _NO_STATE = (
-    "waiting for the microscope, which has published no state yet: is its translator running? If it never publishes "
-    "what is in force when a scheduler connects: restart it, or scan once by hand"
+    "waiting for the microscope, which has published no state yet: is its translator running? If it does not "
+    "publish its state when a scheduler connects: restart it, or scan once by hand"
 )
 NOT_IN_CONTROL = {ControlResponse.NOT_IN_CONTROL, ControlResponse.WRONG_CONTROL_MODE}
 
@@ -157,7 +157,7 @@ class CommandRetry:
                 raise NoResponse(
                     f"the microscope does not answer {kind.name}: {response.reason or 'no reason given'}",
                     where=link.name,
-                    hint="is its translator running? it may or may not have been carried out",
+                    hint="is its translator running? the request may or may not have been carried out",
                 )
             if not has_warned and (
                 response.detail is not ResponseDetail.NOT_SENT or link.clock.monotonic_s() >= late_s

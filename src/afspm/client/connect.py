@@ -104,7 +104,7 @@ def guest_of(folder: Path, name: str) -> Launch:
     guest = read_run_json(folder).get(GUEST)
     if not isinstance(guest, dict):
         raise ConfigError(
-            "this part of the experiment has no component that could be joined",
+            "no component of this run is on this computer, so nothing can be joined here",
             where=str(folder / RUN_FILE),
             hint="connect on the computer where components run",
         )

@@ -364,9 +364,9 @@ class ExperimentLink:
         finally:
             requests.expect("")
         raise NoResponse(
-            f"{request_name(kind)} was not answered, asked {max(sent, 1)} times",
+            f"{request_name(kind)} was not answered, sent {max(sent, 1)} times",
             where=self.name,
-            hint="it may or may not have been carried out",
+            hint="the request may or may not have been carried out",
         )
 
     def send_only(self, kind: ControlRequest, subject: object = None) -> None:

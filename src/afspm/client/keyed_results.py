@@ -52,7 +52,7 @@ class KeyedResults:
 
     def __init__(self, folder: Path | None, name: str) -> None:
         self._folder = folder / f"{name}.results" if folder else None
-        self._outage = OutageLog("what is measured can't be kept", _log)
+        self._outage = OutageLog("keyed measurements can't be saved", _log)
         self._memory = Memory(folder / f"{name}.scope.json" if folder else None)
 
     @property
@@ -138,10 +138,10 @@ def _read(path: Path) -> tuple[Plain, list[object]]:
         with path.open("rb") as file:
             packets = [entry.packet for entry in iter(lambda: read_packet(file), None)]
         if not packets or packets[0].envelope != _HEAD:
-            raise ValueError("not a result")
+            raise ValueError("the file is not a result")
         head = json.loads(bytes(packets[0].payload))
         if len(packets) != 1 + head["things"]:
-            raise ValueError("not all of it is there")
+            raise ValueError("the file is incomplete")
         return head, [wire.decode(packet.envelope, packet.payload) for packet in packets[1:]]
     except (OSError, ValueError, WireError) as error:
-        raise FileError(f"can't be read: {error}", where=str(path), hint="remove it to measure anew") from error
+        raise FileError(f"can't be read: {error}", where=str(path), hint="remove it to measure again") from error

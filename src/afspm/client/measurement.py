@@ -317,7 +317,7 @@ class MeasurementRunner:
             return "it was stopped at the microscope, or its file is missing; the log of the translator says which"
         if cycle.outcome is CycleOutcome.ANOTHER:
             other = target.describe(cycle.other)
-            return f"not what was asked for was measured, but {other}; who else sets the microscope?"
+            return f"another measurement was taken instead: {other}; does another program use the microscope?"
         return "the microscope is free again without a result; was it restarted?"
 
 

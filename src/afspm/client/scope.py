@@ -303,7 +303,7 @@ class Scope(ExperimentView):
             InvalidValue: the text is empty or too long, or the end of the scan is unknown.
         """
         if scan is not None and scan.time_ns is None:
-            raise InvalidValue("the scan does not say when it was finished", hint="give time_ns instead")
+            raise InvalidValue("the scan has no time of its end", hint="give time_ns instead")
         scan_ns, now_ns = None if scan is None else scan.time_ns, self._link.clock.now_ns()
         about_ns = next(one for one in (time_ns, scan_ns, now_ns) if one is not None)
         note = Note(about_ns, self._link.name, text, scan_ns, now_ns)

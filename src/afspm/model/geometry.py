@@ -91,6 +91,7 @@ class Region:
         """Return the four corners after the rotation, shape (4, 2), counter-clockwise from the corner of smallest x and
         y.
         """
+        # imported late, as in all of model: processes without values start in half the time without numpy
         import numpy as np
 
         half = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * np.asarray(self.size_m)

@@ -22,6 +22,7 @@ _MOST_PIXELS: Final = 4096
 """Most pixels of a robust fit, spread over the scan."""
 _ROUNDS: Final = 50
 _TRIALS: Final = 200
+# Huber's constant: 95 % of the efficiency of least squares for normally distributed noise
 _HUBER: Final = 1.345
 _MAD: Final = 1.4826
 """Standard deviation of a normal distribution, in median absolute deviations."""
@@ -81,6 +82,7 @@ def _reweighted(columns: Floats, heights: Floats, weigh: Callable[[Floats], Floa
 
 def _huber(columns: Floats, heights: Floats) -> Floats:
     def weigh(residuals: Floats) -> Floats:
+        # the floors keep a perfectly flat scan from a division by zero
         sigma = max(_MAD * float(np.median(np.abs(residuals))), 1e-9)
         return np.minimum(1.0, _HUBER * sigma / np.maximum(np.abs(residuals), 1e-12))
 
@@ -121,6 +123,7 @@ def _ransac(columns: Floats, heights: Floats) -> Floats:
 
 def _few(columns: Floats, heights: Floats) -> tuple[Floats, Floats]:
     step = max(1, len(heights) // _MOST_PIXELS)
+    # spread over the scan by chance, but with a fixed seed: the same scan is always levelled alike
     chosen = np.random.default_rng(1).permutation(len(heights))[::step] if step > 1 else slice(None)
     return columns[chosen], heights[chosen]
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+# standard deviation of a normal distribution, in median absolute deviations
 _SD_PER_MAD = 1.4826
 _OUTLIERS_SD = 4.0
 
@@ -23,8 +24,8 @@ class Levelling(Enum):
     MEDIANS = "medians"
     """The median of each row."""
     DIFFERENCES = "differences"
-    """Of each line, the median of its differences from the line before, added up: features longer than half a line
-    do no harm."""
+    """The median difference of each row from the row before, summed up: features longer than half a row do no
+    harm."""
 
 
 def levelled(values: Array, how: Levelling) -> Array:
@@ -85,6 +86,7 @@ def _lines(values: Array, finite: NDArray[np.bool_]) -> Array:
 
 def _medians(values: Array, finite: NDArray[np.bool_]) -> Array:
     medians = np.zeros((len(values), 1))
+    # numpy warns of a median over no values
     some = finite.any(axis=1)
     medians[some] = np.nanmedian(np.where(finite, values, np.nan)[some], axis=1, keepdims=True)
     return medians

@@ -45,7 +45,7 @@ class MicroscopeStatus:
         lost_since_s: real time since when nothing is known of the microscope.
         feedback_before: the feedback before a request of unknown outcome.
         in_doubt: there is such a request.
-        told: the danger that was logged.
+        logged: the danger that was logged last.
     """
 
     dangerous: Collection[str] = ()
@@ -56,7 +56,7 @@ class MicroscopeStatus:
     risk: TipRisk = TipRisk()
     feedback_before: bool | None = None
     in_doubt: bool = False
-    told: str | None = None
+    logged: str | None = None
 
     @property
     def is_free(self) -> bool:
@@ -70,10 +70,10 @@ class MicroscopeStatus:
 
     def with_state(self, state: ScopeState, now_s: float) -> MicroscopeStatus:
         """Take a state that the translator published."""
-        told = replace(self, state=state, states_seen=self.states_seen + 1)
+        changed = replace(self, state=state, states_seen=self.states_seen + 1)
         if state is ScopeState.UNDEFINED:
-            return replace(told, lost_since_s=now_s) if self.lost_since_s is None else told
-        return replace(told, lost_since_s=None)._with_risk(replace(self.risk, state=state))
+            return replace(changed, lost_since_s=now_s) if self.lost_since_s is None else changed
+        return replace(changed, lost_since_s=None)._with_risk(replace(self.risk, state=state))
 
     def with_feedback(self, feedback: Feedback) -> MicroscopeStatus:
         """Take the present feedback."""
@@ -103,6 +103,7 @@ class MicroscopeStatus:
 
     def after_action(self, action: str, *, is_away: bool) -> MicroscopeStatus:
         """Take an action that was, or may have been, carried out: all but starts and stops may move the tip."""
+        # to start or stop a scan or spectrum neither engages nor withdraws the tip
         only_runs = action in STARTS or action in STOPS.values()
         return self if only_runs else self.with_tip(away=is_away)
 
@@ -124,11 +125,11 @@ class MicroscopeStatus:
     def telling(self) -> tuple[MicroscopeStatus, str | None]:
         """Return the danger if it was not logged yet, so that each is logged once."""
         danger = self.danger
-        return replace(self, told=danger), None if danger == self.told else danger
+        return replace(self, logged=danger), None if danger == self.logged else danger
 
     def _with_risk(self, risk: TipRisk) -> MicroscopeStatus:
         changed = replace(self, risk=risk)
-        return replace(changed, told=None) if changed.danger is None else changed
+        return replace(changed, logged=None) if changed.danger is None else changed
 
 
 def feedback_of(request: Request) -> Feedback | None:

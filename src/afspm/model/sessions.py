@@ -27,6 +27,7 @@ from afspm.basics.frozen import replace
 
 K = TypeVar("K")
 V = TypeVar("V")
+# tokens of earlier sessions of a name that may still come back
 _FORMERS = 8
 _RUN = re.compile("[0-9a-f]{16}")
 

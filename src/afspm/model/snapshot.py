@@ -69,10 +69,12 @@ def to_plain(value: object, *, lists: bool = False) -> Any:
     if isinstance(value, Mapping):
         if all(isinstance(key, str) for key in value):
             return {key: to_plain(one, lists=lists) for key, one in value.items()}
+        # JSON has only text as keys: other mappings become pairs
         return [[to_plain(key, lists=lists), to_plain(one, lists=lists)] for key, one in value.items()]
     if isinstance(value, list | tuple | deque):
         return [to_plain(one, lists=lists) for one in value]
     if isinstance(value, set | frozenset):
+        # sorted, so that equal states give equal snapshots
         return sorted(to_plain(one, lists=lists) for one in value)
     return value
 
@@ -101,6 +103,7 @@ def from_plain(type_: Any, plain: Any) -> Any:
         return type_(plain)
     if origin is not None:
         return _from_collection(origin, arguments, plain)
+    # a whole number in JSON is an int
     if type_ is float:
         return float(plain)
     if type_ is bytes:

@@ -75,6 +75,7 @@ def _nearest(places: Floats) -> tuple[float, float]:
     from scipy.spatial import cKDTree
 
     extent = float(np.ptp(places, axis=0).max())
+    # positions within a thousandth of the extent are repeats at one point
     same = 1e-3 * extent
     distinct = places[np.unique(np.round(places / same), axis=0, return_index=True)[1]] if extent else places[:1]
     if len(distinct) < 2:
@@ -82,6 +83,7 @@ def _nearest(places: Floats) -> tuple[float, float]:
     found = cKDTree(distinct).query(distinct, k=min(5, len(distinct)))
     distances, others = np.asarray(found[0]), np.asarray(found[1])
     spacing_m = float(np.median(distances[:, 1]))
+    # without diagonal neighbours, which are 1.41 spacings away
     one, rank = np.nonzero((distances > 0.0) & (distances < 1.3 * spacing_m))
     between = distinct[others[one, rank]] - distinct[one]
     angles = np.arctan2(between[:, 1], between[:, 0])
@@ -97,6 +99,7 @@ def _axis(along_m: Floats, spacing_m: float) -> tuple[Floats, NDArray[np.int64]]
     if not steps.size:
         return np.array([float(order.mean())]), np.zeros(len(along_m), np.int64)
     step = float(steps.min())
+    # the mean step over the whole extent: a single step has the error of two positions
     count = round(float(order[-1] - order[0]) / step)
     step = float(order[-1] - order[0]) / count
     lines = np.round((along_m - order[0]) / step).astype(np.int64)
@@ -187,6 +190,7 @@ def _turning_point(swept: Floats) -> int | None:
     extent = float(np.ptp(swept)) if half else 0.0
     if odd or half < 2 or not np.allclose(swept[:half], swept[half:][::-1], rtol=0.0, atol=1e-3 * extent):
         return None
+    # the way there must cover most of the range: a one-way sweep of equal values has no turning point
     return half if abs(swept[half] - swept[0]) > 0.5 * extent else None
 
 

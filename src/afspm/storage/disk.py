@@ -89,6 +89,7 @@ class DiskThread:
             Exception: any exception of `work`.
         """
         task = self.submit(work, size)
+        # while the disk hangs no caller waits again: each would lose the deadline
         if not task.done.acquire(timeout=0.0 if self.hangs else self._deadline_s):
             self.hangs = True
             raise DiskTimeout(self._deadline_s)

@@ -117,5 +117,5 @@ def _number(value: Any) -> Any:
 def _read(content: bytes) -> Plain:
     values = json.loads(content)
     if not isinstance(values, dict):
-        raise ValueError("it is not what a component remembers")
+        raise ValueError("the file is not the memory of a component")
     return values

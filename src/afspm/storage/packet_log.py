@@ -63,6 +63,7 @@ class PacketLog:
         self._full = deque((path, path.stat().st_size) for path in segments(folder))
         self._done_with: list[Path] = []
         self._spare = sorted(folder.glob(f"*{_SPARE_SUFFIX}"))
+        # numbers are never used twice: they distinguish new packets from remains in an overwritten file
         used = [number_of(path) for path in (*self._spare, *(path for path, _ in self._full))]
         self._number = max([*used, (committed(folder) or START).segment])
         self.has_grown = True
@@ -103,6 +104,7 @@ class PacketLog:
             if not is_recorded and self._size <= limit + self._most_unrecorded_bytes:
                 break
             all_recorded = all_recorded and is_recorded
+            # before the segment is freed, else a power cut loses the packets
             self._carry_forward(path, live)
             self._full.popleft()
             self._done_with.append(path)
@@ -239,6 +241,7 @@ def committed(folder: Path) -> Position | None:
         return Position(int(segment), int(offset))
     except FileNotFoundError:
         return None
+    # a damaged file: nothing counts as recorded, so nothing is freed
     except (OSError, ValueError):
         return START
 

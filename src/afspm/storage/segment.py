@@ -58,6 +58,7 @@ class SegmentWriter:
         """
         payload = entry.packet.payload
         head = head_of(entry, self._number)
+        # one system call for a small packet, no copy of a large one
         if len(payload) <= _SMALL:
             self._write(head + payload)
         else:
@@ -80,6 +81,7 @@ class SegmentWriter:
         self._file.close()
 
     def _write(self, data: bytes | memoryview) -> None:
+        # an unbuffered write may take only a part, e.g. on a disk that is nearly full
         view = memoryview(data)
         while view:
             view = view[self._file.write(view) :]

@@ -85,7 +85,7 @@ class ControlClient:
 
     def _interpret(self, frames: list[bytes]) -> list[Incoming]:
         if len(frames) < 2 or frames[0]:
-            raise WireError("the empty frame before it is missing")
+            raise WireError("the empty frame before the answer is missing")
         response = wire.decode_response(frames[1:])
         self._unanswered = b""
         return [ReplyReceived(response)]

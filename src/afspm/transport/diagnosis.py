@@ -94,12 +94,12 @@ _UNREACHED: Mapping[Reach, tuple[str, str]] = {
         "end that program, or give the experiment another port",
     ),
     Reach.NO_GREETING: (
-        "the connection is accepted, and nothing comes: that process hangs, or it is another program",
+        "the connection is accepted, but nothing is sent: that process hangs, or is another program",
         "look which program has this port; a process of the experiment that hangs is restarted by itself",
     ),
     Reach.SILENT: (
-        "no answer at all: a firewall drops what is sent there, the cable is out, or that computer is off",
-        "see that it is on and has this address; then let its firewall accept this port",
+        "no answer at all: a firewall drops the messages, the cable is out, or that computer is off",
+        "check that it is on and has this address; then let its firewall accept this port",
     ),
     Reach.NO_ROUTE: (
         "this computer has no way to that network",
@@ -136,13 +136,15 @@ def of_handshake(address: str, handshake: Handshake, key: str, server: str) -> D
     """Judge the key exchange with the key `key` at an address of `server`."""
     code = f"key-{handshake.value}"
     if handshake is Handshake.DONE:
-        return fine(code, address, f"the key of {key or 'nobody'} is let in")
+        return fine(code, address, f"the key of {key} is accepted" if key else "no key is needed")
     if handshake is Handshake.KEY_REFUSED:
         what = f"{server} does not know the key of {key}"
         return Diagnosis(
             "key-unknown", Severity.ERROR, address, what, f"copy keys/public/{key}.key to the computer of {server}"
         )
-    what = f"the connection stands, but keys do not fit: perhaps keys/public/{server}.key here is not that of {server}"
+    what = (
+        f"the connection stands, but keys do not fit: perhaps keys/public/{server}.key here is of another process"
+    )
     remedy = f"copy keys/public of the computer of {server} to this one"
     return Diagnosis("key-mismatch", Severity.ERROR, address, what, remedy)
 
@@ -154,9 +156,9 @@ def of_clock(ahead_s: float, uncertain_s: float) -> Diagnosis:
     """Judge the lead of this computer's clock over the scheduler's."""
     where = "the clock of this computer"
     if abs(ahead_s) <= MOST_AHEAD_S + uncertain_s:
-        return fine("clock", where, f"agrees with that of the scheduler to {abs(ahead_s) + uncertain_s:.2f} s")
+        return fine("clock", where, f"agrees with the scheduler's clock to {abs(ahead_s) + uncertain_s:.2f} s")
     way = "ahead of" if ahead_s > 0.0 else "behind"
-    what = f"is {duration_text(abs(ahead_s))} {way} that of the scheduler"
+    what = f"is {duration_text(abs(ahead_s))} {way} the scheduler's clock"
     remedy = "let both computers take their time from the network (NTP): files and logs have times that do not fit"
     return Diagnosis("clock", Severity.WARNING, where, what, remedy)
 
@@ -167,7 +169,7 @@ def of_versions(ours: Versions, theirs: Versions | None) -> Diagnosis:
     if theirs is None or theirs == ours:
         return fine("versions", "this computer", here)
     there = f"afspm {theirs.afspm}, Python {theirs.python}, libzmq {theirs.libzmq}"
-    what = f"{here}; that of the scheduler: {there}"
+    what = f"{here}; the scheduler's computer: {there}"
     if theirs.afspm == ours.afspm:
         return fine("versions", "this computer", what)
     remedy = f"install the same on both: pip install afspm=={theirs.afspm}"
@@ -232,7 +234,7 @@ def of_publisher(address: str, heard: Iterable[Heard], *, caught_up: bool) -> Di
     count = sum(one.count for one in heard)
     if caught_up:
         return fine("heard", address, f"{count} packets while listening, after all that was cached")
-    what = "it is connected, and publishes nothing"
+    what = "the publisher is connected, but sends nothing"
     remedy = "wait a moment; if it stays so, the link is too slow for the scans that are cached, or the scheduler hangs"
     return Diagnosis("silent-publisher", Severity.ERROR, address, what, remedy)
 

@@ -230,7 +230,7 @@ def _bindable(address: str) -> str:
     try:
         found = {str(entry[4][0]) for entry in socket.getaddrinfo(host, None, socket.AF_INET)}
     except OSError as error:
-        raise TransportError(f"can't bind: {host!r} is no name that is known here", where=address) from error
+        raise TransportError(f"can't bind: this computer does not know the name {host!r}", where=address) from error
     if not any(map(_is_ours, found)):
         what = f"can't bind: {host!r} is another computer: {', '.join(sorted(found))}"
         raise TransportError(what, where=address, hint="is this process meant to run there (--only)?")

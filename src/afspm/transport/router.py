@@ -27,8 +27,8 @@ from afspm.transport.rate_limited_log import RateLimitedLog
 _LAST_WORDS = 200
 """Most messages received before the end of a sender is reported."""
 _LOOKS_S = (0.0, 0.02, 0.5)
-"""Real times, after a connection has ended, at which its sender is looked for: the library tells of the end a moment
-before it lets go of the peer."""
+"""Real times, after the end of a connection, at which its sender is probed: ZeroMQ reports the end a moment before it
+forgets the peer."""
 
 
 class PeerConnected(NamedTuple):

@@ -115,7 +115,9 @@ def open_server_port(launch: Launch, clock: Clock) -> ZmqServerPort:
         ConfigError: there is no address for requests.
     """
     if launch.sockets.serve is None:
-        raise ConfigError("it has no address to answer requests on", where=launch.name, hint="serve = address")
+        raise ConfigError(
+            "the translator has no address for requests", where=launch.name, hint="serve = address"
+        )
     return ZmqServerPort(
         Network.from_launch(launch.name, launch.keys),
         clock,

@@ -90,7 +90,7 @@ def _decode_scan(payload: Buffer) -> model.Scan:
         raise WireError(f"a scan of {shape.x} x {shape.y} pixels with {values.size} values")
     region = convert.whole_region(convert.spatial_from_wire(message.params.spatial))
     if region is None:
-        raise WireError("a scan that does not say where it was taken")
+        raise WireError("a scan without a place")
     return model.Scan(
         region,
         message.channel,
@@ -103,6 +103,7 @@ def _decode_scan(payload: Buffer) -> model.Scan:
 
 
 def _scan_header(payload: Buffer) -> model.PacketHeader:
+    # the values are cut out before parsing: a header costs the same for a scan of any size
     message = parse(scan_pb2.Scan2d, split(payload, _VALUES_OF_SCAN)[0])
     spatial = message.params.spatial
     size_m = None
@@ -130,7 +131,7 @@ def _decode_lines(payload: Buffer) -> model.ScanLines:
     values, shape = doubles(chunks), message.params.data.shape
     region = convert.whole_region(convert.spatial_from_wire(message.params.spatial))
     if region is None or not shape.x or values.size % shape.x:
-        raise WireError(f"{values.size} values are no lines of {shape.x} pixels of a scan of which the place is known")
+        raise WireError(f"{values.size} values are no lines of {shape.x} pixels of a scan with a known place")
     return model.ScanLines(
         region,
         (shape.y, shape.x),
@@ -161,6 +162,7 @@ def _encode_spectrum(spectrum: model.Spectrum) -> tuple[str, bytes]:
         names=spectrum.names,
         units=spectrum.units,
     )
+    # nested by hand: protobuf would copy the values into a list of Python floats
     inner = b"".join((data.SerializeToString(), *packed(spectrum.values, _VALUES_OF_DATA)))
     return "Spec1d", message.SerializeToString() + nested(inner, _DATA_OF_SPECTRUM)
 
@@ -216,6 +218,7 @@ def _published_parameters(payload: Buffer) -> model.ScanParameters:
     if isinstance(parameters.region, model.RegionChange):  # published parameters are in force: no angle means unrotated
         whole = convert.whole_region(parameters.region)
         parameters = model.ScanParameters(whole or parameters.region, parameters.shape, parameters.unit)
+    # a request may change one axis alone, but parameters in force have both
     if isinstance(parameters.shape, model.ShapeChange):
         raise WireError("scan parameters in force with pixels along one axis only")
     return parameters

@@ -9,6 +9,7 @@ import math
 
 from afspm import model
 from afspm.basics.errors import InvalidValue
+from afspm.basics.formatting import lengths_text
 from afspm.basics.units import convert
 from afspm.wire.generated import control_pb2, scan_pb2, spectroscopy_pb2
 
@@ -44,6 +45,7 @@ def spatial_from_wire(spatial: scan_pb2.SpatialAspects) -> model.RegionChange | 
     if not spatial.HasField("roi"):
         return None
     roi = spatial.roi
+    # the wire format's units for a message without any
     unit = spatial.length_units or "m"
     angle_unit = spatial.angular_units or "deg"
 
@@ -96,6 +98,7 @@ def scan_parameters_from_wire(message: scan_pb2.ScanParameters2d) -> model.ScanP
     """
     change = spatial_from_wire(message.spatial)
     _finite(change)
+    # a request without an angle keeps the present angle, so it is only a change of the region
     region = whole_region(change) if change is not None and change.angle_rad is not None else None
     shape: tuple[int, int] | model.ShapeChange | None = None
     if message.data.HasField("shape"):
@@ -111,8 +114,9 @@ def _finite(change: model.RegionChange | None) -> None:
     for name, value in vars(change).items():
         if value is not None and not math.isfinite(value):
             raise InvalidValue(f"{name.rsplit('_', 1)[0]} of the region is {value}")
-    if any(size is not None and size <= 0 for size in (change.width_m, change.height_m)):
-        raise InvalidValue(f"the region's size ({change.width_m} m, {change.height_m} m) must be above zero")
+    for side, size_m in (("width", change.width_m), ("height", change.height_m)):
+        if size_m is not None and size_m <= 0.0:
+            raise InvalidValue(f"the {side} of the region is {lengths_text([size_m])}", hint="above zero")
 
 
 def position_to_wire(position: model.ProbePosition) -> spectroscopy_pb2.ProbePosition:

@@ -36,7 +36,7 @@ from afspm.wire.split import Buffer
 PROTOCOL_VERSION: Final = 2
 
 KILL: Final = b"KILL"
-"""The packet of one frame by which all subscribers learn that the experiment has ended."""
+"""The packet of one frame to all subscribers that announces the end of the experiment."""
 CLOSE: Final = bytes([100])
 """The request of one frame that ends the translator, which subscribes to no publisher, with the experiment."""
 BEAT: Final = b"\x00"
@@ -110,6 +110,7 @@ def encode_subject(subject: object) -> bytes:
         seconds, nanos = divmod(round(subject * 1e9), 10**9)
         return Duration(seconds=seconds, nanos=nanos).SerializeToString()
     if isinstance(subject, str):
+        # long names are not cached, since 256 of them could take much memory
         return _action_message(subject) if len(subject) <= LONGEST_ID else _new_action_message(subject)
     return encode(subject)[1]
 
@@ -221,10 +222,10 @@ def _number(payload: bytes) -> int:
 
 def _seconds(payload: bytes) -> float:
     try:
-        told = Duration.FromString(payload)
+        duration = Duration.FromString(payload)
     except DecodeError as error:
         raise WireError(f"the bytes are no Duration: {error}") from None
-    seconds = told.seconds + told.nanos * 1e-9
+    seconds = duration.seconds + duration.nanos * 1e-9
     if not 0.0 < seconds <= LONGEST_LEASE_S:
         raise InvalidValue(f"a lease of {seconds:g} s", hint=f"above 0 and at most {LONGEST_LEASE_S:g} s")
     return seconds

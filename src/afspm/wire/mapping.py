@@ -23,6 +23,7 @@ from afspm.wire.split import Buffer
 T = TypeVar("T")
 E = TypeVar("E", bound=IntEnum)
 
+# the record and numpy keep times as ns in a signed 64-bit integer
 _TIMES = 2**63
 _FLOAT32 = struct.Struct("<f")
 
@@ -39,7 +40,7 @@ def time_ns(stamp: Timestamp) -> int:
     """
     found = int(stamp.seconds) * NS_PER_S + stamp.nanos
     if not -_TIMES <= found < _TIMES:
-        raise InvalidValue(f"a time {stamp.seconds} s from 1970")
+        raise InvalidValue(f"a time of {stamp.seconds} s since 1970, outside of the years 1678 to 2261")
     return found
 
 
@@ -108,6 +109,7 @@ class MessageMapping(Generic[T]):
         return self.kind(
             **{
                 attribute: None
+                # an absent field reads as 0, which a request would then set
                 if attribute in self._optional and not message.HasField(field.name)
                 else _converted(field, getattr(message, field.name))
                 for attribute, field in self._fields.items()
@@ -145,6 +147,7 @@ def _each(name: str, mapping: MessageMapping[Any]) -> FieldMapping:
 
 
 def _gain(name: str) -> FieldMapping:
+    # a float32 in the message: its nearest float64 would differ from the value that was set
     def finite(value: float) -> float:
         if not math.isfinite(value):
             raise InvalidValue(f"{name} is {value}")
@@ -177,6 +180,7 @@ CONTROL_STATE = MessageMapping(
     model.ControlState,
     control_pb2.ControlState,
     mode=_enum("control_mode", model.ControlMode),
+    # the wire has an empty name for no holder
     holder=FieldMapping("client_in_control_id", from_wire=lambda holder: holder or None),
     problems=FieldMapping("problems_set", from_wire=lambda problems: tuple(sorted({int(one) for one in problems}))),
 )
@@ -217,6 +221,7 @@ _NOTE = MessageMapping(
     scan_ns=_time("scan"),
     written_ns=_time("written"),
 )
+# Told is the name on the wire, which must stay compatible
 RELAYED = MessageMapping(
     model.RelayedMessage, journal_pb2.Told, "payload", message=FieldMapping("message", from_wire=_needed("a message"))
 )

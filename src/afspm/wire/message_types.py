@@ -57,19 +57,20 @@ def _compiled(path: Path) -> ModuleType:
         from grpc_tools import protoc
     except ImportError:
         raise ConfigError(
-            "needs a compiler for messages",
+            "this file needs a compiler for messages",
             where=str(path),
             hint='pip install "afspm[messages]", or name a _pb2 module',
         ) from None
+    # for files that import google/protobuf/*.proto
     well_known = Path(protoc.__file__).parent / "_proto"
     with tempfile.TemporaryDirectory(prefix="afspm-") as folder:
         arguments = ["protoc", f"-I{path.parent}", f"-I{well_known}", f"--python_out={folder}", str(path)]
         if protoc.main(arguments) != 0:
-            raise ConfigError("has errors, told above", where=str(path))
+            raise ConfigError("has errors; the compiler's messages are above", where=str(path))
         name = f"{path.stem.replace('-', '_')}_pb2"
         spec = importlib.util.spec_from_file_location(name, Path(folder) / f"{name}.py")
         if spec is None or spec.loader is None:
-            raise ConfigError("protoc made no module of it", where=str(path))
+            raise ConfigError("protoc has not made a module from this file", where=str(path))
         module = importlib.util.module_from_spec(spec)
         sys.modules[name] = module
         spec.loader.exec_module(module)

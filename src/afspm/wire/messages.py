@@ -52,10 +52,10 @@ class MessageKind(Enum):
     """The kinds of messages, which receivers treat differently."""
 
     MEASUREMENT = "a finished measurement, with its values"
-    LINES = "rows of a running scan: of the moment, not kept"
-    STATE = "what is in force: the newest replaces those before"
-    EVENT = "what happened to processes, requests and people's notes"
-    RESULT = "what a component or a drift scheduler found out"
+    LINES = "rows of a running scan, for the moment: not kept"
+    STATE = "states and settings in force: the newest replaces earlier ones"
+    EVENT = "events of processes and requests, and people's notes"
+    RESULT = "findings of a component or a drift scheduler"
     PART = "a part of other messages or of requests, or a message of a user"
 
 
@@ -240,9 +240,11 @@ _MODULES = (
     analysis_pb2, control_pb2, drift_pb2, feedback_pb2, geometry_pb2,
     journal_pb2, lines_pb2, scan_pb2, spectroscopy_pb2,
 )  # fmt: skip
+# collected by their class, so that no declaration above can be forgotten
 _declared: dict[str, MessageDeclaration] = {
     one.name: one for one in list(globals().values()) if isinstance(one, MessageDeclaration)
 }
+# all other messages are parts of these
 for _module in _MODULES:
     for _name in _module.DESCRIPTOR.message_types_by_name:
         _declared.setdefault(_name, MessageDeclaration(type=getattr(_module, _name)))
@@ -256,6 +258,7 @@ def declare(declaration: MessageDeclaration) -> MessageDeclaration:
     """
     name = declaration.name
     known = _declared.setdefault(name, declaration)
+    # by full name: a .proto file that is compiled again gives another class of the same message
     if known.type is not declaration.type and known.type.DESCRIPTOR.full_name != declaration.type.DESCRIPTOR.full_name:
         raise InvalidValue(f"there is a message {name!r} already", hint="choose another name")
     if replace(known, type=declaration.type) != declaration:
@@ -333,6 +336,7 @@ def message_of(envelope: str) -> str:
     Raises:
         WireError: the envelope begins with no known name.
     """
+    # the longest name first: the name of a message may begin with that of another and an underscore
     end = len(envelope)
     while end > 0:
         if (name := envelope[:end]) in _declared:

@@ -52,6 +52,7 @@ def split(buffer: bytes | memoryview, field: int) -> tuple[bytes, list[memoryvie
             raise WireError(f"byte {start} begins a field of the unknown kind {wire_type}")
         if at + length > end:
             raise WireError(f"the message breaks off: the field at byte {start} is longer than what is left")
+        # protobuf allows a repeated field in several packed pieces, and unpacked
         if tag >> 3 == field and wire_type in (_LENGTH, _FIXED64):
             found.append(view[at : at + length])
             rest.append(view[kept_from:start])
@@ -73,6 +74,7 @@ def doubles(chunks: list[memoryview]) -> NDArray[np.float64]:
 
     if not chunks:
         return np.empty(0)
+    # the encoder of a peer may send pieces: only these are copied
     data = chunks[0] if len(chunks) == 1 else b"".join(chunks)
     if len(data) % 8:
         raise WireError(f"values of {len(data)} bytes are no float64 numbers")
@@ -106,6 +108,7 @@ def varint(view: memoryview | bytes, at: int) -> tuple[int, int]:
     """
     value = shift = 0
     end = len(view)
+    # a 64-bit number has at most ten bytes; a longer one is damage
     while at < end and shift < 64:
         byte = view[at]
         at += 1

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+# numbers of fields in proto/
 _VALUES = {"Scan2d": 4, "ScanLines": 4}
 _DATA_OF_SPECTRUM, _VALUES_OF_DATA = 4, 5
 _NO_VALUES = 1 << 28  # a field number that no message has
@@ -103,5 +104,6 @@ def relocated(name: str, payload: Buffer, place: bytes) -> bytes:
     part = part_of(message)
     part.Clear()
     part.ParseFromString(place)
+    # a place of default values alone has no bytes, but must be present
     part.SetInParent()
     return b"".join((message.SerializeToString(), *(packed_chunks(values, values_field) if values else [])))

@@ -48,7 +48,7 @@ def test_a_frame_that_is_never_scanned_is_given_up(lab: Lab, scope: Scope) -> No
         lab.publish_scan(OTHER_REGION)
 
     lab._finish_scan = elsewhere  # type: ignore[method-assign]
-    with pytest.raises(NoResponse, match="failed 5 times: not what was asked for"):
+    with pytest.raises(NoResponse, match="failed 5 times: another measurement was taken"):
         scope.scan(REGION, shape=(8, 8))
 
 

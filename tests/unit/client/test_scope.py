@@ -428,7 +428,7 @@ def test_schedulers_answer_about_a_slow_translator_precedes_a_repetition(lab: La
 
 def test_scheduler_that_never_answers_is_reported(lab: Lab, scope: Scope) -> None:
     lab.intercept = lambda request: None
-    with pytest.raises(NoResponse, match="asked 4 times"):
+    with pytest.raises(NoResponse, match="sent 4 times"):
         scope.flag(TIP)
 
 
@@ -815,7 +815,7 @@ def test_note_needs_no_control_and_has_the_time_of_its_scan(lab: Lab, scope: Sco
 
 def test_note_on_a_scan_of_unknown_time_is_refused(scope: Scope) -> None:
     scan = Scan(REGION, "Height", "m", np.zeros((2, 2)))
-    with pytest.raises(InvalidValue, match="when it was finished"):
+    with pytest.raises(InvalidValue, match="has no time of its end"):
         scope.note("here", scan=scan)
 
 

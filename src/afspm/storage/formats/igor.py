@@ -50,7 +50,7 @@ def read_wave(data: bytes) -> Wave:
     if version != 5:
         raise FileError(f"is an Igor wave of version {version}, not 5", hint="save it again in Igor, as version 5")
     if int(np.frombuffer(data, f"{order}i2", _DATA // 2).sum(dtype=np.int64)) & 0xFFFF:
-        raise FileError("its header is damaged: the checksum is wrong")
+        raise FileError("has a damaged header: the checksum is wrong")
     formula, note = struct.unpack_from(f"{order}2i", data, 8)
     unit, *units = struct.unpack_from(f"{order}5i", data, 16)
     sizes = [formula, note, unit, *units, *struct.unpack_from(f"{order}4i", data, 36)]
@@ -97,7 +97,7 @@ def _values(data: bytes, order: str) -> tuple[np.ndarray, int]:
     kind_of = np.dtype(f"{order}{_KINDS[kind]}")
     end = _DATA + count * kind_of.itemsize
     if end > len(data):
-        raise FileError(f"is incomplete: values of {end - _DATA} bytes, of which {len(data) - _DATA} are there")
+        raise FileError(f"is incomplete: {len(data) - _DATA} of {end - _DATA} bytes of values")
     return np.frombuffer(data, kind_of, count, _DATA).reshape(used, order="F"), end
 
 
