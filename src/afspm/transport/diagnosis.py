@@ -142,9 +142,7 @@ def of_handshake(address: str, handshake: Handshake, key: str, server: str) -> D
         return Diagnosis(
             "key-unknown", Severity.ERROR, address, what, f"copy keys/public/{key}.key to the computer of {server}"
         )
-    what = (
-        f"the connection stands, but keys do not fit: perhaps keys/public/{server}.key here is of another process"
-    )
+    what = f"the connection stands, but keys do not fit: perhaps keys/public/{server}.key here is of another process"
     remedy = f"copy keys/public of the computer of {server} to this one"
     return Diagnosis("key-mismatch", Severity.ERROR, address, what, remedy)
 

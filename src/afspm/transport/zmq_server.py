@@ -115,9 +115,7 @@ def open_server_port(launch: Launch, clock: Clock) -> ZmqServerPort:
         ConfigError: there is no address for requests.
     """
     if launch.sockets.serve is None:
-        raise ConfigError(
-            "the translator has no address for requests", where=launch.name, hint="serve = address"
-        )
+        raise ConfigError("the translator has no address for requests", where=launch.name, hint="serve = address")
     return ZmqServerPort(
         Network.from_launch(launch.name, launch.keys),
         clock,

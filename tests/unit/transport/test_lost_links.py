@@ -52,7 +52,7 @@ def test_a_host_name_listens_at_every_address_of_the_computer(open_: Any, monkey
     assert bound.startswith("tcp://0.0.0.0:")
 
 
-@pytest.mark.parametrize(("ip", "reason"), [("192.0.2.7", "another computer: 192.0.2.7"), ("", "does not know the name")])
+@pytest.mark.parametrize(("ip", "reason"), [("192.0.2.7", "another computer: 192.0.2.7"), ("", "not know the name")])
 def test_the_name_of_another_computer_is_refused(
     open_: Any, monkeypatch: pytest.MonkeyPatch, ip: str, reason: str
 ) -> None:
