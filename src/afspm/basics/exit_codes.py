@@ -12,6 +12,7 @@ class ExitCode(IntEnum):
     """Finished on purpose: there is nothing more to do."""
     CRASHED = 1
     """An exception without a handler; its traceback is in the log."""
+    # EX_CONFIG of sysexits.h
     CONFIG = 78
     """The settings can't work: a restart would fail the same way."""
     ENDED = 80

@@ -21,6 +21,7 @@ def lock(file: IO[bytes], *, shared: bool = False, wait: bool = False) -> None:
     if sys.platform == "win32":
         import msvcrt
 
+        # Windows locks bytes from the present position on: the first byte stands for the file
         file.seek(0)
         msvcrt.locking(file.fileno(), msvcrt.LK_LOCK if wait else msvcrt.LK_NBLCK, 1)
     else:

@@ -113,6 +113,7 @@ class Launch:
         return cls(**values, sockets=Sockets(**_fields(Sockets, sockets, "launch line, sockets")))
 
 
+# JSON has one type of number, and 1.0 may be written as 1
 _JSON_TYPES: Mapping[str, tuple[type, ...]] = {
     "str": (str,),
     "str | None": (str, NoneType),
@@ -141,6 +142,7 @@ def _fields(cls: type[Launch | Sockets], plain: object, where: str) -> Plain:
 
 
 def _checked(key: str, value: object, kind: str, where: str) -> object:
+    # a bool is an int in Python
     fits = isinstance(value, _JSON_TYPES[kind]) and (kind == "bool" or not isinstance(value, bool))
     if isinstance(value, int | float):
         fits = fits and value >= 0

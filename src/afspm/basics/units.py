@@ -36,6 +36,7 @@ _BASES = {
     "Ohm": "ohm",
     "ohm": "ohm",
 }
+# fractions are exact: a ratio of two units has no rounding error
 _NANO, _MICRO = Fraction(1, 10**9), Fraction(1, 10**6)
 _DEGREE = Fraction(math.pi) / 180
 _SPECIAL: dict[str, tuple[str, Fraction]] = {
@@ -279,6 +280,7 @@ def _simple(unit: str) -> tuple[str, Fraction] | None:
     return None
 
 
+# pint's names of base units
 _SI_NAMES = {
     "meter": "m",
     "second": "s",

@@ -72,6 +72,7 @@ class Region:
             )
         if values[2] <= 0.0 or values[3] <= 0.0:
             raise InvalidValue(f"a region of {area_text(values[2:4])} is empty", hint="both sizes are above zero")
+        # the class is frozen; text was converted to numbers above
         object.__setattr__(self, "center_m", values[:2])
         object.__setattr__(self, "size_m", values[2:4])
         object.__setattr__(self, "angle_rad", values[4])

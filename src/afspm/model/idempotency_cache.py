@@ -95,6 +95,7 @@ class IdempotencyCache:
         """Return the status or answer of an id; None for a new id, or without one."""
         older, latest = self.table.get(_shelf(client, request.id), _NONE)
         entry = latest.get(request.id) or older.get(request.id) if request.id else None
+        # an id at or below its floor may have been executed, so it is not new
         if entry is None:
             return RequestStatus.FORGOTTEN if self.floors.is_below(client, request.id) else None
         if entry[0] != fingerprint(request):

@@ -28,6 +28,7 @@ class ControlRequest(IntEnum):
     ACTION_SUPPORT = 12
 
 
+# numbers from 100 on are extensions of afspm, unknown to the published implementation
 CLOCK_REQUEST = 101
 """Request for the experiment time; an extension of afspm."""
 RELAY_REQUEST = 102

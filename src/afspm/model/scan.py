@@ -117,6 +117,7 @@ class Scan:
             raise InvalidValue(f"a scan needs values as [y, x], not of shape {self.values.shape}")
         if self.pixels is None:
             return
+        # raises InvalidValue for pixels that no scan can have
         ScanParameters(shape=self.pixels)
         if self.values.size and self.values.shape != self.pixels:
             raise InvalidValue(f"a scan of {self.pixels} pixels with values of shape {self.values.shape}")

@@ -176,6 +176,7 @@ class OutageLog:
         """Enclose a write; its FileError or OSError is logged and not passed on."""
         try:
             yield
+        # a DiskBacklogFull is a DiskTimeout, so it comes first: its data are lost, not late
         except DiskBacklogFull as error:
             self._fails(error)
         except DiskTimeout:

@@ -168,6 +168,7 @@ class Syncer:
 
     def soon(self, file: int) -> None:
         """Sync the data written to an open file within the period."""
+        # by inode: a file that is written often, or through several descriptors, is synced once a period
         found = os.fstat(file)
         with self._changed:
             if (key := (found.st_dev, found.st_ino)) in self._written:

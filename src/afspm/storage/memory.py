@@ -69,6 +69,7 @@ class Memory(MutableMapping[str, Any]):
         return self._saved
 
     def _write(self, text: str) -> bool:
+        # after a failure `_saved` keeps the old text, so the next `save_changes` writes again
         with self._outage.trying():
             if (generations := self._generations) is not None:
                 self._disk.run(lambda: generations.save(text.encode()))

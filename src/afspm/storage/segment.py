@@ -120,8 +120,9 @@ def read_packet(file: IO[bytes], number: int = 0) -> LoggedPacket | None:
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
         return None
-    magic, said, envelope_len, payload_len, time_ns, source_ns, history, _ = _HEAD.unpack(head)
-    if (magic, said) != (_MAGIC, number):
+    # a number of another life marks remains of an overwritten file
+    magic, written_number, envelope_len, payload_len, time_ns, source_ns, history, _ = _HEAD.unpack(head)
+    if (magic, written_number) != (_MAGIC, number):
         return None
     envelope, payload = file.read(envelope_len), file.read(payload_len)
     packet = Packet(envelope.decode("utf-8", "replace"), payload, None if time_ns < 0 else time_ns)

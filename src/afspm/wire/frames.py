@@ -179,6 +179,7 @@ def decode_response(frames: Sequence[Buffer]) -> Response:
     if not count or len(frames[0]) != 1:
         raise WireError(f"a response of {count} frames, the first of {len(frames[0]) if frames else 0} bytes")
     payload = bytes(frames[1]) if count > 1 else b""
+    # text for people: a wrong byte in it must not hide the answer
     reason = str(frames[2], "utf-8", "replace") if count > 2 and frames[2] else ""
     request_id = str(frames[3], "utf-8", "replace") if count > 3 else ""
     detail = known(ResponseDetail, frames[4][0]) if count > 4 and frames[4] else ResponseDetail.NONE

@@ -45,10 +45,12 @@ def read_wave(data: bytes) -> Wave:
     """
     if len(data) < _DATA:
         raise FileError(f"is incomplete: {len(data)} bytes are too few for an Igor wave")
+    # the version, a 16-bit number below 256, comes first: its first byte is 0 in a big-endian file
     order = "<" if data[0] else ">"
     (version,) = struct.unpack_from(f"{order}h", data)
     if version != 5:
         raise FileError(f"is an Igor wave of version {version}, not 5", hint="save it again in Igor, as version 5")
+    # the 16-bit words of both headers sum to zero (Technical Note 003)
     if int(np.frombuffer(data, f"{order}i2", _DATA // 2).sum(dtype=np.int64)) & 0xFFFF:
         raise FileError("has a damaged header: the checksum is wrong")
     formula, note = struct.unpack_from(f"{order}2i", data, 8)
