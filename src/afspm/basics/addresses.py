@@ -44,7 +44,7 @@ def reaches(connect: str, bind: str) -> bool:
 
 
 def connectable(bind: str) -> str:
-    """Return the address by which a peer on this computer connects to a bound socket: a wildcard becomes loopback."""
+    """Return the address for peers on this computer of a bound socket: a wildcard becomes loopback."""
     return re.sub(r"^tcp://(\*|0\.0\.0\.0)(?=:)", f"tcp://{LOOPBACK}", bind)
 
 

@@ -67,7 +67,7 @@ class ScanTarget:
         return is_near(wanted, scan.region, FITS)
 
     def name_of(self, scan: Scan) -> str:
-        """Return the channel, of which a result has only one."""
+        """Return the channel: a result has each channel once."""
         return scan.channel
 
     def describe(self, scan: Scan) -> str:

@@ -13,7 +13,7 @@ FEEDBACK_OFF = "feedback-off"
 STOPS = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
 """Actions that stop a running scan or spectrum."""
 STARTS = {names.START_SCAN: names.STOP_SCAN, names.START_SPEC: names.STOP_SPEC}
-"""Actions that start a scan or spectrum, and those that stop one."""
+"""Actions that start a scan or spectrum, with the actions that stop it."""
 _OFF = names.OFF_WORDS | {"0.0"}  # translators of other makes may take a number
 
 

@@ -28,11 +28,11 @@ DEFINITION = "NXspm"
 BIAS_SPECTRUM = "NXsts"
 """The definition that a spectrum over the bias of a tunnelling microscope follows."""
 ABOUT = "afspm"
-"""The group with what NeXus has no name for."""
+"""The group for facts without a name in NeXus."""
 GRID = "grid"
 """The content of a file with the spectra of a grid."""
 VENDOR = "vendor"
-"""The group with what the controller's own file said."""
+"""The group with the header of the controller's own file."""
 
 
 def read_hdf5(path: Path, zone: tzinfo | None) -> FileContent:

@@ -235,7 +235,7 @@ class CheckpointFile:
         self._thread: threading.Thread | None = None
 
     def save(self, content: bytes) -> None:
-        """Add a generation: a text without line breaks, of which no prefix is valid.
+        """Add a generation: a text without line breaks and without a valid prefix.
 
         Raises:
             FileError: the text can't be written.

@@ -89,7 +89,7 @@ class Network:
 
     Args:
         keys: keys of this process. With keys, connections are encrypted and their owners known: all connections, or
-            only those for requests and those that are not unix sockets (`Keys.binds_encrypted`).
+            only connections for requests and all but unix sockets (`Keys.binds_encrypted`).
         insecure: bind and connect to other computers without keys. Anyone there can then move the tip.
     """
 

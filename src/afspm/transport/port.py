@@ -162,7 +162,7 @@ class ServerPort(Protocol):
 
         Args:
             time_ns: time of the packet. A restarted translator publishes packets that the kill may have lost again,
-                with their first times, so that a receiver ignores those that it has.
+                with their first times, so that a receiver ignores repeated ones.
             keep: keep the packet for later subscribers; False for packets about the present moment only.
         """
 

@@ -63,7 +63,7 @@ class ParentWatch:
     with `code_if_late`; if the tip is in danger, `TIP_WITHIN_S` later.
 
     Args:
-        pipe: descriptor of which the parent holds the other end.
+        pipe: descriptor of a pipe; the parent holds its other end.
     """
 
     def __init__(self, pipe: int, code_if_late: int) -> None:
