@@ -115,7 +115,7 @@ def scale(largest: float, unit: str) -> tuple[float, str]:
     """Return (factor, unit with prefix) that suit numbers up to `largest`: shown = value * factor."""
     if unit not in PREFIXABLE or not math.isfinite(largest) or largest == 0.0:
         return 1.0, unit
-    # 0.9996 µm is shown as "1 µm", not as "1000 nm"
+    # a number that rounds up to a thousand, as 999.6 nm in three digits, belongs to the next prefix
     size = abs(largest) * 1.0005
     power, prefix = next(((p, name) for p, name in _PREFIXES if size >= p), _PREFIXES[-1])
     return 1.0 / power, prefix + unit

@@ -165,6 +165,12 @@ def test_invalid_values_are_refused(subject: object) -> None:
     assert refused.value.response == ControlResponse.PARAM_ERROR
 
 
+def test_empty_region_is_refused_with_its_size_in_a_readable_unit() -> None:
+    payload = encode_subject(ScanParameters(RegionChange(height_m=-7.5e-6)))
+    with pytest.raises(WireError, match=r"the height of the region is -7\.5 µm"):
+        wire.decode_request([bytes([ControlRequest.SET_SCAN_PARAMS]), payload])
+
+
 def test_an_unknown_request_is_not_supported() -> None:
     with pytest.raises(WireError) as refused:
         wire.decode_request([b"\x63"])
