@@ -72,7 +72,7 @@ class ControlHold:
             if not self._wanted:
                 self.leave()
             raise
-        except BaseException:
+        except BaseException:  # also Ctrl-C: control must be released on every way out of the block
             self._end_block(quietly=True)
             raise
         else:

@@ -119,7 +119,7 @@ class MeasurementRunner:
         try:
             self._take_up(task)
             things = self._finish(task)
-        except BaseException:
+        except BaseException:  # also Ctrl-C and StopRequested: the measurement goes on at the microscope
             if task.key is not None and task.watch is not None and not task.watch.is_over():
                 self._unfinished, task.watch = task.watch, None  # the next call with this key takes it up
             raise
